@@ -1,0 +1,129 @@
+"""Pinhole cameras in OpenCV axes: x right, y down, z forward; pixel (c, r) covers [c, c+1) x [r, r+1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from gsseg_core.errors import IntrinsicsError, PoseError
+
+# Poses come from text files of few digits; a deviation this small moves no point by a pixel.
+_RIGID_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A posed pinhole camera without distortion.
+
+    Attributes
+    ----------
+    name : str
+        Stem of the image's file name.
+    width, height : int
+        Image size in pixels.
+    K : ndarray (3, 3) float64
+        Intrinsic matrix in pixels, without skew.
+    world_to_camera : ndarray (4, 4) float64
+        Rigid motion from the world (the scene) to the camera.
+
+    Raises
+    ------
+    IntrinsicsError
+        Size or `K` is not that of a pinhole camera.
+    PoseError
+        `world_to_camera` is NaN, not invertible, or not a rigid motion.
+    """
+
+    name: str
+    width: int
+    height: int
+    K: npt.NDArray[np.float64]  # (3, 3)
+    world_to_camera: npt.NDArray[np.float64]  # (4, 4)
+
+    def __post_init__(self) -> None:
+        """Copy the matrices and validate."""
+        object.__setattr__(self, "K", np.array(self.K, np.float64))
+        object.__setattr__(self, "world_to_camera", np.array(self.world_to_camera, np.float64))
+        self._check_intrinsics()
+        self._check_pose()
+
+    @property
+    def fx(self) -> float:
+        """Focal length along x, in pixels."""
+        return float(self.K[0, 0])
+
+    @property
+    def fy(self) -> float:
+        """Focal length along y, in pixels."""
+        return float(self.K[1, 1])
+
+    @property
+    def cx(self) -> float:
+        """Principal point along x, in pixels from the image's left edge."""
+        return float(self.K[0, 2])
+
+    @property
+    def cy(self) -> float:
+        """Principal point along y, in pixels from the image's upper edge."""
+        return float(self.K[1, 2])
+
+    @property
+    def center(self) -> npt.NDArray[np.float64]:
+        """Position (3,) of the camera in the world."""
+        return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+
+    def project(
+        self,
+        points: npt.ArrayLike,  # (M, 3)
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Project world points into the image.
+
+        Parameters
+        ----------
+        points : array (M, 3)
+            In the world.
+
+        Returns
+        -------
+        uv : ndarray (M, 2)
+            Pixel coordinates, NaN for points that are not in front of the camera.
+        depth : ndarray (M,)
+            z in the camera, in scene units.
+        """
+        local = np.asarray(points, np.float64) @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
+        depth = local[:, 2]
+        divisor = np.where(depth > 0, depth, np.nan)[:, None]
+        return local[:, :2] / divisor * self.K[[0, 1], [0, 1]] + self.K[:2, 2], depth
+
+    def _check_intrinsics(self) -> None:
+        who = f"camera '{self.name}'"
+        for side, size in (("width", self.width), ("height", self.height)):
+            if not isinstance(size, (int, np.integer)) or size < 1:
+                raise IntrinsicsError(f"{who}: {side} is {size!r}; expected a whole number of pixels, at least 1")
+        K = self.K
+        if K.shape != (3, 3) or not np.isfinite(K).all():
+            raise IntrinsicsError(f"{who}: K is {K.tolist()}; expected 3 x 3 finite numbers")
+        if self.fx <= 0 or self.fy <= 0:
+            raise IntrinsicsError(f"{who}: focal lengths are {self.fx:g} and {self.fy:g}; expected positive pixels")
+        if K[0, 1] or K[1, 0] or K[2].tolist() != [0, 0, 1]:
+            raise IntrinsicsError(f"{who}: K is {K.tolist()}; expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+
+    def _check_pose(self) -> None:
+        who = f"camera '{self.name}'"
+        pose = self.world_to_camera
+        if pose.shape != (4, 4):
+            raise PoseError(f"{who}: pose has shape {pose.shape}; expected (4, 4)")
+        if not np.isfinite(pose).all():
+            raise PoseError(f"{who}: pose holds NaN or infinite numbers; expected a rigid motion")
+        rotation = pose[:3, :3]
+        determinant = np.linalg.det(rotation)
+        if abs(determinant) < 1e-9:
+            raise PoseError(f"{who}: pose is not invertible (determinant {determinant:.3g}); expected a rigid motion")
+        off = max(abs(rotation @ rotation.T - np.eye(3)).max(), abs(pose[3] - (0, 0, 0, 1)).max())
+        if determinant < 0 or off > _RIGID_TOLERANCE:
+            raise PoseError(
+                f"{who}: pose is not a rigid motion (determinant {determinant:.6g}, off by {off:.3g}); expected a "
+                "rotation of determinant 1, a translation, and 0 0 0 1 as the last row"
+            )

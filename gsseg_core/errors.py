@@ -1,0 +1,78 @@
+"""Every error that gsseg raises on purpose: one class per cause, all derived from `GssegError`.
+
+A message is one line. It names the file (or topic), what was found there, and what was expected.
+"""
+
+from __future__ import annotations
+
+
+class GssegError(Exception):
+    """Base of all errors of gsseg; the command line prints it as one line and exits with code 2."""
+
+
+class SceneFileError(GssegError):
+    """A scene file is missing, truncated, or not a PLY."""
+
+
+class ScenePropertyError(GssegError):
+    """A PLY lacks the properties of a 3DGS scene, or has them in an unusable form."""
+
+
+class SceneValueError(GssegError):
+    """Values of a scene are NaN, infinite, out of range, or of the wrong shape."""
+
+
+class EmptySceneError(GssegError):
+    """A scene, or a selection from one, holds no Gaussian."""
+
+
+class CameraFileError(GssegError):
+    """A camera file is missing or broken, or a folder has no cameras."""
+
+
+class PoseError(GssegError):
+    """A camera pose is NaN, not invertible, or not a rigid motion."""
+
+
+class IntrinsicsError(GssegError):
+    """An intrinsic matrix or image size is unusable, or a lens is not a pinhole without distortion."""
+
+
+class MaskFormatError(GssegError):
+    """A mask is missing, unreadable, or not an image of one 8- or 16-bit integer per pixel."""
+
+
+class MaskSizeError(GssegError):
+    """A mask has another size than its camera."""
+
+
+class UnknownLabelError(GssegError):
+    """A mask holds a label that the classes do not name."""
+
+
+class ClassesFileError(GssegError):
+    """`classes.json` is broken."""
+
+
+class SplitFileError(GssegError):
+    """`split.json` is broken, or names views that do not exist."""
+
+
+class NoUsableViewsError(GssegError):
+    """No view is left to learn from or to render."""
+
+
+class WriteError(GssegError):
+    """A file could not be written: disk full, folder not writable, path taken by a folder."""
+
+
+class StateFileError(GssegError):
+    """A saved state or segmentation is missing or broken."""
+
+
+class StateMismatchError(GssegError):
+    """A saved state or segmentation belongs to another scene."""
+
+
+class SettingsError(GssegError):
+    """A setting has an impossible value."""

@@ -1,0 +1,179 @@
+"""Label maps with the errors that real segmenters make, drawn from a seed, to learn from and to be measured against.
+
+Each kind of error is one function of (labels, generator, settings), and `corrupt` applies them in the order in which
+they arise: where the outline of an object lies, what is missing inside it, which label it gets, and clutter on top.
+Every kind has a stream of random numbers of its own, so switching one off leaves the draws of the others as they were.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from gsseg_core.errors import SettingsError
+
+
+@dataclass(frozen=True)
+class MaskErrors:
+    """How wrong masks are. An object is a label above 0 that occurs in the view; the defaults are realistic.
+
+    Attributes
+    ----------
+    missed : float
+        Probability that an object of a view is missed: its pixels become `missed_label`.
+    swapped : float
+        Probability that an object of a view carries the label of another object of that view instead of its own.
+    edge_px : int
+        The outline of each object of a view moves in or out by a whole number of px, all from 0 to this one as likely.
+    holes : float
+        Probability that an object of a view has a hole, which becomes `missed_label`.
+    hole_px : float
+        Largest mean radius of a hole in px; the smallest is a third of it.
+    blobs : float
+        Mean number of clutter blobs in a view; each carries the label of some object of the view.
+    blob_px : float
+        Largest mean radius of a blob in px; the smallest is a third of it.
+    missed_label : int
+        What a segmenter writes where it found nothing: the background, or the label of what surrounds the objects.
+
+    Raises
+    ------
+    SettingsError
+        A probability outside [0, 1], `missed` and `swapped` together above 1, or a negative amount.
+    """
+
+    missed: float = 0.15
+    swapped: float = 0.10
+    edge_px: int = 3
+    holes: float = 0.0
+    hole_px: float = 8.0
+    blobs: float = 0.0
+    blob_px: float = 12.0
+    missed_label: int = 0
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        for name in ("missed", "swapped", "holes"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise SettingsError(f"mask errors: found {name} = {getattr(self, name)}; expected a probability")
+        if self.missed + self.swapped > 1:
+            raise SettingsError(
+                f"mask errors: found missed + swapped = {self.missed + self.swapped}; expected at most 1, "
+                "since an object meets one of the two"
+            )
+        for name in ("edge_px", "hole_px", "blobs", "blob_px", "missed_label"):
+            if not getattr(self, name) >= 0:
+                raise SettingsError(f"mask errors: found {name} = {getattr(self, name)}; expected 0 or more")
+
+
+def corrupt(
+    labels: np.ndarray,  # (H, W)
+    rng: np.random.Generator,
+    settings: MaskErrors | None = None,
+) -> np.ndarray:
+    """Draw one wrong version of a view's label map.
+
+    Parameters
+    ----------
+    labels : array (H, W) of int
+        True labels; unknown (negative) pixels stay as they are.
+    rng : numpy.random.Generator
+        Source of all randomness. Streams are spawned from it, so the n-th call on a generator depends on its seed and
+        on n alone.
+    settings : MaskErrors, optional
+        How wrong; `MaskErrors()` by default.
+
+    Returns
+    -------
+    ndarray (H, W) int32
+        A new array.
+    """
+    settings = settings or MaskErrors()
+    wrong = np.array(labels, np.int32)
+    for make_error, stream in zip(_KINDS, rng.spawn(len(_KINDS)), strict=True):
+        wrong = make_error(wrong, stream, settings)
+    wrong[labels < 0] = labels[labels < 0]
+    return wrong
+
+
+def _move_edges(labels: np.ndarray, rng: np.random.Generator, settings: MaskErrors) -> np.ndarray:
+    """Grow or shrink every object on its own, in random order; what a shrunk one gives up goes to its neighbours."""
+    objects = _objects(labels)
+    shifts = rng.integers(-settings.edge_px, settings.edge_px, len(objects), endpoint=True)
+    for k in rng.permutation(len(objects)):
+        label, shift = objects[k], shifts[k]
+        mask = labels == label
+        if not shift or not mask.any():  # a neighbour may have grown over it
+            continue
+        window = _window(mask, max(shift, 1))
+        own = mask[window]
+        if shift > 0:
+            labels[window][ndimage.distance_transform_edt(~own) <= shift] = label
+        elif not own.all():
+            depth, (rows, columns) = ndimage.distance_transform_edt(own, return_indices=True)
+            lost = own & (depth <= -shift)
+            labels[window][lost] = labels[window][rows[lost], columns[lost]]
+    return labels
+
+
+def _punch_holes(labels: np.ndarray, rng: np.random.Generator, settings: MaskErrors) -> np.ndarray:
+    """Leave a hole somewhere in some objects."""
+    objects = _objects(labels)
+    for label in objects[rng.random(len(objects)) < settings.holes]:
+        own = labels == label
+        labels[own & _blob(own, settings.hole_px, rng)] = settings.missed_label
+    return labels
+
+
+def _mistake_objects(labels: np.ndarray, rng: np.random.Generator, settings: MaskErrors) -> np.ndarray:
+    """Miss some objects and give others the label of another one; no object meets both."""
+    objects = _objects(labels)
+    fate = rng.random(len(objects))
+    others = (np.arange(len(objects)) + rng.integers(1, max(len(objects), 2), len(objects))) % max(len(objects), 1)
+    swapped = (settings.missed <= fate) & (fate < settings.missed + settings.swapped)
+    new_labels = np.where(swapped, objects[others], objects)
+    new_labels[fate < settings.missed] = settings.missed_label
+    table: np.ndarray = np.arange(labels.max(initial=0) + 1, dtype=np.int32)
+    table[objects] = new_labels
+    relabelled: np.ndarray = table[np.maximum(labels, 0)]
+    return relabelled
+
+
+def _add_blobs(labels: np.ndarray, rng: np.random.Generator, settings: MaskErrors) -> np.ndarray:
+    """Drop clutter anywhere in the view."""
+    objects = _objects(labels)
+    anywhere = np.ones(labels.shape, bool)
+    for _ in range(rng.poisson(settings.blobs) if objects.size and anywhere.size else 0):
+        labels[_blob(anywhere, settings.blob_px, rng)] = rng.choice(objects)
+    return labels
+
+
+_KINDS = (_move_edges, _punch_holes, _mistake_objects, _add_blobs)
+
+
+def _objects(labels: np.ndarray) -> np.ndarray:
+    """Labels of the objects in a view, ascending."""
+    present = np.flatnonzero(np.bincount(np.maximum(labels, 0).ravel()))
+    return present[present > 0]
+
+
+def _window(mask: np.ndarray, margin: int) -> tuple[slice, slice]:
+    """Bounding box of a mask, widened by a margin in px as far as the image goes."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    return (
+        slice(max(rows[0] - margin, 0), rows[-1] + margin + 1),
+        slice(max(columns[0] - margin, 0), columns[-1] + margin + 1),
+    )
+
+
+def _blob(inside: np.ndarray, largest: float, rng: np.random.Generator) -> np.ndarray:
+    """(H, W) bool, a roundish patch with a wavy outline around a random pixel of a mask."""
+    row, column = rng.choice(np.argwhere(inside))
+    radius = rng.uniform(largest / 3, largest)
+    y, x = np.ogrid[: inside.shape[0], : inside.shape[1]]
+    angle = np.arctan2(y - row, x - column)
+    waves = sum(rng.uniform(0, 0.2) * np.cos(k * angle + rng.uniform(0, 2 * np.pi)) for k in (2, 3, 5))
+    patch: np.ndarray = np.hypot(y - row, x - column) <= radius * (1 + waves)
+    return patch

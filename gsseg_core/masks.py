@@ -1,0 +1,124 @@
+"""Label images and class names.
+
+In memory labels are int32, 0 the background and `UNKNOWN` (-1) "no evidence here"; in files the largest number of the
+encoding, 255 or 65535, stands for unknown.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from gsseg_core.atomic import write_atomically
+from gsseg_core.errors import ClassesFileError, MaskFormatError, SettingsError
+from gsseg_core.json_files import read_json
+
+UNKNOWN = -1
+BACKGROUND_NAME = "background"
+
+_PNG_KINDS = {0: "gray", 2: "RGB", 3: "palette", 4: "gray + alpha", 6: "RGBA"}
+
+
+class Mask(NamedTuple):
+    """A label image and how many bits a pixel had in its file."""
+
+    labels: npt.NDArray[np.int32]  # (H, W)
+    bits: int
+
+
+def read_mask(path: str | os.PathLike[str]) -> Mask:
+    """Read a label image: a PNG with 8- or 16-bit gray values, or palette indices, as labels.
+
+    Returns
+    -------
+    Mask
+        `labels` (H, W) int32 with `UNKNOWN` for 255 (8 bits) or 65535 (16 bits), and `bits`.
+
+    Raises
+    ------
+    MaskFormatError
+        The file is missing, broken, or another kind of image (RGB, alpha, 1-bit, not a PNG).
+    """
+    bits = mask_bits(path)
+    try:
+        # Other formats are lossy or ambiguous about integers, whatever the file is named.
+        with Image.open(path, formats=["PNG"]) as image:
+            labels = np.array(image).astype(np.int32)
+    except (OSError, SyntaxError, ValueError, EOFError, struct.error) as error:
+        raise MaskFormatError(f"{path}: broken PNG ({error}); expected a whole label image") from error
+    labels[labels == 2**bits - 1] = UNKNOWN
+    return Mask(labels, bits)
+
+
+def mask_bits(path: str | os.PathLike[str]) -> int:
+    """Bits per label of a PNG, 8 or 16, from its header alone; raises `MaskFormatError` as `read_mask` does."""
+    try:
+        with open(path, "rb") as file:
+            header = file.read(26)
+    except OSError as error:
+        raise MaskFormatError(f"{path}: cannot be read ({error.strerror or error}); expected a label image") from error
+    if len(header) < 26 or not header.startswith(b"\x89PNG\r\n\x1a\n"):
+        raise MaskFormatError(f"{path}: not a PNG; expected a one-channel 8- or 16-bit PNG of labels")
+    # The header chunk comes first: 8 bytes of signature, 8 of chunk, width, height, bit depth, colour type.
+    depth, kind = header[24], _PNG_KINDS.get(header[25], "unknown")
+    if kind == "palette":
+        return 8
+    if kind == "gray" and depth in (8, 16):
+        return depth
+    raise MaskFormatError(
+        f"{path}: is {kind} of {depth} bits per channel; expected a one-channel 8- or 16-bit PNG of labels"
+    )
+
+
+def write_mask(
+    path: str | os.PathLike[str],
+    labels: npt.NDArray[np.integer[Any]],  # (H, W)
+    bits: int,
+) -> None:
+    """Write a label image as a gray PNG of 8 or 16 bits, atomically; `UNKNOWN` becomes 255 or 65535.
+
+    Raises
+    ------
+    MaskFormatError
+        A label does not fit.
+    WriteError
+        The file cannot be written.
+    """
+    if bits not in (8, 16):
+        raise SettingsError(f"{path}: masks of {bits} bits were asked for; expected 8 or 16")
+    unknown = 2**bits - 1
+    low, high = (int(labels.min()), int(labels.max())) if labels.size else (0, 0)
+    if low < UNKNOWN or high >= unknown:
+        raise MaskFormatError(f"{path}: labels are {low} to {high}; {bits} bits hold {UNKNOWN} to {unknown - 1}")
+    values = np.where(labels == UNKNOWN, unknown, labels).astype(np.uint8 if bits == 8 else np.uint16)
+    with write_atomically(path) as temporary:
+        Image.fromarray(values).save(temporary, format="PNG")
+
+
+def read_classes(path: str | os.PathLike[str]) -> dict[int, str]:
+    """Read `classes.json`, an object from id to name; sorted by id, 0 being "background" unless named otherwise.
+
+    Raises
+    ------
+    ClassesFileError
+        The file is missing or broken, an id is not a whole number from 0 to 65534, or a name is not text.
+    """
+    path = Path(path)
+    content = read_json(path, ClassesFileError)
+    if not isinstance(content, dict):
+        raise ClassesFileError(f'{path}: holds {type(content).__name__}; expected an object such as {{"1": "chair"}}')
+    names = {0: BACKGROUND_NAME}
+    for key, name in content.items():
+        if not re.fullmatch(r"0|[1-9][0-9]{0,4}", key) or int(key) >= 2**16 - 1:
+            raise ClassesFileError(f"{path}: id {key[:60]!r} is unusable; expected whole numbers from 0 to 65534")
+        if not isinstance(name, str) or not name.strip():
+            raise ClassesFileError(f"{path}: id {key} has the name {name!r}; expected text")
+        names[int(key)] = name
+    return dict(sorted(names.items()))

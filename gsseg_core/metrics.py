@@ -1,0 +1,267 @@
+"""How well predicted label maps agree with true ones: IoU, accuracy and boundary IoU, accumulated over views.
+
+All figures are ratios of pixel counts summed over every view that was added, never means of per-view figures, so a
+class that is a speck in one view and fills another is weighed by what was seen of it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from gsseg_core.errors import MaskFormatError, MaskSizeError, NoUsableViewsError
+from gsseg_core.masks import UNKNOWN, read_mask
+
+BOUNDARY_SHARE = 0.02
+"""Width of the boundary band as a share of the image diagonal (Cheng et al., Boundary IoU, CVPR 2021)."""
+
+
+class Evaluation:
+    """Agreement of predicted label maps with the truth, accumulated view by view.
+
+    Labels are integers from 0; K is the largest one seen so far plus one, and grows by itself. Pixels whose truth is
+    `UNKNOWN` are ignored altogether; a prediction that is `UNKNOWN` where the truth is known is a miss of the true
+    class and a find of none.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> evaluation = Evaluation()
+    >>> evaluation.add(truth=np.array([[0, 0, 1, 1]]), prediction=np.array([[0, 1, 1, 1]]))
+    >>> evaluation.iou.round(3).tolist()
+    [0.5, 0.667]
+    >>> round(evaluation.mean_iou, 3)
+    0.583
+    """
+
+    def __init__(self) -> None:
+        self.num_views = 0
+        self._pairs: Counter[tuple[int, int]] = Counter()
+        self._area = np.zeros((3, 0), np.int64)  # pixels per class: in both, in the truth, in the prediction
+        self._band = np.zeros((3, 0), np.int64)  # the same, of boundary bands
+
+    def add(
+        self,
+        truth: np.ndarray,  # (H, W)
+        prediction: np.ndarray,  # (H, W)
+        name: str = "view",
+    ) -> None:
+        """Add one view.
+
+        Parameters
+        ----------
+        truth, prediction : array (H, W) of int
+            Label maps of one size, `UNKNOWN` where there is no label.
+        name : str
+            What to call the view in an error message.
+
+        Raises
+        ------
+        MaskSizeError
+            The two are not label maps of the same size.
+        """
+        if truth.shape != prediction.shape or truth.ndim != 2:
+            raise MaskSizeError(
+                f"{name}: found a prediction of shape {prediction.shape} for a truth of shape {truth.shape}; "
+                "expected two label maps (height, width) of the same size"
+            )
+        known = truth != UNKNOWN
+        # What nobody knows is taken as predicted, so that no boundary of the truth runs along the unknown.
+        truth, prediction = np.where(known, truth, prediction).astype(np.int32), prediction.astype(np.int32)
+        answered = known & (prediction != UNKNOWN)
+        size = max(self.num_classes, int(truth.max(initial=-1)) + 1, int(prediction.max(initial=-1)) + 1)
+
+        codes, counts = np.unique(truth[answered] * np.int64(size) + prediction[answered], return_counts=True)
+        for code, count in zip(codes.tolist(), counts.tolist(), strict=True):
+            self._pairs[divmod(code, size)] += count
+
+        width = max(1, round(BOUNDARY_SHARE * float(np.hypot(*truth.shape))))
+        near_truth, near_prediction = known & boundary_band(truth, width), answered & boundary_band(prediction, width)
+        self._area = _grow(self._area, size) + _count(truth, prediction, known, answered, size)
+        self._band = _grow(self._band, size) + _count(truth, prediction, near_truth, near_prediction, size)
+        self.num_views += 1
+
+    @property
+    def num_classes(self) -> int:
+        """K, the largest label seen in truth or prediction plus one; 0 before the first view."""
+        return self._area.shape[1]
+
+    @property
+    def confusion(self) -> np.ndarray:
+        """(K, K) int64, pixels by true label (row) and predicted label (column)."""
+        matrix = np.zeros((self.num_classes, self.num_classes), np.int64)
+        for pair, count in self._pairs.items():
+            matrix[pair] = count
+        return matrix
+
+    @property
+    def iou(self) -> np.ndarray:
+        """(K,) float64, intersection over union of each class; NaN for a class in neither truth nor prediction."""
+        return _iou(self._area)
+
+    @property
+    def accuracy(self) -> np.ndarray:
+        """(K,) float64, share of each true class's pixels that were predicted right; NaN where the truth has none."""
+        return _ratio(self._area[0], self._area[1])
+
+    @property
+    def boundary_iou(self) -> np.ndarray:
+        """(K,) float64, IoU of each class's boundary band: its pixels nearer to its edge than 2 % of the diagonal."""
+        return _iou(self._band)
+
+    @property
+    def mean_iou(self) -> float:
+        """Mean of `iou` over the classes that occur in the truth or in the prediction."""
+        return _mean(self.iou)
+
+    @property
+    def mean_accuracy(self) -> float:
+        """Mean of `accuracy` over the classes that occur in the truth."""
+        return _mean(self.accuracy)
+
+    @property
+    def mean_boundary_iou(self) -> float:
+        """Mean of `boundary_iou` over the classes that occur in the truth or in the prediction."""
+        return _mean(self.boundary_iou)
+
+    def as_dict(self, class_names: Mapping[int, str] | None = None) -> dict[str, Any]:
+        """Everything as plain numbers for JSON; what is undefined is None.
+
+        Parameters
+        ----------
+        class_names : mapping from label to name, optional
+            Where it lacks one, the name is `class_<label>`.
+
+        Returns
+        -------
+        dict
+            `views`, `mean_iou`, `mean_accuracy`, `mean_boundary_iou`, and `classes`: for each class that occurs its
+            `id`, `name`, `iou`, `accuracy`, `boundary_iou` and `pixels` in the truth.
+        """
+        names = class_names or {}
+        iou, accuracy, boundary = self.iou, self.accuracy, self.boundary_iou
+        return {
+            "views": self.num_views,
+            "mean_iou": _plain(self.mean_iou),
+            "mean_accuracy": _plain(self.mean_accuracy),
+            "mean_boundary_iou": _plain(self.mean_boundary_iou),
+            "classes": [
+                {
+                    "id": k,
+                    "name": names.get(k, f"class_{k:02d}"),
+                    "iou": _plain(iou[k]),
+                    "accuracy": _plain(accuracy[k]),
+                    "boundary_iou": _plain(boundary[k]),
+                    "pixels": int(self._area[1, k]),
+                }
+                for k in np.flatnonzero(self._area.any(axis=0)).tolist()
+            ],
+        }
+
+
+def boundary_band(
+    labels: np.ndarray,  # (H, W)
+    width: int,
+) -> np.ndarray:
+    """Find the pixels on the inner boundary of their own class, of all classes at once.
+
+    A pixel is in the band of its class c unless all pixels up to `width` rows and columns away are c; what lies
+    outside the image is no class. For each class this is the mask minus its erosion by `width` steps of a 3x3 square,
+    as boundary IoU defines it. A square is all one label exactly where its smallest and largest label are the same.
+
+    Parameters
+    ----------
+    labels : array (H, W) of int
+        At least `UNKNOWN`, in a signed type.
+    width : int
+        In pixels.
+
+    Returns
+    -------
+    ndarray (H, W) bool
+    """
+    size = 2 * width + 1
+    lowest = ndimage.minimum_filter(labels, size, mode="constant", cval=UNKNOWN - 1)
+    highest = ndimage.maximum_filter(labels, size, mode="constant", cval=UNKNOWN - 1)
+    band: np.ndarray = lowest != highest
+    return band
+
+
+def evaluate_folders(pred_dir: str | Path, truth_dir: str | Path) -> Evaluation:
+    """Compare every `<stem>.png` in one folder of label images with the file of the same name in another.
+
+    Truth without a prediction is ignored, since a folder of true masks holds the train views too.
+
+    Parameters
+    ----------
+    pred_dir, truth_dir : path
+        Folders of 8- or 16-bit label images.
+
+    Returns
+    -------
+    Evaluation
+
+    Raises
+    ------
+    NoUsableViewsError
+        There is no PNG in `pred_dir`.
+    MaskFormatError
+        A prediction has no truth, or a file is no label image.
+    MaskSizeError
+        A prediction and its truth differ in size.
+    """
+    pred_dir, truth_dir = Path(pred_dir), Path(truth_dir)
+    predictions = sorted(pred_dir.glob("*.png"))
+    if not predictions:
+        raise NoUsableViewsError(f"{pred_dir}: found no predictions; expected label images <stem>.png")
+    missing = [path.name for path in predictions if not (truth_dir / path.name).is_file()]
+    if missing:
+        raise MaskFormatError(
+            f"{truth_dir}: found no {missing[0]} (and {len(missing) - 1} more of {len(predictions)} are missing); "
+            f"expected a true mask for every prediction in {pred_dir}"
+        )
+    evaluation = Evaluation()
+    for path in predictions:
+        evaluation.add(read_mask(truth_dir / path.name).labels, read_mask(path).labels, name=str(path))
+    return evaluation
+
+
+def _count(
+    truth: np.ndarray,  # (H, W)
+    prediction: np.ndarray,  # (H, W)
+    in_truth: np.ndarray,  # (H, W)
+    in_prediction: np.ndarray,  # (H, W)
+    size: int,
+) -> np.ndarray:
+    """(3, size), pixels per class that count in both, in the truth, in the prediction."""
+    in_both = in_truth & in_prediction & (truth == prediction)
+    chosen = truth[in_both], truth[in_truth], prediction[in_prediction]
+    return np.stack([np.bincount(labels, minlength=size) for labels in chosen])
+
+
+def _grow(counts: np.ndarray, size: int) -> np.ndarray:
+    return np.pad(counts, ((0, 0), (0, size - counts.shape[1])))
+
+
+def _iou(counts: np.ndarray) -> np.ndarray:
+    both, truth, prediction = counts
+    return _ratio(both, truth + prediction - both)
+
+
+def _ratio(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    ratio: np.ndarray = np.divide(part, whole, out=np.full(part.shape, np.nan), where=whole > 0)
+    return ratio
+
+
+def _mean(values: np.ndarray) -> float:
+    defined = values[~np.isnan(values)]
+    return float(defined.mean()) if defined.size else float("nan")
+
+
+def _plain(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)

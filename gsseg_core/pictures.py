@@ -1,0 +1,215 @@
+"""Pictures for people: a palette, label overlays, contact sheets and legends, all as (H, W, 3) uint8 RGB arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from gsseg_core.atomic import write_atomically
+
+BACKGROUND = (58, 60, 66)
+"""The colour of label 0, a dark neutral grey."""
+
+PAPER, INK, FAINT_INK = (255, 255, 255), (32, 34, 38), (128, 131, 138)
+FILL = 0.55
+"""How much of a label's colour goes into an overlaid pixel."""
+
+
+@lru_cache(maxsize=8)
+def palette(num_classes: int) -> np.ndarray:
+    """Colours for labels, as different from each other as they can be.
+
+    Every colour is the one of a fixed set that lies farthest, in OKLab, from all the earlier ones, so the colours of a
+    smaller palette are the first ones of a larger one. Beyond about 1,500 classes they start to repeat.
+
+    Parameters
+    ----------
+    num_classes : int
+        K, the number of labels, background included.
+
+    Returns
+    -------
+    ndarray (K, 3) uint8, read-only
+        Row 0 is `BACKGROUND`.
+    """
+    levels = np.arange(15, 256, 16)
+    candidates = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1).reshape(-1, 3)
+    lab = _oklab(candidates)
+    chroma = np.hypot(lab[:, 1], lab[:, 2])
+    pleasant = (lab[:, 0] > 0.5) & (lab[:, 0] < 0.9) & (chroma > 0.07) & (chroma < 0.21)
+    candidates, lab = candidates[pleasant], lab[pleasant]
+
+    chosen = [int(np.argmin(np.abs(candidates - np.array([79, 143, 239])).sum(axis=1)))]  # a clear blue first
+    distance = np.linalg.norm(lab - _oklab(np.array([BACKGROUND])), axis=1)
+    while len(chosen) < min(num_classes - 1, len(candidates)):
+        distance = np.minimum(distance, np.linalg.norm(lab - lab[chosen[-1]], axis=1))
+        chosen.append(int(np.argmax(distance)))
+    colors = np.empty((num_classes, 3), np.uint8)
+    colors[:1] = BACKGROUND
+    colors[1:] = np.resize(candidates[chosen], (max(num_classes - 1, 0), 3))
+    colors.setflags(write=False)
+    return colors
+
+
+def overlay(
+    image: np.ndarray,  # (H, W, 3)
+    labels: np.ndarray,  # (H, W)
+    colors: np.ndarray,  # (K, 3)
+) -> np.ndarray:
+    """Lay labels over an image: tinted areas, and a thin line in the label's full colour along every class border.
+
+    Background (0) and unknown (negative) pixels keep the image, a little greyed.
+
+    Parameters
+    ----------
+    image : ndarray (H, W, 3) uint8
+        What was seen.
+    labels : array (H, W) of int
+        Label of each pixel; every one below K.
+    colors : ndarray (K, 3) uint8
+        `palette(K)`.
+
+    Returns
+    -------
+    ndarray (H, W, 3) uint8
+    """
+    named = labels > 0
+    tint = colors[np.maximum(labels, 0)].astype(np.float32)
+    grey = image.mean(axis=-1, keepdims=True, dtype=np.float32)
+    blend = np.where(named[..., None], grey + FILL * (tint - grey), 0.35 * image + 0.65 * (0.75 * grey + 30))
+    line = _borders(labels)
+    blend[line & named] = np.minimum(1.12 * tint[line & named], 255)
+    blend[line & ~named] *= 0.45
+    picture: np.ndarray = blend.round().astype(np.uint8)
+    return picture
+
+
+def contact_sheet(
+    images: Sequence[np.ndarray],
+    captions: Sequence[str],
+    columns: int,
+) -> np.ndarray:
+    """Lay pictures out in rows, each with its caption below it.
+
+    Parameters
+    ----------
+    images : sequence of ndarray (H, W, 3) uint8
+        One or more pictures; smaller ones are centred in cells of the largest one's size.
+    captions : sequence of str
+        One for each picture.
+    columns : int
+        Pictures in a row.
+
+    Returns
+    -------
+    ndarray (H, W, 3) uint8
+    """
+    gap, text = 12, 14
+    height, width = np.max([image.shape[:2] for image in images], axis=0).tolist()
+    columns = min(columns, len(images))
+    rows = -(-len(images) // columns)
+    step_x, step_y = width + gap, height + gap + text + 6
+    sheet = Image.new("RGB", (columns * step_x + gap, rows * step_y + gap), PAPER)
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(text)
+    for i, (image, caption) in enumerate(zip(images, captions, strict=True)):
+        x, y = gap + i % columns * step_x, gap + i // columns * step_y
+        sheet.paste(Image.fromarray(image), (x + (width - image.shape[1]) // 2, y + (height - image.shape[0]) // 2))
+        draw.text((x + width / 2, y + height + 4), _shorten(caption, font, width), INK, font, anchor="ma")
+    return np.asarray(sheet)
+
+
+def legend(
+    class_names: Mapping[int, str],
+    colors: np.ndarray,  # (K, 3)
+    counts: np.ndarray,  # (K,)
+    rows: int = 24,
+) -> np.ndarray:
+    """Draw one line a class: its colour, label, name and count, in as many columns as it takes.
+
+    Parameters
+    ----------
+    class_names : mapping from label to name
+        What to show, in the order given.
+    colors : ndarray (K, 3) uint8
+        `palette(K)`.
+    counts : array (K,) of int
+        What to write behind each name, such as the number of Gaussians.
+    rows : int
+        Most lines in a column; columns are of even length.
+
+    Returns
+    -------
+    ndarray (H, W, 3) uint8
+    """
+    margin, line = 16, 26
+    font = ImageFont.load_default(15)
+    names = {k: _shorten(name, font, 260) for k, name in class_names.items()}
+    name_width = max((font.getlength(name) for name in names.values()), default=0)
+    count_width = max((font.getlength(f"{counts[k]:,}") for k in names), default=0)
+    id_width = max((font.getlength(str(k)) for k in names), default=0)
+    column = round(30 + id_width + 12 + name_width + 24 + count_width)
+    columns = max(1, -(-len(names) // rows))
+    rows = max(1, -(-len(names) // columns))
+    sheet = Image.new("RGB", (columns * (column + 2 * margin), rows * line + 2 * margin), PAPER)
+    draw = ImageDraw.Draw(sheet)
+    for i, (k, name) in enumerate(names.items()):
+        x, y = margin + i // rows * (column + 2 * margin), margin + i % rows * line
+        draw.rounded_rectangle((x, y + 4, x + 18, y + 21), 4, fill=tuple(colors[k].tolist()))
+        middle = y + line / 2
+        draw.text((x + 30 + id_width, middle), str(k), FAINT_INK, font, anchor="rm")
+        draw.text((x + 30 + id_width + 12, middle), name, INK, font, anchor="lm")
+        draw.text((x + column, middle), f"{counts[k]:,}", FAINT_INK, font, anchor="rm")
+    return np.asarray(sheet)
+
+
+def save_png(path: str | Path, image: np.ndarray) -> None:
+    """Write a picture as PNG; an earlier file stays whole until the new one is complete.
+
+    Raises
+    ------
+    WriteError
+        The file cannot be written.
+    """
+    with write_atomically(path) as temporary:
+        Image.fromarray(image).save(temporary, format="PNG")
+
+
+def _borders(labels: np.ndarray) -> np.ndarray:
+    """(H, W) bool, pixels with another label beside, above or below them."""
+    border = np.zeros(labels.shape, bool)
+    across, down = labels[:, 1:] != labels[:, :-1], labels[1:] != labels[:-1]
+    border[:, 1:] |= across
+    border[:, :-1] |= across
+    border[1:] |= down
+    border[:-1] |= down
+    return border
+
+
+def _shorten(text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: float) -> str:
+    """As much of a text as fits into a width in px, with an ellipsis where it was cut."""
+    if font.getlength(text) <= width:
+        return text
+    while text and font.getlength(text + "...") > width:
+        text = text[:-1]
+    return text + "..."
+
+
+def _oklab(rgb: np.ndarray) -> np.ndarray:
+    """(M, 3) uint8-ranged sRGB to OKLab (lightness, green-red, blue-yellow), by Ottosson's published matrices."""
+    share = rgb / 255.0
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    to_cones = np.array(
+        [[0.4122214708, 0.5363325363, 0.0514459929], [0.2119034982, 0.6806995451, 0.1073969566],
+         [0.0883024619, 0.2817188376, 0.6299787005]]
+    )  # fmt: skip
+    to_lab = np.array(
+        [[0.2104542553, 0.7936177850, -0.0040720468], [1.9779984951, -2.4285922050, 0.4505937099],
+         [0.0259040371, 0.7827717662, -0.8086757660]]
+    )  # fmt: skip
+    lab: np.ndarray = np.cbrt(linear @ to_cones.T) @ to_lab.T
+    return lab

@@ -1,0 +1,66 @@
+"""PLY files in and out, as structured arrays; the only module that knows plyfile."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import plyfile  # type: ignore[import-untyped]
+
+from gsseg_core.atomic import write_atomically
+from gsseg_core.errors import SceneFileError, ScenePropertyError
+
+
+def read_vertices(path: str | os.PathLike[str]) -> npt.NDArray[np.void]:
+    """Read the `vertex` element of a PLY file, ascii or binary of either byte order.
+
+    Parameters
+    ----------
+    path : path
+        The PLY file. Elements other than `vertex` are ignored.
+
+    Returns
+    -------
+    numpy.ndarray
+        Structured array (N,), one field per property in the file's order and type, native byte order, in memory.
+
+    Raises
+    ------
+    SceneFileError
+        The file is missing, truncated, not a PLY, or has no `vertex` element.
+    ScenePropertyError
+        A vertex property is a list.
+    """
+    path = Path(path)
+    try:
+        ply = plyfile.PlyData.read(str(path))
+    except OSError as error:
+        raise SceneFileError(f"{path}: cannot be read ({error.strerror or error}); expected a 3DGS PLY") from error
+    except (plyfile.PlyParseError, ValueError, OverflowError, MemoryError) as error:
+        raise SceneFileError(f"{path}: truncated or not a PLY file ({error}); expected a whole 3DGS PLY") from error
+    if "vertex" not in ply:
+        found = ", ".join(element.name for element in ply) or "none"
+        raise SceneFileError(f"{path}: PLY has no element 'vertex' (elements found: {found})")
+    element = ply["vertex"]
+    lists = [prop.name for prop in element.properties if isinstance(prop, plyfile.PlyListProperty)]
+    if lists:
+        raise ScenePropertyError(f"{path}: vertex properties {', '.join(lists)} are lists; expected one number each")
+    # A copy, so that the scene outlives changes to the memory-mapped file.
+    data = element.data
+    return np.array(data, dtype=data.dtype.newbyteorder("="), subok=False)
+
+
+def write_vertices(path: str | os.PathLike[str], vertices: npt.NDArray[Any]) -> None:
+    """Write a structured array (N,) as the `vertex` element of a binary little-endian PLY, atomically.
+
+    Raises
+    ------
+    WriteError
+        The file cannot be written; an earlier file at `path` stays whole.
+    """
+    ply = plyfile.PlyData([plyfile.PlyElement.describe(vertices, "vertex")], byte_order="<")
+    with write_atomically(path) as temporary:
+        ply.write(str(temporary))

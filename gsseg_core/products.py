@@ -1,0 +1,253 @@
+"""Products with the weight matrix W of one view, tile by tile: W q, W^T r, and both restricted to the pixels' own labels."""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+
+from gsseg_core.blend import blend_tile
+from gsseg_core.tiles import TILE
+
+CHUNK = 32
+"""Channels that one pass of the general adjoint sums at once; bounds its memory at entries x 32 float32."""
+
+
+@nb.njit(inline="always")
+def _scratch(entries: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    # Sized for the worst case; pages that no record reaches are never touched.
+    return (
+        np.empty((TILE, TILE), np.float32),
+        np.empty((TILE * entries, TILE), np.float32),
+        np.empty(TILE * entries, np.uint8),
+        np.empty(entries, np.int32),
+    )
+
+
+@nb.njit(parallel=True, cache=True)
+def render(
+    columns: int,
+    table: np.ndarray,  # (M, 9)
+    start: np.ndarray,  # (T + 1,)
+    entries: np.ndarray,  # (E,)
+    codes: np.ndarray,  # (M, K) float32
+    out: np.ndarray,  # (H, W, K) float32 out
+    left_over: np.ndarray,  # (H, W) float32 out: final transmittance
+) -> None:
+    height, width, channels = out.shape
+    for tile in nb.prange(start.shape[0] - 1):
+        first, last = start[tile], start[tile + 1]
+        rays, weights, rows, ends = _scratch(last - first)
+        used = blend_tile(tile, columns, width, height, table, entries, first, last, rays, weights, rows, ends)
+        block = np.zeros((TILE, channels, TILE), np.float32)
+        n = 0
+        for e in range(used):
+            g = entries[first + e]
+            for i in range(n, ends[e]):
+                target = block[rows[i]]
+                for k in range(channels):
+                    code = codes[g, k]
+                    for c in range(weights.shape[1]):
+                        target[k, c] += code * weights[i, c]
+            n = ends[e]
+        left, top = (tile % columns) * TILE, (tile // columns) * TILE
+        for r in range(min(TILE, height - top)):
+            for c in range(min(TILE, width - left)):
+                left_over[top + r, left + c] = rays[r, c]
+                for k in range(channels):
+                    out[top + r, left + c, k] = block[r, k, c]
+
+
+@nb.njit(parallel=True, cache=True, fastmath={"reassoc", "contract"})
+def adjoint_entries(
+    columns: int,
+    table: np.ndarray,  # (M, 9)
+    start: np.ndarray,  # (T + 1,)
+    entries: np.ndarray,  # (E,)
+    residual: np.ndarray,  # (H, W, C) float32, C <= CHUNK
+    sums: np.ndarray,  # (E, C) float32 out
+) -> None:
+    height, width, channels = residual.shape
+    for tile in nb.prange(start.shape[0] - 1):
+        first, last = start[tile], start[tile + 1]
+        rays, weights, rows, ends = _scratch(last - first)
+        used = blend_tile(tile, columns, width, height, table, entries, first, last, rays, weights, rows, ends)
+        left, top = (tile % columns) * TILE, (tile // columns) * TILE
+        block = np.zeros((TILE, channels, TILE), np.float32)
+        for r in range(min(TILE, height - top)):
+            for c in range(min(TILE, width - left)):
+                for k in range(channels):
+                    block[r, k, c] = residual[top + r, left + c, k]
+        sums[first:last] = 0.0
+        n = 0
+        for e in range(used):
+            for i in range(n, ends[e]):
+                source = block[rows[i]]
+                for k in range(channels):
+                    total = np.float32(0.0)
+                    for c in range(weights.shape[1]):
+                        total += source[k, c] * weights[i, c]
+                    sums[first + e, k] += total
+            n = ends[e]
+
+
+@nb.njit(parallel=True, cache=True)
+def reduce_entries(
+    gaussian_start: np.ndarray,  # (M + 1,)
+    gaussian_entries: np.ndarray,  # (E,)
+    sums: np.ndarray,  # (E, C)
+    out: np.ndarray,  # (M, C) float32 out
+) -> None:
+    for g in nb.prange(out.shape[0]):
+        out[g] = 0.0
+        for i in range(gaussian_start[g], gaussian_start[g + 1]):
+            e = gaussian_entries[i]
+            for k in range(out.shape[1]):
+                out[g, k] += sums[e, k]
+
+
+@nb.njit(cache=True)
+def tile_labels(
+    labels: np.ndarray,  # (H, W) int32, negative = unknown
+    columns: int,
+    rows: int,
+    num_labels: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Number the labels of each tile.
+
+    Returns
+    -------
+    start : (T + 1,) int64
+    present : (start[-1],) int32
+        Labels of tile t are present[start[t]:start[t + 1]].
+    slots : (T, 16, 16) int16
+        Position of each pixel's label among those of its tile, -1 where unknown or outside.
+    """
+    height, width = labels.shape
+    start = np.zeros(columns * rows + 1, np.int64)
+    present = np.empty(height * width, np.int32)
+    slots = np.full((columns * rows, TILE, TILE), -1, np.int16)
+    slot_of = np.full(num_labels, -1, np.int16)
+    n = 0
+    for tile in range(columns * rows):
+        left, top = (tile % columns) * TILE, (tile // columns) * TILE
+        for r in range(min(TILE, height - top)):
+            for c in range(min(TILE, width - left)):
+                label = labels[top + r, left + c]
+                if label < 0:
+                    continue
+                if slot_of[label] < 0:
+                    slot_of[label] = n - start[tile]
+                    present[n] = label
+                    n += 1
+                slots[tile, r, c] = slot_of[label]
+        for i in range(start[tile], n):
+            slot_of[present[i]] = -1
+        start[tile + 1] = n
+    return start, present[:n].copy(), slots
+
+
+@nb.njit(parallel=True, cache=True, fastmath={"reassoc", "contract"}, error_model="numpy")
+def labelled(
+    columns: int,
+    width: int,
+    height: int,
+    table: np.ndarray,  # (M, 9)
+    start: np.ndarray,  # (T + 1,)
+    entries: np.ndarray,  # (E,)
+    label_start: np.ndarray,  # (T + 1,)
+    present: np.ndarray,
+    slots: np.ndarray,  # (T, 16, 16)
+    codes: np.ndarray,  # (M, L) float32
+    rest: np.ndarray,  # (L,) float32: what the transmittance left over counts for each label
+    divide: bool,
+    slot_start: np.ndarray,  # (T + 1,) where each tile's sums begin
+    likelihood: np.ndarray,  # (T, 16, 16) float32 out: (W codes)[p, y_p] + T_end rest[y_p]; 1 where unknown
+    left_over: np.ndarray,  # (T, 16, 16) float32 out: final transmittance
+    sums: np.ndarray,  # (slot_start[-1],) float32 out: per entry and label, sum of w, or of w / likelihood
+) -> None:
+    """Sum each Gaussian's weights by the labels of the pixels that it made, divided or not by what the codes say of them."""
+    for tile in nb.prange(start.shape[0] - 1):
+        first, last = start[tile], start[tile + 1]
+        labels = present[label_start[tile] : label_start[tile + 1]]
+        many = labels.shape[0]
+        likelihood[tile] = 1.0
+        if many == 0:
+            left_over[tile] = 0.0
+            continue
+        rays, weights, rows, ends = _scratch(last - first)
+        used = blend_tile(tile, columns, width, height, table, entries, first, last, rays, weights, rows, ends)
+        left_over[tile] = rays
+
+        # Per row, the slots that occur in it and where: most rows hold one label, so one product a record.
+        counts = np.zeros(TILE, np.int64)
+        slot = np.empty((TILE, TILE), np.int64)
+        where = np.zeros((TILE, TILE, TILE), np.float32)
+        for r in range(TILE):
+            for c in range(TILE):
+                s = slots[tile, r, c]
+                if s < 0:
+                    continue
+                j = 0
+                while j < counts[r] and slot[r, j] != s:
+                    j += 1
+                if j == counts[r]:
+                    slot[r, j] = s
+                    counts[r] += 1
+                where[r, j, c] = 1.0
+
+        if divide:
+            value = np.zeros((TILE, TILE), np.float32)
+            n = 0
+            for e in range(used):
+                g = entries[first + e]
+                for i in range(n, ends[e]):
+                    r = rows[i]
+                    for j in range(counts[r]):
+                        code = codes[g, labels[slot[r, j]]]
+                        for c in range(weights.shape[1]):
+                            value[r, c] += code * (weights[i, c] * where[r, j, c])
+                n = ends[e]
+            for r in range(TILE):
+                for j in range(counts[r]):
+                    extra = rest[labels[slot[r, j]]]
+                    for c in range(TILE):
+                        if where[r, j, c] > 0:
+                            p = value[r, c] + extra * rays[r, c]
+                            likelihood[tile, r, c] = p
+                            where[r, j, c] = 1.0 / p if p > 0 else 0.0
+
+        target = sums[slot_start[tile] : slot_start[tile + 1]]
+        target[:] = 0.0
+        n = 0
+        for e in range(used):
+            for i in range(n, ends[e]):
+                r = rows[i]
+                for j in range(counts[r]):
+                    total = np.float32(0.0)
+                    for c in range(weights.shape[1]):
+                        total += weights[i, c] * where[r, j, c]
+                    target[e * many + slot[r, j]] += total
+            n = ends[e]
+
+
+@nb.njit(parallel=True, cache=True)
+def reduce_labelled(
+    start: np.ndarray,  # (T + 1,)
+    gaussian_start: np.ndarray,  # (M + 1,)
+    gaussian_entries: np.ndarray,  # (E,)
+    entry_tile: np.ndarray,  # (E,)
+    label_start: np.ndarray,  # (T + 1,)
+    present: np.ndarray,
+    slot_start: np.ndarray,  # (T + 1,)
+    sums: np.ndarray,
+    out: np.ndarray,  # (M, L) float32 out
+) -> None:
+    for g in nb.prange(out.shape[0]):
+        out[g] = 0.0
+        for i in range(gaussian_start[g], gaussian_start[g + 1]):
+            e = gaussian_entries[i]
+            tile = entry_tile[e]
+            many = label_start[tile + 1] - label_start[tile]
+            base = slot_start[tile] + (e - start[tile]) * many
+            for j in range(many):
+                out[g, present[label_start[tile] + j]] += sums[base + j]

@@ -1,0 +1,284 @@
+"""A trained 3DGS scene: validated, activated arrays over the PLY vertices that they came from."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numpy.lib.recfunctions import structured_to_unstructured
+
+from gsseg_core import spherical_harmonics
+from gsseg_core.errors import EmptySceneError, ScenePropertyError, SceneValueError
+from gsseg_core.ply import read_vertices, write_vertices
+
+_MEANS = ("x", "y", "z")
+_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+_OPACITY = ("opacity",)
+_SCALES = ("scale_0", "scale_1", "scale_2")
+_QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
+_REST_COUNTS = tuple(3 * (d + 1) ** 2 - 3 for d in range(spherical_harmonics.MAX_DEGREE + 1))
+
+# Logits and log scales beyond these change nothing that can be seen, but the activated values would leave (0, 1), or
+# their squares the range of float32.
+_MAX_LOGIT = 16.0
+_MAX_LOG_SCALE = 40.0
+
+
+def _rest(count: int) -> tuple[str, ...]:
+    return tuple(f"f_rest_{i}" for i in range(count))
+
+
+def _columns(
+    vertices: npt.NDArray[np.void],  # (N,)
+    names: tuple[str, ...],
+) -> npt.NDArray[np.float32]:
+    """Properties side by side, (N, len(names)): a view where they lie so in memory, else a copy."""
+    with np.errstate(over="ignore"):  # doubles beyond float32 become infinite, which validation reports
+        columns: npt.NDArray[np.float32] = structured_to_unstructured(vertices[list(names)], dtype=np.float32)
+    return columns
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianScene:
+    """The Gaussians of a scene. Make one with `load` or `from_arrays`; every instance is valid and not empty.
+
+    Attributes
+    ----------
+    means : ndarray (N, 3) float32
+        Centres, in scene units.
+    quats : ndarray (N, 4) float32
+        Unit quaternions w, x, y, z.
+    scales : ndarray (N, 3) float32
+        Standard deviations along the local axes, in scene units, > 0. Limited to exp(-40)..exp(40).
+    opacities : ndarray (N,) float32
+        In (0, 1). Logits are limited to -16..16.
+    vertices : ndarray (N,) structured
+        The PLY vertices as read, all properties: what `subset` and `save` carry on exactly.
+    path : pathlib.Path or None
+        Where the scene was loaded from.
+    """
+
+    means: npt.NDArray[np.float32]  # (N, 3)
+    quats: npt.NDArray[np.float32]  # (N, 4)
+    scales: npt.NDArray[np.float32]  # (N, 3)
+    opacities: npt.NDArray[np.float32]  # (N,)
+    vertices: npt.NDArray[np.void] = field(repr=False)  # (N,)
+    path: Path | None = None
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> GaussianScene:
+        """Load a 3DGS PLY: SH degree 0 to 3, ascii or binary, float or double, properties in any order.
+
+        Raises
+        ------
+        SceneFileError
+            The file is missing, truncated or not a PLY.
+        ScenePropertyError
+            Properties of 3DGS are missing or are lists.
+        SceneValueError
+            Values are NaN or infinite, or quaternions are zero.
+        EmptySceneError
+            There is no Gaussian.
+        """
+        path = Path(path)
+        return cls._from_vertices(read_vertices(path), path)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        means: npt.ArrayLike,  # (N, 3)
+        quats: npt.ArrayLike,  # (N, 4)
+        scales: npt.ArrayLike,  # (N, 3)
+        opacities: npt.ArrayLike,  # (N,)
+        sh: npt.ArrayLike,  # (N, (d + 1)^2, 3)
+    ) -> GaussianScene:
+        """Build a scene from activated values; it equals what `load` reads back after `save`.
+
+        Parameters
+        ----------
+        means : array (N, 3)
+            Centres.
+        quats : array (N, 4)
+            Quaternions w, x, y, z, of any length but zero.
+        scales : array (N, 3)
+            Standard deviations, > 0.
+        opacities : array (N,)
+            In [0, 1]; kept 1e-7 away from the ends, where the logit of the PLY is infinite.
+        sh : array (N, (d + 1)^2, 3)
+            Coefficients of spherical harmonics of degree d = 0..3, RGB last.
+
+        Raises
+        ------
+        SceneValueError
+            Shapes disagree, or values are out of range, NaN or infinite.
+        EmptySceneError
+            There is no Gaussian.
+        """
+        given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
+        arrays = {name: np.asarray(values, np.float64) for name, values in given.items()}
+        n = len(np.atleast_1d(arrays["means"]))
+        shapes: dict[str, list[tuple[int, ...]]] = {
+            "means": [(n, 3)],
+            "quats": [(n, 4)],
+            "scales": [(n, 3)],
+            "opacities": [(n,)],
+            "sh": [(n, (d + 1) ** 2, 3) for d in range(spherical_harmonics.MAX_DEGREE + 1)],
+        }
+        for name, array in arrays.items():
+            if array.shape not in shapes[name]:
+                expected = " or ".join(map(str, shapes[name]))
+                raise SceneValueError(f"scene: {name} has shape {array.shape}; expected {expected}")
+        if not (arrays["scales"] > 0).all():
+            raise SceneValueError("scene: scales hold values that are NaN or not positive; expected all > 0")
+        if not ((arrays["opacities"] >= 0) & (arrays["opacities"] <= 1)).all():
+            raise SceneValueError("scene: opacities hold values that are NaN or outside [0, 1]")
+
+        dc, rest = arrays["sh"][:, 0], arrays["sh"][:, 1:]
+        rest = rest.transpose(0, 2, 1).reshape(n, 3 * rest.shape[1])  # all of red, then green, then blue
+        opacity = np.clip(arrays["opacities"], 1e-7, 1 - 1e-7)
+        columns = {
+            _MEANS: arrays["means"],
+            ("nx", "ny", "nz"): np.zeros((n, 3)),
+            _DC: dc,
+            _rest(rest.shape[1]): rest,
+            _OPACITY: np.log(opacity / (1 - opacity))[:, None],
+            _SCALES: np.log(arrays["scales"]),
+            _QUATS: arrays["quats"],
+        }
+        vertices = np.empty(n, [(name, np.float32) for names in columns for name in names])
+        with np.errstate(over="ignore"):
+            for names, values in columns.items():
+                for name, column in zip(names, values.T, strict=True):
+                    vertices[name] = column
+        return cls._from_vertices(vertices, None)
+
+    @classmethod
+    def _from_vertices(cls, vertices: npt.NDArray[np.void], path: Path | None) -> GaussianScene:
+        """Validate and activate."""
+        source = "scene" if path is None else str(path)
+        sh_names = _check_properties(vertices, source)
+        if len(vertices) == 0:
+            raise EmptySceneError(f"{source}: holds no Gaussian (0 vertices); expected at least one")
+        means, logits, log_scales, quats = (_columns(vertices, names) for names in (_MEANS, _OPACITY, _SCALES, _QUATS))
+        _check_finite(means, "positions", source)
+        _check_finite(logits, "opacities", source)
+        _check_finite(log_scales, "scales", source)
+        _check_finite(quats, "rotations", source)
+        _check_finite(_columns(vertices, sh_names), "SH coefficients", source)
+
+        lengths = np.linalg.norm(quats.astype(np.float64), axis=1, keepdims=True)
+        zero = np.flatnonzero(lengths == 0)
+        if zero.size:
+            raise SceneValueError(
+                f"{source}: {zero.size} of {len(vertices)} Gaussians have a rotation quaternion of zero "
+                f"(first at index {zero[0]}); expected quaternions of non-zero length"
+            )
+        return cls(
+            means=np.ascontiguousarray(means),
+            quats=(quats / lengths).astype(np.float32),
+            scales=np.exp(np.clip(log_scales, -_MAX_LOG_SCALE, _MAX_LOG_SCALE)),
+            opacities=np.reciprocal(1 + np.exp(-np.clip(logits[:, 0], -_MAX_LOGIT, _MAX_LOGIT))),
+            vertices=vertices,
+            path=path,
+        )
+
+    def __len__(self) -> int:
+        """Count the Gaussians."""
+        return len(self.means)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a binary little-endian 3DGS PLY with all properties that were read, atomically (`WriteError`)."""
+        write_vertices(path, self.vertices)
+
+    def subset(self, index: npt.NDArray[Any]) -> GaussianScene:
+        """Pick Gaussians by a boolean mask (N,) or by integer indices.
+
+        Raises
+        ------
+        EmptySceneError
+            Nothing is picked.
+        """
+        picked = np.arange(len(self))[index].reshape(-1)
+        if picked.size == 0:
+            raise EmptySceneError(f"{self.path or 'scene'}: none of its {len(self)} Gaussians is in the subset")
+        return GaussianScene(
+            self.means[picked],
+            self.quats[picked],
+            self.scales[picked],
+            self.opacities[picked],
+            self.vertices[picked],
+            self.path,
+        )
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
+        return _REST_COUNTS.index(_count_rest(self.vertices))
+
+    @cached_property
+    def sh(self) -> npt.NDArray[np.float32]:
+        """Coefficients of spherical harmonics, (N, (d + 1)^2, 3) float32, band after band, RGB last."""
+        sh = _columns(self.vertices, _DC)[:, None, :]
+        count = _count_rest(self.vertices)
+        if count:
+            # In the PLY all of red comes first, then green, then blue; f_dc is one of each.
+            rest = _columns(self.vertices, _rest(count)).reshape(len(self), 3, -1).transpose(0, 2, 1)
+            sh = np.concatenate([sh, rest], axis=1)
+        return np.ascontiguousarray(sh)
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 (hex) of the geometry: positions, opacities, scales and rotations as stored, colours apart."""
+        geometry = _columns(self.vertices, _MEANS + _OPACITY + _SCALES + _QUATS)
+        return hashlib.sha256(np.ascontiguousarray(geometry, "<f4").data).hexdigest()
+
+    def colors(
+        self,
+        camera_center: npt.ArrayLike | None = None,  # (3,)
+    ) -> npt.NDArray[np.float32]:
+        """Evaluate the colours (N, 3), RGB float32 in [0, 1], seen from `camera_center`; of degree 0 only if None."""
+        if camera_center is None:
+            return spherical_harmonics.to_rgb(_columns(self.vertices, _DC)[:, None, :], self.means)
+        offsets = self.means - np.asarray(camera_center, np.float32)
+        lengths = np.linalg.norm(offsets, axis=1, keepdims=True)
+        return spherical_harmonics.to_rgb(self.sh, offsets / np.maximum(lengths, np.finfo(np.float32).tiny))
+
+
+def _count_rest(vertices: npt.NDArray[np.void]) -> int:
+    return sum(name.startswith("f_rest_") for name in vertices.dtype.names or ())
+
+
+def _check_properties(vertices: npt.NDArray[np.void], source: str) -> tuple[str, ...]:
+    """Names of the SH properties, after making sure that all properties of 3DGS are there."""
+    names = set(vertices.dtype.names or ())
+    missing = [name for name in _MEANS + _DC + _OPACITY + _SCALES + _QUATS if name not in names]
+    if missing:
+        raise ScenePropertyError(f"{source}: not a 3DGS scene, lacks the vertex properties {', '.join(missing)}")
+    count = _count_rest(vertices)
+    rest = _rest(count)
+    if count not in _REST_COUNTS or not names.issuperset(rest):
+        expected = ", ".join(map(str, _REST_COUNTS))
+        raise ScenePropertyError(
+            f"{source}: has {count} properties f_rest_*; expected {expected} (SH degree 0, 1, 2, 3), numbered from 0"
+        )
+    return _DC + rest
+
+
+def _check_finite(
+    values: npt.NDArray[np.float32],  # (N, C)
+    what: str,
+    source: str,
+) -> None:
+    finite = np.isfinite(values)
+    if not finite.all():
+        bad = np.flatnonzero(~finite.all(axis=1))
+        raise SceneValueError(
+            f"{source}: {bad.size} of {len(values)} Gaussians have NaN or infinite {what} "
+            f"(first at index {bad[0]}); expected finite numbers"
+        )

@@ -1,0 +1,87 @@
+"""View-dependent colours: real spherical harmonics up to degree 3, in the order and with the signs of 3DGS.
+
+Band l holds the orders m = -l..l. Each function is the orthonormal real harmonic with the Condon-Shortley phase
+(-1)^m, written out as a polynomial in the unit direction (x, y, z).
+"""
+
+from __future__ import annotations
+
+from math import pi, sqrt
+
+import numpy as np
+import numpy.typing as npt
+
+MAX_DEGREE = 3
+C0 = sqrt(1 / (4 * pi))
+_C1 = sqrt(3 / (4 * pi))
+_C2 = sqrt(15 / (4 * pi))
+
+
+def basis(
+    directions: npt.NDArray[np.floating],  # (N, 3)
+    degree: int,
+) -> npt.NDArray[np.float32]:
+    """Evaluate all harmonics up to `degree`.
+
+    Parameters
+    ----------
+    directions : ndarray (N, 3)
+        Unit vectors.
+    degree : int
+        0 to 3.
+
+    Returns
+    -------
+    ndarray (N, (degree + 1)^2) float32
+        One column per harmonic, band after band.
+    """
+    if not 0 <= degree <= MAX_DEGREE:
+        raise ValueError(f"degree is {degree}; expected 0 to {MAX_DEGREE}")
+    x, y, z = np.asarray(directions, np.float32).T
+    columns = [np.full_like(x, C0)]
+    if degree >= 1:
+        columns += [-_C1 * y, _C1 * z, -_C1 * x]
+    if degree >= 2:
+        xx, yy, zz = x * x, y * y, z * z
+        columns += [
+            _C2 * x * y,
+            -_C2 * y * z,
+            sqrt(5 / (16 * pi)) * (2 * zz - xx - yy),
+            -_C2 * x * z,
+            _C2 / 2 * (xx - yy),
+        ]
+    if degree >= 3:
+        a, b, c = sqrt(35 / (32 * pi)), sqrt(105 / (4 * pi)), sqrt(21 / (32 * pi))
+        columns += [
+            -a * y * (3 * xx - yy),
+            b * x * y * z,
+            -c * y * (4 * zz - xx - yy),
+            sqrt(7 / (16 * pi)) * z * (2 * zz - 3 * xx - 3 * yy),
+            -c * x * (4 * zz - xx - yy),
+            b / 2 * z * (xx - yy),
+            -a * x * (xx - 3 * yy),
+        ]
+    return np.stack(columns, axis=1)
+
+
+def to_rgb(
+    sh: npt.NDArray[np.float32],  # (N, (d + 1)^2, 3)
+    directions: npt.NDArray[np.floating],  # (N, 3)
+) -> npt.NDArray[np.float32]:
+    """Colours seen along `directions`, from the camera to each Gaussian, as 3DGS defines them: 0.5 + sum, in [0, 1].
+
+    Parameters
+    ----------
+    sh : ndarray (N, (d + 1)^2, 3)
+        Coefficients, band after band, RGB last.
+    directions : ndarray (N, 3)
+        Unit vectors.
+
+    Returns
+    -------
+    ndarray (N, 3) float32
+        RGB, clipped to [0, 1].
+    """
+    degree = round(sqrt(sh.shape[1])) - 1
+    rgb: npt.NDArray[np.float32] = np.einsum("nb,nbc->nc", basis(directions, degree), sh)
+    return (rgb + np.float32(0.5)).clip(0, 1)

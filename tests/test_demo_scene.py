@@ -1,0 +1,114 @@
+"""The demo scene: a dataset like any other, whose masks and Gaussians tell the same story."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsseg_core.dataset import Dataset
+from gsseg_core.demo_scene import CLASS_NAMES, FLOATER, DemoScene, build_demo
+from gsseg_core.masks import read_mask
+from gsseg_core.scene import GaussianScene
+from gsseg_core.solids import WALL, Box, Cone, Ellipsoid, Solid
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> DemoScene:
+    return build_demo(tmp_path_factory.mktemp("demo"))
+
+
+def test_the_folder_is_a_dataset_with_train_and_test_views(demo: DemoScene) -> None:
+    dataset = Dataset(demo.root)
+    assert dataset.class_names == demo.class_names == dict(enumerate(CLASS_NAMES))
+    train, test = dataset.views("train"), dataset.views("test")
+    assert [view.name for view in train] == demo.train and len(train) == 30
+    assert [view.name for view in test] == demo.test and len(test) == 6
+    for view in train:
+        assert view.read_labels().shape == (300, 400)
+    assert all(view.mask_path is None for view in test)
+    assert len(Dataset(demo.root, labels="labels_true").views("test")) == 6
+
+
+def test_the_scene_on_disk_is_the_one_returned_with_a_true_label_each(demo: DemoScene) -> None:
+    scene = GaussianScene.load(demo.root / "scene.ply")
+    assert scene.digest == demo.scene.digest
+    assert scene.sh_degree == 1
+    assert 35_000 < len(scene) < 50_000
+    truth = np.load(demo.root / "truth.npz")["labels"]
+    np.testing.assert_array_equal(truth, demo.truth)
+    assert truth.dtype == np.int32 and truth.shape == (len(scene),)
+    counts = np.bincount(truth - FLOATER)
+    assert len(counts) == len(CLASS_NAMES) + 1 and counts.min() >= 500
+
+
+def test_every_object_is_seen_and_some_hide_others(demo: DemoScene) -> None:
+    views = [read_mask(path).labels for path in sorted((demo.root / "labels_true").iterdir())]
+    pixels = np.array([np.bincount(labels.ravel(), minlength=len(CLASS_NAMES)) for labels in views])
+    assert len(views) == 36
+    assert ((pixels > 200).sum(axis=0) >= 12).all()
+    assert (pixels.min(axis=0)[1:9] < 0.5 * np.median(pixels, axis=0)[1:9]).sum() >= 4
+
+
+def test_gaussians_project_into_the_true_masks_of_their_class(demo: DemoScene) -> None:
+    dataset = Dataset(demo.root, labels="labels_true")
+    seen_own = np.zeros(len(demo.scene), bool)
+    for view in dataset.views("all"):
+        uv, depth = view.camera.project(demo.scene.means)
+        inside = (depth > 0) & (uv >= 0).all(axis=1) & (uv < [view.camera.width, view.camera.height]).all(axis=1)
+        columns, rows = uv[inside].astype(int).T
+        seen_own[inside] |= view.read_labels()[rows, columns] == demo.truth[inside]
+    assert seen_own[demo.truth > 0].mean() > 0.99
+
+
+def test_train_masks_have_errors_and_test_masks_stay_hidden(demo: DemoScene) -> None:
+    assert sorted(path.stem for path in (demo.root / "labels").iterdir()) == demo.train
+    wrong = []
+    for name in demo.train:
+        truth, seen = (read_mask(demo.root / folder / f"{name}.png").labels for folder in ("labels_true", "labels"))
+        objects = (truth > 0) & (truth < 9)
+        wrong.append((truth != seen)[objects].mean())
+    assert 0.15 < np.mean(wrong) < 0.45
+
+
+def test_the_same_seed_gives_the_same_scene_and_another_one_another(demo: DemoScene, tmp_path: Path) -> None:
+    again, other = build_demo(tmp_path / "again"), build_demo(tmp_path / "other", seed=1)
+    assert again.scene.digest == demo.scene.digest != other.scene.digest
+    name = f"labels/{demo.train[0]}.png"
+    assert (again.root / name).read_bytes() == (demo.root / name).read_bytes()
+    name = f"labels_true/{demo.train[0]}.png"
+    assert (other.root / name).read_bytes() == (demo.root / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    "solid",
+    [
+        Ellipsoid((0.3, 0.32, 0.28)),
+        Box((0.4, 0.2, 0.6)),
+        Cone(0.3, 0.3, 0.5),
+        Cone(0.3, 0.1, 0.4),
+        Cone(0.2, 0.0, 0.4),
+        Cone(0.2, 0.3, 0.3, hollow=True),
+    ],
+    ids=str,
+)
+def test_rays_from_outside_hit_a_solid_where_its_surface_was_sampled(solid: Solid) -> None:
+    rng = np.random.default_rng(0)
+    points, normals = solid.sample(rng.random((2000, 3)), inset=0.0)
+    low, high = solid.corners
+    assert (points >= low - 1e-9).all() and (points <= high + 1e-9).all()
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        distances = solid.hit(points + 1e-4 * normals, -normals)
+        misses = solid.hit(points + (high - low).max() * 4, np.ones_like(points))
+    # Rays meet a cup's outer side, which from the inside is a wall further away.
+    assert (distances < 2e-4 + (WALL if getattr(solid, "hollow", False) else 0)).mean() > 0.99
+    assert np.isinf(misses).all()
+
+
+@pytest.mark.parametrize("solid", [Ellipsoid((0.3, 0.32, 0.28)), Box((0.4, 0.2, 0.6)), Cone(0.3, 0.1, 0.4)], ids=str)
+def test_a_solid_contains_what_lies_under_its_surface_and_nothing_above_it(solid: Solid) -> None:
+    points, normals = solid.sample(np.random.default_rng(0).random((2000, 3)), inset=0.0)
+    assert solid.contains(points - 1e-6 * normals).mean() > 0.999
+    assert not solid.contains(points + 1e-6 * normals).any()

@@ -1,0 +1,123 @@
+"""The errors that masks are given: as many and as large as the settings say, and the same for the same seed."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from gsseg_core.errors import SettingsError
+from gsseg_core.mask_errors import MaskErrors, corrupt
+from gsseg_core.masks import UNKNOWN
+
+NONE = MaskErrors(missed=0, swapped=0, edge_px=0)
+
+
+def make_grid(rows: int = 5, columns: int = 6, size: int = 16, gap: int = 8) -> np.ndarray:
+    """Square objects 1, 2, 3, ... on background."""
+    ids = np.arange(1, rows * columns + 1, dtype=np.int32).reshape(rows, columns)
+    cell = np.pad(np.ones((size, size), np.int32), gap)
+    return np.kron(ids, cell)
+
+
+def test_no_errors_leave_the_labels_as_they_are() -> None:
+    labels = make_grid()
+    wrong = corrupt(labels, np.random.default_rng(0), NONE)
+    np.testing.assert_array_equal(wrong, labels)
+    assert wrong is not labels and wrong.dtype == np.int32
+
+
+def test_the_same_seed_gives_the_same_errors_and_another_one_others() -> None:
+    labels = make_grid()
+    settings = MaskErrors(holes=0.5, blobs=3)
+    first, again, other = (corrupt(labels, np.random.default_rng(seed), settings) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+
+
+def test_views_drawn_from_one_generator_differ() -> None:
+    rng = np.random.default_rng(0)
+    assert (corrupt(make_grid(), rng) != corrupt(make_grid(), rng)).any()
+
+
+def test_objects_are_missed_and_swapped_as_often_as_asked() -> None:
+    labels = make_grid()
+    rng = np.random.default_rng(0)
+    middles = labels > 0
+    missed = swapped = 0.0
+    for _ in range(100):
+        wrong = corrupt(labels, rng, MaskErrors(missed=0.15, swapped=0.1, edge_px=0, missed_label=99))
+        assert (wrong[~middles] == 0).all()
+        missed += (wrong[middles] == 99).mean() / 100
+        swapped += ((wrong != labels) & (wrong != 99))[middles].mean() / 100
+        assert np.isin(wrong, [0, 99, *range(1, 31)]).all()
+    assert missed == pytest.approx(0.15, abs=0.03)
+    assert swapped == pytest.approx(0.10, abs=0.03)
+
+
+def test_every_object_has_one_label_again() -> None:
+    labels = make_grid()
+    wrong = corrupt(labels, np.random.default_rng(3), MaskErrors(missed=0.4, swapped=0.4, edge_px=0))
+    for k in range(1, 31):
+        assert len(np.unique(wrong[labels == k])) == 1
+
+
+def test_edges_move_by_every_amount_up_to_the_largest_and_no_further() -> None:
+    labels = make_grid(rows=10, columns=10)
+    wrong = corrupt(labels, np.random.default_rng(0), MaskErrors(missed=0, swapped=0, edge_px=3))
+    widths = [np.ptp(np.flatnonzero((wrong == k).any(axis=0))) + 1 for k in range(1, 101)]
+    assert set(widths) == {16 + 2 * shift for shift in range(-3, 4)}
+    # Distance to the nearest pixel of the other side, so no pixel further than 3 px from an outline changes.
+    depth = np.maximum(*(ndimage.distance_transform_edt(side) for side in (labels > 0, labels == 0)))
+    assert depth[wrong != labels].max() <= 3
+
+
+def test_what_a_shrunk_object_gives_up_goes_to_its_neighbours() -> None:
+    labels = np.repeat(np.array([[4, 7]], np.int32), 20, axis=1).repeat(10, axis=0)
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        wrong = corrupt(labels, rng, MaskErrors(missed=0, swapped=0, edge_px=5))
+        assert set(np.unique(wrong)) <= {4, 7}
+
+
+def test_holes_and_blobs_come_where_they_are_asked_for() -> None:
+    labels = make_grid()
+    holed = corrupt(labels, np.random.default_rng(0), MaskErrors(0, 0, 0, holes=1, hole_px=4))
+    assert (holed[labels == 0] == 0).all()
+    assert all((holed[labels == k] == 0).any() for k in range(1, 31))
+    blobbed = corrupt(labels, np.random.default_rng(0), MaskErrors(0, 0, 0, blobs=5, blob_px=6))
+    changed = blobbed != labels
+    assert 0 < changed.sum() < 20 * np.pi * 12**2
+    assert (blobbed[changed] > 0).all()
+
+
+def test_one_kind_of_error_does_not_change_the_draws_of_another() -> None:
+    labels = make_grid()
+    plain = corrupt(labels, np.random.default_rng(5), MaskErrors(edge_px=0))
+    blobbed = corrupt(labels, np.random.default_rng(5), MaskErrors(edge_px=0, blobs=2, blob_px=5))
+    assert 0 < (plain != blobbed).mean() < 0.05
+
+
+@hypothesis_settings(deadline=None, max_examples=40)
+@given(seed=st.integers(0, 10**6), height=st.integers(1, 12), width=st.integers(1, 12), classes=st.integers(1, 4))
+def test_unknown_stays_unknown_and_labels_stay_labels_on_any_map(
+    seed: int, height: int, width: int, classes: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    labels = rng.integers(UNKNOWN, classes, (height, width))
+    wrong = corrupt(labels, rng, MaskErrors(missed=0.3, swapped=0.3, edge_px=4, holes=0.5, blobs=2))
+    assert wrong.shape == labels.shape
+    assert (wrong[labels == UNKNOWN] == UNKNOWN).all()
+    assert np.isin(wrong, [UNKNOWN, 0, *np.unique(labels)]).all()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"missed": -0.1}, {"swapped": 1.5}, {"missed": 0.6, "swapped": 0.6}, {"edge_px": -1}, {"blobs": float("nan")}],
+)
+def test_impossible_settings_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(SettingsError, match=next(iter(wrong))):
+        MaskErrors(**wrong)  # type: ignore[arg-type]

@@ -1,0 +1,84 @@
+"""Pictures: colours that can be told apart, outlines where classes meet, sheets and legends that hold everything."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsseg_core.errors import WriteError
+from gsseg_core.masks import UNKNOWN
+from gsseg_core.pictures import BACKGROUND, PAPER, contact_sheet, legend, overlay, palette, save_png
+
+
+def test_colours_are_all_different_and_the_first_is_the_background() -> None:
+    colors = palette(1000)
+    assert colors.shape == (1000, 3) and colors.dtype == np.uint8
+    assert len(np.unique(colors, axis=0)) == 1000
+    assert tuple(colors[0]) == BACKGROUND
+
+
+def test_a_small_palette_is_the_beginning_of_a_large_one() -> None:
+    np.testing.assert_array_equal(palette(10), palette(60)[:10])
+    assert palette(1).shape == (1, 3)
+
+
+def test_colours_of_few_classes_are_far_apart() -> None:
+    colors = palette(20).astype(float)
+    distances = np.linalg.norm(colors[:, None] - colors, axis=-1) + 1e3 * np.eye(20)
+    assert distances.min() > 40
+
+
+def test_more_classes_than_colours_still_get_one_each() -> None:
+    assert palette(5000).shape == (5000, 3)
+
+
+def test_an_overlay_draws_lines_exactly_where_labels_change() -> None:
+    labels = np.zeros((20, 30), int)
+    labels[5:15, 10:20] = 1
+    image = np.full((20, 30, 3), 120, np.uint8)
+    picture = overlay(image, labels, palette(2))
+    inside, line, outside = picture[10, 15], picture[10, 10], picture[1, 1]
+    assert picture.shape == image.shape and picture.dtype == np.uint8
+    assert (picture[6:14, 11:19] == inside).all()
+    assert (picture[5:15, [10, 19]] == line).all() and (picture[[5, 14], 10:20] == line).all()
+    assert (picture[:4] == outside).all()
+    assert len({tuple(inside), tuple(line), tuple(outside)}) == 3
+    assert (image == 120).all()
+
+
+def test_unknown_pixels_are_shown_like_background() -> None:
+    image = np.full((4, 4, 3), 90, np.uint8)
+    unknown = overlay(image, np.full((4, 4), UNKNOWN), palette(2))
+    np.testing.assert_array_equal(unknown, overlay(image, np.zeros((4, 4), int), palette(2)))
+
+
+def test_a_contact_sheet_holds_every_picture_whole() -> None:
+    colors = palette(8)[1:]
+    images = [np.broadcast_to(color, (30 + 4 * i, 50, 3)) for i, color in enumerate(colors)]
+    sheet = contact_sheet(images, [f"a caption that is much too long for its picture {i}" for i in range(7)], columns=3)
+    for image, color in zip(images, colors, strict=True):
+        assert (sheet == color).all(axis=-1).sum() == image.shape[0] * image.shape[1]
+    assert tuple(sheet[0, 0]) == PAPER
+
+
+def test_a_legend_has_a_swatch_for_every_class_in_as_many_columns_as_it_takes() -> None:
+    colors = palette(60)
+    names = {k: "object " * (k % 9) for k in range(60)}
+    sheet = legend(names, colors, np.arange(60) * 10_000)
+    for color in colors:
+        assert (sheet == color).all(axis=-1).sum() > 200
+    assert sheet.shape[1] > legend({0: "background"}, colors, np.zeros(60, int)).shape[1]
+    assert legend({}, colors, np.zeros(60, int)).ndim == 3
+
+
+def test_a_saved_picture_reads_back_and_survives_a_failed_write(tmp_path: Path) -> None:
+    picture = np.random.default_rng(0).integers(0, 255, (5, 7, 3), np.uint8)
+    path = tmp_path / "new folder" / "picture.png"
+    save_png(path, picture)
+    np.testing.assert_array_equal(np.asarray(Image.open(path)), picture)
+    with pytest.raises(WriteError, match=r"picture\.png"):
+        save_png(path / "below a file.png", picture)
+    np.testing.assert_array_equal(np.asarray(Image.open(path)), picture)
