@@ -1,0 +1,74 @@
+"""Segment trained 3D Gaussian Splatting scenes: from posed 2D masks to a class for every Gaussian.
+
+>>> from gsseg_core import Dataset, EMLearner, GaussianScene, Segmentation, export_classes
+>>> scene, data = GaussianScene.load("scene.ply"), Dataset("dataset")  # doctest: +SKIP
+>>> learner = EMLearner(scene, data.num_classes)  # doctest: +SKIP
+>>> for view in data.views("train"):  # doctest: +SKIP
+...     learner.observe(view)
+>>> result = Segmentation.from_codes(scene, learner.fit().codes_, data.class_names)  # doctest: +SKIP
+>>> export_classes(scene, result, "classes")  # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gsseg_core.cameras import Camera
+    from gsseg_core.dataset import Dataset, View
+    from gsseg_core.em import EMLearner, EMSettings
+    from gsseg_core.errors import GssegError
+    from gsseg_core.export import export_classes
+    from gsseg_core.gradient import GradientLearner, GradientSettings
+    from gsseg_core.metrics import Evaluation
+    from gsseg_core.operator import ViewOperator, make_operator
+    from gsseg_core.refine import RefineSettings
+    from gsseg_core.scene import GaussianScene
+    from gsseg_core.segmentation import Segmentation
+    from gsseg_core.votes import VoteLearner
+
+_HOMES = {
+    "Camera": "cameras",
+    "Dataset": "dataset",
+    "EMLearner": "em",
+    "EMSettings": "em",
+    "Evaluation": "metrics",
+    "GaussianScene": "scene",
+    "GradientLearner": "gradient",
+    "GradientSettings": "gradient",
+    "GssegError": "errors",
+    "RefineSettings": "refine",
+    "Segmentation": "segmentation",
+    "View": "dataset",
+    "ViewOperator": "operator",
+    "VoteLearner": "votes",
+    "export_classes": "export",
+    "make_operator": "operator",
+}
+
+__all__ = [
+    "Camera",
+    "Dataset",
+    "EMLearner",
+    "EMSettings",
+    "Evaluation",
+    "GaussianScene",
+    "GradientLearner",
+    "GradientSettings",
+    "GssegError",
+    "RefineSettings",
+    "Segmentation",
+    "View",
+    "ViewOperator",
+    "VoteLearner",
+    "export_classes",
+    "make_operator",
+]
+
+
+def __getattr__(name: str) -> Any:
+    # Loaded on first use: compiled kernels and PyTorch take longer to import than all the rest.
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -1,65 +1,230 @@
-"""A posed view as a linear operator: the weight matrix W (pixels x Gaussians) and its transpose."""
+"""A posed view as a linear operator: render and adjoint, whatever makes them."""
 
 from __future__ import annotations
 
-from functools import cached_property
+from abc import ABC, abstractmethod
+from typing import NamedTuple
 
 import numpy as np
 
-from gsseg_core import products
 from gsseg_core.cameras import Camera
-from gsseg_core.projection import project
+from gsseg_core.errors import MaskSizeError, SceneValueError, SettingsError
 from gsseg_core.scene import GaussianScene
-from gsseg_core.tiles import TILE, assign
 
 
-class ViewOperator:
-    def __init__(self, scene, camera):
-        self.camera = camera
-        self.num_gaussians = len(scene)
-        self._projected = project(scene, camera)
-        self._tiles = assign(self._projected, camera.width, camera.height)
+class Weights(NamedTuple):
+    """The non-zero entries of W, by pixel and nearest Gaussian first.
+
+    Attributes
+    ----------
+    pixels : (P,) int32
+        Pixel index, row * width + column.
+    gaussians : (P,) int32
+        Index in the scene.
+    weights : (P,) float32
+        alpha times the transmittance in front, in (0, 0.99].
+    """
+
+    pixels: np.ndarray
+    gaussians: np.ndarray
+    weights: np.ndarray
+
+
+class Shares(NamedTuple):
+    """What the labelled pixels of a view say of the Gaussians that made them.
+
+    Attributes
+    ----------
+    gaussians : (M, L) float32
+        Sum over the pixels of each label of w[p, i] / likelihood[p].
+    rest : (L,) float64
+        The same for what the rays had left over, T_end[p] / likelihood[p].
+    log_likelihood : float
+        Sum over the labelled pixels of log likelihood[p], natural.
+    """
+
+    gaussians: np.ndarray
+    rest: np.ndarray
+    log_likelihood: float
+
+
+class Observation(ABC):
+    """A view with its mask: W cut down, in each pixel, to the label that was seen there.
+
+    It serves votes, the paper's loss and its gradient, and every step of EM, at a cost that does not depend on the
+    number of classes.
+
+    Attributes
+    ----------
+    ids : (M,) int32
+        Gaussians that reach the image, as indices in the scene.
+    classes : (L,) int32
+        Labels that occur in the mask, ascending.
+    num_pixels : int
+        Pixels with a label.
+    """
+
+    ids: np.ndarray
+    classes: np.ndarray
+    num_pixels: int
 
     @property
-    def ids(self):
-        return self._projected.ids
+    @abstractmethod
+    def nbytes(self) -> int:
+        """Memory that it holds, in bytes."""
 
-    def render(self, codes):
-        codes = np.ascontiguousarray(codes[self.ids], np.float32)
-        t = self._tiles
-        out = np.empty((self.camera.height, self.camera.width, codes.shape[1]), np.float32)
-        left = np.empty(out.shape[:2], np.float32)
-        products.render(t.columns, self._projected.table, t.start, t.entries, codes, out, left)
-        return out, left
+    @abstractmethod
+    def votes(self) -> np.ndarray:
+        """Weights summed by label: W^T onehot(y), (M, L) float32."""
 
-    def adjoint(self, residual):
-        t = self._tiles
-        out = np.zeros((self.num_gaussians, residual.shape[2]), np.float32)
-        rows = np.empty((len(self.ids), products.CHUNK), np.float32)
-        for k in range(0, residual.shape[2], products.CHUNK):
-            part = np.ascontiguousarray(residual[..., k:k + products.CHUNK], np.float32)
-            sums = np.empty((len(t.entries), part.shape[2]), np.float32)
-            products.adjoint_entries(t.columns, self._projected.table, t.start, t.entries, part, sums)
-            rows = np.empty((len(self.ids), part.shape[2]), np.float32)
-            products.reduce_entries(t.gaussian_start, t.gaussian_entries, sums, rows)
-            out[self.ids, k:k + products.CHUNK] = rows
-        return out
+    @abstractmethod
+    def shares(
+        self,
+        codes: np.ndarray,  # (M, L)
+        rest: np.ndarray,  # (L,)
+    ) -> Shares:
+        """Share one vote per labelled pixel among the Gaussians that made it.
 
-    def prepare(self, labels, num):
-        t = self._tiles
-        ls, present, slots = products.tile_labels(labels, t.columns, t.rows, num)
-        per = np.diff(t.start)
-        ss = np.concatenate([[0], np.cumsum(per * np.diff(ls))])
-        et = np.repeat(np.arange(len(per), dtype=np.int32), per)
-        return ls, present, slots, ss, et
+        With likelihood[p] = (W codes)[p, y_p] + T_end[p] rest[y_p], the share of Gaussian i in label y is the sum over
+        the pixels of that label of w[p, i] / likelihood[p]. It is the gradient of the log likelihood with respect to
+        codes[i, y].
 
-    def lift(self, prep, codes, rest, divide):
-        t = self._tiles
-        ls, present, slots, ss, et = prep
-        lik = np.empty((len(t.start) - 1, TILE, TILE), np.float32)
-        left = np.empty_like(lik)
-        sums = np.empty(ss[-1], np.float32)
-        products.labelled(t.columns, self.camera.width, self.camera.height, self._projected.table, t.start, t.entries, ls, present, slots, codes, rest, divide, ss, lik, left, sums)
-        out = np.empty(codes.shape, np.float32)
-        products.reduce_labelled(t.start, t.gaussian_start, t.gaussian_entries, et, ls, present, ss, sums, out)
-        return out, lik, left
+        Parameters
+        ----------
+        codes : (M, L) float32
+            What each Gaussian says of each label in `classes`, at least 0.
+        rest : (L,) float32
+            What the background says of each label.
+        """
+
+
+class ViewOperator(ABC):
+    """The weight matrix W (pixels x Gaussians) of one view of one scene, and its transpose.
+
+    w[p, i] = alpha_i(p) * prod over nearer j of (1 - alpha_j(p)), as 3DGS blends colours (Kerbl et al. 2023, eq. 3).
+    A row of W sums to 1 minus the ray's final transmittance.
+
+    Attributes
+    ----------
+    camera : Camera
+        Where from.
+    num_gaussians : int
+        N, the size of the scene.
+    ids : (M,) int32
+        Gaussians that reach the image, nearest first. All others have a column of zeros.
+    """
+
+    camera: Camera
+    num_gaussians: int
+    ids: np.ndarray
+
+    def render(
+        self,
+        codes: np.ndarray,  # (N, K)
+    ) -> np.ndarray:
+        """Blend codes into the view: W q.
+
+        Parameters
+        ----------
+        codes : (N, K)
+            Anything that a Gaussian carries: class probabilities, colours, depths.
+
+        Returns
+        -------
+        (H, W, K) float32
+
+        Raises
+        ------
+        SceneValueError
+            There is not one row of codes per Gaussian.
+        """
+        codes = np.asarray(codes)
+        if codes.ndim != 2 or len(codes) != self.num_gaussians:
+            raise SceneValueError(f"codes have shape {codes.shape}; expected ({self.num_gaussians}, K)")
+        return self._render(codes)
+
+    def adjoint(
+        self,
+        residual: np.ndarray,  # (H, W, K)
+    ) -> np.ndarray:
+        """Carry values of pixels back to the Gaussians that made them: W^T r.
+
+        Parameters
+        ----------
+        residual : (H, W, K)
+            Anything that a pixel carries: one-hot labels, the gradient of a loss.
+
+        Returns
+        -------
+        (N, K) float32
+
+        Raises
+        ------
+        MaskSizeError
+            The residual is not of the camera's size.
+        """
+        residual = np.asarray(residual)
+        self._check_size(residual, 3)
+        return self._adjoint(residual)
+
+    def observe(
+        self,
+        labels: np.ndarray,  # (H, W) int32, negative = unknown
+    ) -> Observation:
+        """Tie the view to its mask.
+
+        Raises
+        ------
+        MaskSizeError
+            The labels are not of the camera's size.
+        """
+        self._check_size(labels, 2)
+        return self._observe(labels)
+
+    def visibility(self) -> np.ndarray:
+        """Sum of each Gaussian's weights over the image: W^T 1, (N,) float32, in px."""
+        return self.adjoint(np.ones((self.camera.height, self.camera.width, 1), np.float32))[:, 0]
+
+    @abstractmethod
+    def transmittance(self) -> np.ndarray:
+        """What is left of each ray after the last Gaussian, (H, W) float32 in [0, 1]."""
+
+    @abstractmethod
+    def weights(self, row: int | None = None, column: int | None = None) -> Weights:
+        """List W, or only the row of W of one pixel: which Gaussians made it, and how much.
+
+        Parameters
+        ----------
+        row, column : int, optional
+            The pixel. Without them, every pixel of the image.
+        """
+
+    @abstractmethod
+    def _render(self, codes: np.ndarray) -> np.ndarray: ...
+
+    @abstractmethod
+    def _adjoint(self, residual: np.ndarray) -> np.ndarray: ...
+
+    @abstractmethod
+    def _observe(self, labels: np.ndarray) -> Observation: ...
+
+    def _check_size(self, image: np.ndarray, dimensions: int) -> None:
+        height, width = self.camera.height, self.camera.width
+        if image.ndim != dimensions or image.shape[:2] != (height, width):
+            expected = f"({height}, {width}{', K' if dimensions == 3 else ''})"
+            raise MaskSizeError(f"view '{self.camera.name}': image has shape {image.shape}; expected {expected}")
+
+
+def make_operator(scene: GaussianScene, camera: Camera, device: str = "cpu") -> ViewOperator:
+    """Make the operator of a view on a device.
+
+    Raises
+    ------
+    SettingsError
+        There is no such device.
+    """
+    if device != "cpu":
+        raise SettingsError(f"device is {device!r}; expected 'cpu', the only one that this version can use")
+    from gsseg_core.tile_operator import TileOperator
+
+    return TileOperator(scene, camera)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import plyfile  # type: ignore[import-untyped]
+import plyfile
 
 from gsseg_core.atomic import write_atomically
 from gsseg_core.errors import SceneFileError, ScenePropertyError

@@ -8,6 +8,8 @@ import numpy as np
 from gsseg_core.blend import blend_tile
 from gsseg_core.tiles import TILE
 
+_FAST = {"contract", "nnan", "nsz", "reassoc"}
+
 CHUNK = 32
 """Channels that one pass of the general adjoint sums at once; bounds its memory at entries x 32 float32."""
 
@@ -57,7 +59,7 @@ def render(
                     out[top + r, left + c, k] = block[r, k, c]
 
 
-@nb.njit(parallel=True, cache=True, fastmath={"reassoc", "contract"})
+@nb.njit(parallel=True, cache=True, fastmath=_FAST)
 def adjoint_entries(
     columns: int,
     table: np.ndarray,  # (M, 9)
@@ -146,7 +148,7 @@ def tile_labels(
     return start, present[:n].copy(), slots
 
 
-@nb.njit(parallel=True, cache=True, fastmath={"reassoc", "contract"}, error_model="numpy")
+@nb.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
 def labelled(
     columns: int,
     width: int,
@@ -197,16 +199,7 @@ def labelled(
 
         if divide:
             value = np.zeros((TILE, TILE), np.float32)
-            n = 0
-            for e in range(used):
-                g = entries[first + e]
-                for i in range(n, ends[e]):
-                    r = rows[i]
-                    for j in range(counts[r]):
-                        code = codes[g, labels[slot[r, j]]]
-                        for c in range(weights.shape[1]):
-                            value[r, c] += code * (weights[i, c] * where[r, j, c])
-                n = ends[e]
+            _blend_labels(used, entries[first:last], ends, rows, weights, counts, slot, where, labels, codes, value)
             for r in range(TILE):
                 for j in range(counts[r]):
                     extra = rest[labels[slot[r, j]]]
@@ -215,19 +208,61 @@ def labelled(
                             p = value[r, c] + extra * rays[r, c]
                             likelihood[tile, r, c] = p
                             where[r, j, c] = 1.0 / p if p > 0 else 0.0
+        _sum_labels(used, ends, rows, weights, counts, slot, where, many, sums[slot_start[tile] : slot_start[tile + 1]])
 
-        target = sums[slot_start[tile] : slot_start[tile + 1]]
-        target[:] = 0.0
-        n = 0
-        for e in range(used):
-            for i in range(n, ends[e]):
-                r = rows[i]
-                for j in range(counts[r]):
-                    total = np.float32(0.0)
-                    for c in range(weights.shape[1]):
-                        total += weights[i, c] * where[r, j, c]
-                    target[e * many + slot[r, j]] += total
-            n = ends[e]
+
+@nb.njit(fastmath=_FAST)
+def _blend_labels(
+    used: int,
+    entries: np.ndarray,  # (E_t,) of this tile
+    ends: np.ndarray,  # (E_t,)
+    rows: np.ndarray,  # (R,)
+    weights: np.ndarray,  # (R, 16)
+    counts: np.ndarray,  # (16,) labels in each row
+    slot: np.ndarray,  # (16, 16)
+    where: np.ndarray,  # (16, 16, 16) 1 where a row's pixel has its j-th label
+    labels: np.ndarray,  # (L_t,)
+    codes: np.ndarray,  # (M, L)
+    value: np.ndarray,  # (16, 16) out
+) -> None:
+    n = 0
+    for e in range(used):
+        code_of = codes[entries[e]]
+        for i in range(n, ends[e]):
+            r = rows[i]
+            record, target = weights[i], value[r]
+            for j in range(counts[r]):
+                code, mask = code_of[labels[slot[r, j]]], where[r, j]
+                for c in range(record.shape[0]):
+                    target[c] += code * (record[c] * mask[c])
+        n = ends[e]
+
+
+@nb.njit(fastmath=_FAST)
+def _sum_labels(
+    used: int,
+    ends: np.ndarray,  # (E_t,)
+    rows: np.ndarray,  # (R,)
+    weights: np.ndarray,  # (R, 16)
+    counts: np.ndarray,  # (16,)
+    slot: np.ndarray,  # (16, 16)
+    where: np.ndarray,  # (16, 16, 16) what a weight counts where a row's pixel has its j-th label
+    many: int,
+    sums: np.ndarray,  # (E_t * many,) out
+) -> None:
+    sums[:] = 0.0
+    n = 0
+    for e in range(used):
+        for i in range(n, ends[e]):
+            r = rows[i]
+            record = weights[i]
+            for j in range(counts[r]):
+                mask = where[r, j]
+                total = np.float32(0.0)
+                for c in range(record.shape[0]):
+                    total += record[c] * mask[c]
+                sums[e * many + slot[r, j]] += total
+        n = ends[e]
 
 
 @nb.njit(parallel=True, cache=True)
@@ -251,3 +286,40 @@ def reduce_labelled(
             base = slot_start[tile] + (e - start[tile]) * many
             for j in range(many):
                 out[g, present[label_start[tile] + j]] += sums[base + j]
+
+
+@nb.njit(parallel=True, cache=True)
+def list_weights(
+    columns: int,
+    width: int,
+    height: int,
+    table: np.ndarray,  # (M, 9)
+    start: np.ndarray,  # (T + 1,)
+    entries: np.ndarray,  # (E,)
+    wanted: np.ndarray,  # (U,) tiles
+    place: np.ndarray,  # (U + 1,) int64: counts out (place[1:]) when the lists are empty, else where each tile's part begins
+    pixels: np.ndarray,  # (P,) int32 out
+    rows_of: np.ndarray,  # (P,) int32 out: row of the table
+    values: np.ndarray,  # (P,) float32 out
+) -> None:
+    """Count the non-zero weights of each tile, or write them where a first call's counts say."""
+    for i in nb.prange(wanted.shape[0]):
+        tile = wanted[i]
+        first, last = start[tile], start[tile + 1]
+        rays, weights, rows, ends = _scratch(last - first)
+        used = blend_tile(tile, columns, width, height, table, entries, first, last, rays, weights, rows, ends)
+        left, top = (tile % columns) * TILE, (tile // columns) * TILE
+        position = place[i] if values.shape[0] else 0
+        n = 0
+        for e in range(used):
+            for record in range(n, ends[e]):
+                for c in range(TILE):
+                    if weights[record, c] > 0:
+                        if values.shape[0]:
+                            pixels[position] = (top + rows[record]) * width + left + c
+                            rows_of[position] = entries[first + e]
+                            values[position] = weights[record, c]
+                        position += 1
+            n = ends[e]
+        if not values.shape[0]:
+            place[i + 1] = position

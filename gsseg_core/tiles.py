@@ -50,7 +50,7 @@ def assign(projected: Projected, width: int, height: int) -> Tiles:
     entries = np.empty(start[-1], np.int32)
     _fill(projected.table, columns, rows, start, entries)
     gaussian_start = np.zeros(len(projected.ids) + 1, np.int64)
-    gaussian_entries = np.empty_like(entries)
+    gaussian_entries = np.empty(len(entries), np.int32)
     _transpose(entries, gaussian_start, gaussian_entries)
     return Tiles(columns, rows, start, entries, gaussian_start, gaussian_entries)
 

@@ -1,0 +1,177 @@
+"""The command `gsseg`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+
+from tqdm import tqdm
+
+from gsseg_core.errors import GssegError, SettingsError
+from gsseg_core.export import write_json
+from gsseg_core.learner import Progress, silent
+from gsseg_core.refine import RefineSettings
+
+_INTERRUPTED = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code: 0, 2 on an error of the input, 130 when interrupted."""
+    options = _parser().parse_args(arguments)
+    try:
+        code: int = options.run(options)
+    except GssegError as error:
+        print(f"gsseg: error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("\ngsseg: interrupted; nothing that was saved before has changed", file=sys.stderr)
+        return _INTERRUPTED
+    except BrokenPipeError:
+        # The reader of our output has left, as `head` does; there is nobody to tell.
+        sys.stderr.close()
+        return 0
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="gsseg", description="Segment a trained 3D Gaussian Splatting scene, all objects at once, from posed 2D masks."
+    )
+    parser.add_argument("--version", action="version", version=f"gsseg {version('gsseg')}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    command = commands.add_parser("segment", help="learn from masks, refine, write labels and one PLY per object")
+    _add_scene(command)
+    command.add_argument("--out", required=True, metavar="OUT", help="folder to write to")
+    command.add_argument("--labels", default="labels", metavar="DIR", help="folder of the masks in DATASET (default: labels)")
+    command.add_argument("--learner", choices=("em", "gradient", "votes"), default="em", help="default: em")
+    command.add_argument("--views", type=int, metavar="N", help="learn from N train views, spread evenly (default: all)")
+    command.add_argument("--k", type=int, default=RefineSettings.k, help="neighbours in KNN and filter (default: %(default)s)")
+    command.add_argument(
+        "--beta", type=float, default=RefineSettings.beta, help="confidence below which KNN decides (default: %(default)s)"
+    )
+    command.add_argument("--no-knn", action="store_true", help="leave uncertain and unobserved Gaussians as they are")
+    command.add_argument("--no-filter", action="store_true", help="keep Gaussians that lie far from the rest of their object")
+    command.add_argument("--seed", type=int, default=0, help="for learners that draw at random (default: %(default)s)")
+    command.add_argument(
+        "--ids", choices=("global", "per-view"), default="global", help="whether an id means the same in every view"
+    )
+    command.add_argument("--scheduler", metavar="ADDRESS", help="distribute the work (not in this version)")
+    command.set_defaults(run=_segment)
+
+    command = commands.add_parser("render", help="render label maps and overlays of a segmentation")
+    _add_scene(command)
+    command.add_argument("--segmentation", required=True, metavar="FILE", help="segmentation.npz of this scene")
+    command.add_argument("--split", choices=("train", "test", "all"), default="test", help="default: test")
+    command.add_argument("--out", required=True, metavar="DIR", help="folder to write to")
+    command.set_defaults(run=_render)
+
+    command = commands.add_parser("eval", help="score label maps: mIoU, mAcc, boundary IoU")
+    command.add_argument("--pred", required=True, metavar="DIR", help="folder of predicted label maps <stem>.png")
+    command.add_argument("--truth", required=True, metavar="DIR", help="folder of true label maps <stem>.png")
+    command.add_argument("--json", metavar="FILE", help="write the scores there, too")
+    command.set_defaults(run=_eval)
+
+    command = commands.add_parser("demo", help="make a small scene with known truth and segment it")
+    command.add_argument("--out", default="demo_out", metavar="DIR", help="folder to write to (default: %(default)s)")
+    command.add_argument("--seed", type=int, default=0, help="of the scene and its masks' errors (default: %(default)s)")
+    command.add_argument("--quiet", action="store_true", help="no progress bars")
+    command.set_defaults(run=_demo)
+    return parser
+
+
+def _add_scene(command: argparse.ArgumentParser) -> None:
+    command.add_argument("scene", metavar="SCENE.ply", help="trained 3DGS scene")
+    command.add_argument(
+        "--data", required=True, metavar="DATASET", help="folder with cameras, labels/<stem>.png, classes.json, split.json"
+    )
+    command.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="default: cpu")
+    command.add_argument("--quiet", action="store_true", help="no progress bars")
+
+
+def _segment(options: argparse.Namespace) -> int:
+    # Compiled kernels load with the pipeline; `gsseg --help` must not wait for them.
+    from gsseg_core import pipeline
+
+    if options.ids != "global":
+        raise SettingsError("--ids per-view is not in this version; expected global: ids that mean the same in every view")
+    if options.scheduler:
+        raise SettingsError("--scheduler is not in this version; expected a run on this machine")
+    report = pipeline.segment(
+        options.scene,
+        options.data,
+        options.out,
+        labels=options.labels,
+        learner=options.learner,
+        views=options.views,
+        refine=RefineSettings(
+            k=options.k, beta=options.beta, cluster=not options.no_knn, filter=not options.no_filter
+        ),
+        device=options.device,
+        seed=options.seed,
+        progress=_progress(options.quiet),
+    )
+    from gsseg_core.tables import segment_summary
+
+    print(segment_summary(report, options.out))
+    return 0
+
+
+def _render(options: argparse.Namespace) -> int:
+    from gsseg_core import pipeline
+
+    paths = pipeline.render(
+        options.scene,
+        options.data,
+        options.segmentation,
+        options.out,
+        split=options.split,
+        device=options.device,
+        progress=_progress(options.quiet),
+    )
+    print(f"{len(paths)} label maps in {options.out}, overlays in {options.out}/overlays")
+    return 0
+
+
+def _eval(options: argparse.Namespace) -> int:
+    from gsseg_core.metrics import evaluate_folders
+    from gsseg_core.tables import evaluation_summary
+
+    scores = evaluate_folders(options.pred, options.truth).as_dict()
+    if options.json:
+        write_json(options.json, scores)
+    print(evaluation_summary(scores))
+    return 0
+
+
+def _demo(options: argparse.Namespace) -> int:
+    from gsseg_core.demo import run_demo
+
+    print(run_demo(options.out, seed=options.seed, progress=_progress(options.quiet)))
+    return 0
+
+
+def _progress(quiet: bool) -> Progress:
+    return silent if quiet else _Bars()
+
+
+class _Bars:
+    """One progress bar a stage, on standard error."""
+
+    def __init__(self) -> None:
+        self._stage = ""
+        self._bar: tqdm[None] | None = None
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        if self._bar is None or stage != self._stage:
+            self._stage, self._bar = stage, tqdm(total=total, desc=stage, file=sys.stderr, dynamic_ncols=True)
+        self._bar.update(done - self._bar.n)
+        if done == total:
+            self._bar.close()
+            self._bar = None
+
+
+if __name__ == "__main__":
+    sys.exit(main())

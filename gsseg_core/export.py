@@ -1,0 +1,111 @@
+"""A segmentation as files for others: one PLY per object, a report, pictures."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsseg_core.atomic import write_atomically
+from gsseg_core.dataset import View
+from gsseg_core.errors import WriteError
+from gsseg_core.operator import ViewOperator, make_operator
+from gsseg_core.pictures import contact_sheet, legend, overlay, palette, save_png
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segmentation import Segmentation
+
+
+def export_classes(
+    scene: GaussianScene,
+    segmentation: Segmentation,
+    folder: str | os.PathLike[str],
+) -> dict[int, Path]:
+    """Write `<id>_<name>.ply` for every class that has Gaussians; valid 3DGS PLYs with all properties kept.
+
+    The folder is replaced as a whole, at the end: it never mixes two segmentations.
+
+    Raises
+    ------
+    WriteError
+        Something cannot be written; an earlier folder is unchanged.
+    """
+    folder = Path(folder)
+    names = {k: class_file_name(k, segmentation.class_names[k]) for k in np.flatnonzero(segmentation.counts()).tolist()}
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=".gsseg-", dir=folder.parent))
+    except OSError as error:
+        raise WriteError(f"{folder}: cannot be written ({error.strerror or error})") from error
+    try:
+        (work / "new").mkdir()
+        for k, name in names.items():
+            scene.subset(segmentation.labels == k).save(work / "new" / name)
+        if folder.exists():
+            folder.rename(work / "old")
+        (work / "new").rename(folder)
+    except OSError as error:
+        raise WriteError(f"{folder}: cannot be written ({error.strerror or error})") from error
+    finally:
+        if (work / "old").exists() and not folder.exists():
+            (work / "old").rename(folder)
+        shutil.rmtree(work, ignore_errors=True)
+    return {k: folder / name for k, name in names.items()}
+
+
+def class_file_name(label: int, name: str) -> str:
+    """File name of a class, safe on any file system."""
+    return f"{label}_{re.sub(r'[^0-9A-Za-z._-]+', '_', name).strip('._') or 'class'}.ply"
+
+
+def write_json(path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:
+    """Write JSON atomically."""
+    with write_atomically(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def background_image(scene: GaussianScene, operator: ViewOperator) -> np.ndarray:
+    """Render the scene's colours from a view, (H, W, 3) uint8, on black."""
+    image = operator.render(scene.colors(operator.camera.center))
+    pixels: np.ndarray = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    return pixels
+
+
+def write_pictures(
+    scene: GaussianScene,
+    segmentation: Segmentation,
+    views: Iterable[View],
+    folder: str | os.PathLike[str],
+    *,
+    device: str = "cpu",
+) -> list[Path]:
+    """Write overlays of some views, a contact sheet of them, and the legend.
+
+    Returns
+    -------
+    list of pathlib.Path
+        `overlay_<stem>.png` ..., `contact_sheet.png`, `legend.png`.
+    """
+    folder = Path(folder)
+    colors = palette(segmentation.num_classes)
+    images, captions, paths = [], [], []
+    for view in views:
+        operator = make_operator(scene, view.camera, device)
+        labels = segmentation.render_labels(operator)
+        images.append(overlay(background_image(scene, operator), labels, colors))
+        captions.append(view.name)
+        paths.append(folder / f"overlay_{view.name}.png")
+        save_png(paths[-1], images[-1])
+    if images:
+        columns = min(4, len(images))
+        paths.append(folder / "contact_sheet.png")
+        save_png(paths[-1], contact_sheet(images, captions, columns))
+    paths.append(folder / "legend.png")
+    save_png(paths[-1], legend(segmentation.class_names, colors, segmentation.counts()))
+    return paths

@@ -1,0 +1,206 @@
+"""What all learners share: views come and go one at a time, votes are kept exactly, and `fit` makes codes of them."""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from typing import TypeVar
+
+import numpy as np
+
+from gsseg_core.dataset import View
+from gsseg_core.errors import NoUsableViewsError, SettingsError, UnknownLabelError
+from gsseg_core.operator import Observation, make_operator
+from gsseg_core.scene import GaussianScene
+from gsseg_core.views_file import load_views, save_views
+
+VOTE_UNIT = 2.0**-24
+"""Votes are counted in whole multiples of this many px, so that adding and taking back are exact."""
+
+NO_MASK, SEES_NOTHING, ALL_UNKNOWN = "no mask", "sees no Gaussian", "all pixels unknown"
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is being done, how many steps of it are done, and of how many."""
+
+Self = TypeVar("Self", bound="Learner")
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """Report no progress."""
+
+
+class Learner(ABC):
+    """Learns which class each Gaussian of a scene belongs to.
+
+    Parameters
+    ----------
+    scene : GaussianScene
+        N Gaussians.
+    num_classes : int
+        K; labels are 0 (background) to K - 1.
+    device : str
+        Where views are rendered.
+    memory_budget : int
+        Bytes of prepared views to keep between steps; those beyond it are prepared anew each time.
+
+    Attributes
+    ----------
+    views : dict of str to View
+        Views that count, by name, in the order in which they came.
+    rejected : dict of str to str
+        Names of views that could not be used, and why.
+    codes_ : (N, K) float32
+        After `fit`: class probabilities of each Gaussian; a row of zeros where no labelled pixel saw it.
+    observed_ : (N,) bool
+        After `fit`: whether any labelled pixel saw the Gaussian.
+    history_ : list of float
+        After `fit`: the objective after each step, for learners that have one.
+    """
+
+    def __init__(
+        self, scene: GaussianScene, num_classes: int, *, device: str = "cpu", memory_budget: int = 1 << 30
+    ) -> None:
+        if num_classes < 1:
+            raise SettingsError(f"num_classes is {num_classes}; expected at least 1")
+        self.scene, self.num_classes, self.device = scene, num_classes, device
+        self.memory_budget = memory_budget
+        self.views: dict[str, View] = {}
+        self.rejected: dict[str, str] = {}
+        self.history_: list[float] = []
+        self._votes = np.zeros((len(scene), num_classes), np.int64)
+        self._prepared: dict[str, Observation] = {}
+
+    def observe(self, view: View) -> bool:
+        """Add a view and its votes. A view of a name that is there already replaces it.
+
+        Returns
+        -------
+        bool
+            Whether the view can be used; if not, `rejected` says why, and nothing has changed.
+
+        Raises
+        ------
+        MaskFormatError, MaskSizeError, UnknownLabelError
+            The mask is broken, of another size than the camera, or has labels beyond the classes.
+        """
+        observation, why = self._open(view)
+        if observation is None:
+            self.rejected[view.name] = why
+            return False
+        if view.name in self.views:
+            self.retract(view.name)
+        self.rejected.pop(view.name, None)
+        self._count(observation, 1)
+        self.views[view.name] = view
+        self._keep(view.name, observation)
+        return True
+
+    def retract(self, name: str) -> None:
+        """Take a view's votes back, exactly.
+
+        Raises
+        ------
+        SettingsError
+            There is no such view.
+        """
+        if name not in self.views:
+            raise SettingsError(f"view {name!r} was not observed; there are {len(self.views)} others")
+        self._count(self._observation(name), -1)
+        del self.views[name]
+        self._prepared.pop(name, None)
+
+    @abstractmethod
+    def fit(self: Self, progress: Progress = silent) -> Self:
+        """Learn `codes_` from the views observed so far.
+
+        Raises
+        ------
+        NoUsableViewsError
+            There is no view.
+        """
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Save the views, with their masks and votes, atomically. The scene itself is not in the file.
+
+        Raises
+        ------
+        WriteError
+            The file cannot be written; an earlier one is unchanged.
+        """
+        save_views(path, self.scene.digest, self.views.values(), self._votes)
+
+    def restore(self, path: str | os.PathLike[str]) -> None:
+        """Replace the views by those of a saved state; on any error nothing changes.
+
+        Raises
+        ------
+        StateFileError
+            The file is missing or broken.
+        StateMismatchError
+            It was saved for another scene or another number of classes.
+        """
+        views, votes = load_views(path, self.scene.digest, self._votes.shape)
+        self.views, self._votes = {view.name: view for view in views}, votes
+        self.rejected.clear()
+        self._prepared.clear()
+
+    def reject_summary(self) -> dict[str, int]:
+        """Count the rejected views by reason."""
+        return dict(Counter(self.rejected.values()))
+
+    def _open(self, view: View) -> tuple[Observation | None, str]:
+        if not view.has_mask:
+            return None, NO_MASK
+        labels = view.read_labels()
+        self._check_labels(view, labels)
+        if not (labels >= 0).any():
+            return None, ALL_UNKNOWN
+        observation = make_operator(self.scene, view.camera, self.device).observe(labels)
+        return (observation, "") if len(observation.ids) else (None, SEES_NOTHING)
+
+    def _check_labels(self, view: View, labels: np.ndarray) -> None:
+        largest = int(labels.max())
+        if largest >= self.num_classes:
+            raise UnknownLabelError(
+                f"{view.mask_path or view.name}: mask holds the label {largest}; expected at most "
+                f"{self.num_classes - 1}, since there are {self.num_classes} classes"
+            )
+
+    def _count(self, observation: Observation, sign: int) -> None:
+        votes = np.rint(observation.votes().astype(np.float64) / VOTE_UNIT).astype(np.int64)
+        self._votes[np.ix_(observation.ids, observation.classes)] += sign * votes
+
+    def _keep(self, name: str, observation: Observation) -> None:
+        used = sum(kept.nbytes for kept in self._prepared.values())
+        if used + observation.nbytes <= self.memory_budget:
+            self._prepared[name] = observation
+
+    def _observation(self, name: str) -> Observation:
+        if name not in self._prepared:
+            view = self.views[name]
+            return make_operator(self.scene, view.camera, self.device).observe(view.read_labels())
+        return self._prepared[name]
+
+    def _observations(self, names: Iterable[str] | None = None) -> Iterator[tuple[str, Observation]]:
+        for name in self.views if names is None else names:
+            yield name, self._observation(name)
+
+    def _vote_codes(self) -> np.ndarray:
+        """Votes as probabilities, (N, K) float32; sets `observed_`."""
+        if not self.views:
+            reasons = ", ".join(f"{count} {why}" for why, count in self.reject_summary().items()) or "none was given"
+            raise NoUsableViewsError(f"no view to learn from ({reasons}); expected posed views with label images")
+        total = self._votes.sum(axis=1)
+        self.observed_ = total > 0
+        return normalise(self._votes * np.float32(VOTE_UNIT))
+
+
+def normalise(
+    codes: np.ndarray,  # (N, K) float32, changed in place
+) -> np.ndarray:
+    """Scale rows to sum 1; rows of zeros stay zero."""
+    total = codes.sum(axis=1, keepdims=True)
+    np.divide(codes, total, out=codes, where=total > 0)
+    return codes

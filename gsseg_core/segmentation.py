@@ -1,0 +1,164 @@
+"""The result: a label, a probability per class and a confidence for every Gaussian."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from gsseg_core.atomic import write_atomically
+from gsseg_core.errors import GssegError, StateFileError, StateMismatchError
+from gsseg_core.operator import ViewOperator
+from gsseg_core.refine import RefineSettings, cluster, statistical_filter
+from gsseg_core.scene import GaussianScene
+
+UNOBSERVED, REMOVED = -1, -2
+"""Labels of Gaussians that no view spoke for, and of those that the filter took out."""
+
+FORMAT = "gsseg-segmentation-1"
+
+
+@dataclass(frozen=True, eq=False)
+class Segmentation:
+    """What each Gaussian of one scene belongs to.
+
+    Attributes
+    ----------
+    labels : (N,) int32
+        Class, or `UNOBSERVED` (-1), or `REMOVED` (-2).
+    probabilities : (N, K) float32
+        Rows sum to 1; zeros where unobserved. Removed Gaussians keep theirs.
+    class_names : dict of int to str
+        Names by class id.
+    scene_digest : str
+        Which scene it belongs to.
+    clustered : (N,) bool
+        Gaussians whose code came from their neighbours.
+    """
+
+    labels: np.ndarray
+    probabilities: np.ndarray
+    class_names: dict[int, str]
+    scene_digest: str
+    clustered: np.ndarray
+
+    @classmethod
+    def from_codes(
+        cls,
+        scene: GaussianScene,
+        codes: np.ndarray,  # (N, K)
+        class_names: Mapping[int, str],
+        settings: RefineSettings | None = None,
+    ) -> Segmentation:
+        """Refine learnt codes, as the paper does, and label every Gaussian by its largest entry.
+
+        Parameters
+        ----------
+        scene : GaussianScene
+            N Gaussians.
+        codes : (N, K) float32
+            Class probabilities; a row of zeros where nothing is known.
+        class_names : mapping from id to name
+            Classes without a name get one like "class_07".
+        settings : RefineSettings, optional
+            Either step can be switched off there.
+        """
+        settings = settings or RefineSettings()
+        names = {k: class_names.get(k, f"class_{k:02d}") for k in range(codes.shape[1])}
+        clustered = np.zeros(len(codes), bool)
+        if settings.cluster:
+            codes, clustered = cluster(scene.means, codes, codes.any(axis=1), settings.k, settings.beta)
+        labels = np.where(codes.any(axis=1), codes.argmax(axis=1), UNOBSERVED).astype(np.int32)
+        result = cls(labels, codes, names, scene.digest, clustered)
+        return result.filtered(scene, settings) if settings.filter else result
+
+    def filtered(self, scene: GaussianScene, settings: RefineSettings) -> Segmentation:
+        """Take the outliers out of each object: the paper's statistical filter."""
+        removed = statistical_filter(
+            scene.means, self.labels, settings.k, settings.filter_sigmas, self.probabilities.shape[1]
+        )
+        return replace(self, labels=np.where(removed, np.int32(REMOVED), self.labels))
+
+    @property
+    def num_classes(self) -> int:
+        """K, the background included."""
+        return int(self.probabilities.shape[1])
+
+    @property
+    def confidence(self) -> np.ndarray:
+        """Largest probability of each Gaussian, (N,) float32; 0 where unobserved."""
+        confidence: np.ndarray = self.probabilities.max(axis=1)
+        return confidence
+
+    def counts(self) -> np.ndarray:
+        """Number of Gaussians of each class, (K,) int64."""
+        return np.bincount(self.labels[self.labels >= 0], minlength=self.num_classes)
+
+    def render_labels(self, operator: ViewOperator) -> np.ndarray:
+        """Label map of a view: the class of the largest blended probability in each pixel, (H, W) int32.
+
+        Removed and unobserved Gaussians hide what is behind them, and say nothing; what a ray has left over is background.
+        """
+        codes = np.where(self.labels[:, None] >= 0, self.probabilities, np.float32(0))
+        image = operator.render(codes)
+        image[..., 0] += operator.transmittance()
+        return image.argmax(axis=2).astype(np.int32)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write labels, probabilities, confidence and class names as one npz, atomically.
+
+        Raises
+        ------
+        WriteError
+            The file cannot be written; an earlier one is unchanged.
+        """
+        header = {"format": FORMAT, "scene": self.scene_digest, "class_names": self.class_names}
+        with write_atomically(path, suffix=".npz") as temporary, open(temporary, "wb") as file:
+            np.savez_compressed(
+                file,
+                allow_pickle=False,
+                labels=self.labels,
+                probabilities=self.probabilities,
+                confidence=self.confidence,
+                clustered=self.clustered,
+                header=np.array(json.dumps(header)),
+            )
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str], scene: GaussianScene) -> Segmentation:
+        """Read a segmentation of `scene`.
+
+        Raises
+        ------
+        StateFileError
+            The file is missing or damaged.
+        StateMismatchError
+            It belongs to another scene.
+        """
+        path = Path(path)
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                header = json.loads(str(file["header"]))
+                if header["format"] != FORMAT:
+                    raise StateFileError(f"{path}: format is {header['format']!r}; expected {FORMAT!r}")
+                if header["scene"] != scene.digest:
+                    raise StateMismatchError(
+                        f"{path}: belongs to the scene {header['scene'][:12]}; expected {scene.digest[:12]}, "
+                        f"that of {scene.path or 'the scene in use'}"
+                    )
+                names = {int(k): str(name) for k, name in header["class_names"].items()}
+                result = cls(file["labels"], file["probabilities"], names, header["scene"], file["clustered"])
+        except GssegError:
+            raise
+        except FileNotFoundError as error:
+            raise StateFileError(f"{path}: does not exist; expected a segmentation.npz") from error
+        except (OSError, KeyError, ValueError, TypeError, AttributeError, zipfile.BadZipFile, EOFError) as error:
+            raise StateFileError(f"{path}: is not a segmentation.npz, or is damaged ({error})") from error
+        if result.labels.shape != (len(scene),) or result.probabilities.shape != (len(scene), len(names)):
+            raise StateFileError(f"{path}: arrays of shape {result.probabilities.shape}; expected ({len(scene)}, K)")
+        return result

@@ -1,0 +1,58 @@
+"""Plain-text tables for the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Lay out rows in columns: the first flush left, the others flush right."""
+    lines = [list(header), *map(list, rows)]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
+    lines.insert(1, ["-" * width for width in widths])
+    return "\n".join(
+        "  ".join(cell.ljust(width) if i == 0 else cell.rjust(width) for i, (cell, width) in enumerate(zip(line, widths, strict=True)))
+        for line in lines
+    )
+
+
+def seconds_table(seconds: Mapping[str, float]) -> str:
+    """Seconds per stage, and their sum."""
+    rows = [[name, f"{value:.2f}"] for name, value in seconds.items()]
+    return table(["stage", "seconds"], [*rows, ["total", f"{sum(seconds.values()):.2f}"]])
+
+
+def segment_summary(report: Mapping[str, Any], out: str) -> str:
+    """What `gsseg segment` prints: classes, counts, seconds, and where the files are."""
+    classes = [
+        [f"{entry['id']} {entry['name']}", f"{entry['gaussians']:,}", percent(entry["mean_confidence"])]
+        for entry in report["classes"]
+        if entry["gaussians"]
+    ]
+    views, gaussians = report["views"], report["gaussians"]
+    rejected = ", ".join(f"{count} {why}" for why, count in views["rejected"].items())
+    return "\n\n".join(
+        [
+            table(["class", "Gaussians", "confidence"], classes),
+            f"{views['used']} views used" + (f", rejected: {rejected}" if rejected else "") + "\n"
+            f"{report['scene']['gaussians']:,} Gaussians: {gaussians['labelled']:,} labelled "
+            f"({gaussians['from_neighbours']:,} of them by their neighbours), {gaussians['removed']:,} removed by the filter, "
+            f"{gaussians['unobserved']:,} unobserved",
+            seconds_table(report["seconds"]),
+            f"Objects: {out}/classes\nPictures: {out}/pictures\nLabels: {out}/segmentation.npz\nReport: {out}/report.json",
+        ]
+    )
+
+
+def evaluation_summary(scores: Mapping[str, Any]) -> str:
+    """What `gsseg eval` prints: scores per class and their means, in percent."""
+    names = ("iou", "accuracy", "boundary_iou")
+    rows = [[f"{entry['id']} {entry['name']}", *(percent(entry[name]) for name in names)] for entry in scores["classes"]]
+    mean = ["mean", *(percent(scores[f"mean_{name}"]) for name in names)]
+    return table(["class", "IoU", "accuracy", "boundary IoU"], [*rows, mean]) + f"\n{scores['views']} views"
+
+
+def percent(value: float | None) -> str:
+    """Write a ratio in percent, a dash where it is undefined."""
+    return "-" if value is None else f"{100 * value:.1f} %"

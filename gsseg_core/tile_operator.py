@@ -1,0 +1,148 @@
+"""The view operator on the CPU: numba kernels over 16 x 16 tiles."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsseg_core import products
+from gsseg_core.cameras import Camera
+from gsseg_core.operator import Observation, Shares, ViewOperator, Weights
+from gsseg_core.projection import project
+from gsseg_core.scene import GaussianScene
+from gsseg_core.tiles import TILE, assign
+
+
+class TileOperator(ViewOperator):
+    """W of one view, remade tile by tile at every product and never stored.
+
+    Holds only the projected Gaussians and their tiles, about 36 bytes per visible Gaussian and 12 per tile that it
+    touches. Results are the same bit for bit whatever the number of threads and the order of the Gaussians.
+    """
+
+    def __init__(self, scene: GaussianScene, camera: Camera) -> None:
+        self.camera = camera
+        self.num_gaussians = len(scene)
+        projected = project(scene, camera)
+        self.ids = projected.ids
+        self._table = projected.table
+        self._tiles = assign(projected, camera.width, camera.height)
+
+    def _render(self, codes: np.ndarray) -> np.ndarray:
+        return self._blend(codes[self.ids].astype(np.float32, order="C"))[0]
+
+    def transmittance(self) -> np.ndarray:
+        return self._blend(np.empty((len(self.ids), 0), np.float32))[1]
+
+    def _blend(self, codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        image = np.empty((self.camera.height, self.camera.width, codes.shape[1]), np.float32)
+        left_over = np.empty(image.shape[:2], np.float32)
+        tiles = self._tiles
+        products.render(tiles.columns, self._table, tiles.start, tiles.entries, codes, image, left_over)
+        return image, left_over
+
+    def _adjoint(self, residual: np.ndarray) -> np.ndarray:
+        tiles = self._tiles
+        out = np.zeros((self.num_gaussians, residual.shape[2]), np.float32)
+        for k in range(0, residual.shape[2], products.CHUNK):
+            part = residual[..., k : k + products.CHUNK].astype(np.float32, order="C")
+            sums = np.empty((len(tiles.entries), part.shape[2]), np.float32)
+            rows = np.empty((len(self.ids), part.shape[2]), np.float32)
+            products.adjoint_entries(tiles.columns, self._table, tiles.start, tiles.entries, part, sums)
+            products.reduce_entries(tiles.gaussian_start, tiles.gaussian_entries, sums, rows)
+            out[self.ids, k : k + products.CHUNK] = rows
+        return out
+
+    def weights(self, row: int | None = None, column: int | None = None) -> Weights:
+        tiles, camera = self._tiles, self.camera
+        wanted = np.arange(tiles.columns * tiles.rows)
+        if row is not None and column is not None:
+            wanted = np.array([row // TILE * tiles.columns + column // TILE])
+        image = (tiles.columns, camera.width, camera.height, self._table, tiles.start, tiles.entries, wanted)
+        counts = np.zeros(len(wanted) + 1, np.int64)
+        none = np.empty(0, np.int32)
+        products.list_weights(*image, counts, none, none, np.empty(0, np.float32))
+        start = np.cumsum(counts)
+        pixels, rows = np.empty(start[-1], np.int32), np.empty(start[-1], np.int32)
+        weights = np.empty(start[-1], np.float32)
+        products.list_weights(*image, start, pixels, rows, weights)
+        # Entries of a tile are sorted by depth; a stable sort by pixel keeps that order within each.
+        order = np.argsort(pixels, kind="stable")
+        if row is not None and column is not None:
+            order = order[pixels[order] == row * camera.width + column]
+        return Weights(pixels[order], self.ids[rows[order]], weights[order])
+
+    def _observe(self, labels: np.ndarray) -> Observation:
+        return TileObservation(self, labels)
+
+
+class TileObservation(Observation):
+    """A view and its mask on the CPU."""
+
+    def __init__(
+        self,
+        operator: TileOperator,
+        labels: np.ndarray,  # (H, W)
+    ) -> None:
+        tiles = operator._tiles
+        self.ids = operator.ids
+        self._camera, self._table, self._tiles = operator.camera, operator._table, tiles
+        self.classes = np.unique(labels[labels >= 0]).astype(np.int32)
+        position = np.full(max(self.classes.max(initial=0) + 1, 1), -1, np.int32)
+        position[self.classes] = np.arange(len(self.classes))
+        local = np.where(labels >= 0, position[np.maximum(labels, 0)], -1).astype(np.int32)
+        self._label_start, self._present, self._slots = products.tile_labels(
+            local, tiles.columns, tiles.rows, len(self.classes)
+        )
+        self.num_pixels = int((labels >= 0).sum())
+        entries = np.diff(tiles.start)
+        self._slot_start = np.concatenate([[0], np.cumsum(entries * np.diff(self._label_start))])
+        self._entry_tile = np.repeat(np.arange(len(entries), dtype=np.int32), entries)
+
+    @property
+    def nbytes(self) -> int:
+        tiles = self._tiles
+        held = (self._table, self.ids, tiles.start, tiles.entries, tiles.gaussian_start, tiles.gaussian_entries,
+                self._label_start, self._present, self._slots, self._slot_start, self._entry_tile)  # fmt: skip
+        return sum(array.nbytes for array in held)
+
+    def votes(self) -> np.ndarray:
+        shape = (len(self.ids), len(self.classes))
+        return self._share(np.empty(shape, np.float32), np.zeros(shape[1], np.float32), divide=False)[0]
+
+    def shares(
+        self,
+        codes: np.ndarray,  # (M, L)
+        rest: np.ndarray,  # (L,)
+    ) -> Shares:
+        codes, rest = np.ascontiguousarray(codes, np.float32), np.ascontiguousarray(rest, np.float32)
+        sums, likelihood, left_over = self._share(codes, rest, divide=True)
+        known = self._slots >= 0
+        tile = np.nonzero(known)[0]
+        label = self._present[self._label_start[tile] + self._slots[known]]
+        # A pixel that no Gaussian explains (likelihood 0) has no share to give, at any codes; its term is held at a floor.
+        p = np.maximum(likelihood[known], np.finfo(np.float32).tiny)
+        left = np.where(likelihood[known] > 0, left_over[known] / p, 0.0)
+        total = np.bincount(label, weights=left, minlength=len(self.classes))
+        return Shares(sums, total, float(np.log(p).sum(dtype=np.float64)))
+
+    def _share(
+        self,
+        codes: np.ndarray,  # (M, L)
+        rest: np.ndarray,  # (L,)
+        divide: bool,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        tiles = self._tiles
+        likelihood = np.empty(self._slots.shape, np.float32)
+        left_over = np.empty_like(likelihood)
+        sums = np.empty(self._slot_start[-1], np.float32)
+        out = np.empty(codes.shape, np.float32)
+        products.labelled(
+            tiles.columns, self._camera.width, self._camera.height, self._table, tiles.start, tiles.entries,
+            self._label_start, self._present, self._slots, codes, rest, divide, self._slot_start,
+            likelihood, left_over, sums,
+        )  # fmt: skip
+        products.reduce_labelled(
+            tiles.start, tiles.gaussian_start, tiles.gaussian_entries, self._entry_tile,
+            self._label_start, self._present, self._slot_start, sums, out,
+        )  # fmt: skip
+        return out, likelihood, left_over

@@ -1,0 +1,17 @@
+"""Votes: the sum over views of W^T onehot(y)."""
+
+from __future__ import annotations
+
+from gsseg_core.learner import Learner, Progress, silent
+
+
+class VoteLearner(Learner):
+    """Codes proportional to the votes. Exact, additive, one pass: what a live robot runs.
+
+    FlashSplat (Shen et al. 2024) takes the largest entry of the same sums.
+    """
+
+    def fit(self, progress: Progress = silent) -> VoteLearner:
+        """Normalise the votes."""
+        self.codes_ = self._vote_codes()
+        return self

@@ -1,0 +1,175 @@
+from __future__ import annotations
+
+import doctest
+
+import numba as nb
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from gsseg_core import refine
+from gsseg_core.errors import SettingsError
+from gsseg_core.refine import RefineSettings, cluster, statistical_filter
+
+
+def slow_cluster(means, probabilities, observed, k, beta):
+    """Readable twin of `cluster`."""
+    refined, changed = probabilities.astype(np.float64), np.zeros(len(means), bool)
+    neighbours = np.flatnonzero(observed)
+    k = min(k, len(neighbours))
+    for i in range(len(means) if k else 0):
+        if observed[i] and probabilities[i].max() >= beta:
+            continue
+        distances = np.linalg.norm(means[neighbours].astype(np.float64) - means[i], axis=1)
+        radius = np.sort(distances)[k - 1]
+        inside, tied = distances < radius, distances == radius
+        weights = (inside + tied * (k - inside.sum()) / tied.sum()) / k
+        refined[i], changed[i] = weights @ probabilities[neighbours], True
+    return refined, changed
+
+
+def slow_filter(means, labels, k, sigmas, num_classes):
+    """Readable twin of `statistical_filter`."""
+    removed = np.zeros(len(means), bool)
+    for c in range(1, num_classes):
+        members = np.flatnonzero(labels == c)
+        if len(members) < 3:
+            continue
+        points = means[members].astype(np.float64)
+        distances = np.sort(np.linalg.norm(points[:, None] - points[None], axis=2), axis=1)
+        mean_distance = distances[:, 1 : k + 1].mean(axis=1)
+        limit = mean_distance.mean() + sigmas * mean_distance.std()
+        removed[members] = mean_distance > limit * (1 + 1e-6)
+    return removed
+
+
+def scene(seed, n, num_classes=5, on_grid=False):
+    """Positions, codes, observed and labels; on a grid many positions and distances are the same."""
+    rng = np.random.default_rng(seed)
+    means = rng.integers(-4, 5, (n, 3)) if on_grid else rng.normal(size=(n, 3)) * rng.choice([0.1, 1, 5], (n, 1))
+    probabilities = rng.dirichlet(np.full(num_classes, 0.3), n).astype(np.float32)
+    return means.astype(np.float32), probabilities, rng.random(n) < 0.8, rng.integers(-2, num_classes, n, np.int32)
+
+
+@pytest.mark.parametrize("on_grid", [False, True])
+@pytest.mark.parametrize(("n", "k"), [(1, 1), (7, 50), (40, 3), (300, 1), (300, 16), (1500, 50)])
+def test_both_steps_agree_with_their_slow_twins(n, k, on_grid):
+    means, probabilities, observed, labels = scene(n + k, n, on_grid=on_grid)
+    result = cluster(means, probabilities, observed, k, 0.65)
+    expected, changed = slow_cluster(means, probabilities, observed, k, 0.65)
+    np.testing.assert_allclose(result.probabilities, expected, atol=1e-6)
+    np.testing.assert_array_equal(result.changed, changed)
+    np.testing.assert_array_equal(
+        statistical_filter(means, labels, k, 1.0, 5), slow_filter(means, labels, k, 1.0, 5)
+    )
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10**6), n=st.integers(1, 400), k=st.integers(1, 60), on_grid=st.booleans())
+def test_order_of_gaussians_and_number_of_threads_change_no_bit(seed, n, k, on_grid):
+    means, probabilities, observed, labels = scene(seed, n, on_grid=on_grid)
+    result, removed = cluster(means, probabilities, observed, k), statistical_filter(means, labels, k)
+    shuffled = np.random.default_rng(seed).permutation(n)
+    threads = nb.get_num_threads()
+    nb.set_num_threads(1)
+    try:
+        again = cluster(means[shuffled], probabilities[shuffled], observed[shuffled], k)
+        removed_again = statistical_filter(means[shuffled], labels[shuffled], k)
+    finally:
+        nb.set_num_threads(threads)
+    np.testing.assert_array_equal(again.probabilities, result.probabilities[shuffled])
+    np.testing.assert_array_equal(again.changed, result.changed[shuffled])
+    np.testing.assert_array_equal(removed_again, removed[shuffled])
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_a_rigid_motion_changes_nothing(seed):
+    means, probabilities, observed, labels = scene(seed, 300)
+    rotation = Rotation.random(random_state=seed).as_matrix()
+    moved = (means.astype(np.float64) @ rotation.T + [0.3, -2, 1]).astype(np.float32)
+    before, after = cluster(means, probabilities, observed, 10), cluster(moved, probabilities, observed, 10)
+    # Rounding of the positions may swap neighbours that are all but tied, of one Gaussian in hundreds.
+    same = np.isclose(before.probabilities, after.probabilities, atol=1e-5).all(axis=1)
+    assert same.sum() >= len(same) - 2
+    np.testing.assert_array_equal(before.changed, after.changed)
+    assert (statistical_filter(means, labels, 10) != statistical_filter(moved, labels, 10)).sum() <= 1
+
+
+def test_sure_gaussians_keep_their_codes_and_rows_sum_to_one():
+    means, probabilities, observed, _ = scene(0, 2000)
+    before = probabilities.copy()
+    result = cluster(means, probabilities, observed, 50, 0.65)
+    np.testing.assert_array_equal(probabilities, before)
+    np.testing.assert_array_equal(result.changed, ~observed | (probabilities.max(axis=1) < 0.65))
+    np.testing.assert_array_equal(result.probabilities[~result.changed], probabilities[~result.changed])
+    np.testing.assert_allclose(result.probabilities.sum(axis=1), 1, atol=1e-6)
+
+
+def test_unobserved_codes_are_never_read():
+    means, probabilities, observed, _ = scene(1, 500)
+    probabilities[~observed] = np.nan
+    assert np.isfinite(cluster(means, probabilities, observed, 10).probabilities).all()
+
+
+@pytest.mark.parametrize(("n", "seen"), [(0, False), (1, False), (60, False), (1, True), (60, True)])
+def test_nothing_changes_where_all_are_unobserved_or_all_are_sure(n, seen):
+    means, probabilities, _, _ = scene(2, n)
+    result = cluster(means, probabilities, np.full(n, seen), 50, beta=0.0)
+    assert not result.changed.any()
+    np.testing.assert_array_equal(result.probabilities, probabilities)
+
+
+def test_classes_of_one_or_two_the_background_and_negative_labels_are_left_alone():
+    means = scene(3, 400)[0]
+    labels = np.repeat(np.array([0, -1, -2], np.int32), [200, 100, 100])
+    labels[:3] = 1, 2, 2
+    means[0] = 1000
+    assert not statistical_filter(means, labels, 50, 0.0, 3).any()
+    assert statistical_filter(np.empty((0, 3), np.float32), np.empty(0, np.int32)).shape == (0,)
+
+
+def test_a_far_floater_is_removed_and_its_dense_blob_stays():
+    rng = np.random.default_rng(4)
+    blob = rng.uniform(-1, 1, (3000, 3))
+    means = np.concatenate([blob, [[1e4, -2e4, 1e4]]]).astype(np.float32)
+    labels = np.ones(len(means), np.int32)
+    np.testing.assert_array_equal(np.flatnonzero(statistical_filter(means, labels)), [3000])
+
+
+@pytest.mark.parametrize("position", [0.0, 7.3])
+def test_gaussians_at_one_position_and_equal_spacings_stay(position):
+    same = np.full((5000, 3), position, np.float32)
+    assert not statistical_filter(same, np.ones(5000, np.int32)).any()
+    corners = np.eye(3, dtype=np.float32) * 0.1 + np.float32(position)
+    assert not statistical_filter(corners, np.ones(3, np.int32), sigmas=0.0).any()
+    _, probabilities, observed, _ = scene(5, 5000)
+    result = cluster(same, probabilities, observed)
+    expected = np.broadcast_to(probabilities[observed].mean(axis=0, dtype=np.float64), (5000, 5))[result.changed]
+    np.testing.assert_allclose(result.probabilities[result.changed], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1e-25, 1e30])
+def test_scenes_of_any_size_give_the_same_result(scale):
+    means, probabilities, observed, labels = scene(6, 300)
+    means, scale = means * np.float32(2**-10), np.float32(2.0 ** np.round(np.log2(scale)))
+    np.testing.assert_array_equal(
+        cluster(means * scale, probabilities, observed).probabilities, cluster(means, probabilities, observed).probabilities
+    )
+    np.testing.assert_array_equal(statistical_filter(means * scale, labels), statistical_filter(means, labels))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"k": 0}, {"k": 2.5}, {"k": 1 << 21}, {"beta": -0.1}, {"beta": float("nan")}, {"filter_sigmas": -1.0},
+     {"filter_sigmas": float("inf")}],
+)  # fmt: skip
+def test_settings_out_of_range_are_refused_by_name(wrong):
+    with pytest.raises(SettingsError, match=f"found {next(iter(wrong))} = .*; expected"):
+        RefineSettings(**wrong)
+
+
+def test_examples_in_the_documentation_hold():
+    assert doctest.testmod(refine).failed == 0
