@@ -33,9 +33,10 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
+from gsseg_core.em_kernels import collect, mix
 from gsseg_core.errors import SettingsError
 from gsseg_core.learner import VOTE_UNIT, Learner, Progress, normalise, silent
-from gsseg_core.operator import Observation, Shares
+from gsseg_core.operator import Observation
 from gsseg_core.scene import GaussianScene
 
 
@@ -197,7 +198,9 @@ class EMLearner(Learner):
         settings, classes = self.settings, observation.classes
         if not settings.errors:
             return ErrorModel.trusting(classes, self.num_classes, settings.outliers)
-        counts = codes[observation.ids].T @ observation.votes()
+        votes = observation.votes()
+        nothing = np.zeros((len(classes), self.num_classes), np.float32)
+        counts = collect(codes, observation.ids, nothing, votes, np.zeros_like(codes))
         return ErrorModel.from_counts(classes, counts, settings.error_prior, settings.outliers)
 
     def _step(
@@ -214,13 +217,13 @@ class EMLearner(Learner):
         for name, observation in self._observations():
             model = models[name]
             objective += model.log_prior
-            seen = codes[observation.ids]
-            likelihood = model.likelihood
-            shares = observation.shares(seen @ likelihood, likelihood[0])
+            likelihood = np.ascontiguousarray(model.likelihood.T)
+            shares = observation.shares(mix(codes, observation.ids, likelihood), likelihood[:, 0])
             objective += shares.log_likelihood
-            gains[observation.ids] += shares.gaussians @ likelihood.T
+            counts = collect(codes, observation.ids, likelihood, shares.gaussians, gains)
             if adapt:
-                model.maximise(_expected_counts(seen, shares, model))
+                counts[0] += shares.rest
+                model.maximise(counts * (1 - model.outliers) * model.confusion)
         gains *= codes
         gains += prior
         return normalise(gains), objective
@@ -236,14 +239,3 @@ class EMLearner(Learner):
         adjacency = csr_array((ones, nearest, np.arange(0, len(nearest) + 1, k)), shape=(len(votes), len(votes)))
         return normalise(adjacency @ votes)
 
-
-def _expected_counts(
-    seen: np.ndarray,  # (M, K) codes of the visible Gaussians
-    shares: Shares,
-    model: ErrorModel,
-) -> np.ndarray:
-    """Pixels of each class under each label that were not outliers, (K, L)."""
-    counts = seen.T @ shares.gaussians
-    counts[0] += shares.rest
-    expected: np.ndarray = counts * (1 - model.outliers) * model.confusion
-    return expected

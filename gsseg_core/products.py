@@ -10,6 +10,8 @@ from gsseg_core.tiles import TILE
 
 _FAST = {"contract", "nnan", "nsz", "reassoc"}
 
+_TINY = np.float32(1e-30)
+
 CHUNK = 32
 """Channels that one pass of the general adjoint sums at once; bounds its memory at entries x 32 float32."""
 
@@ -163,8 +165,8 @@ def labelled(
     rest: np.ndarray,  # (L,) float32: what the transmittance left over counts for each label
     divide: bool,
     slot_start: np.ndarray,  # (T + 1,) where each tile's sums begin
-    likelihood: np.ndarray,  # (T, 16, 16) float32 out: (W codes)[p, y_p] + T_end rest[y_p]; 1 where unknown
-    left_over: np.ndarray,  # (T, 16, 16) float32 out: final transmittance
+    logs: np.ndarray,  # (T,) float64 out: sum of log likelihood, (W codes)[p, y_p] + T_end rest[y_p]
+    left_over: np.ndarray,  # like present, float64 out: sum of T_end / likelihood by label
     sums: np.ndarray,  # (slot_start[-1],) float32 out: per entry and label, sum of w, or of w / likelihood
 ) -> None:
     """Sum each Gaussian's weights by the labels of the pixels that it made, divided or not by what the codes say of them."""
@@ -172,13 +174,11 @@ def labelled(
         first, last = start[tile], start[tile + 1]
         labels = present[label_start[tile] : label_start[tile + 1]]
         many = labels.shape[0]
-        likelihood[tile] = 1.0
+        logs[tile] = 0.0
         if many == 0:
-            left_over[tile] = 0.0
             continue
         rays, weights, rows, ends = _scratch(last - first)
         used = blend_tile(tile, columns, width, height, table, entries, first, last, rays, weights, rows, ends)
-        left_over[tile] = rays
 
         # Per row, the slots that occur in it and where: most rows hold one label, so one product a record.
         counts = np.zeros(TILE, np.int64)
@@ -200,14 +200,9 @@ def labelled(
         if divide:
             value = np.zeros((TILE, TILE), np.float32)
             _blend_labels(used, entries[first:last], ends, rows, weights, counts, slot, where, labels, codes, value)
-            for r in range(TILE):
-                for j in range(counts[r]):
-                    extra = rest[labels[slot[r, j]]]
-                    for c in range(TILE):
-                        if where[r, j, c] > 0:
-                            p = value[r, c] + extra * rays[r, c]
-                            likelihood[tile, r, c] = p
-                            where[r, j, c] = 1.0 / p if p > 0 else 0.0
+            spare = left_over[label_start[tile] : label_start[tile + 1]]
+            spare[:] = 0.0
+            logs[tile] = _invert(counts, slot, where, rest[labels], rays, value, spare)
         _sum_labels(used, ends, rows, weights, counts, slot, where, many, sums[slot_start[tile] : slot_start[tile + 1]])
 
 
@@ -236,6 +231,30 @@ def _blend_labels(
                 for c in range(record.shape[0]):
                     target[c] += code * (record[c] * mask[c])
         n = ends[e]
+
+
+@nb.njit(error_model="numpy")
+def _invert(
+    counts: np.ndarray,  # (16,)
+    slot: np.ndarray,  # (16, 16)
+    where: np.ndarray,  # (16, 16, 16) in: 1 where a row's pixel has its j-th label; out: 1 / likelihood there
+    rest: np.ndarray,  # (L_t,)
+    rays: np.ndarray,  # (16, 16) final transmittance
+    value: np.ndarray,  # (16, 16) W codes
+    spare: np.ndarray,  # (L_t,) out: sum of T_end / likelihood
+) -> float:
+    total = 0.0
+    for r in range(TILE):
+        for j in range(counts[r]):
+            s = slot[r, j]
+            for c in range(TILE):
+                if where[r, j, c] > 0:
+                    p = value[r, c] + rest[s] * rays[r, c]
+                    # A pixel that nothing explains has no share to give, at any codes; its term is held at a floor.
+                    total += np.log(np.float64(max(p, _TINY)))
+                    where[r, j, c] = 1.0 / p if p > _TINY else 0.0
+                    spare[s] += rays[r, c] * where[r, j, c]
+    return total
 
 
 @nb.njit(fastmath=_FAST)

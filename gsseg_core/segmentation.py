@@ -7,6 +7,7 @@ import os
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,9 @@ class Segmentation:
     scene_digest : str
         Which scene it belongs to.
     clustered : (N,) bool
-        Gaussians whose code came from their neighbours.
+        Gaussians whose probabilities came from their neighbours.
+    learnt : (C, K) float32
+        What these had learnt themselves, in the order of the scene; zeros where unobserved.
     """
 
     labels: np.ndarray
@@ -46,6 +49,7 @@ class Segmentation:
     class_names: dict[int, str]
     scene_digest: str
     clustered: np.ndarray
+    learnt: np.ndarray
 
     @classmethod
     def from_codes(
@@ -70,11 +74,13 @@ class Segmentation:
         """
         settings = settings or RefineSettings()
         names = {k: class_names.get(k, f"class_{k:02d}") for k in range(codes.shape[1])}
-        clustered = np.zeros(len(codes), bool)
+        probabilities, clustered = codes, np.zeros(len(codes), bool)
         if settings.cluster:
-            codes, clustered = cluster(scene.means, codes, codes.any(axis=1), settings.k, settings.beta)
-        labels = np.where(codes.any(axis=1), codes.argmax(axis=1), UNOBSERVED).astype(np.int32)
-        result = cls(labels, codes, names, scene.digest, clustered)
+            refined = cluster(scene.means, codes, codes.any(axis=1), settings.k, settings.beta)
+            probabilities, clustered = refined.probabilities, refined.changed
+        known = probabilities.any(axis=1)
+        labels = np.where(known, probabilities.argmax(axis=1), UNOBSERVED).astype(np.int32)
+        result = cls(labels, probabilities, names, scene.digest, clustered, codes[clustered])
         return result.filtered(scene, settings) if settings.filter else result
 
     def filtered(self, scene: GaussianScene, settings: RefineSettings) -> Segmentation:
@@ -102,12 +108,24 @@ class Segmentation:
     def render_labels(self, operator: ViewOperator) -> np.ndarray:
         """Label map of a view: the class of the largest blended probability in each pixel, (H, W) int32.
 
-        Removed and unobserved Gaussians hide what is behind them, and say nothing; what a ray has left over is background.
+        Here refinement has no say. A Gaussian across an edge is rightly a mixture: neighbours decide to which object it
+        goes, but the picture is sharper with what it learnt itself. One that the filter took out of its object still covers
+        what is behind it. What a ray has left over is background, if any mask ever showed the background; else nothing.
         """
-        codes = np.where(self.labels[:, None] >= 0, self.probabilities, np.float32(0))
-        image = operator.render(codes)
-        image[..., 0] += operator.transmittance()
+        image = operator.render(self._blended)
+        if self._shows_background:
+            image[..., 0] += operator.transmittance()
         return image.argmax(axis=2).astype(np.int32)
+
+    @cached_property
+    def _blended(self) -> np.ndarray:
+        codes = self.probabilities.copy()
+        codes[self.clustered] = np.where(self.learnt.any(axis=1, keepdims=True), self.learnt, codes[self.clustered])
+        return codes
+
+    @cached_property
+    def _shows_background(self) -> bool:
+        return bool(self._blended[:, 0].any())
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write labels, probabilities, confidence and class names as one npz, atomically.
@@ -126,6 +144,7 @@ class Segmentation:
                 probabilities=self.probabilities,
                 confidence=self.confidence,
                 clustered=self.clustered,
+                learnt=self.learnt,
                 header=np.array(json.dumps(header)),
             )
 
@@ -152,7 +171,9 @@ class Segmentation:
                         f"that of {scene.path or 'the scene in use'}"
                     )
                 names = {int(k): str(name) for k, name in header["class_names"].items()}
-                result = cls(file["labels"], file["probabilities"], names, header["scene"], file["clustered"])
+                arrays = (file[name] for name in ("labels", "probabilities", "clustered", "learnt"))
+                labels, probabilities, clustered, learnt = arrays
+                result = cls(labels, probabilities, names, header["scene"], clustered, learnt)
         except GssegError:
             raise
         except FileNotFoundError as error:

@@ -107,7 +107,7 @@ class TileObservation(Observation):
 
     def votes(self) -> np.ndarray:
         shape = (len(self.ids), len(self.classes))
-        return self._share(np.empty(shape, np.float32), np.zeros(shape[1], np.float32), divide=False)[0]
+        return self._share(np.empty(shape, np.float32), np.zeros(shape[1], np.float32), divide=False).gaussians
 
     def shares(
         self,
@@ -115,34 +115,26 @@ class TileObservation(Observation):
         rest: np.ndarray,  # (L,)
     ) -> Shares:
         codes, rest = np.ascontiguousarray(codes, np.float32), np.ascontiguousarray(rest, np.float32)
-        sums, likelihood, left_over = self._share(codes, rest, divide=True)
-        known = self._slots >= 0
-        tile = np.nonzero(known)[0]
-        label = self._present[self._label_start[tile] + self._slots[known]]
-        # A pixel that no Gaussian explains (likelihood 0) has no share to give, at any codes; its term is held at a floor.
-        p = np.maximum(likelihood[known], np.finfo(np.float32).tiny)
-        left = np.where(likelihood[known] > 0, left_over[known] / p, 0.0)
-        total = np.bincount(label, weights=left, minlength=len(self.classes))
-        return Shares(sums, total, float(np.log(p).sum(dtype=np.float64)))
+        return self._share(codes, rest, divide=True)
 
     def _share(
         self,
         codes: np.ndarray,  # (M, L)
         rest: np.ndarray,  # (L,)
         divide: bool,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    ) -> Shares:
         tiles = self._tiles
-        likelihood = np.empty(self._slots.shape, np.float32)
-        left_over = np.empty_like(likelihood)
+        logs, left_over = np.zeros(len(self._slots)), np.zeros(len(self._present))
         sums = np.empty(self._slot_start[-1], np.float32)
         out = np.empty(codes.shape, np.float32)
         products.labelled(
             tiles.columns, self._camera.width, self._camera.height, self._table, tiles.start, tiles.entries,
             self._label_start, self._present, self._slots, codes, rest, divide, self._slot_start,
-            likelihood, left_over, sums,
+            logs, left_over, sums,
         )  # fmt: skip
         products.reduce_labelled(
             tiles.start, tiles.gaussian_start, tiles.gaussian_entries, self._entry_tile,
             self._label_start, self._present, self._slot_start, sums, out,
         )  # fmt: skip
-        return out, likelihood, left_over
+        total = np.bincount(self._present, weights=left_over, minlength=codes.shape[1])
+        return Shares(out, total, float(logs.sum()))

@@ -1,0 +1,127 @@
+"""Seconds that refinement takes on the real scene, and its neighbour search beside those of other libraries.
+
+    python benchmarks/bench_refine.py
+
+The scene is $GSSEG_DATA/replica_apartment/scene.ply (default ../shared/data beside the repository). Its labels are made
+here: the nearest of 40 random Gaussians, 3 % of them at random, and about one code in eight is unsure.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numba as nb
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsseg_core.refine import RefineSettings, _nearest, _scaled, _Tree, cluster, statistical_filter
+from gsseg_core.scene import GaussianScene
+
+REPEATS = 7
+CLASSES = 40
+DATA = Path(os.environ.get("GSSEG_DATA", Path(__file__).resolve().parents[1] / "../shared/data"))
+
+
+def main() -> None:
+    """Measure and print one table."""
+    path = DATA / "replica_apartment" / "scene.ply"
+    if not path.is_file():
+        print(f"skipped: no {path}; set GSSEG_DATA to the folder that holds replica_apartment/")
+        return
+    means = GaussianScene.load(path).means
+    labels, probabilities, observed = make_codes(means)
+    k, beta = RefineSettings.k, RefineSettings.beta
+    unsure = cluster(means, probabilities, observed, k, beta).changed.mean()
+
+    print(f"{processor()}, {nb.get_num_threads()} threads, load {load()} before; numpy {np.__version__}, numba {nb.__version__}")
+    print(f"{len(means)} Gaussians, {CLASSES} classes, {unsure:.1%} unsure or unobserved; k = {k}; {REPEATS} runs each\n")
+    steps = {
+        "cluster": lambda: cluster(means, probabilities, observed, k, beta),
+        "filter": lambda: statistical_filter(means, labels, k, 1.0, CLASSES),
+    }
+    steps["cluster + filter"] = lambda: (steps["cluster"](), steps["filter"]())
+    searches = {f"search: {name}": search for name, search in neighbour_searches(means, k).items()}
+    print(f"{'':28} {'median ms':>10} {'best ms':>10}")
+    for name, step in (steps | searches).items():
+        seconds = timed(step)
+        print(f"{name:28} {1e3 * statistics.median(seconds):10.0f} {1e3 * min(seconds):10.0f}")
+    print(f"\nsearch: mean distance of every Gaussian to its {k} nearest others, tree included; load {load()} after")
+
+
+def make_codes(means: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Labels (N,) int32, probabilities (N, 40) float32 and observed (N,) bool."""
+    rng, n = np.random.default_rng(0), len(means)
+    labels = cKDTree(rng.choice(means, CLASSES, replace=False)).query(means)[1].astype(np.int32)
+    labels = np.where(rng.random(n) < 0.03, rng.integers(0, CLASSES, n, np.int32), labels)
+    top = np.where(rng.random(n) < 0.1, rng.uniform(0.2, 0.65, n), rng.uniform(0.65, 1.0, n))
+    probabilities = np.repeat((1 - top)[:, None] / (CLASSES - 1), CLASSES, axis=1).astype(np.float32)
+    probabilities[np.arange(n), labels] = top
+    return labels, probabilities, rng.random(n) < 0.98
+
+
+def neighbour_searches(means: np.ndarray, k: int) -> dict[str, Callable[[], object]]:
+    """Ours and those of the libraries at hand, each from positions to mean distances."""
+
+    def ours() -> np.ndarray:
+        tree = _Tree.build(_scaled(means))
+        return _nearest(tree.points, tree.boxes, tree.points, k + 1)[1] / k
+
+    def scipy() -> np.ndarray:
+        return cKDTree(means).query(means, k + 1, workers=-1)[0].sum(axis=1) / k
+
+    searches: dict[str, Callable[[], object]] = {"ours": ours, "scipy cKDTree": scipy}
+    if pykdtree := optional("pykdtree.kdtree"):
+        searches["pykdtree"] = lambda: pykdtree.KDTree(means).query(means, k + 1)[0].sum(axis=1) / k
+    if small_gicp := optional("small_gicp"):
+        points, threads = means.astype(np.float64), nb.get_num_threads()
+
+        def gicp() -> np.ndarray:
+            tree = small_gicp.KdTree(points, num_threads=threads)
+            return np.sqrt(tree.batch_knn_search(points, k + 1, num_threads=threads)[1]).sum(axis=1) / k
+
+        searches["small_gicp"] = gicp
+    return searches
+
+
+def optional(name: str) -> Any:
+    """Import a module, or None where it is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        return None
+
+
+def timed(step: Callable[[], object]) -> list[float]:
+    """Seconds of each of several runs, after one to warm up."""
+    step()
+    seconds = []
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        step()
+        seconds.append(time.perf_counter() - start)
+    return seconds
+
+
+def processor() -> str:
+    """Name of the processor."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return f"{names[0] if names else platform.processor() or platform.machine()} ({os.cpu_count()} cores)"
+
+
+def load() -> str:
+    """Mean number of runnable processes over the last minute: above 0 before means that the machine was shared."""
+    return f"{os.getloadavg()[0]:.1f}" if sys.platform != "win32" else "unknown"
+
+
+if __name__ == "__main__":
+    main()
