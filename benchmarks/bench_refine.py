@@ -41,8 +41,8 @@ def main() -> None:
     k, beta = RefineSettings.k, RefineSettings.beta
     unsure = cluster(means, probabilities, observed, k, beta).changed.mean()
 
-    print(f"{processor()}, {nb.get_num_threads()} threads, load {load()} before; numpy {np.__version__}, numba {nb.__version__}")
-    print(f"{len(means)} Gaussians, {CLASSES} classes, {unsure:.1%} unsure or unobserved; k = {k}; {REPEATS} runs each\n")
+    print(f"{processor()}, {nb.get_num_threads()} threads, load {load()} before, numba {nb.__version__}")
+    print(f"{len(means)} Gaussians, {CLASSES} classes, {unsure:.1%} unsure or unobserved, k = {k}, {REPEATS} runs\n")
     steps = {
         "cluster": lambda: cluster(means, probabilities, observed, k, beta),
         "filter": lambda: statistical_filter(means, labels, k, 1.0, CLASSES),

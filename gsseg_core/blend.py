@@ -13,7 +13,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from gsseg_core.projection import HEIGHT, LOG_OPACITY, SHEAR, U, V, WIDTH, Y_REACH
+from gsseg_core.projection import HEIGHT, LOG_OPACITY, SHEAR, WIDTH, Y_REACH, U, V
 from gsseg_core.tiles import LOG_ALPHA_MIN, TILE
 
 ALPHA_MAX = np.float32(0.99)
@@ -34,7 +34,7 @@ _P0, _P1, _P2, _P3, _P4, _P5 = (
 
 
 @nb.njit(inline="always")
-def _exp2(x: float) -> float:
+def _exp2(x: float) -> np.float32:
     """2^x for x in [-126, 1), in float32, without a call, so that sixteen run at once."""
     whole = np.floor(x)
     f = np.float32(x - whole)
@@ -68,7 +68,8 @@ def blend_tile(
         live_rows += inside
         for c in range(TILE):
             transmittance[r, c] = 1.0 if inside and left + c < width else 0.0
-    # Read from the array, since a loop of a constant sixteen would be unrolled into scalars before it can become a vector.
+    # Read from the array, since a loop of a constant sixteen would be unrolled into scalars before it can become a
+    # vector.
     lanes = weights.shape[1]
     n = 0
     for e in range(first, last):

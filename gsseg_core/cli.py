@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import version
 
 from tqdm import tqdm
@@ -37,7 +38,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="gsseg", description="Segment a trained 3D Gaussian Splatting scene, all objects at once, from posed 2D masks."
+        prog="gsseg",
+        description="Segment a trained 3D Gaussian Splatting scene, all objects at once, from posed 2D masks.",
     )
     parser.add_argument("--version", action="version", version=f"gsseg {version('gsseg')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
@@ -45,15 +47,26 @@ def _parser() -> argparse.ArgumentParser:
     command = commands.add_parser("segment", help="learn from masks, refine, write labels and one PLY per object")
     _add_scene(command)
     command.add_argument("--out", required=True, metavar="OUT", help="folder to write to")
-    command.add_argument("--labels", default="labels", metavar="DIR", help="folder of the masks in DATASET (default: labels)")
-    command.add_argument("--learner", choices=("em", "gradient", "votes"), default="em", help="default: em")
-    command.add_argument("--views", type=int, metavar="N", help="learn from N train views, spread evenly (default: all)")
-    command.add_argument("--k", type=int, default=RefineSettings.k, help="neighbours in KNN and filter (default: %(default)s)")
     command.add_argument(
-        "--beta", type=float, default=RefineSettings.beta, help="confidence below which KNN decides (default: %(default)s)"
+        "--labels", default="labels", metavar="DIR", help="folder of the masks in DATASET (default: labels)"
+    )
+    command.add_argument("--learner", choices=("em", "gradient", "votes"), default="em", help="default: em")
+    command.add_argument(
+        "--views", type=int, metavar="N", help="learn from N train views, spread evenly (default: all)"
+    )
+    command.add_argument(
+        "--k", type=int, default=RefineSettings.k, help="neighbours in KNN and filter (default: %(default)s)"
+    )
+    command.add_argument(
+        "--beta",
+        type=float,
+        default=RefineSettings.beta,
+        help="confidence below which KNN decides (default: %(default)s)",
     )
     command.add_argument("--no-knn", action="store_true", help="leave uncertain and unobserved Gaussians as they are")
-    command.add_argument("--no-filter", action="store_true", help="keep Gaussians that lie far from the rest of their object")
+    command.add_argument(
+        "--no-filter", action="store_true", help="keep Gaussians that lie far from the rest of their object"
+    )
     command.add_argument("--seed", type=int, default=0, help="for learners that draw at random (default: %(default)s)")
     command.add_argument(
         "--ids", choices=("global", "per-view"), default="global", help="whether an id means the same in every view"
@@ -76,7 +89,9 @@ def _parser() -> argparse.ArgumentParser:
 
     command = commands.add_parser("demo", help="make a small scene with known truth and segment it")
     command.add_argument("--out", default="demo_out", metavar="DIR", help="folder to write to (default: %(default)s)")
-    command.add_argument("--seed", type=int, default=0, help="of the scene and its masks' errors (default: %(default)s)")
+    command.add_argument(
+        "--seed", type=int, default=0, help="of the scene and its masks' errors (default: %(default)s)"
+    )
     command.add_argument("--quiet", action="store_true", help="no progress bars")
     command.set_defaults(run=_demo)
     return parser
@@ -85,7 +100,10 @@ def _parser() -> argparse.ArgumentParser:
 def _add_scene(command: argparse.ArgumentParser) -> None:
     command.add_argument("scene", metavar="SCENE.ply", help="trained 3DGS scene")
     command.add_argument(
-        "--data", required=True, metavar="DATASET", help="folder with cameras, labels/<stem>.png, classes.json, split.json"
+        "--data",
+        required=True,
+        metavar="DATASET",
+        help="folder with cameras, labels/<stem>.png, classes.json, split.json",
     )
     command.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="default: cpu")
     command.add_argument("--quiet", action="store_true", help="no progress bars")
@@ -96,23 +114,25 @@ def _segment(options: argparse.Namespace) -> int:
     from gsseg_core import pipeline
 
     if options.ids != "global":
-        raise SettingsError("--ids per-view is not in this version; expected global: ids that mean the same in every view")
+        raise SettingsError(
+            "--ids per-view is not in this version; expected global: ids that mean the same in every view"
+        )
     if options.scheduler:
         raise SettingsError("--scheduler is not in this version; expected a run on this machine")
-    report = pipeline.segment(
-        options.scene,
-        options.data,
-        options.out,
-        labels=options.labels,
-        learner=options.learner,
-        views=options.views,
-        refine=RefineSettings(
-            k=options.k, beta=options.beta, cluster=not options.no_knn, filter=not options.no_filter
-        ),
-        device=options.device,
-        seed=options.seed,
-        progress=_progress(options.quiet),
-    )
+    refine = RefineSettings(k=options.k, beta=options.beta, cluster=not options.no_knn, filter=not options.no_filter)
+    with _progress(options.quiet) as progress:
+        report = pipeline.segment(
+            options.scene,
+            options.data,
+            options.out,
+            labels=options.labels,
+            learner=options.learner,
+            views=options.views,
+            refine=refine,
+            device=options.device,
+            seed=options.seed,
+            progress=progress,
+        )
     from gsseg_core.tables import segment_summary
 
     print(segment_summary(report, options.out))
@@ -122,15 +142,16 @@ def _segment(options: argparse.Namespace) -> int:
 def _render(options: argparse.Namespace) -> int:
     from gsseg_core import pipeline
 
-    paths = pipeline.render(
-        options.scene,
-        options.data,
-        options.segmentation,
-        options.out,
-        split=options.split,
-        device=options.device,
-        progress=_progress(options.quiet),
-    )
+    with _progress(options.quiet) as progress:
+        paths = pipeline.render(
+            options.scene,
+            options.data,
+            options.segmentation,
+            options.out,
+            split=options.split,
+            device=options.device,
+            progress=progress,
+        )
     print(f"{len(paths)} label maps in {options.out}, overlays in {options.out}/overlays")
     return 0
 
@@ -149,12 +170,23 @@ def _eval(options: argparse.Namespace) -> int:
 def _demo(options: argparse.Namespace) -> int:
     from gsseg_core.demo import run_demo
 
-    print(run_demo(options.out, seed=options.seed, progress=_progress(options.quiet)))
+    with _progress(options.quiet) as progress:
+        summary = run_demo(options.out, seed=options.seed, progress=progress)
+    print(summary)
     return 0
 
 
-def _progress(quiet: bool) -> Progress:
-    return silent if quiet else _Bars()
+@contextmanager
+def _progress(quiet: bool) -> Iterator[Progress]:
+    if quiet:
+        yield silent
+        return
+    bars = _Bars()
+    try:
+        yield bars
+    finally:
+        # An error message must not end up on the line of an unfinished bar.
+        bars.close()
 
 
 class _Bars:
@@ -169,6 +201,11 @@ class _Bars:
             self._stage, self._bar = stage, tqdm(total=total, desc=stage, file=sys.stderr, dynamic_ncols=True)
         self._bar.update(done - self._bar.n)
         if done == total:
+            self.close()
+
+    def close(self) -> None:
+        """Finish the bar that is shown, if there is one."""
+        if self._bar is not None:
             self._bar.close()
             self._bar = None
 

@@ -67,7 +67,7 @@ class EMSettings:
     errors: bool = True
     error_prior: float = 0.3
     outliers: float = 1e-3
-    prior_weight: float = 10.0
+    prior_weight: float = 3.0
     prior_k: int = 50
 
     def __post_init__(self) -> None:
@@ -238,4 +238,3 @@ class EMLearner(Learner):
         ones = np.ones(len(nearest), np.float32)
         adjacency = csr_array((ones, nearest, np.arange(0, len(nearest) + 1, k)), shape=(len(votes), len(votes)))
         return normalise(adjacency @ votes)
-

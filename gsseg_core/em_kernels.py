@@ -15,7 +15,7 @@ def mix(
     ids: np.ndarray,  # (M,) int32
     likelihood: np.ndarray,  # (L, K) float32
 ) -> np.ndarray:
-    """What each visible Gaussian says of each label, codes[ids] @ likelihood.T: (M, L) float32."""
+    """Return what each visible Gaussian says of each label, codes[ids] @ likelihood.T: (M, L) float32."""
     out = np.empty((ids.shape[0], likelihood.shape[0]), np.float32)
     for m in nb.prange(ids.shape[0]):
         row = codes[ids[m]]
@@ -51,4 +51,5 @@ def collect(
                     for k in range(classes):
                         gain[k] += share * likelihood[y, k]
                         part[y, k] += share * code[k]
-    return parts.sum(axis=0).T
+    counts: np.ndarray = parts.sum(axis=0).T
+    return counts

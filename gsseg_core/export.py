@@ -34,9 +34,10 @@ def export_classes(
     Raises
     ------
     WriteError
-        Something cannot be written; an earlier folder is unchanged.
+        Something cannot be written, or the folder holds files that are no export; an earlier folder is unchanged.
     """
     folder = Path(folder)
+    _check_replaceable(folder)
     names = {k: class_file_name(k, segmentation.class_names[k]) for k in np.flatnonzero(segmentation.counts()).tolist()}
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -59,9 +60,21 @@ def export_classes(
     return {k: folder / name for k, name in names.items()}
 
 
+def _check_replaceable(folder: Path) -> None:
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise WriteError(f"{folder}: is a file; expected a folder, or nothing")
+    strangers = sorted(path.name for path in folder.iterdir() if not re.fullmatch(r"[0-9]+_.+\.ply", path.name))
+    if strangers:
+        raise WriteError(
+            f"{folder}: holds {strangers[0]!r}, which is no earlier export; expected a folder that can be replaced"
+        )
+
+
 def class_file_name(label: int, name: str) -> str:
     """File name of a class, safe on any file system."""
-    return f"{label}_{re.sub(r'[^0-9A-Za-z._-]+', '_', name).strip('._') or 'class'}.ply"
+    return f"{label}_{re.sub(r'[^0-9A-Za-z._-]+', '_', name)[:100].strip('._') or 'class'}.ply"
 
 
 def write_json(path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:

@@ -53,9 +53,9 @@ class GradientLearner(Learner):
 
     Where the paper is silent, this was chosen:
 
-    - The softmax of the codes is taken before blending, so a rendered code is a probability up to the transmittance left
-      over, which belongs to class 0. (The paper takes the softmax in its clustering step, and speaks of rendered
-      probabilities.)
+    - The softmax of the codes is taken before blending, so a rendered code is a probability up to the transmittance
+      left over, which belongs to class 0. (The paper takes the softmax in its clustering step, and speaks of
+      rendered probabilities.)
     - All codes start at zero, the "initial state of uniform distribution across all categories" of its section 3.2.
     - Adam with rate 0.05, falling exponentially to a tenth; one view a step, in random order, ten times over all views.
     - Pixels whose label is unknown do not count, neither in the sum nor in N.

@@ -59,6 +59,9 @@ class Learner(ABC):
         After `fit`: the objective after each step, for learners that have one.
     """
 
+    codes_: np.ndarray
+    observed_: np.ndarray
+
     def __init__(
         self, scene: GaussianScene, num_classes: int, *, device: str = "cpu", memory_budget: int = 1 << 30
     ) -> None:

@@ -187,7 +187,7 @@ class ViewOperator(ABC):
 
     @abstractmethod
     def transmittance(self) -> np.ndarray:
-        """What is left of each ray after the last Gaussian, (H, W) float32 in [0, 1]."""
+        """Return what is left of each ray after the last Gaussian, (H, W) float32 in [0, 1]."""
 
     @abstractmethod
     def weights(self, row: int | None = None, column: int | None = None) -> Weights:

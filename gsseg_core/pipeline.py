@@ -47,9 +47,7 @@ class Stopwatch:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
 
-def make_learner(
-    name: str, scene: GaussianScene, num_classes: int, *, seed: int = 0, device: str = "cpu"
-) -> Learner:
+def make_learner(name: str, scene: GaussianScene, num_classes: int, *, seed: int = 0, device: str = "cpu") -> Learner:
     """Make a learner by its name, with its default settings.
 
     Raises
@@ -124,7 +122,10 @@ def segment(
             teacher.observe(view)
         progress("observe", len(train), len(train))
     with watch.stage("learn"):
-        teacher.fit(progress)
+        try:
+            teacher.fit(progress)
+        except NoUsableViewsError as error:
+            raise NoUsableViewsError(f"{data}: {error}") from error
     with watch.stage("refine"):
         result = Segmentation.from_codes(scene, teacher.codes_, dataset.class_names, refine)
     out = Path(out)

@@ -1,4 +1,7 @@
-"""Products with the weight matrix W of one view, tile by tile: W q, W^T r, and both restricted to the pixels' own labels."""
+"""Products with the weight matrix W of one view, tile by tile.
+
+They are W q, W^T r, and both restricted to the pixels' own labels.
+"""
 
 from __future__ import annotations
 
@@ -37,6 +40,7 @@ def render(
     out: np.ndarray,  # (H, W, K) float32 out
     left_over: np.ndarray,  # (H, W) float32 out: final transmittance
 ) -> None:
+    """Blend codes into the image, W q."""
     height, width, channels = out.shape
     for tile in nb.prange(start.shape[0] - 1):
         first, last = start[tile], start[tile + 1]
@@ -70,6 +74,7 @@ def adjoint_entries(
     residual: np.ndarray,  # (H, W, C) float32, C <= CHUNK
     sums: np.ndarray,  # (E, C) float32 out
 ) -> None:
+    """Sum weight times residual over the pixels of each entry: the part of W^T r that one tile adds to a Gaussian."""
     height, width, channels = residual.shape
     for tile in nb.prange(start.shape[0] - 1):
         first, last = start[tile], start[tile + 1]
@@ -101,6 +106,7 @@ def reduce_entries(
     sums: np.ndarray,  # (E, C)
     out: np.ndarray,  # (M, C) float32 out
 ) -> None:
+    """Add up each Gaussian's entries, in tile order."""
     for g in nb.prange(out.shape[0]):
         out[g] = 0.0
         for i in range(gaussian_start[g], gaussian_start[g + 1]):
@@ -116,7 +122,7 @@ def tile_labels(
     rows: int,
     num_labels: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Number the labels of each tile.
+    """Give each tile's labels numbers of its own.
 
     Returns
     -------
@@ -169,7 +175,7 @@ def labelled(
     left_over: np.ndarray,  # like present, float64 out: sum of T_end / likelihood by label
     sums: np.ndarray,  # (slot_start[-1],) float32 out: per entry and label, sum of w, or of w / likelihood
 ) -> None:
-    """Sum each Gaussian's weights by the labels of the pixels that it made, divided or not by what the codes say of them."""
+    """Sum each Gaussian's weights by the labels of the pixels that it made, as they are or over the likelihood."""
     for tile in nb.prange(start.shape[0] - 1):
         first, last = start[tile], start[tile + 1]
         labels = present[label_start[tile] : label_start[tile + 1]]
@@ -296,6 +302,7 @@ def reduce_labelled(
     sums: np.ndarray,
     out: np.ndarray,  # (M, L) float32 out
 ) -> None:
+    """Add up what `labelled` summed for each Gaussian's entries, in tile order."""
     for g in nb.prange(out.shape[0]):
         out[g] = 0.0
         for i in range(gaussian_start[g], gaussian_start[g + 1]):
@@ -316,7 +323,7 @@ def list_weights(
     start: np.ndarray,  # (T + 1,)
     entries: np.ndarray,  # (E,)
     wanted: np.ndarray,  # (U,) tiles
-    place: np.ndarray,  # (U + 1,) int64: counts out (place[1:]) when the lists are empty, else where each tile's part begins
+    place: np.ndarray,  # (U + 1,) int64: where each tile's part begins; with empty lists, counts out (in place[1:])
     pixels: np.ndarray,  # (P,) int32 out
     rows_of: np.ndarray,  # (P,) int32 out: row of the table
     values: np.ndarray,  # (P,) float32 out

@@ -6,7 +6,8 @@ Splatting uses it: the camera is linearised at the centre of each Gaussian and 0
 
     d^T S^-1 d = (dx - shear dy)^2 / var_x_given_y + dy^2 / S_yy,      shear = S_xy / S_yy,
 
-so that nothing cancels for thin Gaussians, and the columns that a Gaussian reaches in one row follow from one square root.
+so that nothing cancels for thin Gaussians, and the columns that a Gaussian reaches in one row follow from one square
+root.
 """
 
 from __future__ import annotations
@@ -152,7 +153,9 @@ def _project(
         sxy = a0 * b0 + a1 * b1 + a2 * b2
         syy = b0 * b0 + b1 * b1 + b2 * b2 + DILATION
         reach_x, reach_y = np.sqrt(cut * sxx), np.sqrt(cut * syy)
-        if not (u + reach_x >= 0.5 and u - reach_x <= width - 0.5 and v + reach_y >= 0.5 and v - reach_y <= height - 0.5):
+        if not (
+            u + reach_x >= 0.5 and u - reach_x <= width - 0.5 and v + reach_y >= 0.5 and v - reach_y <= height - 0.5
+        ):
             continue
         table[i, U] = u
         table[i, V] = v

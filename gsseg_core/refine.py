@@ -25,7 +25,7 @@ FIXED = float(1 << 40)
 """Sums are in steps of 1 / FIXED. Nothing summed exceeds 4, so that 2^20 neighbours fit into int64."""
 
 MAX_K = 1 << 20
-SUBTREES = 6  # below this level of the tree each subtree is built by one thread
+SUBTREE = 8  # levels of a subtree that one thread builds alone: about 4000 points
 CHUNK = 256  # consecutive queries of one thread, each bounded by the one before
 SLACK = np.float32(1.00001)  # covers float32 rounding in a bound
 TINY = np.float32(1e-30)
@@ -42,7 +42,8 @@ class RefineSettings:
     beta : float
         A Gaussian whose largest probability is below this one (0 to 1) takes the mean code of its neighbours.
     filter_sigmas : float
-        Standard deviations above the mean neighbour distance of its class from which on a Gaussian is removed; 0 or more.
+        A Gaussian is removed where its mean neighbour distance is more than this many standard deviations, 0 or more,
+        above the mean of its class.
     cluster, filter : bool
         Whether to take each of the two steps.
 
@@ -229,20 +230,28 @@ class _Tree:
         depth = ((len(points) - 1) // LEAF).bit_length()
         points, order = points.copy(), np.arange(len(points), dtype=np.int32)
         boxes = np.empty((2 << depth, 6), np.float32)
-        _grow(points, order, boxes, depth)
+        if depth > SUBTREE:
+            _grow(points, order, boxes, depth)
+        else:  # waking other threads would take longer than the work
+            _grow_subtree(points, order, boxes, depth, 0, 0)
         return cls(np.ascontiguousarray(points.T), order, boxes)
 
 
 @nb.njit(parallel=True, cache=True)
 def _grow(points: np.ndarray, order: np.ndarray, boxes: np.ndarray, depth: int) -> None:
-    top = min(depth, SUBTREES)
+    top = max(depth - SUBTREE, 0)
     for level in range(top):
         for j in nb.prange(1 << level):
             _split(points, order, boxes, depth, level, j)
-    for subtree in nb.prange(1 << top):
-        for level in range(top, depth + 1):
-            for j in range(subtree << (level - top), (subtree + 1) << (level - top)):
-                _split(points, order, boxes, depth, level, j)
+    for j in nb.prange(1 << top):
+        _grow_subtree(points, order, boxes, depth, top, j)
+
+
+@nb.njit(cache=True)
+def _grow_subtree(points: np.ndarray, order: np.ndarray, boxes: np.ndarray, depth: int, top: int, root: int) -> None:
+    for level in range(top, depth + 1):
+        for j in range(root << (level - top), (root + 1) << (level - top)):
+            _split(points, order, boxes, depth, level, j)
 
 
 @nb.njit
@@ -294,7 +303,7 @@ def _nearest(
     queries: np.ndarray,  # (3, M)
     k: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Squared distance to the k-th nearest point (M,) float32, and sum of the distances to the k nearest (M,) float64."""
+    """Squared distance to the k-th nearest point, (M,) float32, and sum of the k smallest distances, (M,) float64."""
     m = queries.shape[1]
     radii, sums = np.empty(m, np.float32), np.empty(m, np.float64)
     for chunk in nb.prange((m + CHUNK - 1) // CHUNK):
@@ -369,16 +378,17 @@ def _search(
 
 
 @nb.njit(inline="always")
-def _gap(boxes: np.ndarray, node: int, x: float, y: float, z: float) -> float:
+def _gap(boxes: np.ndarray, node: int, x: float, y: float, z: float) -> np.float32:
     """Squared distance to a box, in float32 never above that to a point inside it, since rounding is monotonic."""
     dx = max(max(boxes[node, 0] - x, x - boxes[node, 3]), np.float32(0))
     dy = max(max(boxes[node, 1] - y, y - boxes[node, 4]), np.float32(0))
     dz = max(max(boxes[node, 2] - z, z - boxes[node, 5]), np.float32(0))
-    return dx * dx + dy * dy + dz * dz
+    squared: np.float32 = dx * dx + dy * dy + dz * dz
+    return squared
 
 
 @nb.njit
-def _smallest(values: np.ndarray, n: int, k: int) -> float:
+def _smallest(values: np.ndarray, n: int, k: int) -> np.float32:
     """k-th smallest of the first n values, float32 and none negative.
 
     Such floats sort like their bits, so this bisects the bits: counting what is at most the middle takes a few vector
@@ -397,7 +407,7 @@ def _smallest(values: np.ndarray, n: int, k: int) -> float:
             high = middle
         else:
             low = middle + np.int32(1)
-    smallest = np.float32(0)
+    smallest: np.float32 = np.float32(0)
     for i in range(n):
         if bits[i] == low:
             smallest = values[i]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -75,8 +76,9 @@ class Segmentation:
         settings = settings or RefineSettings()
         names = {k: class_names.get(k, f"class_{k:02d}") for k in range(codes.shape[1])}
         probabilities, clustered = codes, np.zeros(len(codes), bool)
+        observed: np.ndarray = codes.max(axis=1) > 0
         if settings.cluster:
-            refined = cluster(scene.means, codes, codes.any(axis=1), settings.k, settings.beta)
+            refined = cluster(scene.means, codes, observed, settings.k, settings.beta)
             probabilities, clustered = refined.probabilities, refined.changed
         known = probabilities.any(axis=1)
         labels = np.where(known, probabilities.argmax(axis=1), UNOBSERVED).astype(np.int32)
@@ -102,20 +104,23 @@ class Segmentation:
         return confidence
 
     def counts(self) -> np.ndarray:
-        """Number of Gaussians of each class, (K,) int64."""
-        return np.bincount(self.labels[self.labels >= 0], minlength=self.num_classes)
+        """Count the Gaussians of each class, (K,) int64."""
+        counts: np.ndarray = np.bincount(self.labels[self.labels >= 0], minlength=self.num_classes)
+        return counts
 
     def render_labels(self, operator: ViewOperator) -> np.ndarray:
         """Label map of a view: the class of the largest blended probability in each pixel, (H, W) int32.
 
         Here refinement has no say. A Gaussian across an edge is rightly a mixture: neighbours decide to which object it
-        goes, but the picture is sharper with what it learnt itself. One that the filter took out of its object still covers
-        what is behind it. What a ray has left over is background, if any mask ever showed the background; else nothing.
+        goes, but the picture is sharper with what it learnt itself. One that the filter took out of its object still
+        covers what is behind it. What a ray has left over is background, if any mask ever showed the background; else
+        nothing.
         """
         image = operator.render(self._blended)
         if self._shows_background:
             image[..., 0] += operator.transmittance()
-        return image.argmax(axis=2).astype(np.int32)
+        labels: np.ndarray = image.argmax(axis=2).astype(np.int32)
+        return labels
 
     @cached_property
     def _blended(self) -> np.ndarray:
@@ -178,7 +183,16 @@ class Segmentation:
             raise
         except FileNotFoundError as error:
             raise StateFileError(f"{path}: does not exist; expected a segmentation.npz") from error
-        except (OSError, KeyError, ValueError, TypeError, AttributeError, zipfile.BadZipFile, EOFError) as error:
+        except (
+            OSError,
+            KeyError,
+            ValueError,
+            TypeError,
+            AttributeError,
+            EOFError,
+            zipfile.BadZipFile,
+            zlib.error,
+        ) as error:
             raise StateFileError(f"{path}: is not a segmentation.npz, or is damaged ({error})") from error
         if result.labels.shape != (len(scene),) or result.probabilities.shape != (len(scene), len(names)):
             raise StateFileError(f"{path}: arrays of shape {result.probabilities.shape}; expected ({len(scene)}, K)")

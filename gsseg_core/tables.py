@@ -12,7 +12,10 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
     lines.insert(1, ["-" * width for width in widths])
     return "\n".join(
-        "  ".join(cell.ljust(width) if i == 0 else cell.rjust(width) for i, (cell, width) in enumerate(zip(line, widths, strict=True)))
+        "  ".join(
+            cell.ljust(width) if i == 0 else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
+        )
         for line in lines
     )
 
@@ -24,7 +27,7 @@ def seconds_table(seconds: Mapping[str, float]) -> str:
 
 
 def segment_summary(report: Mapping[str, Any], out: str) -> str:
-    """What `gsseg segment` prints: classes, counts, seconds, and where the files are."""
+    """Write what `gsseg segment` prints: classes, counts, seconds, and where the files are."""
     classes = [
         [f"{entry['id']} {entry['name']}", f"{entry['gaussians']:,}", percent(entry["mean_confidence"])]
         for entry in report["classes"]
@@ -37,18 +40,21 @@ def segment_summary(report: Mapping[str, Any], out: str) -> str:
             table(["class", "Gaussians", "confidence"], classes),
             f"{views['used']} views used" + (f", rejected: {rejected}" if rejected else "") + "\n"
             f"{report['scene']['gaussians']:,} Gaussians: {gaussians['labelled']:,} labelled "
-            f"({gaussians['from_neighbours']:,} of them by their neighbours), {gaussians['removed']:,} removed by the filter, "
-            f"{gaussians['unobserved']:,} unobserved",
+            f"({gaussians['from_neighbours']:,} of them by their neighbours), {gaussians['removed']:,} removed by the "
+            f"filter, {gaussians['unobserved']:,} unobserved",
             seconds_table(report["seconds"]),
-            f"Objects: {out}/classes\nPictures: {out}/pictures\nLabels: {out}/segmentation.npz\nReport: {out}/report.json",
+            f"Objects: {out}/classes\nPictures: {out}/pictures\n"
+            f"Labels: {out}/segmentation.npz\nReport: {out}/report.json",
         ]
     )
 
 
 def evaluation_summary(scores: Mapping[str, Any]) -> str:
-    """What `gsseg eval` prints: scores per class and their means, in percent."""
+    """Write what `gsseg eval` prints: scores per class and their means, in percent."""
     names = ("iou", "accuracy", "boundary_iou")
-    rows = [[f"{entry['id']} {entry['name']}", *(percent(entry[name]) for name in names)] for entry in scores["classes"]]
+    rows = [
+        [f"{entry['id']} {entry['name']}", *(percent(entry[name]) for name in names)] for entry in scores["classes"]
+    ]
     mean = ["mean", *(percent(scores[f"mean_{name}"]) for name in names)]
     return table(["class", "IoU", "accuracy", "boundary IoU"], [*rows, mean]) + f"\n{scores['views']} views"
 

@@ -31,6 +31,7 @@ class TileOperator(ViewOperator):
         return self._blend(codes[self.ids].astype(np.float32, order="C"))[0]
 
     def transmittance(self) -> np.ndarray:
+        """Return what is left of each ray after the last Gaussian, (H, W) float32 in [0, 1]."""
         return self._blend(np.empty((len(self.ids), 0), np.float32))[1]
 
     def _blend(self, codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -53,6 +54,7 @@ class TileOperator(ViewOperator):
         return out
 
     def weights(self, row: int | None = None, column: int | None = None) -> Weights:
+        """List W, or only the row of W of one pixel."""
         tiles, camera = self._tiles, self.camera
         wanted = np.arange(tiles.columns * tiles.rows)
         if row is not None and column is not None:
@@ -100,12 +102,14 @@ class TileObservation(Observation):
 
     @property
     def nbytes(self) -> int:
+        """Memory that it holds, in bytes, the operator's included."""
         tiles = self._tiles
         held = (self._table, self.ids, tiles.start, tiles.entries, tiles.gaussian_start, tiles.gaussian_entries,
                 self._label_start, self._present, self._slots, self._slot_start, self._entry_tile)  # fmt: skip
         return sum(array.nbytes for array in held)
 
     def votes(self) -> np.ndarray:
+        """Sum the weights by label: W^T onehot(y), (M, L) float32."""
         shape = (len(self.ids), len(self.classes))
         return self._share(np.empty(shape, np.float32), np.zeros(shape[1], np.float32), divide=False).gaussians
 
@@ -114,6 +118,7 @@ class TileObservation(Observation):
         codes: np.ndarray,  # (M, L)
         rest: np.ndarray,  # (L,)
     ) -> Shares:
+        """Share one vote per labelled pixel among the Gaussians that made it."""
         codes, rest = np.ascontiguousarray(codes, np.float32), np.ascontiguousarray(rest, np.float32)
         return self._share(codes, rest, divide=True)
 

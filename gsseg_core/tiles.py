@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
-from gsseg_core.projection import HEIGHT, LOG_OPACITY, SHEAR, U, V, WIDTH, X_REACH, X_TURN, Y_REACH, Projected
+from gsseg_core.projection import HEIGHT, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, Projected, U, V
 
 TILE = 16
 """Side of a tile in px. One row of a tile is one vector register of sixteen float32."""
@@ -68,7 +68,8 @@ def _touched(
     if bottom < -reach or top > reach:
         return 0, 0
     cut = table[g, LOG_OPACITY] - LOG_ALPHA_MIN
-    # The outline x(dy) is concave on the right and convex on the left: its extremes in the band are at the turning points or the ends.
+    # The outline x(dy) is concave on the right and convex on the left: its extremes in the band are at the turning
+    # points or the ends.
     dy = min(max(table[g, X_TURN], top), bottom)
     right = table[g, SHEAR] * dy + np.sqrt(max(cut - table[g, HEIGHT] * dy * dy, 0.0) / table[g, WIDTH])
     dy = min(max(-table[g, X_TURN], top), bottom)

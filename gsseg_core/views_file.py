@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import zipfile
+import zlib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -69,7 +70,7 @@ def load_views(
         raise
     except FileNotFoundError as error:
         raise StateFileError(f"{path}: does not exist; expected a saved state") from error
-    except (OSError, KeyError, ValueError, TypeError, IndexError, zipfile.BadZipFile, EOFError) as error:
+    except (OSError, KeyError, ValueError, TypeError, IndexError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise StateFileError(f"{path}: is not a saved state, or is damaged ({error})") from error
 
 

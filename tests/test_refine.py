@@ -61,9 +61,7 @@ def test_both_steps_agree_with_their_slow_twins(n, k, on_grid):
     expected, changed = slow_cluster(means, probabilities, observed, k, 0.65)
     np.testing.assert_allclose(result.probabilities, expected, atol=1e-6)
     np.testing.assert_array_equal(result.changed, changed)
-    np.testing.assert_array_equal(
-        statistical_filter(means, labels, k, 1.0, 5), slow_filter(means, labels, k, 1.0, 5)
-    )
+    np.testing.assert_array_equal(statistical_filter(means, labels, k, 1.0, 5), slow_filter(means, labels, k, 1.0, 5))
 
 
 @settings(max_examples=15, deadline=None)
@@ -155,9 +153,8 @@ def test_gaussians_at_one_position_and_equal_spacings_stay(position):
 def test_scenes_of_any_size_give_the_same_result(scale):
     means, probabilities, observed, labels = scene(6, 300)
     means, scale = means * np.float32(2**-10), np.float32(2.0 ** np.round(np.log2(scale)))
-    np.testing.assert_array_equal(
-        cluster(means * scale, probabilities, observed).probabilities, cluster(means, probabilities, observed).probabilities
-    )
+    scaled, plain = cluster(means * scale, probabilities, observed), cluster(means, probabilities, observed)
+    np.testing.assert_array_equal(scaled.probabilities, plain.probabilities)
     np.testing.assert_array_equal(statistical_filter(means * scale, labels), statistical_filter(means, labels))
 
 

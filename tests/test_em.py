@@ -1,0 +1,168 @@
+"""EM: the objective never falls, a readable twin agrees, and wrong masks do less harm than to votes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, mean_iou, taught, wrong_views
+
+from gsseg_core.dataset import View
+from gsseg_core.em import EMLearner, EMSettings
+from gsseg_core.errors import SettingsError
+from gsseg_core.operator import make_operator
+from gsseg_core.scene import GaussianScene
+from gsseg_core.votes import VoteLearner
+
+SCENE, TRUTH = balls_on_a_table()
+
+
+def slow_em(
+    scene: GaussianScene, views: list[View], settings: EMSettings
+) -> tuple[np.ndarray, list[float], dict[str, np.ndarray]]:
+    """Readable twin of `EMLearner.fit`, with W as dense matrices in float64: codes, objectives, confusions R."""
+    n, K, o = len(scene), NUM_CLASSES, settings.outliers
+    seen = []
+    for view in views:
+        operator, y = make_operator(scene, view.camera), view.read_labels().ravel()
+        entries = operator.weights()
+        W = np.zeros((y.size, n))
+        W[entries.pixels, entries.gaussians] = entries.weights
+        rest = operator.transmittance().ravel().astype(np.float64)
+        classes = np.unique(y[y >= 0])
+        onehot = (y[:, None] == classes).astype(np.float64)
+        known = y >= 0
+        seen.append((W[known], rest[known], onehot[known], classes))
+
+    votes = np.zeros((n, K))
+    for W, _, onehot, classes in seen:
+        votes[:, classes] += W.T @ onehot
+    distances = np.linalg.norm(scene.means[:, None].astype(np.float64) - scene.means, axis=2)
+    nearest = np.argsort(distances, axis=1)[:, : settings.prior_k]
+    prior = settings.prior_weight * scaled(scaled(votes)[nearest].mean(axis=1))
+    q = scaled(votes + prior)
+
+    confusions, rights = [], []
+    for W, _, onehot, classes in seen:
+        diagonal = np.eye(K)[:, classes]
+        counts = q.T @ (W.T @ onehot)
+        right = settings.error_prior * counts[classes].sum(axis=1) if settings.errors else np.zeros(len(classes))
+        flat = np.full((K, len(classes)), 1 / len(classes))
+        confusions.append(scaled(counts + diagonal * right, flat) if settings.errors else diagonal)
+        rights.append(right)
+
+    objectives = []
+    for _ in range(settings.max_steps):
+        told = prior > 0
+        objective, gains = (prior[told] * np.log(q[told])).sum(), np.zeros((n, K))
+        for v, (W, rest, onehot, classes) in enumerate(seen):
+            C = (1 - o) * confusions[v] + o / len(classes)
+            diagonal = np.eye(K)[:, classes]
+            p = ((W @ q + rest[:, None] * np.eye(K)[0]) @ C * onehot).sum(axis=1)
+            a, R = rights[v], (confusions[v] * diagonal).sum(axis=0)
+            objective += np.log(p).sum() + (a[a > 0] * np.log(R[a > 0])).sum()
+            B = W.T @ (onehot / p[:, None])
+            gains += B @ C.T
+            if settings.errors:
+                counts = q.T @ B
+                counts[0] += rest @ (onehot / p[:, None])
+                confusions[v] = scaled((1 - o) * confusions[v] * counts + diagonal * a, confusions[v])
+        objectives.append(objective / sum(len(onehot) for _, _, onehot, _ in seen))
+        q = scaled(q * gains + prior)
+    q[~votes.any(axis=1)] = 0
+    return q, objectives, {view.name: R for view, R in zip(views, confusions, strict=True)}
+
+
+def scaled(rows: np.ndarray, otherwise: np.ndarray | float = 0.0) -> np.ndarray:
+    """Rows that sum to 1, or something else where they are zero."""
+    total = rows.sum(axis=1, keepdims=True)
+    return np.where(total > 0, rows / np.where(total > 0, total, 1), otherwise)
+
+
+@pytest.mark.parametrize("errors", [True, False])
+@pytest.mark.parametrize("steps", [1, 4])
+def test_steps_agree_with_a_slow_twin_written_from_the_equations(steps: int, errors: bool) -> None:
+    views = wrong_views(4, seed=3)
+    labels = views[0].read_labels()
+    labels[:10] = -1
+    views[0] = View.from_arrays(views[0].camera, labels)
+    settings = EMSettings(max_steps=steps, tolerance=0.0, errors=errors, prior_k=9)
+    learner = taught(EMLearner(SCENE, NUM_CLASSES, settings), views).fit()
+    codes, objectives, confusions = slow_em(SCENE, views, settings)
+    # Where a Gaussian shows in a trace of a pixel only, its votes are rounded to whole units.
+    firm = learner._votes.sum(axis=1) > 2**14
+    np.testing.assert_allclose(learner.codes_[firm], codes[firm], atol=2e-3)
+    np.testing.assert_allclose(learner.history_[:steps], objectives, rtol=1e-4)
+    for name, confusion in confusions.items():
+        np.testing.assert_allclose(learner.error_models_[name].confusion, confusion, atol=2e-3)
+
+
+@pytest.mark.parametrize("errors", [True, False])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_objective_never_falls(seed: int, errors: bool) -> None:
+    views = wrong_views(6, seed=seed, missed=0.1 * seed, swapped=0.2)
+    settings = EMSettings(max_steps=40, tolerance=0.0, errors=errors)
+    history = np.array(taught(EMLearner(SCENE, NUM_CLASSES, settings), views).fit().history_)
+    assert len(history) >= 2
+    assert (np.diff(history) >= -1e-6 * np.abs(history[1:])).all()
+
+
+@pytest.mark.parametrize("views", [clean_views(5), wrong_views(5)], ids=["clean", "wrong"])
+def test_it_stops_by_itself(views: list[View]) -> None:
+    learner = taught(EMLearner(SCENE, NUM_CLASSES, EMSettings(max_steps=500)), views).fit()
+    assert 2 <= len(learner.history_) < 100
+    assert learner.history_[-1] - learner.history_[-2] < learner.settings.tolerance
+
+
+def test_with_wrong_masks_em_is_ahead_of_votes() -> None:
+    scores = []
+    for seed in range(3):
+        views = wrong_views(10, seed=seed, missed=0.2, swapped=0.15)
+        em = taught(EMLearner(SCENE, NUM_CLASSES), views).fit()
+        scores.append([mean_iou(em), mean_iou(taught(VoteLearner(SCENE, NUM_CLASSES), views).fit())])
+    em, votes = np.mean(scores, axis=0)
+    assert em > votes and em > 0.9
+
+
+def test_the_error_model_tells_which_object_was_swapped_in_which_view() -> None:
+    views = clean_views(6)
+    labels = views[2].read_labels()
+    views[2] = View.from_arrays(views[2].camera, np.where(labels == 1, 3, labels))
+    models = taught(EMLearner(SCENE, NUM_CLASSES), views).fit().error_models_
+    assert set(models) == {view.name for view in views}
+    for view in views:
+        model = models[view.name]
+        np.testing.assert_allclose(model.confusion.sum(axis=1), 1, atol=1e-5)
+        seen_as = model.classes[model.confusion[1].argmax()]
+        assert seen_as == (3 if view is views[2] else 1)
+        assert model.classes[model.confusion[2].argmax()] == 2
+
+
+def test_without_the_error_model_every_mask_is_taken_at_its_word() -> None:
+    learner = taught(EMLearner(SCENE, NUM_CLASSES, EMSettings(errors=False)), wrong_views(4)).fit()
+    for model in learner.error_models_.values():
+        np.testing.assert_array_equal(model.confusion, np.eye(NUM_CLASSES)[:, model.classes])
+
+
+def test_the_order_of_the_gaussians_does_not_matter() -> None:
+    order = np.random.default_rng(0).permutation(len(SCENE))
+    views = wrong_views(4)
+    one = taught(EMLearner(SCENE, NUM_CLASSES), views).fit()
+    two = taught(EMLearner(SCENE.subset(order), NUM_CLASSES), views).fit()
+    np.testing.assert_allclose(two.codes_, one.codes_[order], atol=1e-3)
+    np.testing.assert_array_equal(two.observed_, one.observed_[order])
+
+
+def test_fitting_twice_gives_the_same_bits() -> None:
+    learner = taught(EMLearner(SCENE, NUM_CLASSES), wrong_views(4))
+    first = learner.fit().codes_.copy()
+    np.testing.assert_array_equal(learner.fit().codes_, first)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"max_steps": 0}, {"prior_k": 0}, {"outliers": 0.0}, {"outliers": 1.0}, {"tolerance": -1.0},
+     {"error_prior": -0.1}, {"prior_weight": -1.0}],
+)  # fmt: skip
+def test_settings_out_of_range_are_refused_by_name(wrong: dict[str, float]) -> None:
+    with pytest.raises(SettingsError, match=f"em: .*{next(iter(wrong))}.*expected"):
+        EMSettings(**wrong)  # type: ignore[arg-type]

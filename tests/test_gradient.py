@@ -1,0 +1,83 @@
+"""The paper's learner: its loss is the formula, and its gradient is the loss's."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, taught
+
+from gsseg_core.dataset import View
+from gsseg_core.errors import SettingsError
+from gsseg_core.gradient import GradientLearner, GradientSettings, cross_entropy
+from gsseg_core.operator import make_operator
+
+SCENE, TRUTH = balls_on_a_table()
+VIEWS = clean_views(3)
+
+
+def partly_known() -> View:
+    labels = VIEWS[0].read_labels()
+    labels[:9, :30] = -1
+    return View.from_arrays(VIEWS[0].camera, labels)
+
+
+def random_codes(seed: int = 0) -> torch.Tensor:
+    rng = np.random.default_rng(seed)
+    return torch.from_numpy(rng.dirichlet(np.ones(NUM_CLASSES), len(SCENE)).astype(np.float32))
+
+
+def test_the_loss_is_the_formula_of_the_paper_over_the_labelled_pixels() -> None:
+    view, codes = partly_known(), random_codes()
+    operator, labels = make_operator(SCENE, view.camera), view.read_labels()
+    image = operator.render(codes.numpy()).astype(np.float64)
+    image[..., 0] += operator.transmittance()
+    known = labels >= 0
+    losses = [-np.log(image[..., k][labels == k]).sum() / known.sum() for k in range(NUM_CLASSES)]
+    loss = cross_entropy(codes, operator.observe(labels))
+    assert float(loss) == pytest.approx(np.mean(losses), rel=1e-5)
+
+
+def test_the_gradient_is_that_of_finite_differences() -> None:
+    view, codes = partly_known(), random_codes()
+    observation = make_operator(SCENE, view.camera).observe(view.read_labels())
+    codes.requires_grad_(True)
+    (3 * cross_entropy(codes, observation)).backward()
+    assert codes.grad is not None
+    for seed in range(5):
+        direction = torch.from_numpy(np.random.default_rng(seed).normal(size=codes.shape).astype(np.float32))
+        step = 2e-3 * direction * codes.detach()
+        with torch.no_grad():
+            rise = cross_entropy(codes + step, observation) - cross_entropy(codes - step, observation)
+        expected = float((codes.grad.double() * step).sum()) * 2 / 3
+        assert float(rise) == pytest.approx(expected, rel=0.02, abs=2e-6)
+    unseen = np.setdiff1d(np.arange(len(SCENE)), observation.ids)
+    assert not codes.grad[unseen].any()
+
+
+def test_the_loss_falls_from_epoch_to_epoch() -> None:
+    history = taught(GradientLearner(SCENE, NUM_CLASSES), VIEWS).fit().history_
+    assert len(history) == GradientSettings().epochs
+    assert (np.diff(history) < 0).all()
+    assert history[-1] < 0.5 * history[0]
+
+
+def test_the_same_seed_gives_the_same_codes_and_another_one_others() -> None:
+    first, again, other = (
+        taught(GradientLearner(SCENE, NUM_CLASSES, GradientSettings(seed=seed)), VIEWS).fit().codes_
+        for seed in (0, 0, 1)
+    )
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+
+
+def test_the_documentation_names_the_equations_and_where_the_paper_is_silent() -> None:
+    text = GradientLearner.__doc__ or ""
+    for words in ("eq. 2", "eq. 3", "eq. 4", "Where the paper is silent"):
+        assert words in text
+
+
+@pytest.mark.parametrize("wrong", [{"epochs": 0}, {"rate": 0.0}, {"final_rate": 0.0}, {"final_rate": 1.0}])
+def test_settings_out_of_range_are_refused_by_name(wrong: dict[str, float]) -> None:
+    with pytest.raises(SettingsError, match=f"gradient: .*{next(iter(wrong))}.*expected"):
+        GradientSettings(**wrong)  # type: ignore[arg-type]

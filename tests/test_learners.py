@@ -1,0 +1,165 @@
+"""What all learners promise: the same face, exact votes, views that come, go and are refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_scenes import NAMES, NUM_CLASSES, OUT_OF_SIGHT, balls_on_a_table, clean_views, look_at, mean_iou, taught
+
+from gsseg_core.dataset import View
+from gsseg_core.em import EMLearner
+from gsseg_core.errors import MaskSizeError, NoUsableViewsError, SettingsError, UnknownLabelError
+from gsseg_core.gradient import GradientLearner
+from gsseg_core.learner import VOTE_UNIT, Learner
+from gsseg_core.operator import make_operator
+from gsseg_core.segmentation import UNOBSERVED, Segmentation
+from gsseg_core.refine import RefineSettings
+from gsseg_core.votes import VoteLearner
+
+LEARNERS = [VoteLearner, EMLearner, GradientLearner]
+SCENE, TRUTH = balls_on_a_table()
+VIEWS = clean_views(5)
+
+every_learner = pytest.mark.parametrize("kind", LEARNERS)
+
+
+@every_learner
+def test_every_learner_recovers_the_objects_from_clean_masks(kind: type[Learner]) -> None:
+    learner = taught(kind(SCENE, NUM_CLASSES), VIEWS)
+    assert learner.fit() is learner
+    codes, observed = learner.codes_, learner.observed_
+    assert codes.shape == (len(SCENE), NUM_CLASSES) and codes.dtype == np.float32
+    assert observed.shape == (len(SCENE),) and observed.dtype == bool
+    assert (codes >= 0).all()
+    np.testing.assert_allclose(codes.sum(axis=1), observed, atol=1e-5)
+    assert list(learner.views) == [view.name for view in VIEWS] and learner.rejected == {}
+    assert isinstance(learner.history_, list) and np.isfinite(learner.history_).all()
+    assert mean_iou(learner) > (0.93 if kind is VoteLearner else 0.95)
+
+
+@every_learner
+def test_what_no_view_sees_is_unobserved_until_its_neighbours_fill_it_in(kind: type[Learner]) -> None:
+    learner = taught(kind(SCENE, NUM_CLASSES), VIEWS).fit()
+    assert not learner.observed_[-OUT_OF_SIGHT:].any() and not learner.codes_[-OUT_OF_SIGHT:].any()
+    raw = Segmentation.from_codes(SCENE, learner.codes_, NAMES, RefineSettings(cluster=False, filter=False))
+    np.testing.assert_array_equal(raw.labels == UNOBSERVED, ~learner.observed_)
+    filled = Segmentation.from_codes(SCENE, learner.codes_, NAMES, RefineSettings(filter=False))
+    assert (filled.labels >= 0).all() and filled.clustered[-OUT_OF_SIGHT:].all()
+
+
+@every_learner
+def test_the_order_of_the_views_and_the_memory_budget_do_not_matter(kind: type[Learner]) -> None:
+    if kind is GradientLearner:
+        pytest.importorskip("torch")
+        one, two = (taught(kind(SCENE, NUM_CLASSES, memory_budget=b), VIEWS).fit() for b in (0, 1 << 30))
+        np.testing.assert_array_equal(one.codes_, two.codes_)
+        return
+    one = taught(kind(SCENE, NUM_CLASSES), VIEWS).fit()
+    two = taught(kind(SCENE, NUM_CLASSES, memory_budget=0), VIEWS[::-1]).fit()
+    np.testing.assert_allclose(one.codes_, two.codes_, atol=1e-4)
+
+
+def test_votes_are_the_sum_over_views_of_the_adjoint_of_the_masks() -> None:
+    learner = taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS).fit()
+    onehot = np.eye(NUM_CLASSES, dtype=np.float32)
+    expected = sum(make_operator(SCENE, view.camera).adjoint(onehot[view.read_labels()]) for view in VIEWS)
+    np.testing.assert_allclose(learner._votes * VOTE_UNIT, expected, rtol=1e-4, atol=1e-5)
+    seen = expected.sum(axis=1) > 1e-4
+    share = expected[seen] / expected[seen].sum(axis=1, keepdims=True)
+    np.testing.assert_allclose(learner.codes_[seen], share, atol=1e-3)
+
+
+@settings(max_examples=15, deadline=None)
+@given(order=st.permutations(range(5)), taken=st.sets(st.integers(0, 4)))
+def test_views_taken_back_leave_no_trace_whatever_the_order(order: list[int], taken: set[int]) -> None:
+    learner = VoteLearner(SCENE, NUM_CLASSES)
+    for i in order:
+        learner.observe(VIEWS[i])
+    for i in sorted(taken):
+        learner.retract(VIEWS[i].name)
+    fresh = taught(VoteLearner(SCENE, NUM_CLASSES), [view for i, view in enumerate(VIEWS) if i not in taken])
+    np.testing.assert_array_equal(learner._votes, fresh._votes)
+    assert set(learner.views) == set(fresh.views)
+    if fresh.views:
+        np.testing.assert_array_equal(learner.fit().codes_, fresh.fit().codes_)
+
+
+def test_a_view_of_the_same_name_replaces_the_earlier_one() -> None:
+    learner = taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS)
+    other = View.from_arrays(VIEWS[1].camera, np.full_like(VIEWS[1].read_labels(), 3))
+    taught(learner, [other])
+    fresh = taught(VoteLearner(SCENE, NUM_CLASSES), [VIEWS[0], other, *VIEWS[2:]])
+    np.testing.assert_array_equal(learner._votes, fresh._votes)
+    assert len(learner.views) == 5
+
+
+@every_learner
+def test_views_that_cannot_be_used_are_counted_by_reason_and_change_nothing(kind: type[Learner]) -> None:
+    learner = taught(kind(SCENE, NUM_CLASSES), VIEWS[:2])
+    before = learner._votes.copy()
+    unknown = np.full((48, 64), -1, np.int32)
+    away = look_at("away", np.array([0.0, 500.0, 300.0]))
+    turned = np.diag([-1.0, 1, -1, 1]) @ away.world_to_camera
+    blind = View.from_arrays(type(away)("blind", 64, 48, away.K, turned), np.ones((48, 64), np.int32))
+    useless = [
+        View(VIEWS[2].camera),
+        View(VIEWS[3].camera),
+        View.from_arrays(VIEWS[4].camera, unknown),
+        View.from_arrays(VIEWS[0].camera, unknown),
+        blind,
+    ]
+    assert not any(learner.observe(view) for view in useless)
+    assert learner.reject_summary() == {"no mask": 2, "all pixels unknown": 2, "sees no Gaussian": 1}
+    assert set(learner.rejected) == {view.name for view in useless}
+    np.testing.assert_array_equal(learner._votes, before)
+    assert list(learner.views) == [VIEWS[0].name, VIEWS[1].name]
+    assert learner.observe(VIEWS[2]) and VIEWS[2].name not in learner.rejected
+
+
+@every_learner
+def test_no_view_left_is_one_clear_error_that_names_the_reasons(kind: type[Learner]) -> None:
+    learner = kind(SCENE, NUM_CLASSES)
+    with pytest.raises(NoUsableViewsError, match="none was given"):
+        learner.fit()
+    learner.observe(View(VIEWS[0].camera))
+    learner.observe(View(VIEWS[1].camera))
+    with pytest.raises(NoUsableViewsError, match=r"no view to learn from \(2 no mask\); expected"):
+        learner.fit()
+    learner.observe(VIEWS[2])
+    learner.retract(VIEWS[2].name)
+    with pytest.raises(NoUsableViewsError):
+        learner.fit()
+
+
+def test_a_label_beyond_the_classes_is_refused_and_changes_nothing() -> None:
+    learner = taught(VoteLearner(SCENE, 3), [View.from_arrays(VIEWS[0].camera, np.zeros((48, 64), np.int32))])
+    before = learner._votes.copy()
+    with pytest.raises(UnknownLabelError, match="label 3; expected at most 2"):
+        learner.observe(VIEWS[1])
+    np.testing.assert_array_equal(learner._votes, before)
+    with pytest.raises(MaskSizeError):
+        View.from_arrays(VIEWS[1].camera, np.zeros((4, 4), np.int32))
+
+
+def test_impossible_requests_are_refused() -> None:
+    with pytest.raises(SettingsError, match="num_classes is 0; expected at least 1"):
+        VoteLearner(SCENE, 0)
+    with pytest.raises(SettingsError, match="'ghost' was not observed"):
+        VoteLearner(SCENE, 2).retract("ghost")
+
+
+@every_learner
+def test_one_class_only_works(kind: type[Learner]) -> None:
+    views = [View.from_arrays(view.camera, np.zeros((48, 64), np.int32)) for view in VIEWS[:2]]
+    learner = taught(kind(SCENE, 1), views).fit()
+    np.testing.assert_array_equal(learner.codes_[:, 0], learner.observed_)
+
+
+@every_learner
+def test_progress_is_told_from_start_to_end(kind: type[Learner]) -> None:
+    calls: list[tuple[str, int, int]] = []
+    taught(kind(SCENE, NUM_CLASSES), VIEWS[:2]).fit(lambda *call: calls.append(call))
+    assert all(0 <= done <= total for _, done, total in calls)
+    assert not calls or calls[-1][1] == calls[-1][2]
