@@ -2,8 +2,8 @@
 
 Usage: python benchmarks/results.py [--data FOLDER] [--out docs/results.md]
 
-FOLDER holds `replica_apartment/` (default: the environment variable GSSEG_DATA, else ../shared/data). Nothing of it is copied, but for the
-pictures of the ablation, which go to `results_out/` and not into the repository. Takes about ten minutes on two cores.
+FOLDER holds `replica_apartment/` (default: the environment variable GSSEG_DATA, else ../shared/data). Nothing of it is
+copied; the pictures of the ablation go to `results_out/`, outside version control.
 """
 
 from __future__ import annotations
@@ -93,7 +93,8 @@ def learn_all(scene: GaussianScene, folder: Path) -> tuple[dict[tuple[str, str],
         rows.append(row)
     columns = ["mIoU, unrefined", "mIoU", "mAcc", "boundary IoU", "s"]
     header = ["learner", *(f"{MASKS[masks]}: {column}" for masks in MASKS for column in columns)]
-    return codes, LEARNERS.format(table=markdown(header, rows), views=len(Dataset(folder).views("train")), tests=len(truth))
+    views = len(Dataset(folder).views("train"))
+    return codes, LEARNERS.format(table=markdown(header, rows), views=views, tests=len(truth))
 
 
 def learn(name: str, scene: GaussianScene, data: Dataset) -> np.ndarray:
@@ -140,7 +141,7 @@ def ablation(
 
 
 def object_iou(result: Segmentation, scene: GaussianScene, views: Iterable[View]) -> float:
-    """Mean IoU of objects cut out by their hard labels: each pixel shows the strongest class of the Gaussians that are left."""
+    """Mean IoU of objects cut out by their hard labels, where they cover at least half of a pixel."""
     onehot = np.zeros((len(scene), result.num_classes), np.float32)
     kept = np.flatnonzero(result.labels >= 0)
     onehot[kept, result.labels[kept]] = 1
@@ -234,38 +235,40 @@ def machine() -> str:
 
 HEADER = """# Results
 
-Made by `make results` (`python benchmarks/results.py`), which measures everything here again. Machine: {machine}.
+Made by `make results` (`python benchmarks/results.py`), which measures everything here again.
+Machine: {machine}.
 
-The scene is one floor of a real scanned apartment (Replica `apartment_0`), 126,507 Gaussians trained by OpenSplat, 40 objects, 119 views of
-320 x 320. The wrong masks have 15 % of the objects missed and 10 % under another id in every view, and edges off by up to 3 px. Scores are of the test
-views, against the true masks, which no learner saw; [what is measured](#what-is-measured) is at the end. The settings of `em` were chosen on 15 of the
-train views held out from learning, not on the test views.
+The scene is one floor of a real scanned apartment (Replica `apartment_0`): 126,507 Gaussians trained by OpenSplat,
+40 objects, 119 views of 320 x 320. The wrong masks have 15 % of the objects missed and 10 % under another id in every
+view, and edges off by up to 3 px. Scores are of the test views against the true masks; no learner saw either.
+[What is measured](#what-is-measured) stands at the end. The settings of `em` were chosen on 15 of the train views, held
+out from learning for that purpose.
 """
 
 LEARNERS = """## Learners
 
-Learnt from {views} views, scored on {tests}. "mIoU" is of the whole pipeline with the paper's refinement, "unrefined" without it. "Votes made hard" is FlashSplat's rule without its background
-bias. Seconds are of learning, the reading and preparing of views included.
+Learnt from {views} views, scored on {tests}. "mIoU" is of the whole pipeline with the paper's refinement, "unrefined"
+without it. "Votes made hard" is FlashSplat's rule without its background bias. Seconds are of learning, with the
+reading and preparing of the views.
 
 {table}
 """
 
 ABLATION = """## Refinement: what makes up an object
 
-The paper's ablation: objects cut out of the scene by the labels of their Gaussians, every one hard; mean IoU of what they cover in the test views (a pixel counts for
-the strongest class, where that covers at least half of it). The pictures go to `results_out/`.
+The paper's ablation: objects cut out of the scene by the labels of their Gaussians, every label hard. Mean IoU of what
+they cover in the test views; a pixel counts for the strongest class where that covers at least half of it. The pictures
+go to `results_out/`.
 
 {table}
-
-The filter takes the outer sixth or so of each object's Gaussians by construction, where their distances are near a normal distribution; what it takes leaves
-holes. It is for objects that are to be handed on alone, where a stray Gaussian hurts more than a hole.
 """
 
 COMMAND = """## The whole command
 
     gsseg segment replica_apartment/scene.ply --data replica_apartment --out out
 
-In a process of its own, kernels compiled before, with export and pictures; then `gsseg render` and `gsseg eval` on the test views.
+In a process of its own, with export and pictures, its kernels compiled before; then `gsseg render` and `gsseg eval` on
+the test views. Peak memory is that of the largest process so far.
 
 {table}
 """
@@ -278,8 +281,9 @@ On the codes that `em` learnt from the wrong masks.
 
 ## What is measured
 
-Per class over all test views together: IoU = intersection / union of pixels; accuracy = share of the class's true pixels that were found; boundary IoU = the same ratio within
-a band of 2 % of the image diagonal along the inside of each mask's outline. Means are over all ids that occur in the truth or in the prediction (accuracy: in the truth).
+Per class, over all test views together. IoU: intersection / union of pixels. Accuracy: share of the class's true pixels
+that were found. Boundary IoU: the IoU of bands along the inside of the outlines, as wide as 2 % of the image diagonal.
+Means are over all ids that occur in the truth or in the prediction; that of accuracy over those in the truth.
 """
 
 if __name__ == "__main__":

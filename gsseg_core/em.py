@@ -1,28 +1,31 @@
 """Expectation maximisation with an error model of every view.
 
 The likelihood of what was seen. A pixel p of view v carries the label y_p. Its ray belongs to class k with the
-probability O_v[p, k] = (W_v q)[p, k] + T_end[p] [k = 0], and the segmenter calls class k in this view y with the probability
-(Dawid & Skene 1979, who had examiners in place of views)
+probability O_v[p, k] = (W_v q)[p, k] + T_end[p] [k = 0], and the segmenter calls class k in this view y with the
+probability (Dawid & Skene 1979, who had examiners in place of views)
 
     C_v[k, y] = (1 - outliers) R_v[k, y] + outliers / L_v,     p_v(y | p) = sum_k O_v[p, k] C_v[k, y].
 
-A view in which a chair was missed or taken for a table has that in R_v, and so its pixels are no evidence against the chair.
+A view in which a chair was missed or taken for a table has that in R_v, and so its pixels are no evidence against the
+chair.
 
 The objective. The log of the posterior, in nats:
 
-    J(q, R) = sum_v sum_p log p_v(y_p | p) + prior_weight sum_i sum_k m_i[k] log q_i[k] + sum_v sum_k a_v[k] log R_v[k, k].
+    J(q, R) = sum_v sum_p log p_v(y_p | p)
+            + prior_weight sum_i sum_k m_i[k] log q_i[k]
+            + sum_v sum_k a_v[k] log R_v[k, k].
 
-m_i is the mean of the votes' codes over the nearest Gaussians: objects are continuous in space. a_v[k] counts pseudo-pixels
-in which the segmenter was right, a share of those that class k fills in view v by the votes' codes.
+m_i is the mean of the votes' codes over the nearest Gaussians: objects are continuous in space. a_v[k] counts
+pseudo-pixels in which the segmenter was right, a share of those that class k fills in view v by the votes' codes.
 
-The step, with B_v[i, y] = sum over the pixels p seen as y of w_v[p, i] / p_v(y | p). Each factor is the exact maximiser of the
-usual lower bound of J at the old values, so J never falls:
+The step, with B_v[i, y] = sum over the pixels p seen as y of w_v[p, i] / p_v(y | p). Each factor is the exact maximiser
+of the usual lower bound of J at the old values, so J never falls:
 
     q_i[k]     <- normalise( q_i[k] sum_v sum_y C_v[k, y] B_v[i, y] + prior_weight m_i[k] )
     R_v[k, y]  <- normalise( (1 - outliers) R_v[k, y] sum_i q_i[k] B_v[i, y] + a_v[k] [y = k] )
 
-with the left-over transmittance as one more Gaussian of class 0 in the second. Only B_v needs the rasteriser, and its cost does not
-depend on the number of classes.
+with the left-over transmittance as one more Gaussian of class 0 in the second. Only B_v needs the rasteriser, and its
+cost does not depend on the number of classes.
 """
 
 from __future__ import annotations
