@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
+from pathlib import Path
 
 from tqdm import tqdm
 
@@ -157,10 +158,13 @@ def _render(options: argparse.Namespace) -> int:
 
 
 def _eval(options: argparse.Namespace) -> int:
+    from gsseg_core.masks import read_classes
     from gsseg_core.metrics import evaluate_folders
     from gsseg_core.tables import evaluation_summary
 
-    scores = evaluate_folders(options.pred, options.truth).as_dict()
+    classes = Path(options.truth).parent / "classes.json"
+    names = read_classes(classes) if classes.is_file() else None
+    scores = evaluate_folders(options.pred, options.truth).as_dict(names)
     if options.json:
         write_json(options.json, scores)
     print(evaluation_summary(scores))

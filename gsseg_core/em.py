@@ -158,7 +158,7 @@ class EMLearner(Learner):
     error_models_ : dict of str to ErrorModel
         After `fit`: what each view's segmenter got wrong.
     history_ : list of float
-        After `fit`: J per labelled pixel, in nats, before each step and at the end; it never falls.
+        After `fit`: J per labelled pixel, in nats, of what went into each step; it never falls.
     """
 
     def __init__(
@@ -179,7 +179,7 @@ class EMLearner(Learner):
         settings = self.settings
         prior = settings.prior_weight * self._smooth(self._vote_codes())
         # Votes are the first step; with the prior counted in, the objective is finite from the start.
-        codes = normalise(self._votes * np.float32(VOTE_UNIT) + prior)
+        codes = normalise(self._votes.astype(np.float32) * np.float32(VOTE_UNIT) + prior)
         models, pixels = {}, 0
         for name, observation in self._observations():
             models[name] = self._first_model(codes, observation)

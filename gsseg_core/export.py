@@ -65,7 +65,8 @@ def _check_replaceable(folder: Path) -> None:
         return
     if not folder.is_dir():
         raise WriteError(f"{folder}: is a file; expected a folder, or nothing")
-    strangers = sorted(path.name for path in folder.iterdir() if not re.fullmatch(r"[0-9]+_.+\.ply", path.name))
+    names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
+    strangers = [name for name in names if not re.fullmatch(r"[0-9]+_.+\.ply", name)]
     if strangers:
         raise WriteError(
             f"{folder}: holds {strangers[0]!r}, which is no earlier export; expected a folder that can be replaced"
@@ -121,4 +122,7 @@ def write_pictures(
         save_png(paths[-1], contact_sheet(images, captions, columns))
     paths.append(folder / "legend.png")
     save_png(paths[-1], legend(segmentation.class_names, colors, segmentation.counts()))
+    # Overlays of views that an earlier run drew would show another segmentation.
+    for stale in set(folder.glob("overlay_*.png")) - set(paths):
+        stale.unlink(missing_ok=True)
     return paths

@@ -197,7 +197,7 @@ class Learner(ABC):
             raise NoUsableViewsError(f"no view to learn from ({reasons}); expected posed views with label images")
         total = self._votes.sum(axis=1)
         self.observed_ = total > 0
-        return normalise(self._votes * np.float32(VOTE_UNIT))
+        return normalise(self._votes.astype(np.float32) * np.float32(VOTE_UNIT))
 
 
 def normalise(

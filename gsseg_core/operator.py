@@ -95,6 +95,11 @@ class Observation(ABC):
             What each Gaussian says of each label in `classes`, at least 0.
         rest : (L,) float32
             What the background says of each label.
+
+        Raises
+        ------
+        SceneValueError
+            The codes are not of these shapes.
         """
 
 
@@ -189,7 +194,6 @@ class ViewOperator(ABC):
     def transmittance(self) -> np.ndarray:
         """Return what is left of each ray after the last Gaussian, (H, W) float32 in [0, 1]."""
 
-    @abstractmethod
     def weights(self, row: int | None = None, column: int | None = None) -> Weights:
         """List W, or only the row of W of one pixel: which Gaussians made it, and how much.
 
@@ -197,13 +201,30 @@ class ViewOperator(ABC):
         ----------
         row, column : int, optional
             The pixel. Without them, every pixel of the image.
+
+        Raises
+        ------
+        SettingsError
+            The pixel is not in the image, or only one of its coordinates is given.
         """
+        if row is None and column is None:
+            return self._weights(None)
+        height, width = self.camera.height, self.camera.width
+        if row is None or column is None or not (0 <= row < height and 0 <= column < width):
+            raise SettingsError(
+                f"view '{self.camera.name}': pixel is (row {row}, column {column}); "
+                f"expected a row from 0 to {height - 1} and a column from 0 to {width - 1}"
+            )
+        return self._weights((row, column))
 
     @abstractmethod
     def _render(self, codes: np.ndarray) -> np.ndarray: ...
 
     @abstractmethod
     def _adjoint(self, residual: np.ndarray) -> np.ndarray: ...
+
+    @abstractmethod
+    def _weights(self, pixel: tuple[int, int] | None) -> Weights: ...
 
     @abstractmethod
     def _observe(self, labels: np.ndarray) -> Observation: ...

@@ -32,6 +32,9 @@ ALPHA_MIN = 1.0 / 255.0
 FRUSTUM_MARGIN = 0.3
 """The linearisation point is kept within the image widened by this fraction of half its width, as trainers do."""
 
+REACH_MAX = 1e6
+"""A reach is cut off here, in px: far beyond any image, and safely an integer."""
+
 # Columns of the table of projected Gaussians.
 U, V, SHEAR, WIDTH, HEIGHT, LOG_OPACITY, X_REACH, Y_REACH, X_TURN = range(9)
 
@@ -59,7 +62,8 @@ class Projected:
 def project(scene: GaussianScene, camera: Camera) -> Projected:
     """Project a scene and sort what is visible by depth.
 
-    Gaussians at exactly the same depth are ordered by their projected shape, so the order in the scene never matters.
+    Gaussians at exactly the same depth are ordered by their projected shape, so the order in the scene matters only to
+    those that are alike in all of it.
     """
     table = np.empty((len(scene), 9), np.float32)
     depth = np.empty(len(scene), np.float32)
@@ -152,7 +156,7 @@ def _project(
         sxx = a0 * a0 + a1 * a1 + a2 * a2 + DILATION
         sxy = a0 * b0 + a1 * b1 + a2 * b2
         syy = b0 * b0 + b1 * b1 + b2 * b2 + DILATION
-        reach_x, reach_y = np.sqrt(cut * sxx), np.sqrt(cut * syy)
+        reach_x, reach_y = min(np.sqrt(cut * sxx), REACH_MAX), min(np.sqrt(cut * syy), REACH_MAX)
         if not (
             u + reach_x >= 0.5 and u - reach_x <= width - 0.5 and v + reach_y >= 0.5 and v - reach_y <= height - 0.5
         ):
@@ -166,5 +170,5 @@ def _project(
         table[i, LOG_OPACITY] = np.log2(opacity)
         table[i, X_REACH] = reach_x
         table[i, Y_REACH] = reach_y
-        table[i, X_TURN] = sxy * np.sqrt(cut / sxx)
+        table[i, X_TURN] = min(max(sxy * np.sqrt(cut / sxx), -REACH_MAX), REACH_MAX)
         depth[i] = z

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -23,6 +24,12 @@ UNOBSERVED, REMOVED = -1, -2
 """Labels of Gaussians that no view spoke for, and of those that the filter took out."""
 
 FORMAT = "gsseg-segmentation-1"
+
+# What NumPy, zipfile and zlib raise on damaged bytes; RuntimeError where a flipped bit says "encrypted".
+_DAMAGED = (
+    OSError, KeyError, IndexError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
+    struct.error, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +173,8 @@ class Segmentation:
         """
         path = Path(path)
         try:
-            with np.load(path, allow_pickle=False) as file:
+            # Opened here, since np.load leaves a file open that it cannot read.
+            with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
                 header = json.loads(str(file["header"]))
                 if header["format"] != FORMAT:
                     raise StateFileError(f"{path}: format is {header['format']!r}; expected {FORMAT!r}")
@@ -183,16 +191,7 @@ class Segmentation:
             raise
         except FileNotFoundError as error:
             raise StateFileError(f"{path}: does not exist; expected a segmentation.npz") from error
-        except (
-            OSError,
-            KeyError,
-            ValueError,
-            TypeError,
-            AttributeError,
-            EOFError,
-            zipfile.BadZipFile,
-            zlib.error,
-        ) as error:
+        except _DAMAGED as error:
             raise StateFileError(f"{path}: is not a segmentation.npz, or is damaged ({error})") from error
         if result.labels.shape != (len(scene),) or result.probabilities.shape != (len(scene), len(names)):
             raise StateFileError(f"{path}: arrays of shape {result.probabilities.shape}; expected ({len(scene)}, K)")

@@ -6,6 +6,7 @@ import numpy as np
 
 from gsseg_core import products
 from gsseg_core.cameras import Camera
+from gsseg_core.errors import SceneValueError
 from gsseg_core.operator import Observation, Shares, ViewOperator, Weights
 from gsseg_core.projection import project
 from gsseg_core.scene import GaussianScene
@@ -16,7 +17,8 @@ class TileOperator(ViewOperator):
     """W of one view, remade tile by tile at every product and never stored.
 
     Holds only the projected Gaussians and their tiles, about 36 bytes per visible Gaussian and 12 per tile that it
-    touches. Results are the same bit for bit whatever the number of threads and the order of the Gaussians.
+    touches. Results are the same bit for bit whatever the number of threads and the order of the Gaussians, unless two
+    of them have the very same geometry and different codes.
     """
 
     def __init__(self, scene: GaussianScene, camera: Camera) -> None:
@@ -53,12 +55,12 @@ class TileOperator(ViewOperator):
             out[self.ids, k : k + products.CHUNK] = rows
         return out
 
-    def weights(self, row: int | None = None, column: int | None = None) -> Weights:
+    def _weights(self, pixel: tuple[int, int] | None) -> Weights:
         """List W, or only the row of W of one pixel."""
         tiles, camera = self._tiles, self.camera
         wanted = np.arange(tiles.columns * tiles.rows)
-        if row is not None and column is not None:
-            wanted = np.array([row // TILE * tiles.columns + column // TILE])
+        if pixel is not None:
+            wanted = np.array([pixel[0] // TILE * tiles.columns + pixel[1] // TILE])
         image = (tiles.columns, camera.width, camera.height, self._table, tiles.start, tiles.entries, wanted)
         counts = np.zeros(len(wanted) + 1, np.int64)
         none = np.empty(0, np.int32)
@@ -69,8 +71,8 @@ class TileOperator(ViewOperator):
         products.list_weights(*image, start, pixels, rows, weights)
         # Entries of a tile are sorted by depth; a stable sort by pixel keeps that order within each.
         order = np.argsort(pixels, kind="stable")
-        if row is not None and column is not None:
-            order = order[pixels[order] == row * camera.width + column]
+        if pixel is not None:
+            order = order[pixels[order] == pixel[0] * camera.width + pixel[1]]
         return Weights(pixels[order], self.ids[rows[order]], weights[order])
 
     def _observe(self, labels: np.ndarray) -> Observation:
@@ -120,6 +122,12 @@ class TileObservation(Observation):
     ) -> Shares:
         """Share one vote per labelled pixel among the Gaussians that made it."""
         codes, rest = np.ascontiguousarray(codes, np.float32), np.ascontiguousarray(rest, np.float32)
+        expected = (len(self.ids), len(self.classes))
+        if codes.shape != expected or rest.shape != expected[1:]:
+            raise SceneValueError(
+                f"view '{self._camera.name}': codes and rest have shapes {codes.shape} and {rest.shape}; "
+                f"expected {expected} and {expected[1:]}"
+            )
         return self._share(codes, rest, divide=True)
 
     def _share(

@@ -75,12 +75,12 @@ def _touched(
     dy = min(max(-table[g, X_TURN], top), bottom)
     left = table[g, SHEAR] * dy - np.sqrt(max(cut - table[g, HEIGHT] * dy * dy, 0.0) / table[g, WIDTH])
     # A hundredth of a pixel of slack covers float32 rounding; the blend tests alpha itself.
-    first = int(np.floor((table[g, U] + left - 0.51) / TILE))
-    last = int(np.floor((table[g, U] + right - 0.49) / TILE)) + 1
-    return max(first, 0), min(last, columns)
+    first = np.floor((table[g, U] + left - 0.51) / TILE)
+    last = np.floor((table[g, U] + right - 0.49) / TILE) + 1
+    return int(max(first, 0.0)), int(min(max(last, 0.0), columns))
 
 
-@nb.njit(parallel=True, cache=True)
+@nb.njit(parallel=True, cache=True, error_model="numpy")
 def _count(table: np.ndarray, columns: int, rows: int, counts: np.ndarray) -> None:
     for row in nb.prange(rows):
         for g in range(table.shape[0]):
@@ -89,7 +89,7 @@ def _count(table: np.ndarray, columns: int, rows: int, counts: np.ndarray) -> No
                 counts[row * columns + column] += 1
 
 
-@nb.njit(parallel=True, cache=True)
+@nb.njit(parallel=True, cache=True, error_model="numpy")
 def _fill(table: np.ndarray, columns: int, rows: int, start: np.ndarray, entries: np.ndarray) -> None:
     for row in nb.prange(rows):
         cursor = start[row * columns : (row + 1) * columns].copy()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import struct
 import zipfile
 import zlib
 from collections.abc import Iterable
@@ -17,6 +18,12 @@ from gsseg_core.dataset import View
 from gsseg_core.errors import GssegError, StateFileError, StateMismatchError
 
 FORMAT = "gsseg-views-1"
+
+# What NumPy, zipfile and zlib raise on damaged bytes; RuntimeError where a flipped bit says "encrypted".
+_DAMAGED = (
+    OSError, KeyError, IndexError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
+    struct.error, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
 
 
 def save_views(
@@ -50,7 +57,8 @@ def load_views(
     """Read what `save_views` wrote for the same scene and number of classes: views in memory, and votes (N, K)."""
     path = Path(path)
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # Opened here, since np.load leaves a file open that it cannot read.
+        with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
             header = json.loads(str(file["header"]))
             if header["format"] != FORMAT:
                 raise StateFileError(f"{path}: format is {header['format']!r}; expected {FORMAT!r}")
@@ -70,7 +78,7 @@ def load_views(
         raise
     except FileNotFoundError as error:
         raise StateFileError(f"{path}: does not exist; expected a saved state") from error
-    except (OSError, KeyError, ValueError, TypeError, IndexError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except _DAMAGED as error:
         raise StateFileError(f"{path}: is not a saved state, or is damaged ({error})") from error
 
 

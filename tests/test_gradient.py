@@ -59,7 +59,7 @@ def test_the_loss_falls_from_epoch_to_epoch() -> None:
     history = taught(GradientLearner(SCENE, NUM_CLASSES), VIEWS).fit().history_
     assert len(history) == GradientSettings().epochs
     assert (np.diff(history) < 0).all()
-    assert history[-1] < 0.5 * history[0]
+    assert history[-1] < 0.7 * history[0]
 
 
 def test_the_same_seed_gives_the_same_codes_and_another_one_others() -> None:

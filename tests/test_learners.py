@@ -14,8 +14,8 @@ from gsseg_core.errors import MaskSizeError, NoUsableViewsError, SettingsError, 
 from gsseg_core.gradient import GradientLearner
 from gsseg_core.learner import VOTE_UNIT, Learner
 from gsseg_core.operator import make_operator
-from gsseg_core.segmentation import UNOBSERVED, Segmentation
 from gsseg_core.refine import RefineSettings
+from gsseg_core.segmentation import UNOBSERVED, Segmentation
 from gsseg_core.votes import VoteLearner
 
 LEARNERS = [VoteLearner, EMLearner, GradientLearner]
@@ -52,7 +52,6 @@ def test_what_no_view_sees_is_unobserved_until_its_neighbours_fill_it_in(kind: t
 @every_learner
 def test_the_order_of_the_views_and_the_memory_budget_do_not_matter(kind: type[Learner]) -> None:
     if kind is GradientLearner:
-        pytest.importorskip("torch")
         one, two = (taught(kind(SCENE, NUM_CLASSES, memory_budget=b), VIEWS).fit() for b in (0, 1 << 30))
         np.testing.assert_array_equal(one.codes_, two.codes_)
         return

@@ -28,6 +28,10 @@ def make_camera(width, height, world_to_camera=None):
     return Camera("view", width, height, K, np.eye(4) if world_to_camera is None else world_to_camera)
 
 
+def one_gaussian(scale=1.0):
+    return make_scene([[0, 0, 1.0]], [[1, 0, 0, 0]], [[scale] * 3], [0.5])
+
+
 def rigid(rng):
     motion = np.eye(4)
     motion[:3, :3] = Rotation.random(random_state=rng).as_matrix()
@@ -316,6 +320,26 @@ def test_images_of_another_size_are_refused():
     for shape in [(37, 21), (21, 37, 1), (21, 38)]:
         with pytest.raises(MaskSizeError, match=r"view 'view': .* expected \(21, 37\)"):
             operator.observe(np.zeros(shape, np.int32))
+
+
+def test_codes_of_another_shape_than_the_observation_are_refused():
+    camera, scene = make_camera(20, 20), one_gaussian()
+    seen = make_operator(scene, camera).observe(np.zeros((20, 20), np.int32))
+    with pytest.raises(SceneValueError, match=r"expected \(1, 1\) and \(1,\)"):
+        seen.shares(np.ones((5, 3), np.float32), np.ones(7, np.float32))
+
+
+@pytest.mark.parametrize("pixel", [(0, 20), (20, 0), (-1, 3), (5, -1), (3, None)])
+def test_a_pixel_outside_the_image_is_refused(pixel):
+    operator = make_operator(one_gaussian(), make_camera(20, 20))
+    with pytest.raises(SettingsError, match="expected a row from 0 to 19 and a column from 0 to 19"):
+        operator.weights(*pixel)
+
+
+@pytest.mark.parametrize("scale", [1e3, 1e10, 1e17])
+def test_a_gaussian_may_be_as_large_as_it_likes(scale):
+    operator = make_operator(one_gaussian(scale=scale), make_camera(20, 20))
+    np.testing.assert_allclose(operator.transmittance(), 0.5, atol=1e-3)
 
 
 def test_an_unknown_device_is_refused():

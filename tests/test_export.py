@@ -1,0 +1,133 @@
+"""Files for others: one PLY per object, all of one segmentation, and pictures."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views
+
+from gsseg_core.errors import WriteError
+from gsseg_core.export import class_file_name, export_classes, write_json, write_pictures
+from gsseg_core.refine import RefineSettings
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segmentation import Segmentation
+
+SCENE, TRUTH = balls_on_a_table()
+CODES = np.eye(NUM_CLASSES, dtype=np.float32)[TRUTH]
+RESULT = Segmentation.from_codes(SCENE, CODES, NAMES, RefineSettings(cluster=False, k=10))
+
+
+def only(label: int) -> Segmentation:
+    codes = np.eye(NUM_CLASSES, dtype=np.float32)[np.full(len(SCENE), label)]
+    return Segmentation.from_codes(SCENE, codes, NAMES, RefineSettings(filter=False))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_every_class_is_a_valid_ply_of_exactly_its_gaussians(tmp_path: Path) -> None:
+    paths = export_classes(SCENE, RESULT, tmp_path / "classes")
+    assert {k: path.name for k, path in paths.items()} == {
+        0: "0_background.ply", 1: "1_red_ball.ply", 2: "2_cup_mug.ply", 3: "3_box.ply",
+    }  # fmt: skip
+    assert sorted(paths.values()) == sorted((tmp_path / "classes").iterdir())
+    assert (RESULT.labels == -2).any()
+    for k, path in paths.items():
+        part = GaussianScene.load(path)
+        np.testing.assert_array_equal(part.vertices, SCENE.vertices[RESULT.labels == k])
+    assert list(tmp_path.iterdir()) == [tmp_path / "classes"]
+
+
+def test_no_ply_of_an_earlier_export_remains(tmp_path: Path) -> None:
+    folder = tmp_path / "classes"
+    export_classes(SCENE, RESULT, folder)
+    export_classes(SCENE, only(2), folder)
+    assert [path.name for path in folder.iterdir()] == ["2_cup_mug.ply"]
+    assert len(GaussianScene.load(folder / "2_cup_mug.ply")) == len(SCENE)
+
+
+@pytest.mark.parametrize("error", [OSError(28, os.strerror(28)), KeyboardInterrupt()], ids=["disk full", "Ctrl-C"])
+def test_a_failed_export_leaves_the_earlier_folder_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    folder = tmp_path / "classes"
+    export_classes(SCENE, only(1), folder)
+    before, save, saved = contents(folder), GaussianScene.save, []
+
+    def fails_at_the_third(scene: GaussianScene, path: Path) -> None:
+        saved.append(path)
+        if len(saved) == 3:
+            raise error
+        save(scene, path)
+
+    monkeypatch.setattr(GaussianScene, "save", fails_at_the_third)
+    with pytest.raises(WriteError if isinstance(error, OSError) else KeyboardInterrupt):
+        export_classes(SCENE, RESULT, folder)
+    assert contents(folder) == before and list(tmp_path.iterdir()) == [folder]
+
+
+def test_a_move_that_fails_at_the_very_end_brings_the_earlier_folder_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "classes"
+    export_classes(SCENE, only(1), folder)
+    before, rename = contents(folder), Path.rename
+
+    def fails_for_the_new_one(path: Path, target: Path) -> Path:
+        if path.name == "new":
+            raise OSError(5, os.strerror(5))
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", fails_for_the_new_one)
+    with pytest.raises(WriteError, match="classes: cannot be written"):
+        export_classes(SCENE, RESULT, folder)
+    assert contents(folder) == before and list(tmp_path.iterdir()) == [folder]
+
+
+def test_a_folder_with_other_files_is_never_replaced(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("years of work")
+    (tmp_path / "file").write_text("a file")
+    with pytest.raises(WriteError, match=r"mine: holds 'thesis\.tex', which is no earlier export; expected"):
+        export_classes(SCENE, RESULT, tmp_path / "mine")
+    with pytest.raises(WriteError, match="file: is a file; expected"):
+        export_classes(SCENE, RESULT, tmp_path / "file")
+    with pytest.raises(WriteError, match="cannot be written"):
+        export_classes(SCENE, RESULT, tmp_path / "file" / "classes")
+    assert (tmp_path / "mine" / "thesis.tex").read_text() == "years of work"
+    assert (tmp_path / "file").read_text() == "a file"
+
+
+@pytest.mark.parametrize(
+    ("name", "file_name"),
+    [("chair", "7_chair.ply"), ("../../etc/passwd", "7_etc_passwd.ply"), ("a b\n\tc:*?", "7_a_b_c.ply"),
+     ("..", "7_class.ply"), ("", "7_class.ply"), ("椅子", "7_class.ply"), ("x" * 400, f"7_{'x' * 100}.ply")],
+)  # fmt: skip
+def test_names_of_classes_become_safe_names_of_files(name: str, file_name: str) -> None:
+    assert class_file_name(7, name) == file_name
+
+
+def test_pictures_are_an_overlay_per_view_a_contact_sheet_and_a_legend(tmp_path: Path) -> None:
+    paths = write_pictures(SCENE, RESULT, clean_views(2), tmp_path)
+    assert [path.name for path in paths] == [
+        "overlay_view0.png", "overlay_view1.png", "contact_sheet.png", "legend.png",
+    ]  # fmt: skip
+    for path in paths:
+        with Image.open(path) as image:
+            assert image.mode == "RGB"
+            assert np.asarray(image).std() > 5
+    with Image.open(paths[0]) as image:
+        assert image.size == (64, 48)
+
+
+def test_a_report_that_cannot_be_written_leaves_the_earlier_one(tmp_path: Path) -> None:
+    write_json(tmp_path / "report.json", {"a": 1})
+    with pytest.raises(WriteError):
+        write_json(tmp_path / "report.json" / "below.json", {"a": 2})
+    assert json.loads((tmp_path / "report.json").read_text()) == {"a": 1}

@@ -1,0 +1,131 @@
+"""The result: what labels mean, and a file that is whole and belongs to one scene."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_scenes import NAMES, NUM_CLASSES, OUT_OF_SIGHT, balls_on_a_table, clean_views, ring, taught
+
+from gsseg_core import segmentation
+from gsseg_core.errors import StateFileError, StateMismatchError, WriteError
+from gsseg_core.operator import make_operator
+from gsseg_core.refine import RefineSettings
+from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
+from gsseg_core.votes import VoteLearner
+
+SCENE, TRUTH = balls_on_a_table()
+CODES = np.eye(NUM_CLASSES, dtype=np.float32)[TRUTH]
+RAW = RefineSettings(cluster=False, filter=False)
+
+
+def test_labels_are_the_largest_probability_and_minus_one_where_nothing_is_known() -> None:
+    codes = CODES.copy()
+    codes[[3, 500]] = 0
+    result = Segmentation.from_codes(SCENE, codes, NAMES, RAW)
+    expected = TRUTH.copy()
+    expected[[3, 500]] = UNOBSERVED
+    np.testing.assert_array_equal(result.labels, expected)
+    assert result.labels.dtype == np.int32 and UNOBSERVED == -1
+    np.testing.assert_array_equal(result.confidence, expected >= 0)
+    np.testing.assert_array_equal(result.counts(), np.bincount(expected[expected >= 0]))
+    assert not result.clustered.any() and result.num_classes == NUM_CLASSES
+
+
+def test_the_filter_marks_far_gaussians_of_an_object_as_removed_and_keeps_their_probabilities() -> None:
+    codes = CODES.copy()
+    codes[-1] = np.eye(NUM_CLASSES)[1]
+    result = Segmentation.from_codes(SCENE, codes, NAMES, RefineSettings(cluster=False, k=10))
+    assert result.labels[-1] == REMOVED == -2
+    assert result.probabilities[-1, 1] == 1
+    assert result.counts().sum() == (result.labels >= 0).sum() < len(SCENE)
+    assert (result.labels[TRUTH == 0][:-1] >= 0).all()
+
+
+def test_neighbours_fill_in_what_was_unobserved_and_rows_sum_to_one() -> None:
+    codes = CODES.copy()
+    codes[TRUTH == 2] *= np.arange(60)[:, None] % 2
+    result = Segmentation.from_codes(SCENE, codes, NAMES, RefineSettings(k=5, filter=False))
+    np.testing.assert_array_equal(result.clustered, ~codes.any(axis=1))
+    np.testing.assert_allclose(result.probabilities.sum(axis=1), 1, atol=1e-5)
+    assert (result.labels[TRUTH == 2] == 2).mean() > 0.8
+    np.testing.assert_array_equal(result.learnt, codes[result.clustered])
+
+
+def test_nothing_observed_at_all_is_all_unobserved() -> None:
+    result = Segmentation.from_codes(SCENE, np.zeros_like(CODES), NAMES)
+    assert (result.labels == UNOBSERVED).all() and not result.counts().any() and not result.confidence.any()
+    assert result.render_labels(make_operator(SCENE, ring(1)[0])).shape == (48, 64)
+
+
+def test_classes_without_a_name_get_one() -> None:
+    assert Segmentation.from_codes(SCENE, CODES, {1: "cup"}, RAW).class_names == {
+        0: "class_00", 1: "cup", 2: "class_02", 3: "class_03",
+    }  # fmt: skip
+
+
+def test_label_maps_of_true_codes_are_the_true_masks() -> None:
+    result = Segmentation.from_codes(SCENE, CODES, NAMES, RAW)
+    for view in clean_views(2):
+        labels = result.render_labels(make_operator(SCENE, view.camera))
+        assert labels.dtype == np.int32
+        np.testing.assert_array_equal(labels, view.read_labels())
+
+
+def refined() -> Segmentation:
+    learner = taught(VoteLearner(SCENE, NUM_CLASSES), clean_views(3)).fit()
+    return Segmentation.from_codes(SCENE, learner.codes_, NAMES)
+
+
+def test_a_saved_segmentation_comes_back_exactly(tmp_path: Path) -> None:
+    result = refined()
+    assert result.clustered.sum() > OUT_OF_SIGHT
+    result.save(tmp_path / "segmentation.npz")
+    again = Segmentation.load(tmp_path / "segmentation.npz", SCENE)
+    for name in ("labels", "probabilities", "confidence", "clustered", "learnt"):
+        one, two = getattr(result, name), getattr(again, name)
+        assert one.dtype == two.dtype
+        np.testing.assert_array_equal(one, two)
+    assert again.class_names == NAMES and again.scene_digest == SCENE.digest
+    operator = make_operator(SCENE, ring(1)[0])
+    np.testing.assert_array_equal(again.render_labels(operator), result.render_labels(operator))
+
+
+def test_a_segmentation_of_another_scene_is_refused(tmp_path: Path) -> None:
+    refined().save(tmp_path / "segmentation.npz")
+    with pytest.raises(StateMismatchError, match=r"segmentation\.npz: belongs to the scene .* expected"):
+        Segmentation.load(tmp_path / "segmentation.npz", balls_on_a_table(seed=1)[0])
+
+
+def test_a_missing_truncated_or_foreign_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "segmentation.npz"
+    with pytest.raises(StateFileError, match="does not exist"):
+        Segmentation.load(path, SCENE)
+    refined().save(path)
+    content = path.read_bytes()
+    damaged = bytearray(content)
+    damaged[len(content) // 2] ^= 0xFF
+    for broken in (b"", b"text", content[:50], content[: len(content) // 2], content[:-9], bytes(damaged)):
+        path.write_bytes(broken)
+        with pytest.raises(StateFileError, match=r"segmentation\.npz: is not a segmentation\.npz, or is damaged"):
+            Segmentation.load(path, SCENE)
+    np.savez(path, labels=np.zeros(3))
+    with pytest.raises(StateFileError):
+        Segmentation.load(path, SCENE)
+
+
+def test_a_failed_save_leaves_the_earlier_file_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "segmentation.npz"
+    refined().save(path)
+    before = path.read_bytes()
+
+    def disk_full(file: object, **arrays: object) -> None:
+        file.write(b"half of ")  # type: ignore[attr-defined]
+        raise OSError(28, os.strerror(28))
+
+    monkeypatch.setattr(segmentation.np, "savez_compressed", disk_full)
+    with pytest.raises(WriteError, match="No space left"):
+        refined().save(path)
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]

@@ -1,0 +1,117 @@
+"""A learner's state on disk: whole or not at all, and only for its own scene."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, taught
+
+from gsseg_core import views_file
+from gsseg_core.errors import StateFileError, StateMismatchError, WriteError
+from gsseg_core.learner import Learner
+from gsseg_core.votes import VoteLearner
+
+SCENE, TRUTH = balls_on_a_table()
+VIEWS = clean_views(3)
+
+
+def fresh() -> Learner:
+    return VoteLearner(SCENE, NUM_CLASSES)
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    path = tmp_path / "state.npz"
+    taught(fresh(), VIEWS).save(path)
+    return path
+
+
+def assert_refused(learner: Learner, path: Path, error: type[Exception]) -> None:
+    """The learner holds one view before, and the very same after."""
+    before, votes = dict(learner.views), learner._votes.copy()
+    with pytest.raises(error, match=path.name) as caught:
+        learner.restore(path)
+    assert "\n" not in str(caught.value)
+    assert learner.views == before
+    np.testing.assert_array_equal(learner._votes, votes)
+    learner.fit()
+
+
+def test_a_saved_state_comes_back_exactly_and_can_be_added_to_and_taken_from(saved: Path) -> None:
+    original, restored = taught(fresh(), VIEWS), taught(fresh(), clean_views(2, "other", 0.5))
+    restored.restore(saved)
+    assert list(restored.views) == list(original.views)
+    for name, view in restored.views.items():
+        np.testing.assert_array_equal(view.read_labels(), original.views[name].read_labels())
+        np.testing.assert_array_equal(view.camera.world_to_camera, original.views[name].camera.world_to_camera)
+        np.testing.assert_array_equal(view.camera.K, original.views[name].camera.K)
+    np.testing.assert_array_equal(restored.fit().codes_, original.fit().codes_)
+    for learner in (original, restored):
+        learner.retract(VIEWS[1].name)
+    np.testing.assert_array_equal(restored._votes, original._votes)
+    for view in (VIEWS[0], VIEWS[2]):
+        restored.retract(view.name)
+    assert not restored._votes.any()
+
+
+def test_a_learner_without_views_can_be_saved_and_restored(tmp_path: Path) -> None:
+    fresh().save(tmp_path / "empty.npz")
+    learner = taught(fresh(), VIEWS[:1])
+    learner.restore(tmp_path / "empty.npz")
+    assert not learner.views and not learner._votes.any()
+
+
+def test_a_state_of_another_scene_or_of_other_classes_is_refused(saved: Path) -> None:
+    other = balls_on_a_table(seed=1)[0]
+    assert_refused(taught(VoteLearner(other, NUM_CLASSES), VIEWS[:1]), saved, StateMismatchError)
+    assert_refused(taught(VoteLearner(SCENE, NUM_CLASSES + 1), VIEWS[:1]), saved, StateMismatchError)
+
+
+def test_a_missing_empty_truncated_or_foreign_file_is_refused_and_changes_nothing(saved: Path, tmp_path: Path) -> None:
+    learner, content = taught(fresh(), VIEWS[:1]), saved.read_bytes()
+    assert_refused(learner, tmp_path / "missing.npz", StateFileError)
+    assert_refused(learner, tmp_path, StateFileError)
+    path = tmp_path / "broken.npz"
+    for broken in (b"", b"no archive", content[:40], content[: len(content) // 2], content[:-10], content[100:]):
+        path.write_bytes(broken)
+        assert_refused(learner, path, StateFileError)
+    np.savez(path, labels=np.zeros(3))
+    assert_refused(learner, path, StateFileError)
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    assert_refused(learner, tmp_path / "array.npy", StateFileError)
+
+
+def test_flipped_bytes_anywhere_are_refused_or_do_no_harm(saved: Path) -> None:
+    learner, content = taught(fresh(), VIEWS[:1]), saved.read_bytes()
+    reference = taught(fresh(), VIEWS)._votes
+    for place in np.linspace(0, len(content) - 1, 150).astype(int):
+        broken = bytearray(content)
+        broken[place] ^= 0xFF
+        saved.write_bytes(broken)
+        before = learner._votes
+        try:
+            learner.restore(saved)
+        except (StateFileError, StateMismatchError):
+            assert learner._votes is before
+        else:
+            np.testing.assert_array_equal(learner._votes, reference)
+
+
+def test_a_failed_save_leaves_the_earlier_state_whole(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before, learner = saved.read_bytes(), taught(fresh(), VIEWS[:1])
+
+    def disk_full(file: object, **arrays: object) -> None:
+        file.write(b"half of ")  # type: ignore[attr-defined]
+        raise OSError(28, os.strerror(28))
+
+    monkeypatch.setattr(views_file.np, "savez_compressed", disk_full)
+    with pytest.raises(WriteError, match=r"state\.npz: cannot be written \(No space left"):
+        learner.save(saved)
+    assert saved.read_bytes() == before and list(saved.parent.iterdir()) == [saved]
+    monkeypatch.undo()
+    with pytest.raises(WriteError):
+        learner.save(saved / "below" / "a_file.npz")
+    fresh().restore(saved)
