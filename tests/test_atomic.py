@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import resource
@@ -14,13 +15,15 @@ from gsseg_core.atomic import write_atomically
 from gsseg_core.errors import GssegError, SettingsError, WriteError
 
 
-@pytest.fixture
+@contextlib.contextmanager
 def small_files_only() -> Iterator[None]:
-    """Make the system itself refuse to write more than 4 kB into any file, as a full disk does."""
+    """No file may grow beyond 4 kB, as on a full disk. Around one write only: the log of a test run is a file, too."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
-    yield
-    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def test_a_new_file_appears_with_its_folders_and_ordinary_permissions(tmp_path: Path) -> None:
@@ -56,12 +59,10 @@ def test_an_interrupted_write_leaves_the_earlier_file_whole_and_nothing_else(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_full_disk_is_one_clear_error_and_leaves_the_earlier_file_whole(
-    tmp_path: Path, small_files_only: None
-) -> None:
+def test_a_full_disk_is_one_clear_error_and_leaves_the_earlier_file_whole(tmp_path: Path) -> None:
     path = tmp_path / "scene.ply"
     path.write_text("earlier")
-    with pytest.raises(WriteError) as caught, write_atomically(path) as temporary:
+    with pytest.raises(WriteError) as caught, small_files_only(), write_atomically(path) as temporary:
         temporary.write_bytes(bytes(100_000))
     why = os.strerror(errno.EFBIG)
     assert str(caught.value) == f"{path}: cannot be written ({why}); what was there before is unchanged"
