@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import struct
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from gsseg_core.atomic import write_atomically
-from gsseg_core.errors import GssegError, StateFileError, StateMismatchError
+from gsseg_core.errors import StateFileError
+from gsseg_core.npz_files import open_npz
 from gsseg_core.operator import ViewOperator
 from gsseg_core.refine import RefineSettings, cluster, statistical_filter
 from gsseg_core.scene import GaussianScene
@@ -24,12 +22,6 @@ UNOBSERVED, REMOVED = -1, -2
 """Labels of Gaussians that no view spoke for, and of those that the filter took out."""
 
 FORMAT = "gsseg-segmentation-1"
-
-# What NumPy, zipfile and zlib raise on damaged bytes; RuntimeError where a flipped bit says "encrypted".
-_DAMAGED = (
-    OSError, KeyError, IndexError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
-    struct.error, zipfile.BadZipFile, zlib.error,
-)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,27 +164,11 @@ class Segmentation:
             It belongs to another scene.
         """
         path = Path(path)
-        try:
-            # Opened here, since np.load leaves a file open that it cannot read.
-            with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
-                header = json.loads(str(file["header"]))
-                if header["format"] != FORMAT:
-                    raise StateFileError(f"{path}: format is {header['format']!r}; expected {FORMAT!r}")
-                if header["scene"] != scene.digest:
-                    raise StateMismatchError(
-                        f"{path}: belongs to the scene {header['scene'][:12]}; expected {scene.digest[:12]}, "
-                        f"that of {scene.path or 'the scene in use'}"
-                    )
-                names = {int(k): str(name) for k, name in header["class_names"].items()}
-                arrays = (file[name] for name in ("labels", "probabilities", "clustered", "learnt"))
-                labels, probabilities, clustered, learnt = arrays
-                result = cls(labels, probabilities, names, header["scene"], clustered, learnt)
-        except GssegError:
-            raise
-        except FileNotFoundError as error:
-            raise StateFileError(f"{path}: does not exist; expected a segmentation.npz") from error
-        except _DAMAGED as error:
-            raise StateFileError(f"{path}: is not a segmentation.npz, or is damaged ({error})") from error
+        with open_npz(path, "a segmentation.npz", FORMAT, scene.digest) as (file, header):
+            names = {int(k): str(name) for k, name in header["class_names"].items()}
+            arrays = (file[name] for name in ("labels", "probabilities", "clustered", "learnt"))
+            labels, probabilities, clustered, learnt = arrays
+        result = cls(labels, probabilities, names, scene.digest, clustered, learnt)
         if result.labels.shape != (len(scene),) or result.probabilities.shape != (len(scene), len(names)):
             raise StateFileError(f"{path}: arrays of shape {result.probabilities.shape}; expected ({len(scene)}, K)")
         return result

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import struct
-import zipfile
-import zlib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -15,15 +12,10 @@ import numpy as np
 from gsseg_core.atomic import write_atomically
 from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
-from gsseg_core.errors import GssegError, StateFileError, StateMismatchError
+from gsseg_core.errors import StateMismatchError
+from gsseg_core.npz_files import open_npz
 
 FORMAT = "gsseg-views-1"
-
-# What NumPy, zipfile and zlib raise on damaged bytes; RuntimeError where a flipped bit says "encrypted".
-_DAMAGED = (
-    OSError, KeyError, IndexError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
-    struct.error, zipfile.BadZipFile, zlib.error,
-)  # fmt: skip
 
 
 def save_views(
@@ -56,30 +48,16 @@ def load_views(
 ) -> tuple[list[View], np.ndarray]:
     """Read what `save_views` wrote for the same scene and number of classes: views in memory, and votes (N, K)."""
     path = Path(path)
-    try:
-        # Opened here, since np.load leaves a file open that it cannot read.
-        with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
-            header = json.loads(str(file["header"]))
-            if header["format"] != FORMAT:
-                raise StateFileError(f"{path}: format is {header['format']!r}; expected {FORMAT!r}")
-            if header["scene"] != digest:
-                raise StateMismatchError(
-                    f"{path}: belongs to the scene {header['scene'][:12]}; expected {digest[:12]}, the scene in use"
-                )
-            if tuple(header["shape"]) != tuple(shape):
-                raise StateMismatchError(
-                    f"{path}: holds {header['shape'][0]} Gaussians and {header['shape'][1]} classes; "
-                    f"expected {shape[0]} and {shape[1]}"
-                )
-            votes = np.zeros(shape, np.int64)
-            votes[file["seen"]] = file["votes"]
-            return [_read_view(file, i, entry) for i, entry in enumerate(header["views"])], votes
-    except GssegError:
-        raise
-    except FileNotFoundError as error:
-        raise StateFileError(f"{path}: does not exist; expected a saved state") from error
-    except _DAMAGED as error:
-        raise StateFileError(f"{path}: is not a saved state, or is damaged ({error})") from error
+    with open_npz(path, "a saved state", FORMAT, digest) as (file, header):
+        if tuple(header["shape"]) != tuple(shape):
+            raise StateMismatchError(
+                f"{path}: holds {header['shape'][0]} Gaussians and {header['shape'][1]} classes; "
+                f"expected {shape[0]} and {shape[1]}"
+            )
+        votes = np.zeros(shape, np.int64)
+        votes[file["seen"]] = file["votes"]
+        views = [_read_view(file, i, entry) for i, entry in enumerate(header["views"])]
+    return views, votes
 
 
 def _read_view(file: np.lib.npyio.NpzFile, i: int, entry: dict[str, object]) -> View:

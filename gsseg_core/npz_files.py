@@ -1,0 +1,66 @@
+"""Reading what belongs to one scene from an npz: anything wrong with the file is one clear error."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsseg_core.errors import GssegError, StateFileError, StateMismatchError
+
+# What NumPy, zipfile and zlib raise on damaged bytes; RuntimeError where a flipped bit says "encrypted".
+_DAMAGED = (
+    OSError, KeyError, IndexError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
+    struct.error, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+
+
+@contextmanager
+def open_npz(path: Path, what: str, file_format: str, digest: str) -> Iterator[tuple[np.lib.npyio.NpzFile, Any]]:
+    """Open an npz with a JSON header, of a given format and scene.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        The file.
+    what : str
+        What it should be, for messages: "a saved state".
+    file_format, digest : str
+        What the header must say under "format" and "scene".
+
+    Yields
+    ------
+    NpzFile, dict
+        The arrays and the header. Whatever goes wrong with them in the body counts as damage to the file.
+
+    Raises
+    ------
+    StateFileError
+        The file is missing, damaged, or of another format.
+    StateMismatchError
+        It belongs to another scene.
+    """
+    try:
+        # Opened here, since np.load leaves a file open that it cannot read.
+        with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
+            header = json.loads(str(file["header"]))
+            if header["format"] != file_format:
+                raise StateFileError(f"{path}: format is {header['format']!r}; expected {file_format!r}")
+            if header["scene"] != digest:
+                raise StateMismatchError(
+                    f"{path}: belongs to the scene {header['scene'][:12]}; expected {digest[:12]}, the scene in use"
+                )
+            yield file, header
+    except GssegError:
+        raise
+    except FileNotFoundError as error:
+        raise StateFileError(f"{path}: does not exist; expected {what}") from error
+    except _DAMAGED as error:
+        raise StateFileError(f"{path}: is not {what}, or is damaged ({error})") from error
