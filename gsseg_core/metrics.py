@@ -6,6 +6,7 @@ class that is a speck in one view and fills another is weighed by what was seen 
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -80,7 +81,7 @@ class Evaluation:
         for code, count in zip(codes.tolist(), counts.tolist(), strict=True):
             self._pairs[divmod(code, size)] += count
 
-        width = max(1, round(BOUNDARY_SHARE * float(np.hypot(*truth.shape))))
+        width = max(1, round(BOUNDARY_SHARE * float(math.hypot(*truth.shape))))
         near_truth, near_prediction = known & boundary_band(truth, width), answered & boundary_band(prediction, width)
         self._area = _grow(self._area, size) + _count(truth, prediction, known, answered, size)
         self._band = _grow(self._band, size) + _count(truth, prediction, near_truth, near_prediction, size)

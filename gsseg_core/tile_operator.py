@@ -58,7 +58,7 @@ class TileOperator(ViewOperator):
     def _weights(self, pixel: tuple[int, int] | None) -> Weights:
         """List W, or only the row of W of one pixel."""
         tiles, camera = self._tiles, self.camera
-        wanted = np.arange(tiles.columns * tiles.rows)
+        wanted: np.ndarray = np.arange(tiles.columns * tiles.rows)
         if pixel is not None:
             wanted = np.array([pixel[0] // TILE * tiles.columns + pixel[1] // TILE])
         image = (tiles.columns, camera.width, camera.height, self._table, tiles.start, tiles.entries, wanted)
@@ -70,7 +70,7 @@ class TileOperator(ViewOperator):
         weights = np.empty(start[-1], np.float32)
         products.list_weights(*image, start, pixels, rows, weights)
         # Entries of a tile are sorted by depth; a stable sort by pixel keeps that order within each.
-        order = np.argsort(pixels, kind="stable")
+        order: np.ndarray = np.argsort(pixels, kind="stable")
         if pixel is not None:
             order = order[pixels[order] == pixel[0] * camera.width + pixel[1]]
         return Weights(pixels[order], self.ids[rows[order]], weights[order])
