@@ -21,7 +21,7 @@ results: $(READY)  ## measure again what docs/results.md shows
 	$(BIN)/python benchmarks/results.py
 
 clean:  ## remove the environment, the caches and the demo's output
-	rm -rf $(VENV) build demo_out gsseg.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) build demo_out results_out gsseg.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find gsseg_core tests -name __pycache__ -prune -exec rm -rf {} +
 
 # setuptools first, so that the build uses the pinned one too.

@@ -111,7 +111,7 @@ def _add_scene(command: argparse.ArgumentParser) -> None:
 
 
 def _segment(options: argparse.Namespace) -> int:
-    # Compiled kernels load with the pipeline; `gsseg --help` must not wait for them.
+    # The rasteriser's kernels load with the pipeline; `gsseg --help` need not wait for them.
     from gsseg_core import pipeline
 
     if options.ids != "global":

@@ -81,7 +81,7 @@ class GradientLearner(Learner):
     def fit(self, progress: Progress = silent) -> GradientLearner:
         """Run all epochs."""
         settings = self.settings
-        self._vote_codes()
+        self._begin()
         codes = torch.zeros((len(self.scene), self.num_classes), requires_grad=True)
         optimiser = torch.optim.Adam([codes], lr=settings.rate)
         steps = settings.epochs * len(self.views)

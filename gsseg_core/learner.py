@@ -190,13 +190,16 @@ class Learner(ABC):
         for name in self.views if names is None else names:
             yield name, self._observation(name)
 
-    def _vote_codes(self) -> np.ndarray:
-        """Votes as probabilities, (N, K) float32; sets `observed_`."""
+    def _begin(self) -> None:
+        """Set `observed_`; without a view there is nothing to learn from."""
         if not self.views:
             reasons = ", ".join(f"{count} {why}" for why, count in self.reject_summary().items()) or "none was given"
             raise NoUsableViewsError(f"no view to learn from ({reasons}); expected posed views with label images")
-        total = self._votes.sum(axis=1)
-        self.observed_ = total > 0
+        self.observed_ = self._votes.sum(axis=1) > 0
+
+    def _vote_codes(self) -> np.ndarray:
+        """Votes as probabilities, (N, K) float32; sets `observed_`."""
+        self._begin()
         return normalise(self._votes.astype(np.float32) * np.float32(VOTE_UNIT))
 
 
