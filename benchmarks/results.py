@@ -31,7 +31,8 @@ from gsseg_core.metrics import Evaluation, evaluate_folders
 from gsseg_core.operator import make_operator
 from gsseg_core.pictures import contact_sheet, overlay, palette, save_png
 from gsseg_core.pipeline import make_learner
-from gsseg_core.refine import RefineSettings, cluster, statistical_filter
+from gsseg_core.refine import cluster, statistical_filter
+from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
@@ -115,7 +116,7 @@ def score(result: Segmentation, scene: GaussianScene, truth: Iterable[View]) -> 
     """Score rendered label maps against the true labels of views."""
     evaluation = Evaluation()
     for view in truth:
-        evaluation.add(view.read_labels(), result.render_labels(make_operator(scene, view.camera)), view.name)
+        evaluation.add(view.read_labels(), result.render(make_operator(scene, view.camera)).labels, view.name)
     return evaluation
 
 

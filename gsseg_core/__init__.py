@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from gsseg_core.gradient import GradientLearner, GradientSettings
     from gsseg_core.metrics import Evaluation
     from gsseg_core.operator import ViewOperator, make_operator
-    from gsseg_core.refine import RefineSettings
+    from gsseg_core.refine_settings import RefineSettings
     from gsseg_core.scene import GaussianScene
     from gsseg_core.segmentation import Segmentation
     from gsseg_core.votes import VoteLearner
@@ -38,7 +38,7 @@ _HOMES = {
     "GradientLearner": "gradient",
     "GradientSettings": "gradient",
     "GssegError": "errors",
-    "RefineSettings": "refine",
+    "RefineSettings": "refine_settings",
     "Segmentation": "segmentation",
     "View": "dataset",
     "ViewOperator": "operator",

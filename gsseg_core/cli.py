@@ -14,7 +14,7 @@ from tqdm import tqdm
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.export import write_json
 from gsseg_core.learner import Progress, silent
-from gsseg_core.refine import RefineSettings
+from gsseg_core.refine_settings import RefineSettings
 
 _INTERRUPTED = 130
 

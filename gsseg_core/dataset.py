@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,14 +17,14 @@ from gsseg_core.camera_files import read_cameras
 from gsseg_core.cameras import Camera
 from gsseg_core.errors import MaskFormatError, MaskSizeError, SettingsError, SplitFileError, UnknownLabelError
 from gsseg_core.json_files import read_json
-from gsseg_core.masks import BACKGROUND_NAME, UNKNOWN, mask_bits, read_classes, read_mask
+from gsseg_core.masks import BACKGROUND_NAME, MAX_LABEL, UNKNOWN, PackedLabels, mask_bits, read_classes, read_mask
 
 _IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera and what was seen from it. Labels are read when asked for and never kept.
+    """A camera and what was seen from it. Labels of a file are read when asked for; those in memory are compressed.
 
     Attributes
     ----------
@@ -41,7 +42,7 @@ class View:
     mask_path: Path | None = None
     image_path: Path | None = None
     class_names: Mapping[int, str] | None = field(default=None, repr=False)
-    _labels: npt.NDArray[np.int32] | None = field(default=None, repr=False)  # (H, W)
+    _labels: PackedLabels | None = field(default=None, repr=False)
 
     @classmethod
     def from_arrays(
@@ -62,9 +63,9 @@ class View:
             raise MaskFormatError(
                 f"view '{camera.name}': labels are {array.dtype} of shape {array.shape}; expected integers (H, W)"
             )
-        view = cls(camera, class_names=class_names, _labels=array.astype(np.int32))
-        view.read_labels()
-        return view
+        view = cls(camera, class_names=class_names)
+        view._check(array, f"view '{camera.name}'")
+        return replace(view, _labels=PackedLabels(array))
 
     @property
     def name(self) -> str:
@@ -80,8 +81,13 @@ class View:
     def mask_bits(self) -> int | None:
         """Bits per label of the mask, 8 or 16 (in memory: as many as its labels need); None without a mask."""
         if self._labels is not None:
-            return 8 if self._labels.max() < 255 else 16
+            return 8 if self._labels.largest < 255 else 16
         return None if self.mask_path is None else mask_bits(self.mask_path)
+
+    @property
+    def largest_label(self) -> int:
+        """The largest label of the mask, `UNKNOWN` (-1) if it says nothing at all."""
+        return int(self.read_labels().max()) if self._labels is None else self._labels.largest
 
     def read_labels(self) -> npt.NDArray[np.int32]:
         """Read the labels (H, W) int32, `UNKNOWN` (-1) where the mask says nothing.
@@ -97,11 +103,15 @@ class View:
         """
         source = str(self.mask_path or f"view '{self.name}'")
         if self._labels is not None:
-            labels = self._labels.copy()
+            labels = self._labels.unpack()
         elif self.mask_path is not None:
             labels = read_mask(self.mask_path).labels
         else:
             raise MaskFormatError(f"{source}: has no mask; expected a label image {self.name}.png")
+        self._check(labels, source)
+        return labels
+
+    def _check(self, labels: npt.NDArray[np.integer[Any]], source: str) -> None:
         size, expected = labels.shape[::-1], (self.camera.width, self.camera.height)
         if size != expected:
             raise MaskSizeError(
@@ -109,13 +119,12 @@ class View:
                 f"camera '{self.name}' (masks are never resized)"
             )
         self._check_ids(labels, source)
-        return labels
 
-    def _check_ids(self, labels: npt.NDArray[np.int32], source: str) -> None:
+    def _check_ids(self, labels: npt.NDArray[np.integer[Any]], source: str) -> None:
         ids = np.unique(labels)
         if self.class_names is None:
-            unknown = ids[ids < UNKNOWN].tolist()
-            expected = f"0 or more, or {UNKNOWN} for unknown"
+            unknown = ids[(ids < UNKNOWN) | (ids > MAX_LABEL)].tolist()
+            expected = f"0 to {MAX_LABEL}, or {UNKNOWN} for unknown"
         else:
             unknown = [i for i in ids.tolist() if i != UNKNOWN and i not in self.class_names]
             expected = f"ids from {min(self.class_names)} to {max(self.class_names)} that classes.json names"
@@ -203,6 +212,21 @@ class Dataset:
         if count > 1:
             raise SplitFileError(f"{path}: stem {stem!r} occurs {count} times; expected each stem once, in one split")
         return split
+
+
+def spread(views: Sequence[View], count: int | None) -> list[View]:
+    """Choose some views, spread evenly over all of them; all if there are no more, or `count` is None.
+
+    Raises
+    ------
+    SettingsError
+        None is asked for.
+    """
+    if count is None or count >= len(views):
+        return list(views)
+    if count < 1:
+        raise SettingsError(f"views is {count}; expected at least 1")
+    return [views[i] for i in np.linspace(0, len(views) - 1, count).round().astype(int)]
 
 
 def _files_by_stem(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:

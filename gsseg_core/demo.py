@@ -11,6 +11,7 @@ from gsseg_core import pipeline
 from gsseg_core.demo_scene import DemoScene, build_demo
 from gsseg_core.learner import Progress, silent
 from gsseg_core.metrics import evaluate_folders
+from gsseg_core.report import Stopwatch
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.tables import percent, seconds_table, table
@@ -25,7 +26,7 @@ def run_demo(out: str | os.PathLike[str], *, seed: int = 0, progress: Progress =
         Tables for the terminal.
     """
     out = Path(out)
-    watch = pipeline.Stopwatch()
+    watch = Stopwatch()
     with watch.stage("build the scene"):
         demo = build_demo(out / "scene", seed)
     report = pipeline.segment(demo.root / "scene.ply", demo.root, out / "segmented", seed=seed, progress=progress)

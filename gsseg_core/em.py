@@ -30,13 +30,15 @@ cost does not depend on the number of classes.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from gsseg_core.em_kernels import collect, mix
+from gsseg_core.em_kernels import collect, mix, tally
 from gsseg_core.errors import SettingsError
 from gsseg_core.learner import VOTE_UNIT, Learner, Progress, normalise, silent
 from gsseg_core.operator import Observation
@@ -174,36 +176,40 @@ class EMLearner(Learner):
         self.settings = settings or EMSettings()
         self.error_models_: dict[str, ErrorModel] = {}
 
+    @property
+    def loss(self) -> float:
+        """-J per labelled pixel, in nats."""
+        return -self.history_[-1] if self.history_ else float("nan")
+
     def fit(self, progress: Progress = silent) -> EMLearner:
         """Step until a step gains less than the tolerance."""
         settings = self.settings
-        prior = settings.prior_weight * self._smooth(self._vote_codes())
+        self._begin()
+        prior = settings.prior_weight * self._smooth(self.vote_codes())
         # Votes are the first step; with the prior counted in, the objective is finite from the start.
         codes = normalise(self._votes.astype(np.float32) * np.float32(VOTE_UNIT) + prior)
         models, pixels = {}, 0
         for name, observation in self._observations():
+            progress("em", 0, settings.max_steps)
             models[name] = self._first_model(codes, observation)
             pixels += observation.num_pixels
-        history: list[float] = []
+        self.history_ = history = []
         for done in range(settings.max_steps):
-            progress("em", done, settings.max_steps)
-            better, objective = self._step(codes, prior, models, adapt=settings.errors)
+            codes, objective = self._step(codes, prior, models, partial(progress, "em", done, settings.max_steps))
             history.append(objective / pixels)
-            codes = better
-            if done and history[-1] - history[-2] < settings.tolerance:
+            self.converged_ = bool(done and history[-1] - history[-2] < settings.tolerance)
+            if self.converged_:
                 break
         progress("em", settings.max_steps, settings.max_steps)
         codes[~self.observed_] = 0.0
-        self.codes_, self.error_models_, self.history_ = codes, models, history
+        self.codes_, self.error_models_ = codes, models
         return self
 
     def _first_model(self, codes: np.ndarray, observation: Observation) -> ErrorModel:
         settings, classes = self.settings, observation.classes
         if not settings.errors:
             return ErrorModel.trusting(classes, self.num_classes, settings.outliers)
-        votes = observation.votes()
-        nothing = np.zeros((len(classes), self.num_classes), np.float32)
-        counts = collect(codes, observation.ids, nothing, votes, np.zeros_like(codes))
+        counts = tally(codes, observation.ids, observation.votes())
         return ErrorModel.from_counts(classes, counts, settings.error_prior, settings.outliers)
 
     def _step(
@@ -211,20 +217,21 @@ class EMLearner(Learner):
         codes: np.ndarray,  # (N, K)
         prior: np.ndarray,  # (N, K) px
         models: dict[str, ErrorModel],
-        adapt: bool,
+        tell: Callable[[], None],
     ) -> tuple[np.ndarray, float]:
         """One step over all views: better codes, better models in place, and J of what came in."""
         told = prior > 0
         objective = float((prior[told] * np.log(codes[told])).sum(dtype=np.float64))
         gains = np.zeros_like(codes)
         for name, observation in self._observations():
+            tell()  # after each view, so that whoever listens can stop the work at once
             model = models[name]
             objective += model.log_prior
             likelihood = np.ascontiguousarray(model.likelihood.T)
             shares = observation.shares(mix(codes, observation.ids, likelihood), likelihood[:, 0])
             objective += shares.log_likelihood
             counts = collect(codes, observation.ids, likelihood, shares.gaussians, gains)
-            if adapt:
+            if self.settings.errors:
                 counts[0] += shares.rest
                 model.maximise(counts * (1 - model.outliers) * model.confusion)
         gains *= codes

@@ -9,7 +9,7 @@ BLOCKS = 16
 """Counts are summed in this many parts, then together, so that they do not depend on the number of threads."""
 
 
-@nb.njit(parallel=True, cache=True, fastmath={"contract", "reassoc"})
+@nb.njit(parallel=True, nogil=True, cache=True, fastmath={"contract", "reassoc"})
 def mix(
     codes: np.ndarray,  # (N, K) float32
     ids: np.ndarray,  # (M,) int32
@@ -27,7 +27,7 @@ def mix(
     return out
 
 
-@nb.njit(parallel=True, cache=True, fastmath={"contract"})
+@nb.njit(parallel=True, nogil=True, cache=True, fastmath={"contract"})
 def collect(
     codes: np.ndarray,  # (N, K) float32
     ids: np.ndarray,  # (M,) int32, distinct
@@ -50,6 +50,28 @@ def collect(
                 if share > 0:
                     for k in range(classes):
                         gain[k] += share * likelihood[y, k]
+                        part[y, k] += share * code[k]
+    counts: np.ndarray = parts.sum(axis=0).T
+    return counts
+
+
+@nb.njit(parallel=True, nogil=True, cache=True, fastmath={"contract"})
+def tally(
+    codes: np.ndarray,  # (N, K) float32
+    ids: np.ndarray,  # (M,) int32
+    shares: np.ndarray,  # (M, L) float32
+) -> np.ndarray:
+    """Return codes[ids].T @ shares, (K, L) float64: how much of each class lies under each label."""
+    many, classes = shares.shape[1], codes.shape[1]
+    parts = np.zeros((BLOCKS, many, classes))
+    for block in nb.prange(BLOCKS):
+        part = parts[block]
+        for m in range(ids.shape[0] * block // BLOCKS, ids.shape[0] * (block + 1) // BLOCKS):
+            code = codes[ids[m]]
+            for y in range(many):
+                share = shares[m, y]
+                if share > 0:
+                    for k in range(classes):
                         part[y, k] += share * code[k]
     counts: np.ndarray = parts.sum(axis=0).T
     return counts

@@ -76,3 +76,7 @@ class StateMismatchError(GssegError):
 
 class SettingsError(GssegError):
     """A setting has an impossible value."""
+
+
+class NoCodesError(GssegError):
+    """Nothing has been learnt or fused yet that could be shown or saved."""

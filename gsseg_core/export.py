@@ -7,9 +7,9 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -91,6 +91,35 @@ def background_image(scene: GaussianScene, operator: ViewOperator) -> np.ndarray
     return pixels
 
 
+class Drawn(NamedTuple):
+    """A view of a segmentation, for people.
+
+    Attributes
+    ----------
+    view : View
+        Where from.
+    labels : (H, W) int32
+        Class of each pixel.
+    overlay : (H, W, 3) uint8
+        The scene, tinted by class.
+    """
+
+    view: View
+    labels: np.ndarray
+    overlay: np.ndarray
+
+
+def draw_views(
+    scene: GaussianScene, segmentation: Segmentation, views: Iterable[View], *, device: str = "cpu"
+) -> Iterator[Drawn]:
+    """Draw the labels of some views, and the scene under them."""
+    colors = palette(segmentation.num_classes)
+    for view in views:
+        operator = make_operator(scene, view.camera, device)
+        labels = segmentation.render(operator).labels
+        yield Drawn(view, labels, overlay(background_image(scene, operator), labels, colors))
+
+
 def write_pictures(
     scene: GaussianScene,
     segmentation: Segmentation,
@@ -107,22 +136,28 @@ def write_pictures(
         `overlay_<stem>.png` ..., `contact_sheet.png`, `legend.png`.
     """
     folder = Path(folder)
-    colors = palette(segmentation.num_classes)
     images, captions, paths = [], [], []
-    for view in views:
-        operator = make_operator(scene, view.camera, device)
-        labels = segmentation.render_labels(operator)
-        images.append(overlay(background_image(scene, operator), labels, colors))
+    for view, _, image in draw_views(scene, segmentation, views, device=device):
+        images.append(image)
         captions.append(view.name)
         paths.append(folder / f"overlay_{view.name}.png")
-        save_png(paths[-1], images[-1])
-    if images:
-        columns = min(4, len(images))
-        paths.append(folder / "contact_sheet.png")
-        save_png(paths[-1], contact_sheet(images, captions, columns))
-    paths.append(folder / "legend.png")
-    save_png(paths[-1], legend(segmentation.class_names, colors, segmentation.counts()))
+        save_png(paths[-1], image)
+    paths += write_overview(segmentation, images, captions, folder)
     # Overlays of views that an earlier run drew would show another segmentation.
     for stale in set(folder.glob("overlay_*.png")) - set(paths):
         stale.unlink(missing_ok=True)
+    return paths
+
+
+def write_overview(
+    segmentation: Segmentation, images: Sequence[np.ndarray], captions: Sequence[str], folder: Path
+) -> list[Path]:
+    """Write `contact_sheet.png` of some pictures, if there are any, and `legend.png`."""
+    paths = []
+    if images:
+        paths.append(folder / "contact_sheet.png")
+        save_png(paths[-1], contact_sheet(images, captions, min(4, len(images))))
+    paths.append(folder / "legend.png")
+    colors = palette(segmentation.num_classes)
+    save_png(paths[-1], legend(segmentation.class_names, colors, segmentation.counts()))
     return paths

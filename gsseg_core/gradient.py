@@ -78,6 +78,11 @@ class GradientLearner(Learner):
         super().__init__(scene, num_classes, device=device, memory_budget=memory_budget)
         self.settings = settings or GradientSettings()
 
+    @property
+    def loss(self) -> float:
+        """Cross-entropy summed over the classes (K times CES), in nats per labelled pixel; mean of the last epoch."""
+        return self.history_[-1] * self.num_classes if self.history_ else float("nan")
+
     def fit(self, progress: Progress = silent) -> GradientLearner:
         """Run all epochs."""
         settings = self.settings
@@ -89,7 +94,7 @@ class GradientLearner(Learner):
         schedule = torch.optim.lr_scheduler.ExponentialLR(optimiser, decay)
         rng = np.random.default_rng(settings.seed)
         names = list(self.views)
-        history: list[float] = []
+        self.history_ = history = []
         for epoch in range(settings.epochs):
             losses = []
             order = [names[i] for i in rng.permutation(len(names))]
@@ -105,7 +110,7 @@ class GradientLearner(Learner):
         progress("gradient", steps, steps)
         learnt: np.ndarray = torch.softmax(codes, dim=1).detach().numpy()
         learnt[~self.observed_] = 0.0
-        self.codes_, self.history_ = learnt, history
+        self.codes_ = learnt
         return self
 
 

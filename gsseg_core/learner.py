@@ -11,10 +11,10 @@ from typing import TypeVar
 import numpy as np
 
 from gsseg_core.dataset import View
-from gsseg_core.errors import NoUsableViewsError, SettingsError, UnknownLabelError
+from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
 from gsseg_core.operator import Observation, make_operator
 from gsseg_core.scene import GaussianScene
-from gsseg_core.views_file import load_views, save_views
+from gsseg_core.state_file import State
 
 VOTE_UNIT = 2.0**-24
 """Votes are counted in whole multiples of this many px, so that adding and taking back are exact."""
@@ -56,11 +56,14 @@ class Learner(ABC):
     observed_ : (N,) bool
         After `fit`: whether any labelled pixel saw the Gaussian.
     history_ : list of float
-        After `fit`: the objective after each step, for learners that have one.
+        The objective after each step of `fit`, for learners that have one.
+    converged_ : bool
+        After `fit`: whether another step would have changed little.
     """
 
     codes_: np.ndarray
     observed_: np.ndarray
+    converged_: bool = False
 
     def __init__(
         self, scene: GaussianScene, num_classes: int, *, device: str = "cpu", memory_budget: int = 1 << 30
@@ -114,6 +117,22 @@ class Learner(ABC):
         del self.views[name]
         self._prepared.pop(name, None)
 
+    def forget(self, name: str) -> None:
+        """Drop a view and its mask; its votes stay. `fit` learns from the views that are left."""
+        del self.views[name]
+        self._prepared.pop(name, None)
+
+    def grow(self, num_classes: int) -> None:
+        """Have at least this many classes."""
+        if num_classes > self.num_classes:
+            self._votes = np.pad(self._votes, ((0, 0), (0, num_classes - self.num_classes)))
+            self.num_classes = num_classes
+
+    @property
+    def loss(self) -> float:
+        """What `fit` minimises, as of its last step, in nats per labelled pixel; NaN where there is no such thing."""
+        return float("nan")
+
     @abstractmethod
     def fit(self: Self, progress: Progress = silent) -> Self:
         """Learn `codes_` from the views observed so far.
@@ -132,7 +151,11 @@ class Learner(ABC):
         WriteError
             The file cannot be written; an earlier one is unchanged.
         """
-        save_views(path, self.scene.digest, self.views.values(), self._votes)
+        self.state().save(path, self.scene.digest)
+
+    def state(self) -> State:
+        """Return a copy of votes and views, to be saved."""
+        return State(self._votes.copy(), list(self.views.values()), len(self.views))
 
     def restore(self, path: str | os.PathLike[str]) -> None:
         """Replace the views by those of a saved state; on any error nothing changes.
@@ -144,10 +167,21 @@ class Learner(ABC):
         StateMismatchError
             It was saved for another scene or another number of classes.
         """
-        views, votes = load_views(path, self.scene.digest, self._votes.shape)
-        self.views, self._votes = {view.name: view for view in views}, votes
+        state = State.load(path, self.scene.digest, len(self.scene))
+        if state.votes.shape[1] != self.num_classes:
+            raise StateMismatchError(f"{path}: holds {state.votes.shape[1]} classes; expected {self.num_classes}")
+        self.adopt(state)
+
+    def adopt(self, state: State) -> None:
+        """Replace views, votes and number of classes by those of a state of the same scene."""
+        self.views, self._votes = {view.name: view for view in state.views}, state.votes
+        self.num_classes = state.votes.shape[1]
         self.rejected.clear()
         self._prepared.clear()
+
+    def vote_codes(self) -> np.ndarray:
+        """Votes as probabilities, (N, K) float32; a row of zeros where no labelled pixel saw the Gaussian."""
+        return normalise(self._votes.astype(np.float32) * np.float32(VOTE_UNIT))
 
     def reject_summary(self) -> dict[str, int]:
         """Count the rejected views by reason."""
@@ -196,11 +230,6 @@ class Learner(ABC):
             reasons = ", ".join(f"{count} {why}" for why, count in self.reject_summary().items()) or "none was given"
             raise NoUsableViewsError(f"no view to learn from ({reasons}); expected posed views with label images")
         self.observed_ = self._votes.sum(axis=1) > 0
-
-    def _vote_codes(self) -> np.ndarray:
-        """Votes as probabilities, (N, K) float32; sets `observed_`."""
-        self._begin()
-        return normalise(self._votes.astype(np.float32) * np.float32(VOTE_UNIT))
 
 
 def normalise(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import struct
+import zlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,6 +22,8 @@ from gsseg_core.errors import ClassesFileError, MaskFormatError, SettingsError
 from gsseg_core.json_files import read_json
 
 UNKNOWN = -1
+MAX_LABEL = 65534
+"""The largest label that a 16-bit mask can hold."""
 BACKGROUND_NAME = "background"
 
 _PNG_KINDS = {0: "gray", 2: "RGB", 3: "palette", 4: "gray + alpha", 6: "RGBA"}
@@ -100,6 +103,33 @@ def write_mask(
     values = np.where(labels == UNKNOWN, unknown, labels).astype(np.uint8 if bits == 8 else np.uint16)
     with write_atomically(path) as temporary:
         Image.fromarray(values).save(temporary, format="PNG")
+
+
+class PackedLabels:
+    """A label image in memory, compressed: it takes a few bytes per outline and next to none per area.
+
+    Parameters
+    ----------
+    labels : (H, W) of int
+        From `UNKNOWN` to `MAX_LABEL`.
+
+    Attributes
+    ----------
+    largest : int
+        The largest label.
+    nbytes : int
+        Memory that it takes.
+    """
+
+    def __init__(self, labels: npt.NDArray[np.integer[Any]]) -> None:
+        self.largest = int(labels.max()) if labels.size else UNKNOWN
+        self._shape, self._dtype = labels.shape, np.min_scalar_type(-self.largest - 2)
+        self._data = zlib.compress(labels.astype(self._dtype).tobytes(), level=1)
+        self.nbytes = len(self._data)
+
+    def unpack(self) -> npt.NDArray[np.int32]:
+        """Return the labels, (H, W) int32, in memory of their own."""
+        return np.frombuffer(zlib.decompress(self._data), self._dtype).reshape(self._shape).astype(np.int32)
 
 
 def read_classes(path: str | os.PathLike[str]) -> dict[int, str]:

@@ -30,6 +30,21 @@ class Weights(NamedTuple):
     weights: np.ndarray
 
 
+class Blended(NamedTuple):
+    """A view of the scene.
+
+    Attributes
+    ----------
+    image : (H, W, K) float32
+        Codes, blended: W q.
+    transmittance : (H, W) float32
+        What is left of each ray after the last Gaussian, in [0, 1].
+    """
+
+    image: np.ndarray
+    transmittance: np.ndarray
+
+
 class Shares(NamedTuple):
     """What the labelled pixels of a view say of the Gaussians that made them.
 
@@ -143,10 +158,23 @@ class ViewOperator(ABC):
         SceneValueError
             There is not one row of codes per Gaussian.
         """
+        return self.blend(codes).image
+
+    def blend(
+        self,
+        codes: np.ndarray,  # (N, K)
+    ) -> Blended:
+        """Render codes, and return what is left of each ray, in one pass.
+
+        Raises
+        ------
+        SceneValueError
+            There is not one row of codes per Gaussian.
+        """
         codes = np.asarray(codes)
         if codes.ndim != 2 or len(codes) != self.num_gaussians:
             raise SceneValueError(f"codes have shape {codes.shape}; expected ({self.num_gaussians}, K)")
-        return self._render(codes)
+        return self._blend(codes)
 
     def adjoint(
         self,
@@ -190,9 +218,9 @@ class ViewOperator(ABC):
         """Sum of each Gaussian's weights over the image: W^T 1, (N,) float32, in px."""
         return self.adjoint(np.ones((self.camera.height, self.camera.width, 1), np.float32))[:, 0]
 
-    @abstractmethod
     def transmittance(self) -> np.ndarray:
         """Return what is left of each ray after the last Gaussian, (H, W) float32 in [0, 1]."""
+        return self._blend(np.empty((self.num_gaussians, 0), np.float32)).transmittance
 
     def weights(self, row: int | None = None, column: int | None = None) -> Weights:
         """List W, or only the row of W of one pixel: which Gaussians made it, and how much.
@@ -218,7 +246,7 @@ class ViewOperator(ABC):
         return self._weights((row, column))
 
     @abstractmethod
-    def _render(self, codes: np.ndarray) -> np.ndarray: ...
+    def _blend(self, codes: np.ndarray) -> Blended: ...
 
     @abstractmethod
     def _adjoint(self, residual: np.ndarray) -> np.ndarray: ...

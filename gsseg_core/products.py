@@ -30,7 +30,7 @@ def _scratch(entries: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarr
     )
 
 
-@nb.njit(parallel=True, cache=True)
+@nb.njit(parallel=True, nogil=True, cache=True)
 def render(
     columns: int,
     table: np.ndarray,  # (M, 9)
@@ -65,7 +65,7 @@ def render(
                     out[top + r, left + c, k] = block[r, k, c]
 
 
-@nb.njit(parallel=True, cache=True, fastmath=_FAST)
+@nb.njit(parallel=True, nogil=True, cache=True, fastmath=_FAST)
 def adjoint_entries(
     columns: int,
     table: np.ndarray,  # (M, 9)
@@ -99,7 +99,7 @@ def adjoint_entries(
             n = ends[e]
 
 
-@nb.njit(parallel=True, cache=True)
+@nb.njit(parallel=True, nogil=True, cache=True)
 def reduce_entries(
     gaussian_start: np.ndarray,  # (M + 1,)
     gaussian_entries: np.ndarray,  # (E,)
@@ -115,7 +115,7 @@ def reduce_entries(
                 out[g, k] += sums[e, k]
 
 
-@nb.njit(cache=True)
+@nb.njit(nogil=True, cache=True)
 def tile_labels(
     labels: np.ndarray,  # (H, W) int32, negative = unknown
     columns: int,
@@ -156,7 +156,7 @@ def tile_labels(
     return start, present[:n].copy(), slots
 
 
-@nb.njit(parallel=True, cache=True, fastmath=_FAST, error_model="numpy")
+@nb.njit(parallel=True, nogil=True, cache=True, fastmath=_FAST, error_model="numpy")
 def labelled(
     columns: int,
     width: int,
@@ -290,7 +290,7 @@ def _sum_labels(
         n = ends[e]
 
 
-@nb.njit(parallel=True, cache=True)
+@nb.njit(parallel=True, nogil=True, cache=True)
 def reduce_labelled(
     start: np.ndarray,  # (T + 1,)
     gaussian_start: np.ndarray,  # (M + 1,)
@@ -314,7 +314,7 @@ def reduce_labelled(
                 out[g, present[label_start[tile] + j]] += sums[base + j]
 
 
-@nb.njit(parallel=True, cache=True)
+@nb.njit(parallel=True, nogil=True, cache=True)
 def list_weights(
     columns: int,
     width: int,

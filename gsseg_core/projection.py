@@ -92,7 +92,7 @@ def _break_ties(
     return ids
 
 
-@nb.njit(parallel=True, cache=True, error_model="numpy")
+@nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def _project(
     means: np.ndarray,  # (N, 3)
     quats: np.ndarray,  # (N, 4) w, x, y, z

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,13 +16,29 @@ from gsseg_core.atomic import write_atomically
 from gsseg_core.errors import StateFileError
 from gsseg_core.npz_files import open_npz
 from gsseg_core.operator import ViewOperator
-from gsseg_core.refine import RefineSettings, cluster, statistical_filter
+from gsseg_core.refine import cluster, statistical_filter
+from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.scene import GaussianScene
 
 UNOBSERVED, REMOVED = -1, -2
 """Labels of Gaussians that no view spoke for, and of those that the filter took out."""
 
 FORMAT = "gsseg-segmentation-1"
+
+
+class LabelMap(NamedTuple):
+    """A view of a segmentation.
+
+    Attributes
+    ----------
+    labels : (H, W) int32
+        Class of each pixel.
+    confidence : (H, W) float32
+        Its blended probability, at most 1.
+    """
+
+    labels: np.ndarray
+    confidence: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +90,18 @@ class Segmentation:
             Either step can be switched off there.
         """
         settings = settings or RefineSettings()
+        result = cls.unfiltered(scene, codes, class_names, settings)
+        return result.filtered(scene, settings) if settings.filter else result
+
+    @classmethod
+    def unfiltered(
+        cls,
+        scene: GaussianScene,
+        codes: np.ndarray,  # (N, K)
+        class_names: Mapping[int, str],
+        settings: RefineSettings,
+    ) -> Segmentation:
+        """Label learnt codes, after KNN clustering unless that is switched off, and leave the filter to the caller."""
         names = {k: class_names.get(k, f"class_{k:02d}") for k in range(codes.shape[1])}
         probabilities, clustered = codes, np.zeros(len(codes), bool)
         observed: np.ndarray = codes.max(axis=1) > 0
@@ -81,8 +110,7 @@ class Segmentation:
             probabilities, clustered = refined.probabilities, refined.changed
         known = probabilities.any(axis=1)
         labels = np.where(known, probabilities.argmax(axis=1), UNOBSERVED).astype(np.int32)
-        result = cls(labels, probabilities, names, scene.digest, clustered, codes[clustered])
-        return result.filtered(scene, settings) if settings.filter else result
+        return cls(labels, probabilities, names, scene.digest, clustered, codes[clustered])
 
     def filtered(self, scene: GaussianScene, settings: RefineSettings) -> Segmentation:
         """Take the outliers out of each object: the paper's statistical filter."""
@@ -90,6 +118,11 @@ class Segmentation:
             scene.means, self.labels, settings.k, settings.filter_sigmas, self.probabilities.shape[1]
         )
         return replace(self, labels=np.where(removed, np.int32(REMOVED), self.labels))
+
+    def selected(self, classes: Collection[int], min_confidence: float = 0.0) -> Segmentation:
+        """Keep the labels of some classes, and there only of Gaussians at least so sure; the others are removed."""
+        kept = np.isin(self.labels, list(classes)) & (self.confidence >= min_confidence)
+        return replace(self, labels=np.where(kept | (self.labels < 0), self.labels, np.int32(REMOVED)))
 
     @property
     def num_classes(self) -> int:
@@ -107,19 +140,18 @@ class Segmentation:
         counts: np.ndarray = np.bincount(self.labels[self.labels >= 0], minlength=self.num_classes)
         return counts
 
-    def render_labels(self, operator: ViewOperator) -> np.ndarray:
-        """Label map of a view: the class of the largest blended probability in each pixel, (H, W) int32.
+    def render(self, operator: ViewOperator) -> LabelMap:
+        """Label map of a view: the class of the largest blended probability in each pixel.
 
         Here refinement has no say. A Gaussian across an edge is rightly a mixture: neighbours decide to which object it
         goes, but the picture is sharper with what it learnt itself. One that the filter took out of its object still
         covers what is behind it. What a ray has left over is background, if any mask ever showed the background; else
         nothing.
         """
-        image = operator.render(self._blended)
+        image, left_over = operator.blend(self._blended)
         if self._shows_background:
-            image[..., 0] += operator.transmittance()
-        labels: np.ndarray = image.argmax(axis=2).astype(np.int32)
-        return labels
+            image[..., 0] += left_over
+        return LabelMap(image.argmax(axis=2).astype(np.int32), image.max(axis=2))
 
     @cached_property
     def _blended(self) -> np.ndarray:

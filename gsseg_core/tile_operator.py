@@ -7,7 +7,7 @@ import numpy as np
 from gsseg_core import products
 from gsseg_core.cameras import Camera
 from gsseg_core.errors import SceneValueError
-from gsseg_core.operator import Observation, Shares, ViewOperator, Weights
+from gsseg_core.operator import Blended, Observation, Shares, ViewOperator, Weights
 from gsseg_core.projection import project
 from gsseg_core.scene import GaussianScene
 from gsseg_core.tiles import TILE, assign
@@ -29,19 +29,13 @@ class TileOperator(ViewOperator):
         self._table = projected.table
         self._tiles = assign(projected, camera.width, camera.height)
 
-    def _render(self, codes: np.ndarray) -> np.ndarray:
-        return self._blend(codes[self.ids].astype(np.float32, order="C"))[0]
-
-    def transmittance(self) -> np.ndarray:
-        """Return what is left of each ray after the last Gaussian, (H, W) float32 in [0, 1]."""
-        return self._blend(np.empty((len(self.ids), 0), np.float32))[1]
-
-    def _blend(self, codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _blend(self, codes: np.ndarray) -> Blended:
+        codes = codes[self.ids].astype(np.float32, order="C")
         image = np.empty((self.camera.height, self.camera.width, codes.shape[1]), np.float32)
         left_over = np.empty(image.shape[:2], np.float32)
         tiles = self._tiles
         products.render(tiles.columns, self._table, tiles.start, tiles.entries, codes, image, left_over)
-        return image, left_over
+        return Blended(image, left_over)
 
     def _adjoint(self, residual: np.ndarray) -> np.ndarray:
         tiles = self._tiles

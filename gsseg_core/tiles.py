@@ -80,7 +80,7 @@ def _touched(
     return int(max(first, 0.0)), int(min(max(last, 0.0), columns))
 
 
-@nb.njit(parallel=True, cache=True, error_model="numpy")
+@nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def _count(table: np.ndarray, columns: int, rows: int, counts: np.ndarray) -> None:
     for row in nb.prange(rows):
         for g in range(table.shape[0]):
@@ -89,7 +89,7 @@ def _count(table: np.ndarray, columns: int, rows: int, counts: np.ndarray) -> No
                 counts[row * columns + column] += 1
 
 
-@nb.njit(parallel=True, cache=True, error_model="numpy")
+@nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def _fill(table: np.ndarray, columns: int, rows: int, start: np.ndarray, entries: np.ndarray) -> None:
     for row in nb.prange(rows):
         cursor = start[row * columns : (row + 1) * columns].copy()
@@ -100,7 +100,7 @@ def _fill(table: np.ndarray, columns: int, rows: int, start: np.ndarray, entries
                 cursor[column] += 1
 
 
-@nb.njit(cache=True)
+@nb.njit(nogil=True, cache=True)
 def _transpose(entries: np.ndarray, start: np.ndarray, by_gaussian: np.ndarray) -> None:
     for g in entries:
         start[g + 1] += 1

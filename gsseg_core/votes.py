@@ -13,5 +13,6 @@ class VoteLearner(Learner):
 
     def fit(self, progress: Progress = silent) -> VoteLearner:
         """Normalise the votes."""
-        self.codes_ = self._vote_codes()
+        self._begin()
+        self.codes_, self.converged_ = self.vote_codes(), True
         return self

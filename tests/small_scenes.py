@@ -109,7 +109,7 @@ def mean_iou(learner: Learner) -> float:
     scene, evaluation = learner.scene, Evaluation()
     result = Segmentation.from_codes(scene, learner.codes_, NAMES)
     for view in clean_views(4, "test", 0.3):
-        evaluation.add(view.read_labels(), result.render_labels(make_operator(scene, view.camera)))
+        evaluation.add(view.read_labels(), result.render(make_operator(scene, view.camera)).labels)
     return evaluation.mean_iou
 
 

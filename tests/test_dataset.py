@@ -63,7 +63,7 @@ def test_labels_in_memory_are_checked_at_once() -> None:
         View.from_arrays(camera(), LABELS.T)
     with pytest.raises(UnknownLabelError, match="view 'a': mask holds the labels 2, 3; expected ids from 0 to 1 that"):
         View.from_arrays(camera(), LABELS, {0: "background", 1: "chair"})
-    with pytest.raises(UnknownLabelError, match="mask holds the labels -5; expected 0 or more, or -1 for unknown"):
+    with pytest.raises(UnknownLabelError, match="mask holds the labels -5; expected 0 to 65534, or -1 for unknown"):
         View.from_arrays(camera(), np.full((HEIGHT, WIDTH), -5))
     with pytest.raises(UnknownLabelError):
         View.from_arrays(camera(), np.full((HEIGHT, WIDTH), 2**31 + 7))

@@ -13,7 +13,7 @@ from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views
 
 from gsseg_core.errors import WriteError
 from gsseg_core.export import class_file_name, export_classes, write_json, write_pictures
-from gsseg_core.refine import RefineSettings
+from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 

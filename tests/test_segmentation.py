@@ -12,7 +12,7 @@ from small_scenes import NAMES, NUM_CLASSES, OUT_OF_SIGHT, balls_on_a_table, cle
 from gsseg_core import segmentation
 from gsseg_core.errors import StateFileError, StateMismatchError, WriteError
 from gsseg_core.operator import make_operator
-from gsseg_core.refine import RefineSettings
+from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 from gsseg_core.votes import VoteLearner
 
@@ -57,7 +57,7 @@ def test_neighbours_fill_in_what_was_unobserved_and_rows_sum_to_one() -> None:
 def test_nothing_observed_at_all_is_all_unobserved() -> None:
     result = Segmentation.from_codes(SCENE, np.zeros_like(CODES), NAMES)
     assert (result.labels == UNOBSERVED).all() and not result.counts().any() and not result.confidence.any()
-    assert result.render_labels(make_operator(SCENE, ring(1)[0])).shape == (48, 64)
+    assert result.render(make_operator(SCENE, ring(1)[0])).labels.shape == (48, 64)
 
 
 def test_classes_without_a_name_get_one() -> None:
@@ -69,7 +69,7 @@ def test_classes_without_a_name_get_one() -> None:
 def test_label_maps_of_true_codes_are_the_true_masks() -> None:
     result = Segmentation.from_codes(SCENE, CODES, NAMES, RAW)
     for view in clean_views(2):
-        labels = result.render_labels(make_operator(SCENE, view.camera))
+        labels = result.render(make_operator(SCENE, view.camera)).labels
         assert labels.dtype == np.int32
         np.testing.assert_array_equal(labels, view.read_labels())
 
@@ -90,7 +90,7 @@ def test_a_saved_segmentation_comes_back_exactly(tmp_path: Path) -> None:
         np.testing.assert_array_equal(one, two)
     assert again.class_names == NAMES and again.scene_digest == SCENE.digest
     operator = make_operator(SCENE, ring(1)[0])
-    np.testing.assert_array_equal(again.render_labels(operator), result.render_labels(operator))
+    np.testing.assert_array_equal(again.render(operator).labels, result.render(operator).labels)
 
 
 def test_a_segmentation_of_another_scene_is_refused(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, taught
 
-from gsseg_core import views_file
+from gsseg_core import state_file
 from gsseg_core.errors import StateFileError, StateMismatchError, WriteError
 from gsseg_core.learner import Learner
 from gsseg_core.votes import VoteLearner
@@ -107,7 +107,7 @@ def test_a_failed_save_leaves_the_earlier_state_whole(saved: Path, monkeypatch: 
         file.write(b"half of ")  # type: ignore[attr-defined]
         raise OSError(28, os.strerror(28))
 
-    monkeypatch.setattr(views_file.np, "savez_compressed", disk_full)
+    monkeypatch.setattr(state_file.np, "savez_compressed", disk_full)
     with pytest.raises(WriteError, match=r"state\.npz: cannot be written \(No space left"):
         learner.save(saved)
     assert saved.read_bytes() == before and list(saved.parent.iterdir()) == [saved]

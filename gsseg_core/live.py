@@ -1,0 +1,370 @@
+"""What a robot keeps of one scene while it drives: votes of every view, the last views, and the best codes."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsseg_core.dataset import Dataset, View, spread
+from gsseg_core.errors import (
+    GssegError,
+    IntrinsicsError,
+    MaskFormatError,
+    MaskSizeError,
+    NoCodesError,
+    PoseError,
+    SettingsError,
+    StateFileError,
+    UnknownLabelError,
+)
+from gsseg_core.masks import BACKGROUND_NAME
+from gsseg_core.pipeline import make_learner
+from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.report import Stopwatch
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segmentation import Segmentation
+from gsseg_core.state_file import Learnt, State
+from gsseg_core.votes import VoteLearner
+
+VOTES_LIMIT = 2 << 30
+"""Bytes of votes up to which classes without declared names are added as their labels turn up."""
+
+LIVE = "votes"
+"""Name of the learner that fuses views as they arrive."""
+
+_REASONS: dict[type[GssegError], str] = {
+    MaskFormatError: "mask_format",
+    MaskSizeError: "size_mismatch",
+    UnknownLabelError: "unknown_label",
+    PoseError: "bad_pose",
+    IntrinsicsError: "bad_camera_info",
+}
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """Why a view could not be used.
+
+    Attributes
+    ----------
+    reason : str
+        A short name, to count by.
+    message : str
+        What was found and what was expected.
+    """
+
+    reason: str
+    message: str
+
+    @classmethod
+    def of(cls, error: GssegError) -> Rejection:
+        """Sort an error by its cause."""
+        return cls(_REASONS.get(type(error), "unusable"), str(error))
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What `LiveSession.learn` did.
+
+    Attributes
+    ----------
+    learnt : Learnt
+        The codes, in force from now on.
+    num_steps : int
+        Steps that were done; 0 for a learner that has none.
+    converged : bool
+        Whether it stopped because another step would have changed little.
+    loss : float
+        What the learner minimises, per labelled pixel, in nats, at the end; NaN where it has no such thing.
+    rejected : dict of str to str
+        Names of views that could not be used, and why.
+    """
+
+    learnt: Learnt
+    num_steps: int
+    converged: bool
+    loss: float
+    rejected: dict[str, str]
+
+
+class LiveSession:
+    """Fuses views as they arrive, learns better codes when asked, and segments at any time.
+
+    Safe to use from several threads: `fuse`, `segmentation` and the rest answer while `learn` runs.
+
+    Which codes count: after `learn`, its codes hold for every Gaussian that its views saw; all others go by the votes,
+    which grow with every view. Without `learn`, all go by the votes.
+
+    Parameters
+    ----------
+    scene : GaussianScene
+        N Gaussians.
+    class_names : mapping from id to name, optional
+        If given, there are no other classes. If not, classes are added as their labels turn up.
+    max_views : int
+        The last so many views are kept for `learn`; votes are never dropped.
+    device : str
+        Where views are rendered.
+
+    Attributes
+    ----------
+    rejected : Counter of str
+        Views that could not be used, by reason.
+    num_fused : int
+        Views in the votes.
+    """
+
+    num_fused: int
+    _learnt: Learnt | None
+    _kept: tuple[object, Segmentation] | None
+
+    def __init__(
+        self,
+        scene: GaussianScene,
+        class_names: Mapping[int, str] | None = None,
+        *,
+        max_views: int = 200,
+        device: str = "cpu",
+    ) -> None:
+        if max_views < 1:
+            raise SettingsError(f"max_views is {max_views}; expected at least 1")
+        self.scene, self.max_views, self.device = scene, max_views, device
+        self.rejected: Counter[str] = Counter()
+        self._declared = bool(class_names)
+        self._names = {0: BACKGROUND_NAME, **(class_names or {})}
+        self._lock = threading.RLock()
+        self._version = 0
+        self._forget()
+
+    @property
+    def class_names(self) -> dict[int, str]:
+        """Names by id, of every class; one without a name is called like "class_07"."""
+        with self._lock:
+            return {k: self._names.get(k, f"class_{k:02d}") for k in range(self._live.num_classes)}
+
+    @property
+    def num_views(self) -> int:
+        """Views that are kept for `learn`."""
+        return len(self._live.views)
+
+    @property
+    def learnt(self) -> Learnt | None:
+        """What the last `learn` came to."""
+        return self._learnt
+
+    @property
+    def has_codes(self) -> bool:
+        """Whether anything is known of the scene."""
+        return self._learnt is not None or self.num_fused > 0
+
+    def fuse(self, view: View) -> Rejection | None:
+        """Add a view to the votes, and keep it for `learn`.
+
+        Returns
+        -------
+        Rejection or None
+            Why it cannot be used; then nothing has changed but the count of rejected views.
+        """
+        with self._lock:
+            try:
+                self._make_room(view)
+                if not self._live.observe(view):
+                    why = self._live.rejected.pop(view.name)
+                    return self.reject(Rejection(why.replace(" ", "_"), f"view '{view.name}': {why}"))
+            except GssegError as error:
+                return self.reject(Rejection.of(error))
+            self.num_fused += 1
+            self._version += 1
+            self._drop_old_views()
+        return None
+
+    def reject(self, rejection: Rejection) -> Rejection:
+        """Count a view that could not be used."""
+        with self._lock:
+            self.rejected[rejection.reason] += 1
+        return rejection
+
+    def learn(
+        self,
+        learner: str = "em",
+        dataset: Dataset | None = None,
+        *,
+        num_views: int | None = None,
+        max_steps: int | None = None,
+        report: Callable[[str, int, int, float], None] = lambda stage, done, total, loss: None,
+        watch: Stopwatch | None = None,
+    ) -> Outcome:
+        """Learn the best codes from the views kept, or from the train views of a dataset.
+
+        Whatever `report` raises ends the work, and then, as after any error, nothing has changed.
+
+        Parameters
+        ----------
+        learner : str
+            One of `gsseg_core.pipeline.LEARNERS`.
+        dataset : Dataset, optional
+            Learn from this in place of the views kept.
+        num_views : int, optional
+            Use this many views, spread evenly.
+        max_steps : int, optional
+            Stop after this many steps.
+        report : callable
+            Called after every view with stage, done, total, and the loss (nats per labelled pixel; NaN at first).
+        watch : Stopwatch, optional
+            Gets the seconds of each stage.
+
+        Raises
+        ------
+        NoUsableViewsError
+            There is no view to learn from.
+        GssegError
+            A file of the dataset is broken.
+        """
+        watch = watch or Stopwatch()
+        with self._lock:
+            views, num_classes = list(self._live.views.values()), self._live.num_classes
+        if dataset is not None:
+            views = dataset.views("train")
+            if not self._declared:
+                num_classes = max(num_classes, dataset.num_classes)
+        teacher = make_learner(learner, self.scene, num_classes, max_steps=max_steps, device=self.device)
+        views = spread(views, num_views)
+
+        def progress(stage: str, done: int, total: int) -> None:
+            report(stage, done, total, teacher.loss)
+
+        with watch.stage("observe"):
+            for done, view in enumerate(views):
+                progress("observe", done, len(views))
+                teacher.observe(view)
+        with watch.stage("learn"):
+            teacher.fit(progress)
+        learnt = Learnt(learner, teacher.codes_, len(teacher.views))
+        outcome = Outcome(learnt, len(teacher.history_), teacher.converged_, teacher.loss, dict(teacher.rejected))
+        with self._lock:
+            if dataset is not None and not self._declared:
+                self._names.update(dataset.class_names)
+            self._live.grow(num_classes)
+            self._learnt = outcome.learnt
+            self._version += 1
+        return outcome
+
+    def codes(self) -> np.ndarray:
+        """Class probabilities of every Gaussian as they are now, (N, K) float32; a row of zeros where nothing is known.
+
+        Raises
+        ------
+        NoCodesError
+            Nothing has been fused or learnt yet.
+        """
+        with self._lock:
+            if not self.has_codes:
+                raise NoCodesError("no view has been fused and nothing learnt; expected at least one posed mask")
+            codes, learnt = self._live.vote_codes(), self._learnt
+        if learnt is not None:
+            known = learnt.codes.any(axis=1)
+            codes[known] = 0.0
+            codes[known, : learnt.codes.shape[1]] = learnt.codes[known]
+        return codes
+
+    def segmentation(self, settings: RefineSettings | None = None, watch: Stopwatch | None = None) -> Segmentation:
+        """Refine the codes as they are now and label every Gaussian; kept until codes or settings change.
+
+        Raises
+        ------
+        NoCodesError
+            Nothing has been fused or learnt yet.
+        """
+        settings, watch = settings or RefineSettings(), watch or Stopwatch()
+        with self._lock:
+            key, kept, names = (self._version, settings), self._kept, self.class_names
+        if kept is not None and kept[0] == key:
+            return kept[1]
+        with watch.stage("codes"):
+            codes = self.codes()
+        with watch.stage("knn"):
+            result = Segmentation.unfiltered(self.scene, codes, names, settings)
+        if settings.filter:
+            with watch.stage("filter"):
+                result = result.filtered(self.scene, settings)
+        self._kept = (key, result)
+        return result
+
+    def save(self, path: str | os.PathLike[str]) -> int:
+        """Save votes, views and codes, atomically; return the number of views in the votes or the codes.
+
+        Raises
+        ------
+        NoCodesError
+            There is nothing to save.
+        WriteError
+            The file cannot be written; an earlier one is unchanged.
+        """
+        with self._lock:
+            if not self.has_codes:
+                raise NoCodesError(f"{path}: nothing to save; expected at least one view to be fused first")
+            state = self._live.state()
+            names, fused, learnt = self.class_names, self.num_fused, self._learnt
+        State(state.votes, state.views, fused, names, learnt).save(path, self.scene.digest)
+        return learnt.num_views if learnt is not None else fused
+
+    def load(self, path: str | os.PathLike[str]) -> int:
+        """Replace all that is known by a saved state; return the number of views in its votes or codes.
+
+        Raises
+        ------
+        StateFileError
+            The file is missing or damaged, or has more classes than there are names for. Nothing has changed.
+        StateMismatchError
+            It belongs to another scene. Nothing has changed.
+        """
+        state = State.load(path, self.scene.digest, len(self.scene))
+        width = max(state.votes.shape[1], 0 if state.learnt is None else state.learnt.codes.shape[1])
+        if self._declared and width > len(self._names):
+            raise StateFileError(f"{path}: holds {width} classes; expected at most {len(self._names)}, as were named")
+        with self._lock:
+            if not self._declared:
+                self._names = {0: BACKGROUND_NAME, **state.class_names}
+            self._forget()
+            self._live.adopt(state)
+            self._live.grow(max(width, len(self._names) if self._declared else 1))
+            self.num_fused, self._learnt = state.num_fused, state.learnt
+            self._drop_old_views()
+        return state.learnt.num_views if state.learnt is not None else state.num_fused
+
+    def reset(self) -> int:
+        """Forget votes, views and codes; return how many views were forgotten."""
+        with self._lock:
+            dropped = self.num_fused
+            self.rejected.clear()
+            self._forget()
+        return dropped
+
+    def _forget(self) -> None:
+        num_classes = max(self._names) + 1 if self._declared else 1
+        # Views are rendered again by `learn`; to keep them prepared would take far more memory than their masks.
+        self._live = VoteLearner(self.scene, num_classes, device=self.device, memory_budget=0)
+        self._learnt, self._kept = None, None
+        self.num_fused = 0
+        self._version += 1
+
+    def _make_room(self, view: View) -> None:
+        if self._declared:
+            return
+        needed = view.largest_label + 1
+        if needed > self._live.num_classes and needed * len(self.scene) * 8 > VOTES_LIMIT:
+            raise UnknownLabelError(
+                f"view '{view.name}': mask holds the label {needed - 1}; expected at most "
+                f"{VOTES_LIMIT // (8 * len(self.scene)) - 1} for a scene of {len(self.scene)} Gaussians, or "
+                "class_names that declare it"
+            )
+        self._live.grow(needed)
+
+    def _drop_old_views(self) -> None:
+        while len(self._live.views) > self.max_views:
+            self._live.forget(next(iter(self._live.views)))

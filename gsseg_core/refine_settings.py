@@ -1,0 +1,48 @@
+"""Settings of the refinement, apart from its kernels: who only reads options need not load them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gsseg_core.errors import SettingsError
+
+MAX_K = 1 << 20
+"""Most neighbours: sums over more would overflow."""
+
+
+@dataclass(frozen=True)
+class RefineSettings:
+    """How to refine; the defaults are the paper's.
+
+    Attributes
+    ----------
+    k : int
+        Neighbours looked at by both steps, a number of Gaussians from 1 to 2^20.
+    beta : float
+        A Gaussian whose largest probability is below this one (0 to 1) takes the mean code of its neighbours.
+    filter_sigmas : float
+        A Gaussian is removed where its mean neighbour distance is more than this many standard deviations, 0 or more,
+        above the mean of its class.
+    cluster, filter : bool
+        Whether to take each of the two steps.
+
+    Raises
+    ------
+    SettingsError
+        A value outside its range.
+    """
+
+    k: int = 50
+    beta: float = 0.65
+    filter_sigmas: float = 1.0
+    cluster: bool = True
+    filter: bool = True
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        if self.k != int(self.k) or not 1 <= self.k <= MAX_K:
+            raise SettingsError(f"refinement: found k = {self.k}; expected a whole number from 1 to {MAX_K}")
+        if not 0 <= self.beta <= 1:
+            raise SettingsError(f"refinement: found beta = {self.beta}; expected a probability from 0 to 1")
+        if not 0 <= self.filter_sigmas < float("inf"):
+            raise SettingsError(f"refinement: found filter_sigmas = {self.filter_sigmas}; expected 0 or more, finite")
