@@ -1,0 +1,37 @@
+"""Compiles the kernels, or loads them from the cache, before the first view needs them."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from gsseg_core.cameras import Camera
+from gsseg_core.dataset import View
+from gsseg_core.em import EMLearner, EMSettings
+from gsseg_core.operator import make_operator
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segmentation import Segmentation
+
+
+def warm_up(device: str = "cpu") -> float:
+    """Take a few Gaussians through everything that a session does; return the seconds that it took.
+
+    About a second when the kernels are in the cache, and up to a minute at the first time after an installation.
+    """
+    started = time.perf_counter()
+    means = np.stack([np.arange(16) % 4 - 1.5, np.arange(16) // 4 - 1.5, np.full(16, 4.0)], axis=1)
+    ones = np.ones(16)
+    scene = GaussianScene.from_arrays(
+        means, np.tile([1.0, 0, 0, 0], (16, 1)), np.full((16, 3), 0.4), 0.9 * ones, np.zeros((16, 1, 3))
+    )
+    K = np.array([[16.0, 0, 16], [0, 16, 16], [0, 0, 1]])
+    camera = Camera("warm_up", 32, 32, K, np.eye(4))
+    labels = np.repeat(np.arange(2), 16)[None].repeat(32, axis=0)
+    learner = EMLearner(scene, 2, EMSettings(max_steps=2), device=device)
+    learner.observe(View.from_arrays(camera, labels))
+    result = Segmentation.from_codes(scene, learner.fit().codes_, {0: "left", 1: "right"})
+    operator = make_operator(scene, camera, device)
+    result.render(operator)
+    operator.render(scene.colors(camera.center))
+    return time.perf_counter() - started

@@ -1,0 +1,362 @@
+"""All conversion between ROS messages and the values of `gsseg_core`; nothing else reads or fills in a message.
+
+Numbers of a message are set as `array.array`, which rclpy takes over as a whole; anything else it checks and copies
+element by element, which takes seconds for a large cloud.
+"""
+
+from __future__ import annotations
+
+import array
+import math
+import re
+import unicodedata
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, Pose, Quaternion, Transform
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
+from std_msgs.msg import Header
+
+from gsseg_core.cameras import Camera
+from gsseg_core.errors import IntrinsicsError, MaskFormatError, PoseError, SceneValueError
+from gsseg_core.masks import UNKNOWN
+from gsseg_ros.frames import Similarity, quaternion_from_rotation, rigid, rotation_from_quaternion
+
+_NS = 1_000_000_000
+_LARGEST_LABEL = 2**16 - 2  # As in files, see `gsseg_core.masks.read_classes`.
+_UNIT_TOLERANCE = 1e-3
+_LONGEST_TOKEN = 64  # The full name of a topic must stay below 256 characters.
+
+# Type of a pixel, and its value for "unknown".
+_MASK_ENCODINGS: dict[str, tuple[npt.DTypeLike, int]] = {
+    "mono8": (np.uint8, 2**8 - 1),
+    "8UC1": (np.uint8, 2**8 - 1),
+    "mono16": (np.uint16, 2**16 - 1),
+    "16UC1": (np.uint16, 2**16 - 1),
+    "32SC1": (np.int32, UNKNOWN),
+}
+
+# Field, its type in the message, its type here. RViz and PCL want 0x00RRGGBB in the bits of a float.
+_CLOUD_FIELDS = (
+    ("x", PointField.FLOAT32, "f4"),
+    ("y", PointField.FLOAT32, "f4"),
+    ("z", PointField.FLOAT32, "f4"),
+    ("rgb", PointField.FLOAT32, "u4"),
+    ("label", PointField.UINT32, "u4"),
+    ("confidence", PointField.FLOAT32, "f4"),
+)
+_CLOUD_POINT = np.dtype([(name, "<" + kind) for name, _, kind in _CLOUD_FIELDS])
+
+
+class CloudArrays(NamedTuple):
+    """What a cloud of this node holds."""
+
+    points: npt.NDArray[np.float32]  # (M, 3) metres
+    rgb: npt.NDArray[np.uint8]  # (M, 3)
+    labels: npt.NDArray[np.int32]  # (M,) class ids
+    confidence: npt.NDArray[np.float32]  # (M,) 0 to 1
+
+
+def stamp_ns(stamp: Time) -> int:
+    """Nanoseconds of a stamp."""
+    return int(stamp.sec) * _NS + int(stamp.nanosec)
+
+
+def stamp_message(ns: int) -> Time:
+    """Stamp of so many nanoseconds."""
+    seconds, rest = divmod(int(ns), _NS)
+    return Time(sec=seconds, nanosec=rest)
+
+
+def labels_from_image(message: Image, topic: str) -> npt.NDArray[np.int32]:
+    """Read the labels (H, W) of a mask message, `UNKNOWN` (-1) where it says nothing.
+
+    Encodings are mono8 and 8UC1 (255 is unknown), mono16 and 16UC1 (65535) and 32SC1 (-1), of either byte order, with
+    rows of any `step`.
+
+    Raises
+    ------
+    MaskFormatError
+        Another encoding, a size of zero, data too short, or a label out of range.
+    """
+    if message.encoding not in _MASK_ENCODINGS:
+        expected = ", ".join(_MASK_ENCODINGS)
+        raise MaskFormatError(f"{topic}: encoding is '{message.encoding}'; expected labels as one of {expected}")
+    kind, unknown = _MASK_ENCODINGS[message.encoding]
+    labels = _pixels(message, np.dtype(kind), topic).astype(np.int32)
+    labels[labels == unknown] = UNKNOWN
+    low, high = int(labels.min()), int(labels.max())
+    if low < UNKNOWN or high > _LARGEST_LABEL:
+        raise MaskFormatError(f"{topic}: labels are {low} to {high}; expected {UNKNOWN} (unknown) to {_LARGEST_LABEL}")
+    return labels
+
+
+def intrinsics_from_info(info: CameraInfo, topic: str) -> tuple[npt.NDArray[np.float64], int, int]:
+    """Read `K` (3, 3) in pixels, width and height of a rectified camera.
+
+    Raises
+    ------
+    IntrinsicsError
+        The lens is distorted, the image binned or cut, the size zero, or `k` not that of a pinhole camera.
+    """
+    if np.any(info.d):
+        raise IntrinsicsError(
+            f"{topic}: distortion d is {list(info.d)}; expected zeros: use the rectified topic, for example after "
+            "image_proc, for the masks, and a camera_info that describes the rectified image"
+        )
+    if max(info.binning_x, info.binning_y) > 1:
+        raise IntrinsicsError(f"{topic}: binning is {info.binning_x} x {info.binning_y}; expected images without it")
+    roi, size = info.roi, f"{info.width} x {info.height}"
+    if (roi.x_offset, roi.y_offset, roi.width, roi.height) not in ((0,) * 4, (0, 0, info.width, info.height)):
+        raise IntrinsicsError(
+            f"{topic}: roi is {roi.width} x {roi.height} at ({roi.x_offset}, {roi.y_offset}); expected the full image "
+            f"of {size}, or zeros"
+        )
+    # Camera checks the rest; the message names the topic in the camera's place.
+    camera = Camera(topic, info.width, info.height, np.reshape(info.k, (3, 3)), np.eye(4))
+    return camera.K, camera.width, camera.height
+
+
+def matrix_from_pose(pose: Pose, topic: str) -> npt.NDArray[np.float64]:
+    """Turn a pose into a rigid motion (4, 4), in metres.
+
+    Raises
+    ------
+    PoseError
+        A number is NaN or infinite, or the quaternion is not of length 1.
+    """
+    return _matrix(pose.position, pose.orientation, topic)
+
+
+def matrix_from_transform(transform: Transform, topic: str) -> npt.NDArray[np.float64]:
+    """Turn a transform into a rigid motion (4, 4), in metres; raises as `matrix_from_pose` does."""
+    return _matrix(transform.translation, transform.rotation, topic)
+
+
+def pose_from_matrix(
+    matrix: npt.NDArray[np.float64],  # (4, 4)
+) -> Pose:
+    """Turn a rigid motion (4, 4), in metres, into a pose."""
+    x, y, z = matrix[:3, 3].tolist()
+    qx, qy, qz, qw = quaternion_from_rotation(matrix[:3, :3])
+    return Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+
+
+def camera_from_messages(
+    name: str,
+    info: CameraInfo,
+    camera_in_map: npt.NDArray[np.float64],  # (4, 4)
+    similarity: Similarity,
+    topic: str,
+) -> Camera:
+    """Build the scene's camera from a camera_info (of `topic`) and the pose of the optical frame in the map, in metres.
+
+    Raises
+    ------
+    IntrinsicsError, PoseError
+        The camera_info or the pose cannot be used.
+    """
+    K, width, height = intrinsics_from_info(info, topic)
+    return Camera(name, width, height, K, similarity.world_to_camera(camera_in_map))
+
+
+def mask_image(
+    labels: npt.NDArray[np.integer[Any]],  # (H, W)
+    header: Header,
+    bits: int,
+) -> Image:
+    """Write labels (H, W) as mono8 or mono16 (`bits` 8 or 16), `UNKNOWN` (-1) as 255 or 65535.
+
+    Raises
+    ------
+    MaskFormatError
+        A label does not fit.
+    """
+    unknown = 2**bits - 1
+    low, high = (int(labels.min()), int(labels.max())) if labels.size else (0, 0)
+    if low < UNKNOWN or high >= unknown:
+        raise MaskFormatError(f"mask image: labels are {low} to {high}; {bits} bits hold {UNKNOWN} to {unknown - 1}")
+    values = np.where(labels == UNKNOWN, unknown, labels).astype(f"<u{bits // 8}")
+    return _image(values, f"mono{bits}", header)
+
+
+def label_image(
+    labels: npt.NDArray[np.integer[Any]],  # (H, W)
+    header: Header,
+) -> Image:
+    """Write labels (H, W) as mono16, `UNKNOWN` (-1) as 65535; raises as `mask_image` does."""
+    return mask_image(labels, header, 16)
+
+
+def rgb_image(
+    pixels: npt.NDArray[np.uint8],  # (H, W, 3)
+    header: Header,
+) -> Image:
+    """Write a picture (H, W, 3) uint8 as rgb8."""
+    return _image(pixels, "rgb8", header)
+
+
+def confidence_image(
+    confidence: npt.NDArray[np.floating[Any]],  # (H, W)
+    header: Header,
+) -> Image:
+    """Write confidences (H, W), 0 to 1, as 32FC1."""
+    return _image(confidence.astype("<f4"), "32FC1", header)
+
+
+def camera_info(camera: Camera, header: Header) -> CameraInfo:
+    """Describe a camera as that of a rectified image: no distortion, no rotation, `p` = [k | 0]."""
+    return CameraInfo(
+        header=header,
+        width=int(camera.width),
+        height=int(camera.height),
+        distortion_model="plumb_bob",
+        d=array.array("d", bytes(5 * 8)),
+        k=camera.K.ravel(),
+        r=np.eye(3).ravel(),
+        p=np.c_[camera.K, np.zeros(3)].ravel(),
+    )
+
+
+def cloud(
+    header: Header,
+    points: npt.NDArray[np.float32],  # (M, 3)
+    rgb: npt.NDArray[np.uint8],  # (M, 3)
+    labels: npt.NDArray[np.integer[Any]],  # (M,)
+    confidence: npt.NDArray[np.float32],  # (M,)
+) -> PointCloud2:
+    """Write points (M, 3) in metres with colour, class id and confidence; M may be 0, which clears a latched cloud.
+
+    Raises
+    ------
+    SceneValueError
+        Shapes do not go together, or a label is negative.
+    """
+    shapes = [np.shape(values) for values in (points, rgb, labels, confidence)]
+    count = len(labels)
+    if shapes != [(count, 3), (count, 3), (count,), (count,)]:
+        raise SceneValueError(
+            f"cloud: points, rgb, labels, confidence have shapes {shapes}; expected M x 3, M x 3, M, M"
+        )
+    if count and labels.min() < 0:
+        raise SceneValueError(f"cloud: the least label is {labels.min()}; expected class ids, which are 0 or more")
+    records = np.empty(count, _CLOUD_POINT)
+    for axis, name in enumerate("xyz"):
+        records[name] = points[:, axis]
+    records["rgb"] = rgb @ np.array([1 << 16, 1 << 8, 1], np.uint32)
+    records["label"] = labels
+    records["confidence"] = confidence
+    message = PointCloud2(
+        header=header,
+        height=1,
+        width=count,
+        fields=[
+            PointField(name=name, offset=4 * i, datatype=datatype, count=1)
+            for i, (name, datatype, _) in enumerate(_CLOUD_FIELDS)
+        ],
+        is_bigendian=False,
+        point_step=_CLOUD_POINT.itemsize,
+        row_step=_CLOUD_POINT.itemsize * count,
+        is_dense=True,
+    )
+    message.data = _byte_array(records)
+    return message
+
+
+def arrays_from_cloud(message: PointCloud2, topic: str = "cloud") -> CloudArrays:
+    """Read what `cloud` wrote; other fields, other offsets, padding and either byte order are welcome.
+
+    Raises
+    ------
+    SceneValueError
+        A field is missing or of another type, or the data are too short.
+    """
+    found = {field.name: (field.datatype, field.offset) for field in message.fields}
+    wanted = {name: datatype for name, datatype, _ in _CLOUD_FIELDS}
+    if any(name not in found or found[name][0] != datatype for name, datatype in wanted.items()):
+        types = {name: datatype for name, (datatype, _) in found.items()}
+        raise SceneValueError(f"{topic}: fields and their types are {types}; expected {wanted}")
+    rows, columns, step = message.height, message.width, message.point_step
+    reach = max(found[name][1] for name in wanted) + 4
+    if step < reach or message.row_step < columns * step or len(message.data) < rows * message.row_step:
+        raise SceneValueError(
+            f"{topic}: {len(message.data)} bytes with a row_step of {message.row_step} and a point_step of {step}; "
+            f"expected {rows} rows of {columns} points of at least {reach} bytes"
+        )
+    order = ">" if message.is_bigendian else "<"
+    formats, offsets = [order + kind for _, _, kind in _CLOUD_FIELDS], [found[name][1] for name in wanted]
+    point = np.dtype({"names": list(wanted), "formats": formats, "offsets": offsets, "itemsize": step})
+    data = np.frombuffer(message.data, np.uint8, rows * message.row_step).reshape(rows, message.row_step)
+    records = np.ascontiguousarray(data[:, : columns * step]).ravel().view(point)
+    return CloudArrays(
+        np.stack([records[axis] for axis in "xyz"], axis=1).astype(np.float32, copy=False),
+        (records["rgb"][:, None] >> np.array([16, 8, 0], np.uint32)).astype(np.uint8),
+        records["label"].astype(np.int32),
+        records["confidence"].astype(np.float32),
+    )
+
+
+def topic_tokens(class_names: Mapping[int, str]) -> dict[int, str]:
+    """Make a valid part of a topic's name of each class name: unique, ASCII letters, digits and single underscores.
+
+    Where classes would get the same token, that of the lowest id keeps it and the others get `_<id>` appended.
+    """
+    owners: dict[str, int] = {}
+    for number, name in sorted(class_names.items()):
+        token = _token(name, number)
+        while token in owners:
+            token = f"{token}_{number}"
+        owners[token] = number
+    return {number: token for token, number in owners.items()}
+
+
+def _token(name: str, number: int) -> str:
+    ascii_name = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
+    token = re.sub(r"[^A-Za-z0-9]+", "_", ascii_name)[:_LONGEST_TOKEN].strip("_")
+    if not token:
+        return f"class_{number}"
+    return f"class_{token}" if token[0].isdigit() else token
+
+
+def _pixels(message: Image, kind: np.dtype[Any], topic: str) -> npt.NDArray[Any]:
+    width, height, step = message.width, message.height, message.step
+    if width < 1 or height < 1:
+        raise MaskFormatError(f"{topic}: image is {width} x {height} pixels; expected at least 1 x 1")
+    row = width * kind.itemsize
+    if step < row or len(message.data) < height * step:
+        raise MaskFormatError(
+            f"{topic}: {len(message.data)} bytes with a step of {step}; expected {height} rows of {width} pixels "
+            f"of {message.encoding}, thus a step of at least {row} and height * step bytes"
+        )
+    rows = np.frombuffer(message.data, np.uint8, height * step).reshape(height, step)[:, :row]
+    return np.ascontiguousarray(rows).view(kind.newbyteorder(">" if message.is_bigendian else "<"))
+
+
+def _matrix(position: Any, orientation: Any, topic: str) -> npt.NDArray[np.float64]:
+    place = (position.x, position.y, position.z)
+    q = (orientation.x, orientation.y, orientation.z, orientation.w)
+    if not np.isfinite(place + q).all():
+        raise PoseError(f"{topic}: position is {place}, orientation {q}; expected finite numbers")
+    norm = math.hypot(*q)
+    if norm == 0:
+        raise PoseError(f"{topic}: orientation is all zeros: was it filled in? expected a quaternion of length 1")
+    if abs(norm - 1) > _UNIT_TOLERANCE:
+        raise PoseError(f"{topic}: orientation {q} has length {norm:.6g}; expected a quaternion of length 1")
+    return rigid(rotation_from_quaternion(*q), place)
+
+
+def _image(values: npt.NDArray[Any], encoding: str, header: Header) -> Image:
+    height, width = values.shape[:2]
+    step = values[0].nbytes if height else 0
+    message = Image(header=header, height=height, width=width, encoding=encoding, is_bigendian=0, step=step)
+    message.data = _byte_array(values)
+    return message
+
+
+def _byte_array(values: npt.NDArray[Any]) -> array.array[int]:
+    data = array.array("B")
+    data.frombytes(np.ascontiguousarray(values).view(np.uint8).data if values.size else b"")
+    return data

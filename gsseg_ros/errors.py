@@ -1,0 +1,83 @@
+"""Errors of requests, and the error code that each error gets in an answer."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gsseg_core.errors import (
+    GssegError,
+    NoCodesError,
+    NoUsableViewsError,
+    SettingsError,
+    StateMismatchError,
+    WriteError,
+)
+
+
+class NotActiveError(GssegError):
+    """The node's lifecycle state is not active."""
+
+
+class BusyError(GssegError):
+    """Another job is running that cannot run beside this one."""
+
+
+class CanceledError(GssegError):
+    """A job was canceled."""
+
+
+class InvalidRequestError(GssegError):
+    """A field of a request has a value that is not allowed."""
+
+
+class NoSceneError(GssegError):
+    """No scene is loaded."""
+
+
+class UnknownClassError(GssegError):
+    """A class that was asked for does not exist."""
+
+
+class ViewpointError(GssegError):
+    """The pose or the camera of a viewpoint cannot be used."""
+
+
+class NoTransformError(GssegError):
+    """A pose is in a frame that cannot be transformed to the map frame."""
+
+
+class PathNotAllowedError(GssegError):
+    """A path of a request is not below data_root."""
+
+
+class MissingFileError(GssegError):
+    """A file or folder of a request does not exist."""
+
+
+# The first that fits counts. Every other error of the core is about a file.
+_NAMES: tuple[tuple[type[GssegError], str], ...] = (
+    (NotActiveError, "NOT_ACTIVE"),
+    (BusyError, "BUSY"),
+    (CanceledError, "CANCELED"),
+    (InvalidRequestError, "INVALID_REQUEST"),
+    (SettingsError, "INVALID_REQUEST"),
+    (NoSceneError, "NO_SCENE"),
+    (NoCodesError, "NO_CODES"),
+    (NoUsableViewsError, "NO_VIEWS"),
+    (UnknownClassError, "UNKNOWN_CLASS"),
+    (ViewpointError, "INVALID_VIEWPOINT"),
+    (NoTransformError, "NO_TRANSFORM"),
+    (PathNotAllowedError, "PATH_NOT_ALLOWED"),
+    (MissingFileError, "FILE_NOT_FOUND"),
+    (WriteError, "WRITE_FAILED"),
+    (StateMismatchError, "SCENE_MISMATCH"),
+    (GssegError, "INVALID_FILE"),
+)
+
+
+def error_code(error: Exception, interface: Any) -> int:
+    """Return the constant of an answer (a Response or Result class) for an error; its UNKNOWN where none fits."""
+    for kind, name in _NAMES:
+        if isinstance(error, kind):
+            return int(getattr(interface, name, interface.UNKNOWN))
+    return int(interface.UNKNOWN)

@@ -1,0 +1,171 @@
+"""What the node listens to: masks, camera_infos and poses, paired by stamp and fused in a thread of their own."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.lifecycle import LifecycleNode
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import CameraInfo, Image
+
+from gsseg_core.dataset import View
+from gsseg_core.errors import GssegError, PoseError
+from gsseg_core.live import Rejection
+from gsseg_ros.conversions import camera_from_messages, labels_from_image, matrix_from_pose, stamp_ns
+from gsseg_ros.errors import NoSceneError
+from gsseg_ros.jobs import Worker
+from gsseg_ros.pairing import ExactPoses, InterpolatedPoses, Paired, Pairing, PoseSource
+from gsseg_ros.tf_poses import TfPoses
+from gsseg_ros.workspace import Workspace
+
+# As sensor data: the latest count, and what is lost is lost. Deep enough for a burst while the interpreter is busy.
+SENSOR_DATA = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=30,
+    reliability=ReliabilityPolicy.BEST_EFFORT,
+    durability=DurabilityPolicy.VOLATILE,
+)
+EXPIRE_PERIOD, COMPLAIN_PERIOD = 0.1, 5.0  # s
+
+
+class Inputs:
+    """Subscriptions, from activation to deactivation. Callbacks only put messages aside; the worker does the work.
+
+    Attributes
+    ----------
+    arrivals : dict of str to (int, float)
+        By full name of the topic: messages so far, and when the last one came (s, `time.monotonic`).
+    accepted : int
+        Views that were fused.
+    rejected : Counter of str
+        Masks that were not, by reason.
+    """
+
+    def __init__(self, node: LifecycleNode, workspace: Workspace) -> None:
+        settings = workspace.settings
+        self._node, self._workspace = node, workspace
+        self.accepted = 0
+        self.rejected: Counter[str] = Counter()
+        self.arrivals: dict[str, tuple[int, float]] = {}
+        self.started = time.monotonic()
+        self._complained: dict[str, float] = {}
+        self._group = MutuallyExclusiveCallbackGroup()
+        self.tf = TfPoses(node, settings.map_frame) if settings.pose_source == "tf" else None
+        poses: PoseSource = self.tf or (InterpolatedPoses() if settings.pose_source == "odometry" else ExactPoses())
+        self.pairing = Pairing(poses)
+        self.worker: Worker[Paired] = Worker(self._fuse, settings.queue_size)
+        self._subscriptions = [
+            self._listen(Image, "mask", self._on_mask),
+            self._listen(CameraInfo, "camera_info", self._on_camera_info),
+        ]
+        if settings.pose_source == "topic":
+            self._subscriptions.append(self._listen(PoseStamped, "pose", self._on_pose))
+        elif settings.pose_source == "odometry":
+            self._subscriptions.append(self._listen(Odometry, "odometry", self._on_odometry))
+        self._timer = node.create_timer(EXPIRE_PERIOD, self._expire, callback_group=self._group)
+
+    def close(self) -> None:
+        """Stop listening; a mask that is being fused is finished."""
+        self._node.destroy_timer(self._timer)
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+        if self.tf is not None:
+            self.tf.close()
+        self.worker.stop()
+
+    def publishers_of(self, topic: str) -> int:
+        """How many publish on an input."""
+        return int(self._node.count_publishers(topic))
+
+    def complain(self, key: str, message: str) -> None:
+        """Warn, of the same thing once in five seconds."""
+        now = time.monotonic()
+        if now - self._complained.get(key, -COMPLAIN_PERIOD) >= COMPLAIN_PERIOD:
+            self._complained[key] = now
+            self._node.get_logger().warning(message)
+
+    def _listen(self, kind: Any, topic: str, callback: Callable[[str, Any], None]) -> Any:
+        subscription: Any = None
+
+        def arrived(message: Any) -> None:
+            name = subscription.topic_name
+            self.arrivals[name] = (self.arrivals[name][0] + 1, time.monotonic())
+            callback(name, message)
+            self._hand_over()
+
+        subscription = self._node.create_subscription(
+            kind,
+            topic,
+            arrived,
+            SENSOR_DATA,
+            callback_group=self._group,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
+        self.arrivals[subscription.topic_name] = (0, self.started)
+        return subscription
+
+    def _on_mask(self, topic: str, message: Image) -> None:
+        self.pairing.add_mask(stamp_ns(message.header.stamp), (topic, message), message.header.frame_id)
+
+    def _on_camera_info(self, topic: str, message: CameraInfo) -> None:
+        self.pairing.add_camera_info(stamp_ns(message.header.stamp), (topic, message))
+
+    def _on_pose(self, topic: str, message: PoseStamped) -> None:
+        self._add_pose(topic, message.header, message.pose)
+
+    def _on_odometry(self, topic: str, message: Odometry) -> None:
+        self._add_pose(topic, message.header, message.pose.pose, with_camera=True)
+
+    def _add_pose(self, topic: str, header: Any, pose: Any, with_camera: bool = False) -> None:
+        map_frame = self._workspace.settings.map_frame
+        try:
+            if header.frame_id not in ("", map_frame):
+                raise PoseError(
+                    f"{topic}: frame_id is '{header.frame_id}'; expected '{map_frame}', the parameter map_frame"
+                )
+            matrix = matrix_from_pose(pose, topic)
+        except PoseError as error:
+            self.complain("pose", str(error))
+            return
+        if with_camera:
+            matrix = matrix @ self._workspace.settings.camera_in_base
+        self.pairing.add_pose(stamp_ns(header.stamp), matrix)
+
+    def _expire(self) -> None:
+        self.pairing.expire(time.monotonic())
+        self._hand_over()
+
+    def _hand_over(self) -> None:
+        for paired in self.pairing.take():
+            self.worker.submit(paired)
+
+    def _fuse(self, paired: Paired) -> None:
+        try:
+            rejection = self._fused(paired)
+        except NoSceneError as error:
+            rejection = Rejection("no_scene", str(error))
+        except GssegError as error:
+            rejection = self._workspace.session.reject(Rejection.of(error))
+        except Exception as error:
+            self._node.get_logger().error(f"mask {paired.name}: unexpected {type(error).__name__}: {error}")
+            rejection = Rejection("unexpected", str(error))
+        if rejection is None:
+            self.accepted += 1
+            return
+        self.rejected[rejection.reason] += 1
+        self.complain(rejection.reason, f"a view was rejected ({rejection.reason}): {rejection.message}")
+
+    def _fused(self, paired: Paired) -> Rejection | None:
+        workspace = self._workspace
+        session = workspace.session
+        (topic, mask), (info_topic, info) = paired.mask, paired.camera_info
+        labels = labels_from_image(mask, topic)
+        camera = camera_from_messages(paired.name, info, paired.pose, workspace.settings.scene_to_map, info_topic)
+        return session.fuse(View.from_arrays(camera, labels))

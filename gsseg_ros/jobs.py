@@ -1,0 +1,136 @@
+"""Work that takes long: the thread that fuses views, and the one slot for jobs that change all that is known."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Generic, TypeVar
+
+from gsseg_ros.errors import BusyError, CanceledError
+
+T = TypeVar("T")
+
+
+class Job:
+    """A piece of work that can be asked to stop."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self._canceled = threading.Event()
+
+    def cancel(self) -> None:
+        """Ask it to stop."""
+        self._canceled.set()
+
+    def check(self) -> None:
+        """Stop here if that was asked.
+
+        Raises
+        ------
+        CanceledError
+            It was.
+        """
+        if self._canceled.is_set():
+            raise CanceledError(f"{self.name} was canceled; all is as it was before")
+
+
+class JobSlot:
+    """Holds one job at a time: learning, or whatever replaces the scene or its state."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._job: Job | None = None
+        self._free = threading.Event()
+        self._free.set()
+
+    @contextmanager
+    def take(self, name: str) -> Iterator[Job]:
+        """Run a job in the body.
+
+        Raises
+        ------
+        BusyError
+            Another one is running.
+        """
+        with self._lock:
+            if self._job is not None:
+                raise BusyError(f"{self._job.name} is running; expected to start {name} after it: cancel it, or wait")
+            job = self._job = Job(name)
+            self._free.clear()
+        try:
+            yield job
+        finally:
+            with self._lock:
+                self._job = None
+                self._free.set()
+
+    def cancel(self, timeout_s: float) -> bool:
+        """Ask the running job to stop, and wait for that; return whether the slot is free."""
+        with self._lock:
+            if self._job is not None:
+                self._job.cancel()
+        return self._free.wait(timeout_s)
+
+
+class Worker(Generic[T]):
+    """Handles items one after the other, in a thread of its own; of too many that wait, the oldest are dropped.
+
+    Parameters
+    ----------
+    handle : callable
+        Takes one item; must not raise.
+    capacity : int
+        Items that may wait.
+
+    Attributes
+    ----------
+    dropped : int
+        Items that were dropped.
+    """
+
+    def __init__(self, handle: Callable[[T], None], capacity: int) -> None:
+        self.dropped = 0
+        self._handle, self._capacity = handle, capacity
+        self._items: deque[T] = deque()
+        self._changed = threading.Condition()
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name="fusion", daemon=True)
+        self._thread.start()
+
+    def submit(self, item: T) -> None:
+        """Add an item; returns at once."""
+        with self._changed:
+            self._items.append(item)
+            if len(self._items) > self._capacity:
+                self._items.popleft()
+                self.dropped += 1
+            self._changed.notify()
+
+    @property
+    def waiting(self) -> int:
+        """How many items wait."""
+        return len(self._items)
+
+    def clear(self) -> None:
+        """Forget the items that wait."""
+        with self._changed:
+            self._items.clear()
+
+    def stop(self, timeout_s: float = 5.0) -> None:
+        """Finish the item in hand, and end."""
+        with self._changed:
+            self._stopping = True
+            self._items.clear()
+            self._changed.notify()
+        self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._items or self._stopping)
+                if self._stopping:
+                    return
+                item = self._items.popleft()
+            self._handle(item)

@@ -1,0 +1,112 @@
+"""The action `~/learn`: codes from the views received or from a dataset folder, with feedback and cancel."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from gsseg_msgs.action import Learn
+from gsseg_msgs.msg import SegmentationReport
+from rclpy.action.server import ActionServer, CancelResponse, ServerGoalHandle
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.lifecycle import LifecycleNode
+
+from gsseg_core.dataset import Dataset
+from gsseg_core.live import LiveSession, Outcome
+from gsseg_core.pipeline import LEARNERS
+from gsseg_core.refine_settings import RefineSettings
+from gsseg_ros.errors import CanceledError, InvalidRequestError, error_code
+from gsseg_ros.jobs import Job
+from gsseg_ros.reports import Selection, finish, report_message
+from gsseg_ros.services import explain
+from gsseg_ros.workspace import Run, Workspace
+
+FEEDBACK_PERIOD = 0.1
+"""Seconds between two messages of feedback, at least; a new stage is always told."""
+
+RAW = RefineSettings(cluster=False, filter=False)
+
+
+class LearnAction:
+    """Runs one learn job at a time; a second goal is aborted with BUSY. Canceled or failed, it changes nothing."""
+
+    def __init__(self, node: LifecycleNode, workspace: Workspace) -> None:
+        self._node, self._workspace = node, workspace
+        self._server = ActionServer(
+            node,
+            Learn,
+            "~/learn",
+            self._execute,
+            cancel_callback=lambda goal: CancelResponse.ACCEPT,
+            callback_group=ReentrantCallbackGroup(),
+        )
+
+    def close(self) -> None:
+        """Take the action away."""
+        self._server.destroy()
+
+    def _execute(self, goal: ServerGoalHandle) -> Learn.Result:
+        result = Learn.Result()
+        try:
+            self._workspace.require_active()
+            with self._workspace.slot.take("learn") as job, self._workspace.run("learn") as run:
+                self._learn(goal, job, run, result)
+            goal.succeed()
+        except Exception as error:
+            result = Learn.Result(error_code=error_code(error, Learn.Result), error_msg=explain(self._node, error))
+            if isinstance(error, CanceledError) and goal.is_cancel_requested:
+                goal.canceled()
+            else:
+                goal.abort()
+        return result
+
+    def _learn(self, goal: ServerGoalHandle, job: Job, run: Run, result: Learn.Result) -> None:
+        request, session = goal.request, self._workspace.session
+        learner = request.learner or "em"
+        if learner not in LEARNERS:
+            raise InvalidRequestError(f"learner is '{learner[:60]}'; expected one of {', '.join(LEARNERS)}")
+        dataset = None
+        if request.dataset_path:
+            with run.watch.stage("load"):
+                dataset = Dataset(self._workspace.existing(request.dataset_path))
+        outcome = session.learn(
+            learner,
+            dataset,
+            num_views=request.num_views or None,
+            max_steps=request.max_steps or None,
+            report=_Feedback(goal, job),
+            watch=run.watch,
+        )
+        result.num_steps, result.converged, result.loss = outcome.num_steps, outcome.converged, outcome.loss
+        result.report = self._report(session, outcome, run)
+
+    def _report(self, session: LiveSession, outcome: Outcome, run: Run) -> SegmentationReport:
+        settings = self._workspace.settings
+        raw = session.segmentation(RAW, run.watch)
+        selection = Selection(session, raw, sorted(raw.class_names), 0.0, settings.scene_to_map)
+        report = report_message(run, selection, RAW, settings.map_frame)
+        if outcome.rejected:
+            reasons = sorted(set(outcome.rejected.values()))
+            report.rejection_reasons = [reason.replace(" ", "_") for reason in reasons]
+            report.rejection_counts = [list(outcome.rejected.values()).count(reason) for reason in reasons]
+            report.num_views_rejected = len(outcome.rejected)
+        return finish(report, run)
+
+
+class _Feedback:
+    """Tells the client how far the work is, and stops it when that was asked."""
+
+    def __init__(self, goal: ServerGoalHandle, job: Job) -> None:
+        self._goal, self._job = goal, job
+        self._told: tuple[str, float] = ("", 0.0)
+
+    def __call__(self, stage: str, done: int, total: int, loss: float) -> None:
+        if self._goal.is_cancel_requested or not self._goal.is_active:
+            self._job.cancel()
+        self._job.check()
+        now = time.monotonic()
+        if stage == self._told[0] and now - self._told[1] < FEEDBACK_PERIOD and done < total:
+            return
+        self._told = (stage, now)
+        feedback: Any = Learn.Feedback(stage=stage, done=done, total=total, loss=loss)
+        self._goal.publish_feedback(feedback)

@@ -1,0 +1,98 @@
+"""Everything that the node publishes, but for diagnostics."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+
+import numpy as np
+from gsseg_msgs.msg import SegmentationReport
+from rclpy.lifecycle import LifecycleNode
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import Image, PointCloud2
+from std_msgs.msg import Header
+
+from gsseg_ros.conversions import cloud, topic_tokens
+from gsseg_ros.reports import Selection
+
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class Outputs:
+    """Publishes clouds, report and overlay.
+
+    A cloud that is latched always belongs to the last run: a class that this run was not asked for, or that is no more,
+    gets an empty one.
+    """
+
+    def __init__(self, node: LifecycleNode) -> None:
+        self._node = node
+        self._lock = threading.Lock()
+        overridable = QoSOverridingOptions.with_default_policies()
+        self._cloud = node.create_publisher(PointCloud2, "~/cloud", LATCHED, qos_overriding_options=overridable)
+        self._report = node.create_publisher(
+            SegmentationReport, "~/report", LATCHED, qos_overriding_options=overridable
+        )
+        self._overlay = node.create_publisher(Image, "~/overlay", LATCHED, qos_overriding_options=overridable)
+        self._classes: dict[str, Publisher] = {}
+        self._filled: set[str] = set()
+
+    @property
+    def wants_overlay(self) -> bool:
+        """Whether anybody listens to `~/overlay`."""
+        return self._overlay.get_subscription_count() > 0
+
+    def announce(self, class_names: Mapping[int, str]) -> dict[int, str]:
+        """Make a topic for every class, so that subscribers find it before its first cloud; return their full names."""
+        with self._lock:
+            return {k: self._class(token).topic_name for k, token in topic_tokens(class_names).items()}
+
+    def publish_clouds(self, selection: Selection, header: Header) -> None:
+        """Publish one cloud per class that was asked for, empty ones for all others, and that of all objects."""
+        tokens = topic_tokens(selection.result.class_names)
+        with self._lock:
+            filled = set()
+            for k in selection.chosen:
+                message = selection.class_cloud(k, header)
+                self._class(tokens[k]).publish(message)
+                if message.width:
+                    filled.add(tokens[k])
+            for token in self._filled - {tokens[k] for k in selection.chosen}:
+                self._class(token).publish(_empty(header))
+            self._filled = filled
+            self._cloud.publish(selection.objects_cloud(header))
+
+    def publish_report(self, report: SegmentationReport) -> None:
+        """Publish the report of a run."""
+        self._report.publish(report)
+
+    def publish_overlay(self, image: Image) -> None:
+        """Publish a picture."""
+        self._overlay.publish(image)
+
+    def clear(self, header: Header) -> None:
+        """Replace all latched clouds by empty ones."""
+        with self._lock:
+            for token in self._filled:
+                self._class(token).publish(_empty(header))
+            self._filled = set()
+            self._cloud.publish(_empty(header))
+
+    def close(self) -> None:
+        """Take all topics away."""
+        with self._lock:
+            for publisher in (self._cloud, self._report, self._overlay, *self._classes.values()):
+                self._node.destroy_publisher(publisher)
+            self._classes.clear()
+
+    def _class(self, token: str) -> Publisher:
+        if token not in self._classes:
+            self._classes[token] = self._node.create_publisher(PointCloud2, f"~/classes/{token}", LATCHED)
+        return self._classes[token]
+
+
+def _empty(header: Header) -> PointCloud2:
+    nothing = np.empty((0, 3), np.float32)
+    return cloud(header, nothing, nothing.astype(np.uint8), np.empty(0, np.int32), np.empty(0, np.float32))

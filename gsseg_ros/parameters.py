@@ -1,0 +1,187 @@
+"""The parameters of `segment_node`: names, defaults, descriptions, ranges, and the settings that come of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from gsseg_core.errors import GssegError, SettingsError
+from gsseg_core.refine_settings import MAX_K, RefineSettings
+from gsseg_ros.frames import Similarity, pose_from_parameters
+
+POSE_SOURCES = ("topic", "odometry", "tf")
+DEVICES = ("cpu", "cuda")
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """One parameter.
+
+    Attributes
+    ----------
+    name : str
+        Its name.
+    default : object
+        Its default; its type is the parameter's.
+    description : str
+        What it is, with its unit.
+    low, high : float, optional
+        Least and largest value.
+    at_once : bool
+        Whether a change takes effect at once; others are accepted only while the node is unconfigured.
+    """
+
+    name: str
+    default: Any
+    description: str
+    low: float | None = None
+    high: float | None = None
+    at_once: bool = False
+
+
+DECLARATIONS = (
+    Declaration("scene_path", "", "3DGS PLY to load when the node is configured; empty: wait for ~/load_scene"),
+    Declaration("data_root", "", "folder below which paths in requests must lie; empty: no request may name a path"),
+    Declaration(
+        "class_names",
+        [],
+        "names of the classes, the index being the label in the masks (0: background); empty: classes are added and "
+        "named after their numbers as they turn up",
+    ),
+    Declaration("pose_source", "topic", f"where the camera's pose comes from: {', '.join(POSE_SOURCES)}"),
+    Declaration("map_frame", "map", "frame of the poses and of all outputs"),
+    Declaration("max_views", 200, "views kept for learning, the last ones [count]", 1, 100_000),
+    Declaration("k", RefineSettings.k, "neighbours in KNN clustering and filter [count]", 1, MAX_K, True),
+    Declaration(
+        "beta", RefineSettings.beta, "probability below which KNN clustering decides [0..1]", 0.0, 1.0, at_once=True
+    ),
+    Declaration("device", "cpu", f"where views are rendered: {', '.join(DEVICES)}"),
+    Declaration("autostart", True, "configure and activate at start; false: wait for a lifecycle manager"),
+    Declaration("queue_size", 30, "masks waiting to be fused; of more, the oldest are dropped [count]", 1, 1000),
+    Declaration("scene_to_map.scale", 1.0, "metres of the map per unit of the scene [m]", 1e-9, 1e9),
+    Declaration("scene_to_map.translation", [0.0, 0.0, 0.0], "origin of the scene in the map, x y z [m]"),
+    Declaration("scene_to_map.rotation", [0.0, 0.0, 0.0, 1.0], "axes of the scene in the map, quaternion x y z w"),
+    Declaration(
+        "camera_in_base.translation",
+        [0.0, 0.0, 0.0],
+        "pose_source odometry: origin of the camera's optical frame in the odometry's child frame, x y z [m]",
+    ),
+    Declaration(
+        "camera_in_base.rotation",
+        [0.0, 0.0, 0.0, 1.0],
+        "pose_source odometry: axes of the camera's optical frame in the odometry's child frame, quaternion x y z w",
+    ),
+)
+AT_ONCE = frozenset(declaration.name for declaration in DECLARATIONS if declaration.at_once)
+
+
+@dataclass(frozen=True, eq=False)
+class Settings:
+    """The parameters as the node uses them; see `DECLARATIONS`.
+
+    Raises
+    ------
+    SettingsError
+        A value is impossible; the message names the parameter.
+    """
+
+    scene_path: str
+    data_root: str
+    class_names: tuple[str, ...]
+    pose_source: str
+    map_frame: str
+    max_views: int
+    k: int
+    beta: float
+    device: str
+    autostart: bool
+    queue_size: int
+    scene_to_map: Similarity
+    camera_in_base: npt.NDArray[np.float64]  # (4, 4)
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        for name, allowed in (("pose_source", POSE_SOURCES), ("device", DEVICES)):
+            if getattr(self, name) not in allowed:
+                raise SettingsError(f"parameter {name} is '{getattr(self, name)}'; expected {', '.join(allowed)}")
+        if not self.map_frame:
+            raise SettingsError("parameter map_frame is empty; expected the name of a frame, such as 'map'")
+        if "" in self.class_names:
+            index = self.class_names.index("")
+            raise SettingsError(f"parameter class_names: name {index} is empty; expected a name for every label")
+        twice = sorted({name for name in self.class_names if self.class_names.count(name) > 1})
+        if twice:
+            raise SettingsError(f"parameter class_names: {twice[0]!r} occurs more than once; expected distinct names")
+        if self.data_root and not Path(self.data_root).is_dir():
+            raise SettingsError(f"parameter data_root: {self.data_root} is no folder; expected one that exists")
+
+    @classmethod
+    def of(cls, values: dict[str, Any]) -> Settings:
+        """Build from the values of all parameters, by name."""
+        similarity = Similarity.from_parameters(*_triple(values, "scene_to_map", with_scale=True))
+        camera = pose_from_parameters("camera_in_base", *_triple(values, "camera_in_base"))
+        plain = {f.name: values[f.name] for f in fields(cls) if f.name in values}
+        plain["class_names"] = tuple(values["class_names"] or ())
+        return cls(**plain, scene_to_map=similarity, camera_in_base=camera)
+
+    @classmethod
+    def read(cls, node: Node, changed: Sequence[Parameter] = ()) -> Settings:
+        """Build from a node's parameters, some of them about to change."""
+        values = {d.name: node.get_parameter_or(d.name, None) for d in DECLARATIONS}
+        values = {name: None if parameter is None else parameter.value for name, parameter in values.items()}
+        return cls.of({**values, **{p.name: p.value for p in changed if p.name in values}})
+
+    @property
+    def names_by_id(self) -> dict[int, str]:
+        """Declared class names by id."""
+        return dict(enumerate(self.class_names))
+
+
+def _triple(values: dict[str, Any], name: str, with_scale: bool = False) -> list[Any]:
+    parts = ["translation", "rotation"]
+    return [values[f"{name}.{part}"] for part in (["scale", *parts] if with_scale else parts)]
+
+
+def declare(node: Node) -> None:
+    """Declare all parameters; a value from outside that has another type or is out of range is refused by rclpy."""
+    for declaration in DECLARATIONS:
+        # An empty list has no type of its own.
+        default = Parameter.Type.STRING_ARRAY if declaration.default == [] else declaration.default
+        node.declare_parameter(declaration.name, default, _descriptor(declaration))
+
+
+def check(node: Node, changed: Sequence[Parameter], configured: bool) -> SetParametersResult:
+    """Decide whether a node's parameters may change, and say why not."""
+    known = {declaration.name for declaration in DECLARATIONS}
+    for parameter in changed:
+        if configured and parameter.name in known - AT_ONCE:
+            reason = (
+                f"{parameter.name} can change only while the node is unconfigured: deactivate and clean it up first"
+            )
+            return SetParametersResult(successful=False, reason=reason)
+    try:
+        Settings.read(node, changed)
+    except GssegError as error:
+        return SetParametersResult(successful=False, reason=str(error))
+    return SetParametersResult(successful=True)
+
+
+def _descriptor(declaration: Declaration) -> ParameterDescriptor:
+    descriptor = ParameterDescriptor(description=declaration.description)
+    if declaration.low is not None and declaration.high is not None:
+        if isinstance(declaration.default, int):
+            limits = IntegerRange(from_value=int(declaration.low), to_value=int(declaration.high), step=0)
+            descriptor.integer_range = [limits]
+        else:
+            descriptor.floating_point_range = [
+                FloatingPointRange(from_value=float(declaration.low), to_value=float(declaration.high), step=0.0)
+            ]
+    return descriptor

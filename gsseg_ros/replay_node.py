@@ -1,0 +1,217 @@
+"""Publishes a dataset folder or a recorded bag as the topics that the segmentation node listens to."""
+
+from __future__ import annotations
+
+import math
+import signal
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.duration import Duration
+from rclpy.exceptions import ParameterException
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import CameraInfo, Image
+
+from gsseg_core.errors import GssegError, SettingsError
+from gsseg_ros.conversions import stamp_message
+from gsseg_ros.replay_sources import TYPES, BagSource, FolderSource, Group, Source
+
+_CLASSES = {"mask": Image, "camera_info": CameraInfo, "pose": PoseStamped, "image": Image}
+_QOS = QoSProfile(depth=30, reliability=ReliabilityPolicy.RELIABLE)
+
+# Name, default, smallest, largest (of numbers), description.
+_PARAMETERS: tuple[tuple[str, str | int | float, float | None, float | None, str], ...] = (
+    ("data", "", None, None, "Dataset folder to replay; exactly one of 'data' and 'bag' is set"),
+    ("bag", "", None, None, "Bag to replay: a folder, .mcap or .db3; exactly one of 'data' and 'bag' is set"),
+    ("labels", "labels", None, None, "Sub-folder of 'data' with the label images"),
+    ("split", "train", None, None, "Views of 'data' to replay: train, test or all"),
+    ("rate", 10.0, 1e-3, 1e3, "Masks per second"),
+    ("loop", 1, 0, 2**31 - 1, "How many times; 0 is for ever"),
+    ("frame_id", "camera", None, None, "Frame of the camera, in the headers of mask, camera_info and image ('data')"),
+    ("map_frame", "map", None, None, "Frame in which the poses are ('data')"),
+    ("wait_for_subscribers", 5.0, 0.0, 3600.0, "Seconds to wait for somebody who listens to 'mask'"),
+    *(
+        (f"{role}_topic", "", None, None, f"Topic of 'bag' to replay as '{role}'; empty: the one named so at its end")
+        for role in TYPES
+    ),
+)
+
+# Endpoints are discovered one by one: who listens to the masks may not be known to listen to the poses yet.
+_SETTLE_S = 0.5
+# For messages on their way when all is done; a receiver that hangs may not hold up the end for longer.
+_LINGER_S = 1.0
+
+
+# A signal is noticed when a wait ends, so no wait is longer.
+_SLICE_S = 0.05
+
+
+class Stopped(Exception):
+    """The node was asked to stop before it was done."""
+
+
+class ReplayNode(Node):
+    """Node `replay`: publishes `mask`, `camera_info`, `pose` and `image` at a given rate of masks.
+
+    The settings are parameters, read once and described where they are declared; see `_PARAMETERS`.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("replay")
+        self.published: Counter[str] = Counter()
+        self._newest = 0  # stamp, ns
+        self._stop_asked = False
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self)
+        self._topics = {name: self.create_publisher(kind, name, _QOS) for name, kind in _CLASSES.items()}
+
+    def declare(self) -> dict[str, Any]:
+        """Declare all parameters and return their values; raises `SettingsError` for a wrong type or range."""
+        for name, default, low, high, text in _PARAMETERS:
+            descriptor = ParameterDescriptor(description=text, read_only=True)
+            if low is not None and high is not None:
+                if isinstance(default, int):
+                    descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=0)]
+                else:
+                    descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high, step=0.0)]
+            try:
+                self.declare_parameter(name, default, descriptor)
+            except ParameterException as error:
+                limits = "" if low is None else f" from {low:g} to {high:g}"
+                kind = {str: "a string", int: "a whole number", float: "a number with a decimal point"}[type(default)]
+                reason = " ".join(str(error).split())
+                raise SettingsError(f"parameter '{name}': {reason}; expected {kind}{limits}") from None
+        return {name: self.get_parameter(name).value for name, *_ in _PARAMETERS}
+
+    def replay(self, source: Source, rate: float, loop: int) -> None:
+        """Publish all that the source holds, `rate` masks per second, `loop` times (0: until stopped)."""
+        start, offset, passes = time.monotonic(), 0.0, 0
+        while loop == 0 or passes < loop:
+            last = 0.0
+            for group in source:
+                last = group.due
+                # Counted from the start and not from the mask before: waits that last too long do not add up.
+                self._spin_until(start + (offset + group.due) / rate)
+                self._publish(group)
+            offset += math.floor(last) + 1
+            passes += 1
+        self._spin_until(start + offset / rate)
+
+    def wait_for_subscribers(self, seconds: float) -> None:
+        """Wait until somebody listens to `mask`, or warn that nobody does."""
+        deadline = time.monotonic() + seconds
+        while self._topics["mask"].get_subscription_count() == 0:
+            if time.monotonic() >= deadline:
+                topic = self._topics["mask"].topic_name
+                self.get_logger().warning(f"nobody listens to '{topic}' after {seconds:g} s: publishing all the same")
+                return
+            self._spin_until(min(deadline, time.monotonic() + _SLICE_S))
+        self._spin_until(time.monotonic() + _SETTLE_S)
+
+    def linger(self) -> None:
+        """Stay until what was published has arrived, or a moment has passed."""
+        deadline = time.monotonic() + _LINGER_S
+        for publisher in self._topics.values():
+            left = max(0.0, deadline - time.monotonic())
+            publisher.wait_for_all_acked(Duration(seconds=left))
+
+    def stop(self) -> None:
+        """Have the replay end soon with `Stopped`; may be called from a signal handler."""
+        self._stop_asked = True
+
+    def close(self) -> None:
+        """Take the node down."""
+        self._executor.shutdown()
+        self.destroy_node()
+
+    def _publish(self, group: Group) -> None:
+        stamp = self._next_stamp()
+        for topic, message in group.messages:
+            if not isinstance(message, bytes):
+                message.header.stamp = stamp
+            self._topics[topic].publish(message)
+            self.published[topic] += 1
+
+    def _next_stamp(self) -> Any:
+        # Strictly increasing even where the clock stands still (simulated time) or is set back.
+        self._newest = max(self._newest + 1, self.get_clock().now().nanoseconds)
+        return stamp_message(self._newest)
+
+    def _spin_until(self, deadline: float) -> None:
+        """Answer requests until then; raises `Stopped` as soon as that is asked for."""
+        while not self._stop_asked:
+            left = deadline - time.monotonic()
+            if left <= 0:
+                return
+            self._executor.spin_once(timeout_sec=min(left, _SLICE_S))
+        raise Stopped
+
+
+def make_source(settings: dict[str, Any]) -> Source:
+    """Open what the parameters name."""
+    data, bag = settings["data"], settings["bag"]
+    if bool(data) == bool(bag):
+        found = f"data is '{data}' and bag is '{bag}'" if data else "neither 'data' nor 'bag' is set"
+        raise SettingsError(f"parameters: {found}; expected exactly one of 'data' (a dataset folder) and 'bag'")
+    if bag:
+        return BagSource(Path(bag).expanduser(), {role: settings[f"{role}_topic"] for role in TYPES})
+    return FolderSource(
+        Path(data).expanduser(), settings["labels"], settings["split"], settings["frame_id"], settings["map_frame"]
+    )
+
+
+def _run(node: ReplayNode) -> int:
+    """Replay as the parameters say; returns the exit code."""
+    log, start = node.get_logger(), None
+    try:
+        settings = node.declare()
+        source = make_source(settings)
+        missing = source.without_mask if isinstance(source, FolderSource) else []
+        if missing:
+            log.warning(f"{len(missing)} views have no label image and are left out, the first '{missing[0]}'")
+        node.wait_for_subscribers(settings["wait_for_subscribers"])
+        log.info(f"replaying {source.description} at {settings['rate']:g} masks per second")
+        start = time.monotonic()
+        node.replay(source, settings["rate"], settings["loop"])
+        end = "done"
+        node.linger()
+    except GssegError as error:
+        log.error(str(error))
+        return 2
+    except Stopped:
+        end = "stopped"
+    seconds = time.monotonic() - start if start is not None else 0.0
+    counts = ", ".join(f"{node.published[topic]} {topic}" for topic in TYPES)
+    log.info(f"{end}: published {counts} in {seconds:.2f} s")
+    return 0
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node; exit code 0 when done or stopped by a signal, 2 for bad input."""
+    try:
+        # rclpy's own handlers would take the context away in the middle of a publication.
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # arguments that ROS cannot parse; its class for that is not public
+        print(f"replay_node: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    node = ReplayNode()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: node.stop())
+    try:
+        return _run(node)
+    finally:
+        node.close()
+        rclpy.shutdown()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

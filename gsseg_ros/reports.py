@@ -1,0 +1,153 @@
+"""What the node says of a segmentation: the report, and one cloud per class."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from geometry_msgs.msg import Point
+from gsseg_msgs.msg import ClassSummary, SegmentationReport, StageTiming
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import ColorRGBA, Header
+
+from gsseg_core.live import LIVE, LiveSession
+from gsseg_core.pictures import palette
+from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.report import gaussian_counts
+from gsseg_core.segmentation import Segmentation
+from gsseg_ros.conversions import cloud
+from gsseg_ros.frames import Similarity
+from gsseg_ros.workspace import Run
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """A segmentation as it was asked for.
+
+    Attributes
+    ----------
+    session : LiveSession
+        What it comes from.
+    result : Segmentation
+        Of all classes.
+    chosen : sequence of int
+        Ids of the classes that were asked for, ascending.
+    min_confidence : float
+        Gaussians less sure than this are left out.
+    similarity : Similarity
+        From the scene to the map.
+    """
+
+    session: LiveSession
+    result: Segmentation
+    chosen: Sequence[int]
+    min_confidence: float
+    similarity: Similarity
+
+    @cached_property
+    def indices(self) -> dict[int, np.ndarray]:
+        """Gaussians (M,) of each class that was asked for."""
+        labels = self.result.labels
+        order = np.argsort(labels, kind="stable")
+        kept = order[self._confidence[order] >= self.min_confidence]
+        bounds = np.searchsorted(labels[kept], [(k, k + 1) for k in self.chosen])
+        return {k: kept[first:last] for k, (first, last) in zip(self.chosen, bounds.tolist(), strict=True)}
+
+    @cached_property
+    def _confidence(self) -> np.ndarray:
+        return self.result.confidence
+
+    @cached_property
+    def _points(self) -> np.ndarray:
+        return self.similarity.points_to_map(self.session.scene.means)
+
+    @cached_property
+    def _colors(self) -> np.ndarray:
+        return palette(self.result.num_classes)
+
+    def class_cloud(self, k: int, header: Header) -> PointCloud2:
+        """Cloud of one class."""
+        return self._cloud(self.indices[k], header)
+
+    def objects_cloud(self, header: Header) -> PointCloud2:
+        """Cloud of all objects that were asked for: every class but the background."""
+        parts = [index for k, index in self.indices.items() if k > 0]
+        return self._cloud(np.concatenate(parts) if parts else np.empty(0, np.int64), header)
+
+    def _cloud(self, index: np.ndarray, header: Header) -> PointCloud2:
+        labels = self.result.labels[index]
+        return cloud(header, self._points[index], self._colors[labels], labels, self._confidence[index])
+
+    def class_summary(self, k: int, topic: str) -> ClassSummary:
+        """Summarise one class in numbers."""
+        index = self.indices[k]
+        red, green, blue = (float(part) / 255 for part in self._colors[k])
+        summary = ClassSummary(
+            class_id=k,
+            name=self.result.class_names[k],
+            topic=topic,
+            color=ColorRGBA(r=red, g=green, b=blue, a=1.0),
+            num_gaussians=len(index),
+        )
+        if len(index):
+            points, confidence = self._points[index], self._confidence[index]
+            summary.mean_confidence = float(confidence.mean(dtype=np.float64))
+            summary.min_confidence = float(confidence.min())
+            summary.centroid = _point(points.mean(axis=0, dtype=np.float64))
+            summary.box_min, summary.box_max = _point(points.min(axis=0)), _point(points.max(axis=0))
+        return summary
+
+
+def report_message(
+    run: Run,
+    selection: Selection,
+    settings: RefineSettings,
+    map_frame: str,
+    topics: Mapping[int, str] | None = None,
+) -> SegmentationReport:
+    """Report a run; the stages so far and the total are filled in by `finish`."""
+    session, result = selection.session, selection.result
+    counts, learnt = gaussian_counts(result), session.learnt
+    background = int((result.labels == 0).sum())
+    rejected = sorted(session.rejected.items())
+    return SegmentationReport(
+        header=Header(stamp=run.stamp, frame_id=map_frame),
+        revision=run.revision,
+        job=run.job,
+        scene_path=str(session.scene.path),
+        scene_hash=session.scene.digest,
+        num_gaussians=len(session.scene),
+        num_objects=counts["labelled"] - background,
+        num_background=background,
+        num_unobserved=counts["unobserved"],
+        num_removed=counts["removed"],
+        learner=LIVE if learnt is None else learnt.learner,
+        num_views=session.num_fused if learnt is None else learnt.num_views,
+        num_views_rejected=sum(count for _, count in rejected),
+        rejection_reasons=[reason for reason, _ in rejected],
+        rejection_counts=[count for _, count in rejected],
+        k=settings.k if settings.cluster else 0,
+        beta=settings.beta,
+        filtered=settings.filter,
+        min_confidence=selection.min_confidence,
+        classes=[selection.class_summary(k, (topics or {}).get(k, "")) for k in selection.chosen],
+    )
+
+
+def finish(report: SegmentationReport, run: Run) -> SegmentationReport:
+    """Fill in how long the run took."""
+    report.stages = stage_timings(run)
+    report.total_seconds = run.total_seconds
+    return report
+
+
+def stage_timings(run: Run) -> list[StageTiming]:
+    """Seconds of every stage, in the order in which they ran."""
+    return [StageTiming(name=name, seconds=seconds) for name, seconds in run.watch.seconds.items()]
+
+
+def _point(values: Sequence[float]) -> Point:
+    x, y, z = (float(value) for value in values)
+    return Point(x=x, y=y, z=z)

@@ -1,0 +1,198 @@
+"""The lifecycle node `gsseg`: fuses posed masks as they arrive, learns and segments on request."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
+
+from gsseg_core.errors import GssegError
+from gsseg_core.warm_up import warm_up
+from gsseg_ros import diagnostics, parameters
+from gsseg_ros.inputs import Inputs
+from gsseg_ros.learn_action import LearnAction
+from gsseg_ros.outputs import Outputs
+from gsseg_ros.parameters import Settings
+from gsseg_ros.services import Services
+from gsseg_ros.viewpoints import Lookup
+from gsseg_ros.workspace import Workspace
+
+THREADS = 6
+"""Of the executor: one learn job, some requests at once, and always one left for messages and parameters."""
+
+STOP_SECONDS = 3.0
+"""How long a job gets to stop when the node is deactivated or shut down."""
+
+
+class SegmentNode(LifecycleNode):
+    """Wires topics, services and the action to a `Workspace`.
+
+    configure: reads the parameters, loads the scene. activate: listens. deactivate: stops a running job and listening,
+    keeps what was learnt. cleanup: forgets it. Services and the action are there from the start and answer NOT_ACTIVE
+    until then.
+    """
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__("gsseg", **kwargs)
+        parameters.declare(self)
+        self.workspace = Workspace(Settings.read(self), lambda: self.get_clock().now().to_msg())
+        self.inputs: Inputs | None = None
+        self._outputs: Outputs | None = None
+        self._requests = Services(self, self.workspace, self._require_outputs, self._lookup)
+        self._learn = LearnAction(self, self.workspace)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._dropped_before: dict[str, int] = {}
+        self.create_timer(1.0, self._tell)
+        self.add_on_set_parameters_callback(self._check_parameters)
+        self.add_post_set_parameters_callback(self._take_parameters)
+
+    def autostart(self) -> None:
+        """Configure and activate, unless the parameter says not to; what fails is logged and can be tried again."""
+        if not self.workspace.settings.autostart:
+            self.get_logger().info("waiting to be configured and activated (autostart is false)")
+        elif self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+            self.trigger_activate()
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Read the parameters and load the scene."""
+        try:
+            self.workspace.settings = settings = Settings.read(self)
+            self.get_logger().info("loading kernels; at the first start after installing they are compiled (a minute)")
+            warm_up(settings.device)
+            if settings.scene_path:
+                self.workspace.load_scene(self.workspace.scene_path())
+        except GssegError as error:
+            self.get_logger().error(f"cannot be configured: {error}")
+            return TransitionCallbackReturn.FAILURE
+        self._outputs = Outputs(self)
+        self._outputs.announce(settings.names_by_id)
+        if self.workspace.has_scene:
+            session = self.workspace.session
+            self.get_logger().info(f"loaded {session.scene.path}: {len(session.scene):,} Gaussians")
+        else:
+            self.get_logger().warning("no scene yet: set the parameter scene_path, or call ~/load_scene")
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Begin to listen."""
+        try:
+            self.inputs = Inputs(self, self.workspace)
+        except GssegError as error:
+            self.get_logger().error(f"cannot be activated: {error}")
+            return TransitionCallbackReturn.FAILURE
+        self.workspace.active = True
+        topics = ", ".join(self.inputs.arrivals)
+        self.get_logger().info(
+            f"active: listening to {topics}; services and the action are below {self.get_fully_qualified_name()}/"
+        )
+        return super().on_activate(state)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop a running job, and listening."""
+        self._stop()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Forget the scene and all that was learnt."""
+        self._forget()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop, from any state."""
+        self._stop()
+        self._forget()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Go back to unconfigured after an error in a transition."""
+        self._stop()
+        self._forget()
+        return TransitionCallbackReturn.SUCCESS
+
+    def close(self) -> None:
+        """Stop all threads and take the node away."""
+        self._stop()
+        self._learn.close()
+        self.destroy_node()
+
+    def _stop(self) -> None:
+        self.workspace.active = False
+        if not self.workspace.slot.cancel(STOP_SECONDS):
+            self.get_logger().warning(f"a job did not stop within {STOP_SECONDS:g} s; going on without it")
+        if self.inputs is not None:
+            self.inputs.close()
+            self.inputs = None
+
+    def _forget(self) -> None:
+        self.workspace.close()
+        if self._outputs is not None:
+            self._outputs.close()
+            self._outputs = None
+
+    def _require_outputs(self) -> Outputs:
+        if self._outputs is None:
+            self.workspace.require_active()
+            raise AssertionError("an active node has outputs")
+        return self._outputs
+
+    def _lookup(self) -> Lookup | None:
+        return self.inputs.tf.look_up if self.inputs is not None and self.inputs.tf is not None else None
+
+    def _check_parameters(self, changed: Sequence[Parameter]) -> SetParametersResult:
+        return parameters.check(self, changed, configured=self._outputs is not None)
+
+    def _take_parameters(self, changed: Sequence[Parameter]) -> None:
+        if {parameter.name for parameter in changed} & parameters.AT_ONCE:
+            self.workspace.settings = Settings.read(self)
+
+    def _tell(self) -> None:
+        inputs, stamp = self.inputs, self.get_clock().now().to_msg()
+        self._diagnostics.publish(
+            diagnostics.diagnostic_array(self.get_fully_qualified_name(), self.workspace, inputs, stamp)
+        )
+        if inputs is None:
+            return
+        for line in diagnostics.missing_inputs(inputs):
+            inputs.complain(line.split(" for ")[0], line)
+        for line in diagnostics.unpaired(inputs, self._dropped_before):
+            inputs.complain(line.split(" masks")[1], line)
+        self._dropped_before = dict(inputs.pairing.dropped)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node until SIGINT or SIGTERM; returns the exit code: 0, or 2 for arguments that cannot be used."""
+    # rclpy's own handlers would take the context away under a running job, and its spin() does not always notice.
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        node = SegmentNode()
+    except Exception as error:  # What ROS raises for arguments and parameters that it cannot take is not public.
+        print(f"segment_node: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    executor = MultiThreadedExecutor(THREADS)
+    executor.add_node(node)
+    try:
+        node.autostart()
+        while not stop.is_set():
+            executor.spin_once(timeout_sec=0.2)
+    finally:
+        node.close()
+        executor.shutdown(timeout_sec=STOP_SECONDS)
+        rclpy.shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,230 @@
+"""The node's services: each request becomes calls of the core, each error an error code and one line."""
+
+from __future__ import annotations
+
+import functools
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any, TypeVar
+
+from geometry_msgs.msg import Point
+from gsseg_msgs.srv import Export, LoadScene, LoadState, RenderView, Reset, SaveState, Segment
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.lifecycle import LifecycleNode
+from std_msgs.msg import Header
+
+from gsseg_core.errors import GssegError
+from gsseg_core.export import export_classes, write_json
+from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.report import build_report
+from gsseg_ros.errors import InvalidRequestError, error_code
+from gsseg_ros.outputs import Outputs
+from gsseg_ros.reports import Selection, finish, report_message, stage_timings
+from gsseg_ros.viewpoints import Lookup, draw, viewpoint
+from gsseg_ros.workspace import Run, Workspace, checked_confidence, chosen_classes
+
+STATE_FILE, EXPORT_FOLDER = "gsseg_state.npz", "gsseg_export"
+
+Handler = TypeVar("Handler", bound=Callable[..., Any])
+
+
+def answered(handler: Handler) -> Handler:
+    """Make a handler answer every error with its code and one line; nothing that a request asks may end the node."""
+
+    @functools.wraps(handler)
+    def answer(self: Services, request: Any, response: Any) -> Any:
+        try:
+            self.workspace.require_active()
+            handler(self, request, response)
+        except Exception as error:
+            response = type(response)()  # Nothing half filled in goes out.
+            response.error_code = error_code(error, type(response))
+            response.error_msg = explain(self.node, error)
+        return response
+
+    return answer  # type: ignore[return-value]
+
+
+def explain(node: LifecycleNode, error: Exception) -> str:
+    """Log what went wrong, and say it in one line; what was not foreseen is logged with its traceback."""
+    if isinstance(error, GssegError):
+        node.get_logger().warning(str(error))
+        return str(error)
+    node.get_logger().error(f"unexpected {type(error).__name__}: {error}\n{traceback.format_exc()}")
+    return f"unexpected {type(error).__name__}: {error}; the node's log has the details"
+
+
+def refinement(request: Any, workspace: Workspace) -> RefineSettings:
+    """Refinement as a request asks for it, with the node's k and beta."""
+    settings = workspace.settings
+    return RefineSettings(
+        k=settings.k,
+        beta=settings.beta,
+        cluster=not request.skip_refinement,
+        filter=not (request.skip_refinement or request.skip_filter),
+    )
+
+
+class Services:
+    """Answers requests.
+
+    Parameters
+    ----------
+    node : LifecycleNode
+        Offers the services.
+    workspace : Workspace
+        What they work on.
+    outputs : callable
+        The outputs, which exist while the node is configured.
+    lookup : callable
+        The transform lookup, which exists while the node is active with pose_source tf.
+    """
+
+    def __init__(
+        self,
+        node: LifecycleNode,
+        workspace: Workspace,
+        outputs: Callable[[], Outputs],
+        lookup: Callable[[], Lookup | None],
+    ) -> None:
+        self.node, self.workspace = node, workspace
+        self._outputs, self._lookup = outputs, lookup
+        # Reentrant: a request must not wait for another one to be answered.
+        group = ReentrantCallbackGroup()
+        for interface, name, handler in (
+            (Segment, "segment", self.segment),
+            (RenderView, "render_view", self.render_view),
+            (LoadScene, "load_scene", self.load_scene),
+            (SaveState, "save_state", self.save_state),
+            (LoadState, "load_state", self.load_state),
+            (Export, "export", self.export),
+            (Reset, "reset", self.reset),
+        ):
+            node.create_service(interface, f"~/{name}", handler, callback_group=group)
+
+    @answered
+    def segment(self, request: Segment.Request, response: Segment.Response) -> None:
+        """Segment the scene, publish the clouds, and draw the viewpoint if there is one."""
+        settings, outputs = self.workspace.settings, self._outputs()
+        with self.workspace.run("segment") as run:
+            camera = None
+            selection, refine = self._select(request, run)
+            if request.viewpoint_camera.width:
+                camera = viewpoint(request, settings, self._lookup())
+            with run.watch.stage("publish"):
+                topics = outputs.announce(selection.result.class_names)
+                outputs.publish_clouds(selection, self._header(run))
+            if camera is not None:
+                header = Header(stamp=run.stamp, frame_id=request.viewpoint_camera.header.frame_id)
+                with run.watch.stage("render"):
+                    drawing = draw(selection, camera, header, with_overlay=outputs.wants_overlay)
+                response.label_image = drawing.labels
+                if drawing.overlay.width:
+                    outputs.publish_overlay(drawing.overlay)
+            response.report = finish(report_message(run, selection, refine, settings.map_frame, topics), run)
+            outputs.publish_report(response.report)
+
+    @answered
+    def render_view(self, request: RenderView.Request, response: RenderView.Response) -> None:
+        """Draw a viewpoint."""
+        session, settings = self.workspace.session, self.workspace.settings
+        with self.workspace.run("render_view") as run:
+            result = session.segmentation(refinement(request, self.workspace), run.watch)
+            camera = viewpoint(request, settings, self._lookup())
+            header = Header(stamp=run.stamp, frame_id=request.viewpoint_camera.header.frame_id)
+            selection = Selection(session, result, sorted(result.class_names), 0.0, settings.scene_to_map)
+            with run.watch.stage("render"):
+                drawing = draw(selection, camera, header, with_overlay=request.with_overlay)
+            response.revision, response.stages = run.revision, stage_timings(run)
+            response.label_image, response.overlay_image = drawing.labels, drawing.overlay
+            if request.with_confidence:
+                response.confidence_image = drawing.confidence
+
+    @answered
+    def load_scene(self, request: LoadScene.Request, response: LoadScene.Response) -> None:
+        """Load another scene, and drop what was known of the earlier one."""
+        workspace, started = self.workspace, time.perf_counter()
+        if request.path:
+            path = workspace.existing(request.path)
+        elif workspace.settings.scene_path:
+            path = workspace.scene_path()
+        else:
+            raise InvalidRequestError("path and the parameter scene_path are both empty; expected a 3DGS PLY in either")
+        with workspace.slot.take("load_scene"), workspace.run("load_scene") as run:
+            workspace.load_scene(path)
+            self._outputs().clear(self._header(run))
+        session = workspace.session
+        corners = workspace.settings.scene_to_map.points_to_map(session.scene.means)
+        response.path, response.scene_hash = str(session.scene.path), session.scene.digest
+        response.num_gaussians = len(session.scene)
+        response.box_min, response.box_max = (_point(corner) for corner in (corners.min(axis=0), corners.max(axis=0)))
+        response.seconds = time.perf_counter() - started
+
+    @answered
+    def save_state(self, request: SaveState.Request, response: SaveState.Response) -> None:
+        """Save votes, views and codes."""
+        path, session = self.workspace.path(request.path, STATE_FILE), self.workspace.session
+        with self.workspace.run("save_state"):
+            response.num_views = session.save(path)
+        response.path, response.num_bytes = str(path), path.stat().st_size
+
+    @answered
+    def load_state(self, request: LoadState.Request, response: LoadState.Response) -> None:
+        """Load what was saved, in place of what is known."""
+        session, path = self.workspace.session, self.workspace.existing(request.path, STATE_FILE)
+        with self.workspace.slot.take("load_state"), self.workspace.run("load_state"):
+            response.num_views = session.load(path)
+        response.path, response.class_names = str(path), list(session.class_names.values())
+
+    @answered
+    def export(self, request: Export.Request, response: Export.Response) -> None:
+        """Write the files that the command line writes."""
+        folder, settings = self.workspace.path(request.directory, EXPORT_FOLDER), self.workspace.settings
+        with self.workspace.run("export") as run:
+            selection, refine = self._select(request, run)
+            session = selection.session
+            result = selection.result.selected(selection.chosen, selection.min_confidence)
+            with run.watch.stage("write"):
+                result.save(folder / "segmentation.npz")
+                plys = export_classes(session.scene, result, folder / "classes")
+                names = {k: str(path.relative_to(folder)) for k, path in plys.items()}
+                report = finish(report_message(run, selection, refine, settings.map_frame), run)
+                content = build_report(
+                    session.scene,
+                    result,
+                    views={"used": report.num_views, "rejected": dict(session.rejected)},
+                    settings={"learner": report.learner, "device": settings.device, "refine": asdict(refine)},
+                    seconds=run.watch.seconds,
+                    plys=names,
+                )
+                write_json(folder / "report.json", content)
+        response.report = finish(report, run)
+        response.directory, response.files = str(folder), ["segmentation.npz", *names.values(), "report.json"]
+
+    @answered
+    def reset(self, request: Reset.Request, response: Reset.Response) -> None:
+        """Forget codes and views, and clear the clouds."""
+        workspace = self.workspace
+        with workspace.slot.take("reset"), workspace.run("reset") as run:
+            response.num_views_dropped = workspace.session.reset() if workspace.has_scene else 0
+            self._outputs().clear(self._header(run))
+
+    def _select(self, request: Any, run: Run) -> tuple[Selection, RefineSettings]:
+        session, refine = self.workspace.session, refinement(request, self.workspace)
+        threshold = checked_confidence(request)
+        if session.has_codes:
+            # Before the work: a wrong name should not have to wait for it.
+            chosen_classes(request, session.class_names)
+        result = session.segmentation(refine, run.watch)
+        chosen = chosen_classes(request, result.class_names)
+        return Selection(session, result, chosen, threshold, self.workspace.settings.scene_to_map), refine
+
+    def _header(self, run: Run) -> Header:
+        return Header(stamp=run.stamp, frame_id=self.workspace.settings.map_frame)
+
+
+def _point(corner: Any) -> Point:
+    x, y, z = (float(value) for value in corner)
+    return Point(x=x, y=y, z=z)

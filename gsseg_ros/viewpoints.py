@@ -1,0 +1,86 @@
+"""Pictures of a segmentation from a viewpoint that a request names."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from sensor_msgs.msg import Image
+from std_msgs.msg import Header
+
+from gsseg_core.cameras import Camera
+from gsseg_core.errors import IntrinsicsError, PoseError
+from gsseg_core.export import background_image
+from gsseg_core.operator import make_operator
+from gsseg_core.pictures import overlay, palette
+from gsseg_ros.conversions import (
+    camera_from_messages,
+    confidence_image,
+    label_image,
+    matrix_from_pose,
+    rgb_image,
+    stamp_ns,
+)
+from gsseg_ros.errors import NoTransformError, ViewpointError
+from gsseg_ros.parameters import Settings
+from gsseg_ros.reports import Selection
+
+Lookup: TypeAlias = Callable[[str, int], "npt.NDArray[np.float64] | None"]
+"""Pose (4, 4) of a frame in the map frame at a stamp in ns, 0 being the latest; None where there is none."""
+
+MAX_PIXELS = 1 << 26
+"""A viewpoint of more pixels is taken for a mistake."""
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """What a viewpoint shows, as messages; `overlay` is empty unless it was asked for."""
+
+    labels: Image
+    confidence: Image
+    overlay: Image
+
+
+def viewpoint(request: Any, settings: Settings, lookup: Lookup | None) -> Camera:
+    """Make the scene's camera of the viewpoint of a request.
+
+    Raises
+    ------
+    ViewpointError
+        Pose or camera cannot be used.
+    NoTransformError
+        The pose is in a frame that is not the map and cannot be looked up.
+    """
+    pose, info = request.viewpoint_pose, request.viewpoint_camera
+    if info.width * info.height > MAX_PIXELS:
+        raise ViewpointError(f"viewpoint_camera: {info.width} x {info.height} pixels; expected {MAX_PIXELS} at most")
+    try:
+        matrix = matrix_from_pose(pose.pose, "viewpoint_pose")
+        frame = pose.header.frame_id
+        if frame and frame != settings.map_frame:
+            found = lookup(frame, stamp_ns(pose.header.stamp)) if lookup is not None else None
+            if found is None:
+                raise NoTransformError(
+                    f"viewpoint_pose: frame_id is '{frame}', and there is no transform from it to "
+                    f"'{settings.map_frame}'; expected '{settings.map_frame}', or pose_source tf and a known frame"
+                )
+            matrix = found @ matrix
+        return camera_from_messages("viewpoint", info, matrix, settings.scene_to_map, "viewpoint_camera")
+    except (PoseError, IntrinsicsError) as error:
+        raise ViewpointError(str(error)) from error
+
+
+def draw(selection: Selection, camera: Camera, header: Header, *, with_overlay: bool = False) -> Drawing:
+    """Draw the labels of a view; classes that were not asked for are drawn as background."""
+    session = selection.session
+    operator = make_operator(session.scene, camera, session.device)
+    seen = selection.result.render(operator)
+    labels = np.where(np.isin(seen.labels, selection.chosen), seen.labels, 0)
+    picture = Image()
+    if with_overlay:
+        colors = palette(selection.result.num_classes)
+        picture = rgb_image(overlay(background_image(session.scene, operator), labels, colors), header)
+    return Drawing(label_image(labels, header), confidence_image(np.minimum(seen.confidence, 1.0), header), picture)

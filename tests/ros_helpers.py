@@ -1,0 +1,223 @@
+"""What the tests of the ROS nodes share: a private context, node processes, and waits that always end.
+
+Importing this module skips the importing test file where ROS is not installed. A test file imports the
+fixture and its tests take `ros`:
+
+    from ros_helpers import Ros, ros_fixture  # noqa: F401
+
+    def test_something(ros: Ros) -> None:
+        masks = ros.collect(Image, "mask")
+        process = ros.start("replay_node", {"data": folder, "rate": 50.0})
+        ros.wait_until(lambda: len(masks) == 4, "4 masks")
+        assert process.wait() == 0, process.output
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+try:
+    # Set before any message class is imported: only then do they check their fields.
+    os.environ.setdefault("ROS_PYTHON_CHECK_FIELDS", "1")
+    from rclpy.context import Context
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+    from rclpy.node import Node
+
+    with warnings.catch_warnings():
+        # Loads a parser that uses deprecated modules of Python; rclpy would do so at the first publisher.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        import rosidl_generator_py  # noqa: F401
+except ImportError as _error:
+    pytest.skip(f"ROS is not installed ({_error})", allow_module_level=True)
+
+REPOSITORY = Path(__file__).parents[1]
+PATIENCE = 30.0
+"""Seconds until a wait gives up; a busy machine needs some just to start a node."""
+
+_counter = itertools.count()
+
+
+def next_domain() -> int:
+    """A ROS domain that the tests of this run, and of one beside it, do not use soon: 1 to 100."""
+    return (os.getpid() * 17 + next(_counter)) % 100 + 1
+
+
+def wait_until(condition: Callable[[], Any], what: str, timeout: float = PATIENCE) -> None:
+    """Wait until the condition holds; fails the test, saying what was waited for."""
+    deadline = time.monotonic() + timeout
+    while not condition():
+        if time.monotonic() > deadline:
+            pytest.fail(f"waited {timeout:g} s in vain for {what}")
+        time.sleep(0.01)
+
+
+class Process:
+    """`python -m gsseg_ros.<module> <arguments>` whose output, of both kinds, is collected as it comes."""
+
+    def __init__(self, module: str, arguments: list[str], environment: Mapping[str, str]) -> None:
+        self._lines: list[str] = []
+        self._name = module
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", f"gsseg_ros.{module}", *arguments],
+            cwd=REPOSITORY, env=dict(environment), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT, text=True, errors="replace",
+        )  # fmt: skip
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    @property
+    def output(self) -> str:
+        """What it has written so far."""
+        return "".join(self._lines)
+
+    @property
+    def running(self) -> bool:
+        return self._process.poll() is None
+
+    def wait(self, timeout: float = PATIENCE) -> int:
+        """Wait for its end and return the exit code; fails the test if it does not end."""
+        try:
+            code = self._process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            pytest.fail(f"{self._name} did not end within {timeout:g} s; its output:\n{self.output}")
+        self._reader.join(5)
+        return code
+
+    def wait_for(self, text: str, timeout: float = PATIENCE) -> None:
+        """Wait until the text has turned up in the output; fails the test if it does not."""
+        deadline = time.monotonic() + timeout
+        while text not in self.output:
+            if not self.running:
+                self._reader.join(5)
+            if time.monotonic() > deadline or (not self.running and text not in self.output):
+                pytest.fail(f"{self._name} did not write {text!r}; its output:\n{self.output}")
+            time.sleep(0.01)
+
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal."""
+        self._process.send_signal(number)
+
+    def stop(self, timeout: float = 10.0) -> int:
+        """End it as Ctrl-C does and return the exit code; kills it and fails the test if it does not end."""
+        if self.running:
+            self.send(signal.SIGINT)
+        return self.wait(timeout)
+
+    def kill(self) -> None:
+        """End it whatever it does; harmless where it has ended."""
+        self._process.kill()
+        self._process.wait(10)
+        self._reader.join(5)
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        with self._process.stdout as pipe:
+            self._lines.extend(pipe)
+
+
+class Ros:
+    """A ROS context of its own in a domain of its own, with a node that a thread spins."""
+
+    def __init__(self, folder: Path) -> None:
+        self.domain = next_domain()
+        self.environment = {
+            **os.environ,
+            "ROS_DOMAIN_ID": str(self.domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "ROS_PYTHON_CHECK_FIELDS": "1", "ROS_LOG_DIR": str(folder / "ros_log"), "PYTHONUNBUFFERED": "1",
+            "RCUTILS_COLORIZED_OUTPUT": "0",
+        }  # fmt: skip
+        self.context = Context()
+        self.context.init(args=[], domain_id=self.domain)
+        self.node = Node("test", context=self.context, use_global_arguments=False)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self._processes: list[Process] = []
+        self._closing = False
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def start(self, module: str, parameters: Mapping[str, Any] | None = None, *arguments: str) -> Process:
+        """Start a node in this domain; `arguments` are further ones for ROS, such as "-r", "mask:=/other"."""
+        settings = [
+            text
+            for name, value in (parameters or {}).items()
+            for text in ("-p", f"{name}:={json.dumps(_plain(value))}")
+        ]
+        process = Process(module, ["--ros-args", *settings, *arguments], self.environment)
+        self._processes.append(process)
+        return process
+
+    def collect(self, kind: Any, topic: str, qos: Any = 30) -> list[Any]:
+        """Subscribe, and return the list to which the messages are appended as they come."""
+        messages: list[Any] = []
+        self.node.create_subscription(kind, topic, messages.append, qos)
+        return messages
+
+    def wait_until(self, condition: Callable[[], Any], what: str, timeout: float = PATIENCE) -> None:
+        """Wait as `wait_until` does; fails with the output of the processes."""
+        try:
+            wait_until(condition, what, timeout)
+        except pytest.fail.Exception as failure:
+            pytest.fail(f"{failure}; output of the nodes:\n" + "\n".join(p.output for p in self._processes))
+
+    def result(self, future: Any, what: str = "an answer", timeout: float = PATIENCE) -> Any:
+        """Wait for a future of a client of `node` (a service's or an action's) and return its result."""
+        self.wait_until(future.done, what, timeout)
+        return future.result()
+
+    def call(self, kind: Any, name: str, request: Any, timeout: float = PATIENCE) -> Any:
+        """Call a service once it is there and return the response."""
+        client = self.node.create_client(kind, name)
+        try:
+            self.wait_until(client.service_is_ready, f"service {name}", timeout)
+            return self.result(client.call_async(request), f"the answer of {name}", timeout)
+        finally:
+            self.node.destroy_client(client)
+
+    def close(self) -> None:
+        """Kill what still runs and take everything down."""
+        for process in self._processes:
+            process.kill()
+        self._closing = True
+        self.executor.wake()
+        self._thread.join(10)
+        self.executor.shutdown(5)
+        self.node.destroy_node()
+        self.context.try_shutdown()
+        assert not self._thread.is_alive(), "a callback of the test's node does not end"
+
+    def _spin(self) -> None:
+        # Not executor.spin(): its end, asked for from another thread, races with its own clean-up.
+        try:
+            while not self._closing:
+                self.executor.spin_once(timeout_sec=0.5)
+        except ExternalShutdownException:
+            pass
+
+
+def _plain(value: Any) -> Any:
+    return str(value) if isinstance(value, Path) else value
+
+
+@pytest.fixture(name="ros")
+def ros_fixture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ros]:
+    """A private context, node and spinning thread, and processes in the same domain; all gone after the test."""
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path / "ros_log"))
+    ros = Ros(tmp_path)
+    yield ros
+    ros.close()
