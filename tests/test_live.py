@@ -1,0 +1,237 @@
+"""The live session: views fused one by one, codes learnt beside it, saved and restored, from several threads."""
+
+from __future__ import annotations
+
+import math
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, taught, write_dataset, wrong_views
+
+from gsseg_core import live
+from gsseg_core.dataset import Dataset, View
+from gsseg_core.em import EMLearner
+from gsseg_core.errors import (
+    MaskFormatError,
+    NoCodesError,
+    NoUsableViewsError,
+    SettingsError,
+    StateFileError,
+    StateMismatchError,
+    UnknownLabelError,
+)
+from gsseg_core.live import LiveSession
+from gsseg_core.masks import UNKNOWN
+from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.votes import VoteLearner
+
+SCENE, TRUTH = balls_on_a_table()
+VIEWS = clean_views(6)
+
+
+def fed(session: LiveSession, views: list[View] = VIEWS) -> LiveSession:
+    for view in views:
+        assert session.fuse(view) is None
+    return session
+
+
+def blank(view: View, label: int = UNKNOWN) -> View:
+    return View.from_arrays(view.camera, np.full((view.camera.height, view.camera.width), label))
+
+
+def test_codes_of_fused_views_are_those_of_the_votes() -> None:
+    expected = taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS).fit().codes_
+    np.testing.assert_array_equal(fed(LiveSession(SCENE, NAMES)).codes(), expected)
+
+
+def test_classes_turn_up_with_their_labels_unless_they_were_declared() -> None:
+    session = LiveSession(SCENE)
+    assert session.class_names == {0: "background"}
+    fed(session)
+    assert session.class_names == {0: "background", 1: "class_01", 2: "class_02", 3: "class_03"}
+    np.testing.assert_array_equal(session.codes(), fed(LiveSession(SCENE, NAMES)).codes())
+    declared = LiveSession(SCENE, {0: "background", 1: "ball"})
+    rejection = declared.fuse(VIEWS[0])
+    assert rejection is not None and rejection.reason == "unknown_label" and "at most 1" in rejection.message
+
+
+def test_a_label_that_would_take_too_much_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "VOTES_LIMIT", 8 * len(SCENE) * 10)
+    session = LiveSession(SCENE)
+    assert session.fuse(blank(VIEWS[0], 9)) is None
+    rejection = session.fuse(blank(VIEWS[1], 10))
+    assert rejection is not None and "expected at most 9 for a scene of 626 Gaussians" in rejection.message
+    assert len(session.class_names) == 10
+
+
+def test_views_that_cannot_be_used_are_counted_by_reason_and_change_nothing() -> None:
+    session = fed(LiveSession(SCENE, NAMES))
+    before, names = session.codes(), session.class_names
+    for _ in range(70):
+        assert session.fuse(blank(VIEWS[0])).reason == "all_pixels_unknown"  # type: ignore[union-attr]
+        assert session.fuse(blank(VIEWS[1], 9)).reason == "unknown_label"  # type: ignore[union-attr]
+        assert session.fuse(View(VIEWS[0].camera)).reason == "no_mask"  # type: ignore[union-attr]
+    assert session.rejected == {"all_pixels_unknown": 70, "unknown_label": 70, "no_mask": 70}
+    np.testing.assert_array_equal(session.codes(), before)
+    assert session.class_names == names and session.num_fused == len(VIEWS)
+
+
+def test_only_the_last_views_are_kept_and_no_vote_is_dropped() -> None:
+    session = fed(LiveSession(SCENE, NAMES, max_views=2))
+    assert session.num_views == 2 and session.num_fused == len(VIEWS)
+    np.testing.assert_array_equal(session.codes(), fed(LiveSession(SCENE, NAMES)).codes())
+    expected = taught(EMLearner(SCENE, NUM_CLASSES), VIEWS[-2:]).fit().codes_
+    np.testing.assert_array_equal(session.learn().learnt.codes, expected)
+    with pytest.raises(SettingsError, match="max_views is 0; expected at least 1"):
+        LiveSession(SCENE, NAMES, max_views=0)
+
+
+def test_learning_gives_what_the_learner_gives_on_the_same_views() -> None:
+    views = wrong_views(8)
+    session, teacher = fed(LiveSession(SCENE, NAMES), views), taught(EMLearner(SCENE, NUM_CLASSES), views).fit()
+    told: list[tuple[str, int, int, float]] = []
+    outcome = session.learn(report=lambda *what: told.append(what))
+    np.testing.assert_array_equal(outcome.learnt.codes, teacher.codes_)
+    assert outcome.num_steps == len(teacher.history_) and outcome.converged
+    assert outcome.loss == -teacher.history_[-1] and outcome.learnt.num_views == 8
+    assert all(0 <= done <= total for _, done, total, _ in told) and math.isnan(told[0][3])
+    assert told[0][0] == "observe" and told[-1][0] == "em" and told[-1][3] == outcome.loss
+
+
+def test_after_learning_its_codes_hold_and_votes_speak_for_the_gaussians_that_it_did_not_see() -> None:
+    labels = VIEWS[0].read_labels()
+    labels[:, 20:] = UNKNOWN
+    views = [View.from_arrays(VIEWS[0].camera, labels), *VIEWS[1:]]
+    session = fed(LiveSession(SCENE, NAMES), views[:1])
+    learnt = session.learn().learnt.codes
+    fed(session, views[1:])
+    votes, codes = fed(LiveSession(SCENE, NAMES), views).codes(), session.codes()
+    known = learnt.any(axis=1)
+    assert known.any() and not known.all() and (votes.any(axis=1) & ~known).any()
+    np.testing.assert_array_equal(codes[known], learnt[known])
+    np.testing.assert_array_equal(codes[~known], votes[~known])
+
+
+def test_learning_from_a_folder_takes_its_train_views_and_its_names(tmp_path: Path) -> None:
+    data = Dataset(write_dataset(tmp_path / "data"))
+    session = LiveSession(SCENE)
+    outcome = session.learn(dataset=data)
+    expected = taught(EMLearner(SCENE, NUM_CLASSES), data.views("train")).fit().codes_
+    np.testing.assert_array_equal(outcome.learnt.codes, expected)
+    assert session.class_names == NAMES and session.num_fused == 0 and session.has_codes
+    assert session.learn(dataset=data, num_views=2).learnt.num_views == 2
+    assert session.learn(dataset=data, max_steps=1).num_steps == 1
+    assert math.isnan(session.learn("votes", data).loss)
+
+
+@pytest.mark.parametrize("stage", ["observe", "em"])
+def test_learning_that_is_stopped_changes_nothing(stage: str) -> None:
+    class StoppedError(Exception):
+        pass
+
+    def stop(what: str, done: int, total: int, loss: float) -> None:
+        if what == stage and (done or stage == "em"):
+            raise StoppedError
+
+    session = fed(LiveSession(SCENE, NAMES))
+    session.learn(num_views=2)
+    before, version = session.codes(), session.learnt
+    with pytest.raises(StoppedError):
+        session.learn(report=stop)
+    assert session.learnt is version
+    np.testing.assert_array_equal(session.codes(), before)
+
+
+def test_learning_from_broken_files_names_the_file_and_changes_nothing(tmp_path: Path) -> None:
+    session, root = fed(LiveSession(SCENE, NAMES)), write_dataset(tmp_path / "data")
+    before = session.codes()
+    next((root / "labels").glob("view1.png")).write_bytes(b"no picture")
+    with pytest.raises(MaskFormatError, match=r"view1\.png"):
+        session.learn(dataset=Dataset(root))
+    with pytest.raises(UnknownLabelError):
+        LiveSession(SCENE, {0: "background", 1: "one"}).learn(dataset=Dataset(write_dataset(tmp_path / "other")))
+    np.testing.assert_array_equal(session.codes(), before)
+
+
+def test_without_views_there_is_nothing_to_learn_show_or_save(tmp_path: Path) -> None:
+    session = LiveSession(SCENE, NAMES)
+    with pytest.raises(NoUsableViewsError):
+        session.learn()
+    for ask in (session.codes, session.segmentation, lambda: session.save(tmp_path / "state.npz")):
+        with pytest.raises(NoCodesError):
+            ask()
+    assert not session.has_codes and not list(tmp_path.iterdir())
+
+
+def test_a_segmentation_is_kept_until_codes_or_settings_change() -> None:
+    session = fed(LiveSession(SCENE, NAMES), VIEWS[:3])
+    first = session.segmentation()
+    assert session.segmentation() is first
+    other = session.segmentation(RefineSettings(cluster=False, filter=False))
+    assert other is not first and not other.clustered.any()
+    before = session.segmentation()
+    fed(session, VIEWS[3:4])
+    assert session.segmentation() is not before
+
+
+def test_a_saved_session_comes_back_whole(tmp_path: Path) -> None:
+    session = fed(LiveSession(SCENE, max_views=4))
+    session.learn()
+    fed(session, clean_views(2, "late"))
+    assert session.save(tmp_path / "state.npz") == 4
+    again = LiveSession(SCENE)
+    assert again.load(tmp_path / "state.npz") == 4
+    np.testing.assert_array_equal(again.codes(), session.codes())
+    assert again.class_names == session.class_names and again.num_fused == 8 and again.num_views == 4
+    np.testing.assert_array_equal(again.learn().learnt.codes, session.learn().learnt.codes)
+    assert LiveSession(SCENE, NAMES).load(tmp_path / "state.npz") == 4
+
+
+def test_a_state_that_does_not_fit_is_refused_and_changes_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "state.npz"
+    fed(LiveSession(SCENE, NAMES)).save(path)
+    other = LiveSession(balls_on_a_table(seed=1)[0], NAMES)
+    fed(other, VIEWS[:1])
+    few = LiveSession(SCENE, {0: "background", 1: "ball"})
+    few.fuse(blank(VIEWS[0], 1))
+    for session, error in ((other, StateMismatchError), (few, StateFileError)):
+        before = session.codes()
+        with pytest.raises(error):
+            session.load(path)
+        np.testing.assert_array_equal(session.codes(), before)
+
+
+def test_reset_forgets_all_but_the_scene() -> None:
+    session = fed(LiveSession(SCENE))
+    session.learn()
+    session.fuse(blank(VIEWS[0]))
+    assert session.reset() == len(VIEWS)
+    assert not session.has_codes and not session.rejected and session.learnt is None and session.num_views == 0
+    assert session.class_names == {0: "background"}
+
+
+def test_threads_that_fuse_learn_and_segment_at_once_lose_nothing() -> None:
+    session, errors = fed(LiveSession(SCENE, NAMES), VIEWS[:1]), []
+
+    def guarded(work) -> None:  # type: ignore[no-untyped-def]
+        try:
+            work()
+        except Exception as error:
+            errors.append(error)
+
+    def segment() -> None:
+        for _ in range(5):
+            assert session.segmentation().labels.shape == TRUTH.shape
+
+    jobs = [lambda: fed(session, VIEWS[1:]), session.learn, segment, segment]
+    threads = [threading.Thread(target=guarded, args=(job,)) for job in jobs]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    assert not errors and not any(thread.is_alive() for thread in threads)
+    assert session.num_fused == len(VIEWS)
+    session._learnt = None
+    np.testing.assert_array_equal(session.codes(), fed(LiveSession(SCENE, NAMES)).codes())
