@@ -22,7 +22,7 @@ import numba as nb
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsseg_core.neighbours import Tree, nearest, scaled
+from gsseg_core.neighbours import Neighbours
 from gsseg_core.refine import cluster, statistical_filter
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.scene import GaussianScene
@@ -73,8 +73,7 @@ def neighbour_searches(means: np.ndarray, k: int) -> dict[str, Callable[[], obje
     """Ours and those of the libraries at hand, each from positions to mean distances."""
 
     def ours() -> np.ndarray:
-        tree = Tree.build(scaled(means))
-        return nearest(tree.points, tree.boxes, tree.points, k + 1)[1] / k
+        return Neighbours.find(means, k).distances
 
     def scipy() -> np.ndarray:
         return cKDTree(means).query(means, k + 1, workers=-1)[0].sum(axis=1) / k

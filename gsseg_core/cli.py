@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
-from tqdm import tqdm
-
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.export import write_json
-from gsseg_core.learner import Progress, silent
+from gsseg_core.progress import progress_bars
 from gsseg_core.refine_settings import RefineSettings
 
 _INTERRUPTED = 130
@@ -121,7 +118,7 @@ def _segment(options: argparse.Namespace) -> int:
     if options.scheduler:
         raise SettingsError("--scheduler is not in this version; expected a run on this machine")
     refine = RefineSettings(k=options.k, beta=options.beta, cluster=not options.no_knn, filter=not options.no_filter)
-    with _progress(options.quiet) as progress:
+    with progress_bars(options.quiet) as progress:
         report = pipeline.segment(
             options.scene,
             options.data,
@@ -143,7 +140,7 @@ def _segment(options: argparse.Namespace) -> int:
 def _render(options: argparse.Namespace) -> int:
     from gsseg_core import pipeline
 
-    with _progress(options.quiet) as progress:
+    with progress_bars(options.quiet) as progress:
         paths = pipeline.render(
             options.scene,
             options.data,
@@ -174,44 +171,10 @@ def _eval(options: argparse.Namespace) -> int:
 def _demo(options: argparse.Namespace) -> int:
     from gsseg_core.demo import run_demo
 
-    with _progress(options.quiet) as progress:
+    with progress_bars(options.quiet) as progress:
         summary = run_demo(options.out, seed=options.seed, progress=progress)
     print(summary)
     return 0
-
-
-@contextmanager
-def _progress(quiet: bool) -> Iterator[Progress]:
-    if quiet:
-        yield silent
-        return
-    bars = _Bars()
-    try:
-        yield bars
-    finally:
-        # An error message must not end up on the line of an unfinished bar.
-        bars.close()
-
-
-class _Bars:
-    """One progress bar a stage, on standard error."""
-
-    def __init__(self) -> None:
-        self._stage = ""
-        self._bar: tqdm[None] | None = None
-
-    def __call__(self, stage: str, done: int, total: int) -> None:
-        if self._bar is None or stage != self._stage:
-            self._stage, self._bar = stage, tqdm(total=total, desc=stage, file=sys.stderr, dynamic_ncols=True)
-        self._bar.update(done - self._bar.n)
-        if done == total:
-            self.close()
-
-    def close(self) -> None:
-        """Finish the bar that is shown, if there is one."""
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None
 
 
 if __name__ == "__main__":

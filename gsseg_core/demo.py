@@ -12,7 +12,6 @@ from gsseg_core.demo_scene import DemoScene, build_demo
 from gsseg_core.learner import Progress, silent
 from gsseg_core.metrics import evaluate_folders
 from gsseg_core.report import Stopwatch
-from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.tables import percent, seconds_table, table
 
@@ -37,10 +36,10 @@ def run_demo(out: str | os.PathLike[str], *, seed: int = 0, progress: Progress =
         )
     with watch.stage("score"):
         scores = evaluate_folders(out / "rendered", demo.root / "labels_true").as_dict(demo.class_names)
-        overlap = _overlap(demo, out)
+        ious = gaussian_ious(demo, out / "segmented/segmentation.npz")
     images = {entry["id"]: entry["iou"] for entry in scores["classes"]}
     rows = [
-        [entry["name"], f"{entry['gaussians']:,}", percent(overlap[entry["id"]]), percent(images.get(entry["id"]))]
+        [entry["name"], f"{entry['gaussians']:,}", percent(ious[entry["id"]]), percent(images.get(entry["id"]))]
         for entry in report["classes"]
     ]
     return "\n\n".join(
@@ -56,10 +55,9 @@ def run_demo(out: str | os.PathLike[str], *, seed: int = 0, progress: Progress =
     )
 
 
-def _overlap(demo: DemoScene, out: Path) -> list[float]:
-    """IoU of each class over the Gaussians that belong to something."""
-    scene = GaussianScene.load(demo.root / "scene.ply")
-    labels = Segmentation.load(out / "segmented/segmentation.npz", scene).labels
+def gaussian_ious(demo: DemoScene, segmentation: Path) -> list[float]:
+    """IoU of each class with the truth, over the Gaussians that belong to something."""
+    labels = Segmentation.load(segmentation, demo.scene).labels
     real = demo.truth >= 0
     ious = []
     for k in demo.class_names:

@@ -23,6 +23,7 @@ from gsseg_core.errors import (
     UnknownLabelError,
 )
 from gsseg_core.masks import BACKGROUND_NAME
+from gsseg_core.neighbours import neighbours_of
 from gsseg_core.pipeline import make_learner
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.report import Stopwatch
@@ -336,6 +337,10 @@ class LiveSession:
             self.num_fused, self._learnt = state.num_fused, state.learnt
             self._drop_old_views()
         return state.learnt.num_views if state.learnt is not None else state.num_fused
+
+    def prepare(self, settings: RefineSettings) -> None:
+        """Find the neighbours that refinement needs, in a thread of their own, so that the first request has them."""
+        threading.Thread(target=neighbours_of, args=(self.scene, settings.k), name="neighbours").start()
 
     def reset(self) -> int:
         """Forget votes, views and codes; return how many views were forgotten."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsseg_core.neighbours import Tree, average, nearest, scaled
+from gsseg_core.neighbours import Neighbours, Tree, nearest, scaled
 from gsseg_core.refine_settings import RefineSettings
 
 
@@ -36,13 +36,14 @@ def cluster(
     observed: np.ndarray,  # (N,)
     k: int = RefineSettings.k,
     beta: float = RefineSettings.beta,
+    neighbours: Neighbours | None = None,
 ) -> Clustered:
-    """Give every unsure and every unobserved Gaussian the mean code of its k nearest observed ones.
+    """Give every unsure and every unobserved Gaussian the mean code of the observed ones among its k nearest.
 
     Unsure are those whose largest probability is below `beta`. All neighbours' codes are those from before the step.
-    Where the paper is silent: codes are averaged as probabilities, not as logits; an unsure Gaussian is its own nearest
-    neighbour, as in a plain k-nearest query; neighbours may be unsure themselves, but never unobserved; Gaussians tied
-    for the last place share its weight equally. If fewer than k are observed, all of them are the neighbours of each.
+    Where the paper is silent: codes are averaged as probabilities, not as logits; a Gaussian is not its own neighbour;
+    neighbours may be unsure themselves; Gaussians tied for the last place share its weight equally. One with no
+    observed neighbour keeps its code: a part of the scene that no view has come near stays unobserved.
 
     Parameters
     ----------
@@ -51,11 +52,13 @@ def cluster(
     probabilities : array (N, K) of float32
         Rows on the simplex; those of unobserved Gaussians are not read.
     observed : array (N,) of bool
-        Whether any view saw the Gaussian. Where none was seen at all, nothing changes.
+        Whether any view saw the Gaussian.
     k : int
         Number of neighbours, at least 1.
     beta : float
         Threshold of the largest probability.
+    neighbours : Neighbours, optional
+        Those of `means` for this k, if they are known already.
 
     Returns
     -------
@@ -64,24 +67,17 @@ def cluster(
     Examples
     --------
     >>> import numpy as np
-    >>> means = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0]], np.float32)
+    >>> means = np.array([[0, 0, 0], [1, 0, 0], [3, 0, 0]], np.float32)
     >>> codes = np.array([[0, 1], [0.5, 0.5], [0.25, 0.75]], np.float32)
-    >>> cluster(means, codes, np.array([True, False, True]), k=2).probabilities.tolist()
-    [[0.0, 1.0], [0.125, 0.875], [0.25, 0.75]]
+    >>> cluster(means, codes, np.array([True, True, True]), k=1).probabilities.tolist()
+    [[0.0, 1.0], [0.0, 1.0], [0.25, 0.75]]
     """
     codes = np.ascontiguousarray(probabilities, np.float32)
-    neighbours = np.flatnonzero(observed)
-    changed = ~observed | (codes.max(axis=1, initial=0) < beta)
-    if not neighbours.size or not changed.any():
-        return Clustered(codes.copy(), np.zeros(len(codes), bool))
-
-    points, queries = scaled(means), np.flatnonzero(changed)
-    tree, asking = Tree.build(points[neighbours]), Tree.build(points[queries])  # the latter for its order alone
-    k = min(k, neighbours.size)
-    radii, _ = nearest(tree.points, tree.boxes, asking.points, k)
-    refined = codes.copy()
-    into = queries[asking.order]
-    average(tree.points, tree.boxes, neighbours[tree.order], codes, asking.points, radii, k, into, refined)
+    wanted = ~observed | (codes.max(axis=1, initial=0) < beta)
+    refined, changed = codes.copy(), np.zeros(len(codes), bool)
+    if len(means) > 1 and wanted.any() and observed.any():
+        ids, refined_rows = (neighbours or Neighbours.find(means, k)).mean_codes(codes, observed, wanted)
+        refined[ids], changed[ids] = refined_rows, True
     return Clustered(refined, changed)
 
 
@@ -91,6 +87,7 @@ def statistical_filter(
     k: int = RefineSettings.k,
     sigmas: float = RefineSettings.filter_sigmas,
     num_classes: int | None = None,
+    neighbours: Neighbours | None = None,
 ) -> np.ndarray:
     """Find the Gaussians that lie too far from the rest of their own object.
 
@@ -111,6 +108,8 @@ def statistical_filter(
         Standard deviations above the mean at which to cut.
     num_classes : int, optional
         K; labels from there on are ignored. By default there are none.
+    neighbours : Neighbours, optional
+        Those of `means` for this k, if they are known already.
 
     Returns
     -------
@@ -126,16 +125,22 @@ def statistical_filter(
     """
     removed = np.zeros(len(labels), bool)
     limit = int(labels.max(initial=0)) + 1 if num_classes is None else num_classes
+    if len(means) < 3:
+        return removed
+    known = (neighbours or Neighbours.find(means, k)).mean_distances(labels)
     points, by_class = scaled(means), np.argsort(labels, kind="stable")
     bounds = np.searchsorted(labels, np.arange(1, limit + 1), sorter=by_class)
     for first, last in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
         members = by_class[first:last]
         if members.size < 3:
             continue
-        tree, others = Tree.build(points[members]), min(k, members.size - 1)
-        _, distances = nearest(tree.points, tree.boxes, tree.points, others + 1)  # each finds itself, at distance 0
-        distances /= others
+        distances = known[members]
+        mixed = np.isnan(distances)
+        if mixed.any():
+            tree = Tree.build(points[members])
+            places = np.flatnonzero(mixed[tree.order]).astype(np.int32)
+            distances[tree.order[places]] = nearest(tree.points, tree.boxes, places, min(k, members.size - 1))[1]
         in_order = np.sort(distances)  # rounding in the mean must not depend on the order of the Gaussians
         cut = in_order.mean() + sigmas * in_order.std()
-        removed[members[tree.order]] = distances > cut * (1 + 1e-6)
+        removed[members] = distances > cut * (1 + 1e-6)
     return removed

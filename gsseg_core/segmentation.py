@@ -14,6 +14,7 @@ import numpy as np
 
 from gsseg_core.atomic import write_atomically
 from gsseg_core.errors import StateFileError
+from gsseg_core.neighbours import neighbours_of
 from gsseg_core.npz_files import open_npz
 from gsseg_core.operator import ViewOperator
 from gsseg_core.refine import cluster, statistical_filter
@@ -106,7 +107,7 @@ class Segmentation:
         probabilities, clustered = codes, np.zeros(len(codes), bool)
         observed: np.ndarray = codes.max(axis=1) > 0
         if settings.cluster:
-            refined = cluster(scene.means, codes, observed, settings.k, settings.beta)
+            refined = cluster(scene.means, codes, observed, settings.k, settings.beta, neighbours_of(scene, settings.k))
             probabilities, clustered = refined.probabilities, refined.changed
         known = probabilities.any(axis=1)
         labels = np.where(known, probabilities.argmax(axis=1), UNOBSERVED).astype(np.int32)
@@ -115,7 +116,12 @@ class Segmentation:
     def filtered(self, scene: GaussianScene, settings: RefineSettings) -> Segmentation:
         """Take the outliers out of each object: the paper's statistical filter."""
         removed = statistical_filter(
-            scene.means, self.labels, settings.k, settings.filter_sigmas, self.probabilities.shape[1]
+            scene.means,
+            self.labels,
+            settings.k,
+            settings.filter_sigmas,
+            self.probabilities.shape[1],
+            neighbours_of(scene, settings.k),
         )
         return replace(self, labels=np.where(removed, np.int32(REMOVED), self.labels))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -13,6 +14,7 @@ from typing import Any
 from builtin_interfaces.msg import Time
 
 from gsseg_core.live import LiveSession
+from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.report import Stopwatch
 from gsseg_core.scene import GaussianScene
 from gsseg_ros.errors import (
@@ -114,7 +116,9 @@ class Workspace:
         """Load a scene in place of the one there is, with all that was known of that; on any error nothing changes."""
         settings = self.settings
         scene = GaussianScene.load(path)
-        self._session = LiveSession(scene, settings.names_by_id, max_views=settings.max_views, device=settings.device)
+        session = LiveSession(scene, settings.names_by_id, max_views=settings.max_views, device=settings.device)
+        session.prepare(RefineSettings(k=settings.k))
+        self._session = session
 
     def close(self) -> None:
         """Forget the scene."""
@@ -152,7 +156,10 @@ class Workspace:
                 "be set to a folder"
             )
         root = Path(self.settings.data_root).resolve()
-        path = (root / (request or default)).resolve()
+        try:
+            path = (root / (request or default)).resolve()
+        except (OSError, RuntimeError, ValueError) as error:  # Links in a circle, or a NUL.
+            raise PathNotAllowedError(f"path {request!r}: {error}; expected one below {root}") from error
         if "\0" in request or (path != root and root not in path.parents):
             raise PathNotAllowedError(f"path '{request}' is not below data_root; expected one below {root}")
         return path
@@ -168,7 +175,7 @@ class Workspace:
             There is no such file or folder.
         """
         path = self.path(request, default)
-        if not path.exists():
+        if not os.path.exists(path):  # Path.exists raises an error where a name is too long.
             raise MissingFileError(f"{path}: does not exist")
         return path
 

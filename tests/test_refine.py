@@ -11,22 +11,26 @@ from scipy.spatial.transform import Rotation
 
 from gsseg_core import refine
 from gsseg_core.errors import SettingsError
-from gsseg_core.refine import RefineSettings, cluster, statistical_filter
+from gsseg_core.neighbours import neighbours_of
+from gsseg_core.refine import cluster, statistical_filter
+from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.scene import GaussianScene
 
 
 def slow_cluster(means, probabilities, observed, k, beta):
     """Readable twin of `cluster`."""
     refined, changed = probabilities.astype(np.float64), np.zeros(len(means), bool)
-    neighbours = np.flatnonzero(observed)
-    k = min(k, len(neighbours))
+    k = min(k, len(means) - 1)
     for i in range(len(means) if k else 0):
         if observed[i] and probabilities[i].max() >= beta:
             continue
-        distances = np.linalg.norm(means[neighbours].astype(np.float64) - means[i], axis=1)
+        distances = np.linalg.norm(means.astype(np.float64) - means[i], axis=1)
+        distances[i] = np.inf
         radius = np.sort(distances)[k - 1]
         inside, tied = distances < radius, distances == radius
-        weights = (inside + tied * (k - inside.sum()) / tied.sum()) / k
-        refined[i], changed[i] = weights @ probabilities[neighbours], True
+        weights = (inside + tied * (k - inside.sum()) / tied.sum()) * observed
+        if weights.any():
+            refined[i], changed[i] = weights @ probabilities / weights.sum(), True
     return refined, changed
 
 
@@ -145,8 +149,33 @@ def test_gaussians_at_one_position_and_equal_spacings_stay(position):
     assert not statistical_filter(corners, np.ones(3, np.int32), sigmas=0.0).any()
     _, probabilities, observed, _ = scene(5, 5000)
     result = cluster(same, probabilities, observed)
-    expected = np.broadcast_to(probabilities[observed].mean(axis=0, dtype=np.float64), (5000, 5))[result.changed]
-    np.testing.assert_allclose(result.probabilities[result.changed], expected, atol=1e-6)
+    total = probabilities[observed].sum(axis=0, dtype=np.float64)
+    own = np.where(observed[:, None], probabilities, 0)
+    expected = (total - own) / (observed.sum() - observed)[:, None]
+    np.testing.assert_allclose(result.probabilities[result.changed], expected[result.changed], atol=1e-6)
+
+
+def test_what_is_far_from_all_that_was_observed_stays_unobserved():
+    means, probabilities, _, _ = scene(7, 400)
+    observed = np.arange(400) < 200
+    means[~observed] += 1e4
+    result = cluster(means, probabilities, observed, 20)
+    assert not result.changed[~observed].any() and result.changed[observed].any()
+    np.testing.assert_array_equal(result.probabilities[~observed], probabilities[~observed])
+
+
+def test_neighbours_are_found_once_per_scene_and_give_the_same_result():
+    means, probabilities, observed, labels = scene(8, 600)
+    given_scene = GaussianScene.from_arrays(
+        means, np.tile([1.0, 0, 0, 0], (600, 1)), np.ones((600, 3)), np.full(600, 0.5), np.zeros((600, 1, 3))
+    )
+    neighbours = neighbours_of(given_scene, 20)
+    assert neighbours_of(given_scene, 20) is neighbours and neighbours_of(given_scene, 21) is not neighbours
+    with_them = cluster(means, probabilities, observed, 20, neighbours=neighbours)
+    np.testing.assert_array_equal(with_them.probabilities, cluster(means, probabilities, observed, 20).probabilities)
+    removed = statistical_filter(means, labels, 20, neighbours=neighbours)
+    np.testing.assert_array_equal(removed, statistical_filter(means, labels, 20))
+    assert neighbours_of(given_scene.subset([0]), 20) is None
 
 
 @pytest.mark.parametrize("scale", [1e-25, 1e30])
