@@ -1,32 +1,84 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# Python, then ROS, then the messages, each behind a stamp of its own: what needs no ROS does not wait for it, and the
+# messages, which take a minute to compile, are compiled again only when they change.
 READY := $(VENV)/.ready
+ROS_READY := $(VENV)/.ready-ros
+MSGS_READY := $(VENV)/.ready-msgs
+COLCON_VENV := .venv-colcon
+COLCON_READY := $(COLCON_VENV)/.ready
 
-.PHONY: help demo test results clean
+INSTALLED := setup.py package.xml $(wildcard config/* launch/* resource/* rviz/* scripts/* sros2/*)
+MSGS := $(wildcard msg_defs/*.* msg_defs/action/* msg_defs/msg/* msg_defs/srv/*)
+
+# Both builders of the messages obey it; without it one of them compiles file after file.
+export CMAKE_BUILD_PARALLEL_LEVEL ?= $(shell nproc 2>/dev/null || echo 1)
+
+.PHONY: help demo demo-local test colcon results clean
 
 help:  ## list the targets
-	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{ printf "%-14s %s\n", $$1, $$2 }'
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{ printf "%-16s %s\n", $$1, $$2 }'
 
-demo: $(READY)  ## build a small scene with known truth, segment it and show how well that went
+demo: $(READY) $(ROS_READY) $(MSGS_READY)  ## segment a small scene with known truth as robots do, through the ROS 2 node
+	$(BIN)/python -m gsseg_ros.demo --out demo_out
+
+demo-local: $(READY)  ## the same scene without ROS, by the command line
 	$(BIN)/gsseg demo --out demo_out
 
-test: $(READY)  ## lint, check the types and run the tests
+test: $(READY) $(ROS_READY) $(MSGS_READY)  ## lint, check the types and run the tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -W error
 
+colcon: $(COLCON_READY)  ## build both packages with colcon, as a robot does, and run the node that comes out
+	.ci/colcon $(COLCON_VENV) .colcon
+
 results: $(READY)  ## measure again what docs/results.md shows
 	$(BIN)/python benchmarks/results.py
 
-clean:  ## remove the environment, the caches and the demo's output
-	rm -rf $(VENV) build demo_out results_out gsseg.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache
-	find gsseg_core tests -name __pycache__ -prune -exec rm -rf {} +
+clean:  ## remove the environments, the caches, what was built and the demo's output
+	rm -rf $(VENV) $(COLCON_VENV) .colcon build install log demo_out results_out gsseg.egg-info
+	rm -rf .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find gsseg_core gsseg_ros tests -name __pycache__ -prune -exec rm -rf {} +
+
+define check-python
+@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(None if (3, 10) <= v <= (3, 13) else \
+	"gsseg needs Python 3.10 to 3.13, and $(PYTHON) is %d.%d: name another with `make PYTHON=...`" % v)'
+endef
+
+define check-ros
+@test "$$(uname -s -m)" = "Linux x86_64" || \
+	{ echo 'ROS 2 comes as wheels for Linux on x86-64 only; `make demo-local` does without it' >&2; exit 1; }
+@command -v g++ >/dev/null && command -v cmake >/dev/null || \
+	{ echo 'compiling the ROS messages needs gcc, g++ and cmake' >&2; exit 1; }
+endef
 
 # setuptools first, so that the build uses the pinned one too.
-$(READY): setup.py pyproject.toml constraints.txt
+$(READY): $(INSTALLED) pyproject.toml constraints.txt
+	$(check-python)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt setuptools
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable '.[dev]'
+	touch $@
+
+$(ROS_READY): setup.py constraints.txt | $(READY)
+	$(check-ros)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable '.[dev,ros]'
+	touch $@
+
+# The build has an environment of its own, with versions of the generators that nothing else should see. pip hands the
+# constraints on to it only through its own environment variables; which of the two depends on pip's age.
+$(MSGS_READY): $(MSGS) | $(ROS_READY)
+	@echo 'compiling the ROS messages, which takes a minute or two'
+	PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt \
+		$(BIN)/python -m pip install --quiet --no-deps --force-reinstall ./msg_defs
+	touch $@
+
+$(COLCON_READY): .ci/colcon-requirements.txt constraints.txt
+	$(check-python)
+	$(check-ros)
+	$(PYTHON) -m venv $(COLCON_VENV)
+	$(COLCON_VENV)/bin/python -m pip install --quiet --constraint constraints.txt -r .ci/colcon-requirements.txt
 	touch $@

@@ -4,15 +4,37 @@ The metadata is here and not in pyproject.toml because a ROS 2 workspace builds 
 the system's setuptools, and that of Ubuntu 24.04 (68) refuses the form in which newer ones want a licence stated there.
 """
 
-from setuptools import setup
+from setuptools import Distribution, setup
+
+SHARE = "share/gsseg_ros"
+
+
+class DistributionWithData(Distribution):
+    """Installs data_files in an editable install too."""
+
+    def has_data(self) -> bool:
+        """Answer the question that setuptools asks before it does so, and that its own class leaves unanswered."""
+        return self.has_data_files()
+
 
 setup(
+    distclass=DistributionWithData,
     name="gsseg",
     version="0.1.0",
     description="Segments trained 3D Gaussian Splatting scenes into objects from posed 2D masks",
     author="gsseg developers",
     license="Apache-2.0",
-    packages=["gsseg_core"],
+    packages=["gsseg_core", "gsseg_ros"],
+    # What ROS looks for, at the places where it looks: the same after pip, colcon and colcon --symlink-install.
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/gsseg_ros"]),
+        (SHARE, ["package.xml"]),
+        (f"{SHARE}/config", ["config/segment_node.yaml"]),
+        (f"{SHARE}/launch", ["launch/replay.launch.py", "launch/segment.launch.py"]),
+        (f"{SHARE}/rviz", ["rviz/gsseg.rviz"]),
+        (f"{SHARE}/sros2", ["sros2/policy.xml"]),
+        ("lib/gsseg_ros", ["scripts/replay_node", "scripts/segment_node"]),  # For `ros2 run` and `ros2 launch`.
+    ],
     python_requires=">=3.10,<3.14",
     install_requires=[
         "numba>=0.61",
@@ -25,8 +47,21 @@ setup(
         "tqdm>=4.64",
     ],
     extras_require={
-        "dev": ["hypothesis>=6.100", "mypy>=1.15", "pytest>=8", "ruff>=0.9", "scikit-learn>=1.5"],
+        "dev": ["hypothesis>=6.100", "mypy>=1.15", "pytest>=8", "pyyaml>=6.0", "ruff>=0.9", "scikit-learn>=1.5"],
+        # ROS 2 Jazzy as wheels, for a machine without one from apt. Exact, because gsseg_msgs is compiled against them.
+        "ros": [
+            "ros-jazzy-common-interfaces==5.3.6",
+            "ros-jazzy-rclpy==7.1.6",
+            "ros-jazzy-rmw-fastrtps-cpp==8.4.3",
+            "rosbags>=0.10",
+        ],
         "test": ["pytest"],  # colcon test runs pytest only where an extra of this name asks for it.
     },
-    entry_points={"console_scripts": ["gsseg = gsseg_core.cli:main"]},
+    entry_points={
+        "console_scripts": [
+            "gsseg = gsseg_core.cli:main",
+            "replay_node = gsseg_ros.replay_node:main",
+            "segment_node = gsseg_ros.segment_node:main",
+        ]
+    },
 )

@@ -59,7 +59,7 @@ def build_room(
     means[floating] = rng.random((int(floating.sum()), 3)) * SIZE
     truth[floating] = 0
     spacing = np.sqrt(weight.sum() / count / np.where(truth > 0, DETAIL, 1.0))
-    scales = spacing[:, None] * np.exp(rng.normal(-0.2, 0.6, (count, 3)))
+    scales = spacing[:, None] * np.exp(rng.normal(0.35, 0.6, (count, 3)))
     scales[rows, axis] *= 0.15
     opacities = np.where(rng.random(count) < 0.6, rng.beta(12, 1, count), rng.beta(1, 2, count))
     opacities = np.clip(np.where(floating, 0.3 * opacities, opacities), 0.006, 0.995)
