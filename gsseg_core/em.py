@@ -38,8 +38,8 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from gsseg_core.em_kernels import collect, mix, tally
 from gsseg_core.errors import SettingsError
+from gsseg_core.gaussian_kernels import collect, mix, tally
 from gsseg_core.learner import VOTE_UNIT, Learner, Progress, normalise, silent
 from gsseg_core.operator import Observation
 from gsseg_core.scene import GaussianScene

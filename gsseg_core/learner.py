@@ -12,6 +12,7 @@ import numpy as np
 
 from gsseg_core.dataset import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
+from gsseg_core.gaussian_kernels import add_votes
 from gsseg_core.operator import Observation, make_operator
 from gsseg_core.scene import GaussianScene
 from gsseg_core.state_file import State
@@ -206,8 +207,7 @@ class Learner(ABC):
             )
 
     def _count(self, observation: Observation, sign: int) -> None:
-        votes = np.rint(observation.votes().astype(np.float64) / VOTE_UNIT).astype(np.int64)
-        self._votes[np.ix_(observation.ids, observation.classes)] += sign * votes
+        add_votes(self._votes, observation.ids, observation.classes, observation.votes(), 1 / VOTE_UNIT, sign)
 
     def _keep(self, name: str, observation: Observation) -> None:
         used = sum(kept.nbytes for kept in self._prepared.values())

@@ -243,6 +243,7 @@ class LiveSession:
             for done, view in enumerate(views):
                 progress("observe", done, len(views))
                 teacher.observe(view)
+            progress("observe", len(views), len(views))
         with watch.stage("learn"):
             teacher.fit(progress)
         learnt = Learnt(learner, teacher.codes_, len(teacher.views))

@@ -9,6 +9,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.blend import blend_tile
+from gsseg_core.lanes import add_product, add_scaled, add_scaled_product, dot, take_sum
 from gsseg_core.tiles import TILE
 
 _FAST = {"contract", "nnan", "nsz", "reassoc"}
@@ -33,7 +34,7 @@ def _scratch(entries: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarr
 @nb.njit(parallel=True, nogil=True, cache=True)
 def render(
     columns: int,
-    table: np.ndarray,  # (M, 9)
+    table: np.ndarray,  # (M, 8)
     start: np.ndarray,  # (T + 1,)
     entries: np.ndarray,  # (E,)
     codes: np.ndarray,  # (M, K) float32
@@ -51,11 +52,8 @@ def render(
         for e in range(used):
             g = entries[first + e]
             for i in range(n, ends[e]):
-                target = block[rows[i]]
                 for k in range(channels):
-                    code = codes[g, k]
-                    for c in range(weights.shape[1]):
-                        target[k, c] += code * weights[i, c]
+                    add_scaled(block, rows[i] * channels + k, weights, i, codes[g, k])
             n = ends[e]
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
         for r in range(min(TILE, height - top)):
@@ -68,7 +66,7 @@ def render(
 @nb.njit(parallel=True, nogil=True, cache=True, fastmath=_FAST)
 def adjoint_entries(
     columns: int,
-    table: np.ndarray,  # (M, 9)
+    table: np.ndarray,  # (M, 8)
     start: np.ndarray,  # (T + 1,)
     entries: np.ndarray,  # (E,)
     residual: np.ndarray,  # (H, W, C) float32, C <= CHUNK
@@ -90,12 +88,8 @@ def adjoint_entries(
         n = 0
         for e in range(used):
             for i in range(n, ends[e]):
-                source = block[rows[i]]
                 for k in range(channels):
-                    total = np.float32(0.0)
-                    for c in range(weights.shape[1]):
-                        total += source[k, c] * weights[i, c]
-                    sums[first + e, k] += total
+                    sums[first + e, k] += dot(block, rows[i] * channels + k, weights, i)
             n = ends[e]
 
 
@@ -161,7 +155,7 @@ def labelled(
     columns: int,
     width: int,
     height: int,
-    table: np.ndarray,  # (M, 9)
+    table: np.ndarray,  # (M, 8)
     start: np.ndarray,  # (T + 1,)
     entries: np.ndarray,  # (E,)
     label_start: np.ndarray,  # (T + 1,)
@@ -230,12 +224,12 @@ def _blend_labels(
     for e in range(used):
         code_of = codes[entries[e]]
         for i in range(n, ends[e]):
-            r = rows[i]
-            record, target = weights[i], value[r]
+            r = np.int64(rows[i])
+            if counts[r] == 1:  # Pixels of the row without a label get a value too, which nobody reads.
+                add_scaled(value, r, weights, i, code_of[labels[slot[r, 0]]])
+                continue
             for j in range(counts[r]):
-                code, mask = code_of[labels[slot[r, j]]], where[r, j]
-                for c in range(record.shape[0]):
-                    target[c] += code * (record[c] * mask[c])
+                add_scaled_product(value, r, weights, i, where, r * TILE + j, code_of[labels[slot[r, j]]])
         n = ends[e]
 
 
@@ -276,17 +270,21 @@ def _sum_labels(
     sums: np.ndarray,  # (E_t * many,) out
 ) -> None:
     sums[:] = 0.0
+    # Sixteen columns apart, as long as the label stays the same: most rows have one label, most entries too.
+    columns = np.zeros((1, TILE), np.float32)
     n = 0
     for e in range(used):
+        current = np.int64(-1)
         for i in range(n, ends[e]):
-            r = rows[i]
-            record = weights[i]
+            r = np.int64(rows[i])
             for j in range(counts[r]):
-                mask = where[r, j]
-                total = np.float32(0.0)
-                for c in range(record.shape[0]):
-                    total += record[c] * mask[c]
-                sums[e * many + slot[r, j]] += total
+                if slot[r, j] != current:
+                    if current >= 0:
+                        sums[e * many + current] += take_sum(columns, 0)
+                    current = slot[r, j]
+                add_product(columns, 0, weights, i, where, r * TILE + j)
+        if current >= 0:
+            sums[e * many + current] += take_sum(columns, 0)
         n = ends[e]
 
 
@@ -319,7 +317,7 @@ def list_weights(
     columns: int,
     width: int,
     height: int,
-    table: np.ndarray,  # (M, 9)
+    table: np.ndarray,  # (M, 8)
     start: np.ndarray,  # (T + 1,)
     entries: np.ndarray,  # (E,)
     wanted: np.ndarray,  # (U,) tiles

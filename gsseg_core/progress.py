@@ -34,6 +34,7 @@ class _Bars:
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         if self._bar is None or stage != self._stage:
+            self.close()
             self._stage, self._bar = stage, tqdm(total=total, desc=stage, file=sys.stderr, dynamic_ncols=True)
         self._bar.update(done - self._bar.n)
         if done == total:

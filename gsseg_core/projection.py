@@ -18,6 +18,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.cameras import Camera
+from gsseg_core.depth_sort import sort_by_depth
 from gsseg_core.scene import GaussianScene
 
 NEAR = 0.01
@@ -36,9 +37,17 @@ REACH_MAX = 1e6
 """A reach is cut off here, in px: far beyond any image, and safely an integer."""
 
 # Columns of the table of projected Gaussians.
-U, V, SHEAR, WIDTH, HEIGHT, LOG_OPACITY, X_REACH, Y_REACH, X_TURN = range(9)
+U, V, SHEAR, WIDTH, HEIGHT, LOG_OPACITY, Y_REACH, X_TURN = range(8)
 
 HALF_LOG2E = 0.5 / np.log(2.0)
+
+LARGEST_REACH = np.sqrt(2.0 * np.log(255.0))
+"""Standard deviations at which a Gaussian of opacity 1 falls to 1/255."""
+
+ROOT = np.sqrt(DILATION)
+
+CHUNKS = 16
+"""Parts of the scene that are projected beside each other."""
 
 
 @dataclass(frozen=True)
@@ -49,10 +58,10 @@ class Projected:
     ----------
     ids : (M,) int32
         Index of each in the scene.
-    table : (M, 9) float32
+    table : (M, 8) float32
         Per Gaussian: centre u, v in px; shear; WIDTH = log2(e) / (2 var(x|y)) and HEIGHT = log2(e) / (2 S_yy), so that
-        log2(alpha) = LOG_OPACITY - WIDTH (dx - shear dy)^2 - HEIGHT dy^2; reach in x and y in px, where alpha falls to
-        1/255; and dy at the rightmost point of that ellipse.
+        log2(alpha) = LOG_OPACITY - WIDTH (dx - shear dy)^2 - HEIGHT dy^2; reach in y in px, where alpha falls to 1/255;
+        and dy at the rightmost point of that ellipse.
     """
 
     ids: np.ndarray
@@ -65,31 +74,43 @@ def project(scene: GaussianScene, camera: Camera) -> Projected:
     Gaussians at exactly the same depth are ordered by their projected shape, so the order in the scene matters only to
     those that are alike in all of it.
     """
-    table = np.empty((len(scene), 9), np.float32)
-    depth = np.empty(len(scene), np.float32)
+    table, depth = np.empty((len(scene), 8), np.float32), np.empty(len(scene), np.float32)
+    ids, found = np.empty(len(scene), np.int32), np.zeros(CHUNKS, np.int64)
     _project(
         scene.means, scene.quats, scene.scales, scene.opacities, camera.world_to_camera, camera.K,
-        float(camera.width), float(camera.height), table, depth,
+        float(camera.width), float(camera.height), table, depth, ids, found,
     )  # fmt: skip
-    visible = np.flatnonzero(depth > 0)
-    order = np.argsort(depth[visible], kind="stable")
-    ids = _break_ties(visible[order], depth, table)
-    return Projected(ids.astype(np.int32), table[ids])
+    begins = np.arange(CHUNKS) * len(scene) // CHUNKS
+    rows = np.concatenate([np.arange(first, first + count) for first, count in zip(begins, found, strict=True)])
+    order = sort_by_depth(depth[rows])
+    _break_ties(order, rows, depth, table)
+    return Projected(*_gather(rows, order, ids, table))
 
 
 def _break_ties(
-    ids: np.ndarray,  # (M,) sorted by depth
+    order: np.ndarray,  # (M,) of `rows`, sorted by depth; changed in place
+    rows: np.ndarray,  # (M,) of depth and table
     depth: np.ndarray,  # (N,)
-    table: np.ndarray,  # (N, 9)
-) -> np.ndarray:
-    equal = np.flatnonzero(np.diff(depth[ids]) == 0)
+    table: np.ndarray,  # (N, 8)
+) -> None:
+    equal = np.flatnonzero(np.diff(depth[rows[order]]) == 0)
     if len(equal) == 0:
-        return ids
+        return
     tied = np.union1d(equal, equal + 1)
-    group = ids[tied]
+    group = rows[order[tied]]
     keys = (*table[group].T[::-1], depth[group])
-    ids[tied] = group[np.lexsort(keys)]
-    return ids
+    order[tied] = order[tied][np.lexsort(keys)]
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _gather(rows: np.ndarray, order: np.ndarray, ids: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    sorted_ids, sorted_table = np.empty(order.shape[0], np.int32), np.empty((order.shape[0], 8), np.float32)
+    for m in nb.prange(order.shape[0]):
+        row = rows[order[m]]
+        sorted_ids[m] = ids[row]
+        for j in range(8):
+            sorted_table[m, j] = table[row, j]
+    return sorted_ids, sorted_table
 
 
 @nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
@@ -102,73 +123,96 @@ def _project(
     K: np.ndarray,  # (3, 3)
     width: float,
     height: float,
-    table: np.ndarray,  # (N, 9) out
-    depth: np.ndarray,  # (N,) out, 0 where not visible
+    table: np.ndarray,  # (N, 8) out, at the beginning of each chunk's part
+    depth: np.ndarray,  # (N,) out, the same
+    ids: np.ndarray,  # (N,) out, the same
+    found: np.ndarray,  # (CHUNKS,) out: how many
 ) -> None:
+    for chunk in nb.prange(CHUNKS):
+        first, last = chunk * means.shape[0] // CHUNKS, (chunk + 1) * means.shape[0] // CHUNKS
+        n = first
+        for i in range(first, last):
+            z = _project_one(i, means, quats, scales, opacities, viewmat, K, width, height, table[n])
+            if z > 0:
+                depth[n], ids[n] = z, i
+                n += 1
+        found[chunk] = n - first
+
+
+@nb.njit(error_model="numpy")
+def _project_one(
+    i: int,
+    means: np.ndarray,
+    quats: np.ndarray,
+    scales: np.ndarray,
+    opacities: np.ndarray,
+    viewmat: np.ndarray,
+    K: np.ndarray,
+    width: float,
+    height: float,
+    out: np.ndarray,  # (8,) a row of the table
+) -> float:
+    """Project one Gaussian; returns its depth, 0 if it is not visible."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
     x_low, x_high = -cx / fx - margin_x, (width - cx) / fx + margin_x
     y_low, y_high = -cy / fy - margin_y, (height - cy) / fy + margin_y
-    for i in nb.prange(means.shape[0]):
-        depth[i] = 0.0
-        opacity = np.float64(opacities[i])
-        mx, my, mz = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
-        z = viewmat[2, 0] * mx + viewmat[2, 1] * my + viewmat[2, 2] * mz + viewmat[2, 3]
-        if z < NEAR or opacity < ALPHA_MIN:
-            continue
-        x = (viewmat[0, 0] * mx + viewmat[0, 1] * my + viewmat[0, 2] * mz + viewmat[0, 3]) / z
-        y = (viewmat[1, 0] * mx + viewmat[1, 1] * my + viewmat[1, 2] * mz + viewmat[1, 3]) / z
-        u, v = fx * x + cx, fy * y + cy
+    opacity = np.float64(opacities[i])
+    mx, my, mz = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+    z = viewmat[2, 0] * mx + viewmat[2, 1] * my + viewmat[2, 2] * mz + viewmat[2, 3]
+    if z < NEAR or opacity < ALPHA_MIN:
+        return 0.0
+    x = (viewmat[0, 0] * mx + viewmat[0, 1] * my + viewmat[0, 2] * mz + viewmat[0, 3]) / z
+    y = (viewmat[1, 0] * mx + viewmat[1, 1] * my + viewmat[1, 2] * mz + viewmat[1, 3]) / z
+    u, v = fx * x + cx, fy * y + cy
 
-        # A bound of the reach by the longest axis throws out most of what is off the image before the costly part.
-        xc, yc = min(max(x, x_low), x_high), min(max(y, y_low), y_high)
-        cut = 2.0 * np.log(opacity * 255.0)
-        longest = np.float64(max(scales[i, 0], max(scales[i, 1], scales[i, 2]))) / z
-        bound_x = np.sqrt(cut * (longest * longest * fx * fx * (1.0 + xc * xc) + DILATION))
-        bound_y = np.sqrt(cut * (longest * longest * fy * fy * (1.0 + yc * yc) + DILATION))
-        if u + bound_x < 0.0 or u - bound_x > width or v + bound_y < 0.0 or v - bound_y > height:
-            continue
+    # A bound of the reach, by the longest axis and opacity 1, throws out most of what is off the image before the
+    # costly part. It uses sqrt(a^2 + b^2) <= |a| + |b|, twice.
+    xc, yc = min(max(x, x_low), x_high), min(max(y, y_low), y_high)
+    longest = np.float64(max(scales[i, 0], max(scales[i, 1], scales[i, 2]))) / z
+    bound_x = LARGEST_REACH * (longest * fx * (1.0 + abs(xc)) + ROOT)
+    bound_y = LARGEST_REACH * (longest * fy * (1.0 + abs(yc)) + ROOT)
+    if u + bound_x < 0.0 or u - bound_x > width or v + bound_y < 0.0 or v - bound_y > height:
+        return 0.0
 
-        # Rows of J R_view, with J the Jacobian of the pinhole projection.
-        ax = (fx / z) * (viewmat[0, 0] - xc * viewmat[2, 0])
-        ay = (fx / z) * (viewmat[0, 1] - xc * viewmat[2, 1])
-        az = (fx / z) * (viewmat[0, 2] - xc * viewmat[2, 2])
-        bx = (fy / z) * (viewmat[1, 0] - yc * viewmat[2, 0])
-        by = (fy / z) * (viewmat[1, 1] - yc * viewmat[2, 1])
-        bz = (fy / z) * (viewmat[1, 2] - yc * viewmat[2, 2])
-        qw, qx, qy, qz = (
-            np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3]),
-        )  # fmt: skip
-        s0, s1, s2 = np.float64(scales[i, 0]), np.float64(scales[i, 1]), np.float64(scales[i, 2])
-        r00, r01, r02 = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy - qw * qz), 2 * (qx * qz + qw * qy)
-        r10, r11, r12 = 2 * (qx * qy + qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz - qw * qx)
-        r20, r21, r22 = 2 * (qx * qz - qw * qy), 2 * (qy * qz + qw * qx), 1 - 2 * (qx * qx + qy * qy)
-        a0, a1, a2 = (
-            s0 * (ax * r00 + ay * r10 + az * r20),
-            s1 * (ax * r01 + ay * r11 + az * r21),
-            s2 * (ax * r02 + ay * r12 + az * r22),
-        )
-        b0, b1, b2 = (
-            s0 * (bx * r00 + by * r10 + bz * r20),
-            s1 * (bx * r01 + by * r11 + bz * r21),
-            s2 * (bx * r02 + by * r12 + bz * r22),
-        )
-        sxx = a0 * a0 + a1 * a1 + a2 * a2 + DILATION
-        sxy = a0 * b0 + a1 * b1 + a2 * b2
-        syy = b0 * b0 + b1 * b1 + b2 * b2 + DILATION
-        reach_x, reach_y = min(np.sqrt(cut * sxx), REACH_MAX), min(np.sqrt(cut * syy), REACH_MAX)
-        if not (
-            u + reach_x >= 0.5 and u - reach_x <= width - 0.5 and v + reach_y >= 0.5 and v - reach_y <= height - 0.5
-        ):
-            continue
-        table[i, U] = u
-        table[i, V] = v
-        table[i, SHEAR] = sxy / syy
-        # var(x|y) = S_xx - S_xy^2 / S_yy is at least the dilation; rounding must not bring it below.
-        table[i, WIDTH] = HALF_LOG2E / max(sxx - sxy * sxy / syy, DILATION)
-        table[i, HEIGHT] = HALF_LOG2E / syy
-        table[i, LOG_OPACITY] = np.log2(opacity)
-        table[i, X_REACH] = reach_x
-        table[i, Y_REACH] = reach_y
-        table[i, X_TURN] = min(max(sxy * np.sqrt(cut / sxx), -REACH_MAX), REACH_MAX)
-        depth[i] = z
+    cut = 2.0 * np.log(opacity * 255.0)
+    # Rows of J R_view, with J the Jacobian of the pinhole projection.
+    ax = (fx / z) * (viewmat[0, 0] - xc * viewmat[2, 0])
+    ay = (fx / z) * (viewmat[0, 1] - xc * viewmat[2, 1])
+    az = (fx / z) * (viewmat[0, 2] - xc * viewmat[2, 2])
+    bx = (fy / z) * (viewmat[1, 0] - yc * viewmat[2, 0])
+    by = (fy / z) * (viewmat[1, 1] - yc * viewmat[2, 1])
+    bz = (fy / z) * (viewmat[1, 2] - yc * viewmat[2, 2])
+    qw, qx, qy, qz = (
+        np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3]),
+    )  # fmt: skip
+    s0, s1, s2 = np.float64(scales[i, 0]), np.float64(scales[i, 1]), np.float64(scales[i, 2])
+    r00, r01, r02 = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy - qw * qz), 2 * (qx * qz + qw * qy)
+    r10, r11, r12 = 2 * (qx * qy + qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz - qw * qx)
+    r20, r21, r22 = 2 * (qx * qz - qw * qy), 2 * (qy * qz + qw * qx), 1 - 2 * (qx * qx + qy * qy)
+    a0, a1, a2 = (
+        s0 * (ax * r00 + ay * r10 + az * r20),
+        s1 * (ax * r01 + ay * r11 + az * r21),
+        s2 * (ax * r02 + ay * r12 + az * r22),
+    )
+    b0, b1, b2 = (
+        s0 * (bx * r00 + by * r10 + bz * r20),
+        s1 * (bx * r01 + by * r11 + bz * r21),
+        s2 * (bx * r02 + by * r12 + bz * r22),
+    )
+    sxx = a0 * a0 + a1 * a1 + a2 * a2 + DILATION
+    sxy = a0 * b0 + a1 * b1 + a2 * b2
+    syy = b0 * b0 + b1 * b1 + b2 * b2 + DILATION
+    reach_x, reach_y = min(np.sqrt(cut * sxx), REACH_MAX), min(np.sqrt(cut * syy), REACH_MAX)
+    if not (u + reach_x >= 0.5 and u - reach_x <= width - 0.5 and v + reach_y >= 0.5 and v - reach_y <= height - 0.5):
+        return 0.0
+    out[U] = u
+    out[V] = v
+    out[SHEAR] = sxy / syy
+    # var(x|y) = S_xx - S_xy^2 / S_yy is at least the dilation; rounding must not bring it below.
+    out[WIDTH] = HALF_LOG2E / max(sxx - sxy * sxy / syy, DILATION)
+    out[HEIGHT] = HALF_LOG2E / syy
+    out[LOG_OPACITY] = np.log2(opacity)
+    out[Y_REACH] = reach_y
+    out[X_TURN] = min(max(sxy * np.sqrt(cut / sxx), -REACH_MAX), REACH_MAX)
+    return float(z)

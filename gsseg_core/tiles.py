@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
+from gsseg_core.lanes import LANES, LOG_ALPHA_MIN
 from gsseg_core.projection import HEIGHT, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, Projected, U, V
 
-TILE = 16
+TILE = LANES
 """Side of a tile in px. One row of a tile is one vector register of sixteen float32."""
 
-LOG_ALPHA_MIN = -np.log2(255.0)
+CHUNKS = 16
+"""Parts into which Gaussians are cut, to be sorted beside each other; fixed, so that threads change nothing."""
 
 
 @dataclass(frozen=True)
@@ -44,20 +46,35 @@ class Tiles:
 def assign(projected: Projected, width: int, height: int) -> Tiles:
     """Sort projected Gaussians into the tiles that their ellipse of alpha >= 1/255 touches."""
     columns, rows = -(-width // TILE), -(-height // TILE)
-    start = np.zeros(columns * rows + 1, np.int64)
-    _count(projected.table, columns, rows, start[1:])
-    np.cumsum(start, out=start)
-    entries = np.empty(start[-1], np.int32)
-    _fill(projected.table, columns, rows, start, entries)
     gaussian_start = np.zeros(len(projected.ids) + 1, np.int64)
-    gaussian_entries = np.empty(len(entries), np.int32)
-    _transpose(entries, gaussian_start, gaussian_entries)
+    place = np.zeros((CHUNKS, columns * rows), np.int64)
+    _count(projected.table, columns, rows, gaussian_start[1:], place)
+    np.cumsum(gaussian_start, out=gaussian_start)
+    start = np.concatenate([[0], np.cumsum(place.sum(axis=0))])
+    # From counts to places: chunks follow each other within a tile, so that its entries stay sorted by depth.
+    place[1:] = np.cumsum(place[:-1], axis=0)
+    place[0] = 0
+    place += start[:-1]
+    entries, gaussian_entries = np.empty(start[-1], np.int32), np.empty(start[-1], np.int32)
+    _fill(projected.table, columns, rows, gaussian_start, place, entries, gaussian_entries)
     return Tiles(columns, rows, start, entries, gaussian_start, gaussian_entries)
 
 
 @nb.njit(inline="always")
+def _rows_of(
+    table: np.ndarray,  # (M, 8)
+    g: int,
+    rows: int,
+) -> tuple[int, int]:
+    """First and last tile row (exclusive) that Gaussian g may touch."""
+    v, reach = table[g, V], table[g, Y_REACH]
+    first, last = np.floor((v - reach - 0.5) / TILE), np.floor((v + reach - 0.5) / TILE) + 1
+    return int(max(first, 0.0)), int(min(max(last, 0.0), rows))
+
+
+@nb.njit(inline="always")
 def _touched(
-    table: np.ndarray,  # (M, 9)
+    table: np.ndarray,  # (M, 8)
     g: int,
     row: int,
     columns: int,
@@ -81,33 +98,46 @@ def _touched(
 
 
 @nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
-def _count(table: np.ndarray, columns: int, rows: int, counts: np.ndarray) -> None:
-    for row in nb.prange(rows):
-        for g in range(table.shape[0]):
-            first, last = _touched(table, g, row, columns)
-            for column in range(first, last):
-                counts[row * columns + column] += 1
+def _count(
+    table: np.ndarray,  # (M, 8)
+    columns: int,
+    rows: int,
+    per_gaussian: np.ndarray,  # (M,) out
+    per_tile: np.ndarray,  # (CHUNKS, T) out: of each chunk of Gaussians
+) -> None:
+    many = table.shape[0]
+    for chunk in nb.prange(CHUNKS):
+        counts = per_tile[chunk]
+        for g in range(chunk * many // CHUNKS, (chunk + 1) * many // CHUNKS):
+            low, high = _rows_of(table, g, rows)
+            for row in range(low, high):
+                first, last = _touched(table, g, row, columns)
+                for column in range(first, last):
+                    counts[row * columns + column] += 1
+                per_gaussian[g] += max(last - first, 0)
 
 
 @nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
-def _fill(table: np.ndarray, columns: int, rows: int, start: np.ndarray, entries: np.ndarray) -> None:
-    for row in nb.prange(rows):
-        cursor = start[row * columns : (row + 1) * columns].copy()
-        for g in range(table.shape[0]):
-            first, last = _touched(table, g, row, columns)
-            for column in range(first, last):
-                entries[cursor[column]] = g
-                cursor[column] += 1
-
-
-@nb.njit(nogil=True, cache=True)
-def _transpose(entries: np.ndarray, start: np.ndarray, by_gaussian: np.ndarray) -> None:
-    for g in entries:
-        start[g + 1] += 1
-    for g in range(start.shape[0] - 1):
-        start[g + 1] += start[g]
-    cursor = start[:-1].copy()
-    for e in range(entries.shape[0]):
-        g = entries[e]
-        by_gaussian[cursor[g]] = e
-        cursor[g] += 1
+def _fill(
+    table: np.ndarray,  # (M, 8)
+    columns: int,
+    rows: int,
+    gaussian_start: np.ndarray,  # (M + 1,)
+    place: np.ndarray,  # (CHUNKS, T) where each chunk's next entry of a tile goes
+    entries: np.ndarray,  # (E,) out
+    gaussian_entries: np.ndarray,  # (E,) out
+) -> None:
+    many = table.shape[0]
+    for chunk in nb.prange(CHUNKS):
+        cursor = place[chunk]
+        for g in range(chunk * many // CHUNKS, (chunk + 1) * many // CHUNKS):
+            n = gaussian_start[g]
+            low, high = _rows_of(table, g, rows)
+            for row in range(low, high):
+                first, last = _touched(table, g, row, columns)
+                for column in range(first, last):
+                    e = cursor[row * columns + column]
+                    cursor[row * columns + column] = e + 1
+                    entries[e] = g
+                    gaussian_entries[n] = e
+                    n += 1

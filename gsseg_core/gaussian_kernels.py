@@ -1,4 +1,4 @@
-"""The per-Gaussian part of an EM step over one view, between two products with W."""
+"""What learners do Gaussian by Gaussian with the products of one view."""
 
 from __future__ import annotations
 
@@ -75,3 +75,19 @@ def tally(
                         part[y, k] += share * code[k]
     counts: np.ndarray = parts.sum(axis=0).T
     return counts
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def add_votes(
+    total: np.ndarray,  # (N, K) int64, added to
+    ids: np.ndarray,  # (M,) int32, distinct
+    classes: np.ndarray,  # (L,) int32, distinct
+    votes: np.ndarray,  # (M, L) float32
+    units: float,  # per vote; a power of 2
+    sign: int,
+) -> None:
+    """Add a view's votes, or take them away, in whole units."""
+    for m in nb.prange(ids.shape[0]):
+        row = total[ids[m]]
+        for y in range(classes.shape[0]):
+            row[classes[y]] += sign * np.int64(np.rint(np.float64(votes[m, y]) * units))

@@ -1,0 +1,59 @@
+"""Sorts positive float32 keys, by their bits, in parallel and in the same way on any number of threads."""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+
+DIGIT_BITS = 11
+"""Three digits make up a key; counts of one fit the fastest cache."""
+
+CHUNKS = 4
+"""Parts that are counted and moved beside each other; fixed, so that threads change nothing."""
+
+
+def sort_by_depth(
+    depth: np.ndarray,  # (M,) float32 > 0
+) -> np.ndarray:
+    """Order (M,) int32 that sorts depths, nearest first; equal ones stay in their order.
+
+    A radix sort: every pass moves the keys stably by one digit, the least significant first.
+    """
+    keys, order = depth.view(np.uint32), np.arange(len(depth), dtype=np.int32)
+    for shift in range(0, 32, DIGIT_BITS):
+        counts = np.zeros((CHUNKS, 1 << DIGIT_BITS), np.int64)
+        _count_digits(keys, shift, counts)
+        if (counts.sum(axis=0) == len(keys)).any():
+            continue  # All keys have the same digit.
+        # Digit by digit, and chunk by chunk within a digit.
+        place = (np.cumsum(counts.T) - counts.T.ravel()).reshape(-1, CHUNKS).T.copy()
+        moved_keys, moved_order = np.empty_like(keys), np.empty_like(order)
+        _move(keys, order, shift, place, moved_keys, moved_order)
+        keys, order = moved_keys, moved_order
+    return order
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _count_digits(keys: np.ndarray, shift: int, counts: np.ndarray) -> None:
+    many, mask = keys.shape[0], np.uint32((1 << DIGIT_BITS) - 1)
+    for chunk in nb.prange(CHUNKS):
+        for i in range(chunk * many // CHUNKS, (chunk + 1) * many // CHUNKS):
+            counts[chunk, (keys[i] >> np.uint32(shift)) & mask] += 1
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _move(
+    keys: np.ndarray,  # (M,) uint32
+    order: np.ndarray,  # (M,) int32
+    shift: int,
+    place: np.ndarray,  # (CHUNKS, 2^DIGIT_BITS) where the next key of each digit goes
+    moved_keys: np.ndarray,
+    moved_order: np.ndarray,
+) -> None:
+    many, mask = keys.shape[0], np.uint32((1 << DIGIT_BITS) - 1)
+    for chunk in nb.prange(CHUNKS):
+        for i in range(chunk * many // CHUNKS, (chunk + 1) * many // CHUNKS):
+            digit = (keys[i] >> np.uint32(shift)) & mask
+            n = place[chunk, digit]
+            place[chunk, digit] = n + 1
+            moved_keys[n], moved_order[n] = keys[i], order[i]
