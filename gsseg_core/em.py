@@ -35,12 +35,11 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from scipy.sparse import csr_array
-from scipy.spatial import cKDTree
 
 from gsseg_core.errors import SettingsError
 from gsseg_core.gaussian_kernels import collect, mix, tally
 from gsseg_core.learner import VOTE_UNIT, Learner, Progress, normalise, silent
+from gsseg_core.neighbours import neighbours_of
 from gsseg_core.operator import Observation
 from gsseg_core.scene import GaussianScene
 
@@ -64,7 +63,7 @@ class EMSettings:
     prior_weight : float
         Weight of the spatial prior of a Gaussian, in px.
     prior_k : int
-        Neighbours that it averages, the Gaussian itself included.
+        Neighbours that it averages.
     """
 
     max_steps: int = 30
@@ -242,9 +241,10 @@ class EMLearner(Learner):
         self,
         votes: np.ndarray,  # (N, K)
     ) -> np.ndarray:
-        """Mean code of the nearest Gaussians that were observed; rows of zeros where none was."""
-        k = min(self.settings.prior_k, len(votes))
-        nearest = cKDTree(self.scene.means).query(self.scene.means, k, workers=-1)[1].reshape(-1)
-        ones = np.ones(len(nearest), np.float32)
-        adjacency = csr_array((ones, nearest, np.arange(0, len(nearest) + 1, k)), shape=(len(votes), len(votes)))
-        return normalise(adjacency @ votes)
+        """Mean code of those of the nearest Gaussians that were observed; rows of zeros where none was."""
+        smooth = np.zeros_like(votes)
+        neighbours = neighbours_of(self.scene, self.settings.prior_k)
+        if neighbours is not None:
+            ids, means = neighbours.mean_codes(votes, self.observed_, np.ones(len(votes), bool))
+            smooth[ids] = normalise(means)
+        return smooth

@@ -37,6 +37,7 @@ def slow_em(
     for W, _, onehot, classes in seen:
         votes[:, classes] += W.T @ onehot
     distances = np.linalg.norm(scene.means[:, None].astype(np.float64) - scene.means, axis=2)
+    np.fill_diagonal(distances, np.inf)
     nearest = np.argsort(distances, axis=1)[:, : settings.prior_k]
     prior = settings.prior_weight * scaled(scaled(votes)[nearest].mean(axis=1))
     q = scaled(votes + prior)
