@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose, Quaternion, Transform
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Transform
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
@@ -38,6 +38,9 @@ _MASK_ENCODINGS: dict[str, tuple[npt.DTypeLike, int]] = {
     "16UC1": (np.uint16, 2**16 - 1),
     "32SC1": (np.int32, UNKNOWN),
 }
+
+# Type of a channel, and how many.
+_PICTURE_ENCODINGS: dict[str, tuple[npt.DTypeLike, int]] = {"rgb8": (np.uint8, 3), "32FC1": (np.float32, 1)}
 
 # Field, its type in the message, its type here. RViz and PCL want 0x00RRGGBB in the bits of a float.
 _CLOUD_FIELDS = (
@@ -94,6 +97,22 @@ def labels_from_image(message: Image, topic: str) -> npt.NDArray[np.int32]:
     return labels
 
 
+def picture_from_image(message: Image, topic: str) -> npt.NDArray[Any]:
+    """Read what `rgb_image` (H, W, 3) uint8 or `confidence_image` (H, W) float32 wrote.
+
+    Raises
+    ------
+    MaskFormatError
+        Another encoding, a size of zero, or data too short.
+    """
+    if message.encoding not in _PICTURE_ENCODINGS:
+        expected = ", ".join(_PICTURE_ENCODINGS)
+        raise MaskFormatError(f"{topic}: encoding is '{message.encoding}'; expected one of {expected}")
+    kind, channels = _PICTURE_ENCODINGS[message.encoding]
+    pixels = _pixels(message, np.dtype(kind), topic, channels)
+    return pixels.reshape(message.height, message.width, channels) if channels > 1 else pixels
+
+
 def intrinsics_from_info(info: CameraInfo, topic: str) -> tuple[npt.NDArray[np.float64], int, int]:
     """Read `K` (3, 3) in pixels, width and height of a rectified camera.
 
@@ -136,6 +155,11 @@ def matrix_from_transform(transform: Transform, topic: str) -> npt.NDArray[np.fl
     return _matrix(transform.translation, transform.rotation, topic)
 
 
+def array_from_point(point: Point) -> npt.NDArray[np.float64]:
+    """Turn a point into an array (3,)."""
+    return np.array([point.x, point.y, point.z])
+
+
 def pose_from_matrix(
     matrix: npt.NDArray[np.float64],  # (4, 4)
 ) -> Pose:
@@ -161,6 +185,14 @@ def camera_from_messages(
     """
     K, width, height = intrinsics_from_info(info, topic)
     return Camera(name, width, height, K, similarity.world_to_camera(camera_in_map))
+
+
+def viewpoint_messages(
+    camera: Camera,  # in the map
+) -> tuple[PoseStamped, CameraInfo]:
+    """Write a viewpoint for a request: pose of the optical frame in the map frame (frame_id empty), and camera."""
+    camera_in_map = np.linalg.inv(camera.world_to_camera).astype(np.float64)
+    return PoseStamped(pose=pose_from_matrix(camera_in_map)), camera_info(camera, Header())
 
 
 def mask_image(
@@ -321,11 +353,11 @@ def _token(name: str, number: int) -> str:
     return f"class_{token}" if token[0].isdigit() else token
 
 
-def _pixels(message: Image, kind: np.dtype[Any], topic: str) -> npt.NDArray[Any]:
+def _pixels(message: Image, kind: np.dtype[Any], topic: str, channels: int = 1) -> npt.NDArray[Any]:
     width, height, step = message.width, message.height, message.step
     if width < 1 or height < 1:
         raise MaskFormatError(f"{topic}: image is {width} x {height} pixels; expected at least 1 x 1")
-    row = width * kind.itemsize
+    row = width * channels * kind.itemsize
     if step < row or len(message.data) < height * step:
         raise MaskFormatError(
             f"{topic}: {len(message.data)} bytes with a step of {step}; expected {height} rows of {width} pixels "

@@ -39,7 +39,7 @@ def missing_inputs(inputs: Inputs) -> list[str]:
         many = f"{publishers} publisher{'s' * (publishers > 1)}"
         if publishers and not count:
             hint = (
-                f"it has {many}: do their QoS and type match (this side is best effort, volatile; "
+                f"it has {many}: do their QoS and type match (this side is {inputs.policies[topic]}; "
                 f"ros2 topic info -v {topic}), and do they publish?"
             )
         elif publishers:

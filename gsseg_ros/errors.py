@@ -1,4 +1,4 @@
-"""Errors of requests, and the error code that each error gets in an answer."""
+"""Errors of requests, the error code that each error gets in an answer, and what a client makes of it."""
 
 from __future__ import annotations
 
@@ -12,6 +12,26 @@ from gsseg_core.errors import (
     StateMismatchError,
     WriteError,
 )
+
+
+class SegmentationError(GssegError):
+    """The node answered that a request failed.
+
+    Attributes
+    ----------
+    code : int
+        Error code of the answer; see msg_defs/README.md.
+    name : str
+        Name of its constant, such as "NO_SCENE": the same for every request.
+    """
+
+    def __init__(self, code: int, name: str, message: str) -> None:
+        super().__init__(f"{name} ({code}): {message}")
+        self.code, self.name = code, name
+
+
+class NodeUnavailableError(GssegError, TimeoutError):
+    """The node, or what a client waited for, was not there in time."""
 
 
 class NotActiveError(GssegError):
@@ -81,3 +101,11 @@ def error_code(error: Exception, interface: Any) -> int:
         if isinstance(error, kind):
             return int(getattr(interface, name, interface.UNKNOWN))
     return int(interface.UNKNOWN)
+
+
+def error_name(code: int, interface: Any) -> str:
+    """Return the name of an answer's error code (a Response or Result class); "UNKNOWN" for one that has none."""
+    for _, name in _NAMES:
+        if getattr(interface, name, None) == code:
+            return name
+    return "UNKNOWN"

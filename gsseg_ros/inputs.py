@@ -25,13 +25,6 @@ from gsseg_ros.pairing import ExactPoses, InterpolatedPoses, Paired, Pairing, Po
 from gsseg_ros.tf_poses import TfPoses
 from gsseg_ros.workspace import Workspace
 
-# As sensor data: the latest count, and what is lost is lost. Deep enough for a burst while the interpreter is busy.
-SENSOR_DATA = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=30,
-    reliability=ReliabilityPolicy.BEST_EFFORT,
-    durability=DurabilityPolicy.VOLATILE,
-)
 EXPIRE_PERIOD, COMPLAIN_PERIOD = 0.1, 5.0  # s
 
 
@@ -46,6 +39,8 @@ class Inputs:
         Views that were fused.
     rejected : Counter of str
         Masks that were not, by reason.
+    policies : dict of str to str
+        By full name of the topic: quality of service of the subscription, overrides included.
     """
 
     def __init__(self, node: LifecycleNode, workspace: Workspace) -> None:
@@ -54,8 +49,10 @@ class Inputs:
         self.accepted = 0
         self.rejected: Counter[str] = Counter()
         self.arrivals: dict[str, tuple[int, float]] = {}
+        self.policies: dict[str, str] = {}
         self.started = time.monotonic()
         self._complained: dict[str, float] = {}
+        self._told: Counter[str] = Counter()
         self._group = MutuallyExclusiveCallbackGroup()
         self.tf = TfPoses(node, settings.map_frame) if settings.pose_source == "tf" else None
         poses: PoseSource = self.tf or (InterpolatedPoses() if settings.pose_source == "odometry" else ExactPoses())
@@ -100,15 +97,18 @@ class Inputs:
             callback(name, message)
             self._hand_over()
 
+        quality = sensor_data()
         subscription = self._node.create_subscription(
             kind,
             topic,
             arrived,
-            SENSOR_DATA,
+            quality,
             callback_group=self._group,
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
         self.arrivals[subscription.topic_name] = (0, self.started)
+        policies = f"{quality.reliability.short_key}, {quality.durability.short_key}"
+        self.policies[subscription.topic_name] = policies.replace("_", " ")
         return subscription
 
     def _on_mask(self, topic: str, message: Image) -> None:
@@ -145,6 +145,10 @@ class Inputs:
     def _hand_over(self) -> None:
         for paired in self.pairing.take():
             self.worker.submit(paired)
+        dropped = Counter(self.pairing.dropped)
+        dropped["queue_full"] = self.worker.dropped
+        self._workspace.dropped.update(dropped - self._told)
+        self._told = dropped
 
     def _fuse(self, paired: Paired) -> None:
         try:
@@ -169,3 +173,16 @@ class Inputs:
         labels = labels_from_image(mask, topic)
         camera = camera_from_messages(paired.name, info, paired.pose, workspace.settings.scene_to_map, info_topic)
         return session.fuse(View.from_arrays(camera, labels))
+
+
+def sensor_data() -> QoSProfile:
+    """Make a profile as for sensor data, deep enough for a burst while the interpreter is busy.
+
+    A new one for each topic: rclpy writes what the parameters override into it.
+    """
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=30,
+        reliability=ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.VOLATILE,
+    )

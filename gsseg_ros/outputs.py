@@ -17,8 +17,6 @@ from std_msgs.msg import Header
 from gsseg_ros.conversions import cloud, topic_tokens
 from gsseg_ros.reports import Selection
 
-LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
 
 class Outputs:
     """Publishes clouds, report and overlay.
@@ -31,11 +29,11 @@ class Outputs:
         self._node = node
         self._lock = threading.Lock()
         overridable = QoSOverridingOptions.with_default_policies()
-        self._cloud = node.create_publisher(PointCloud2, "~/cloud", LATCHED, qos_overriding_options=overridable)
+        self._cloud = node.create_publisher(PointCloud2, "~/cloud", latched(), qos_overriding_options=overridable)
         self._report = node.create_publisher(
-            SegmentationReport, "~/report", LATCHED, qos_overriding_options=overridable
+            SegmentationReport, "~/report", latched(), qos_overriding_options=overridable
         )
-        self._overlay = node.create_publisher(Image, "~/overlay", LATCHED, qos_overriding_options=overridable)
+        self._overlay = node.create_publisher(Image, "~/overlay", latched(), qos_overriding_options=overridable)
         self._classes: dict[str, Publisher] = {}
         self._filled: set[str] = set()
 
@@ -89,8 +87,13 @@ class Outputs:
 
     def _class(self, token: str) -> Publisher:
         if token not in self._classes:
-            self._classes[token] = self._node.create_publisher(PointCloud2, f"~/classes/{token}", LATCHED)
+            self._classes[token] = self._node.create_publisher(PointCloud2, f"~/classes/{token}", latched())
         return self._classes[token]
+
+
+def latched() -> QoSProfile:
+    """Make a profile for what those who come late get too; a new one for each topic, see `inputs.sensor_data`."""
+    return QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def _empty(header: Header) -> PointCloud2:

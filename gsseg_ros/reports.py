@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -111,7 +112,7 @@ def report_message(
     session, result = selection.session, selection.result
     counts, learnt = gaussian_counts(result), session.learnt
     background = int((result.labels == 0).sum())
-    rejected = sorted(session.rejected.items())
+    rejected = sorted((Counter(session.rejected) + run.dropped).items())
     return SegmentationReport(
         header=Header(stamp=run.stamp, frame_id=map_frame),
         revision=run.revision,

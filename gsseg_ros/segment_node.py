@@ -5,11 +5,13 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
@@ -33,6 +35,9 @@ THREADS = 6
 STOP_SECONDS = 3.0
 """How long a job gets to stop when the node is deactivated or shut down."""
 
+ANSWER_SECONDS = 0.3
+"""For the answer to a job that the end of the node has canceled."""
+
 
 class SegmentNode(LifecycleNode):
     """Wires topics, services and the action to a `Workspace`.
@@ -44,6 +49,9 @@ class SegmentNode(LifecycleNode):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("gsseg", **kwargs)
+        for service in self.services:
+            if service.srv_type is ChangeState:
+                service.callback = self._answered(service.callback)
         parameters.declare(self)
         self.workspace = Workspace(Settings.read(self), lambda: self.get_clock().now().to_msg())
         self.inputs: Inputs | None = None
@@ -99,7 +107,7 @@ class SegmentNode(LifecycleNode):
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop a running job, and listening."""
-        self._stop()
+        self.stop()
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -109,23 +117,18 @@ class SegmentNode(LifecycleNode):
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop, from any state."""
-        self._stop()
+        self.stop()
         self._forget()
         return TransitionCallbackReturn.SUCCESS
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Go back to unconfigured after an error in a transition."""
-        self._stop()
+        self.stop()
         self._forget()
         return TransitionCallbackReturn.SUCCESS
 
-    def close(self) -> None:
-        """Stop all threads and take the node away."""
-        self._stop()
-        self._learn.close()
-        self.destroy_node()
-
-    def _stop(self) -> None:
+    def stop(self) -> None:
+        """Stop a running job, and listening."""
         self.workspace.active = False
         if not self.workspace.slot.cancel(STOP_SECONDS):
             self.get_logger().warning(f"a job did not stop within {STOP_SECONDS:g} s; going on without it")
@@ -133,11 +136,29 @@ class SegmentNode(LifecycleNode):
             self.inputs.close()
             self.inputs = None
 
+    def close(self) -> None:
+        """Stop all threads and take the node away."""
+        self.stop()
+        self._learn.close()
+        self.destroy_node()
+
     def _forget(self) -> None:
         self.workspace.close()
         if self._outputs is not None:
             self._outputs.close()
             self._outputs = None
+
+    def _answered(self, handler: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+        """Refuse a transition that does not start in the present state; in rclpy's own hands that ends the node."""
+
+        def answer(request: ChangeState.Request, response: ChangeState.Response) -> ChangeState.Response:
+            try:
+                return handler(request, response)
+            except RuntimeError as error:
+                self.get_logger().warning(f"transition {request.transition.id} refused: {error}")
+                return ChangeState.Response(success=False)
+
+        return answer
 
     def _require_outputs(self) -> Outputs:
         if self._outputs is None:
@@ -188,6 +209,11 @@ def main(args: list[str] | None = None) -> int:
         while not stop.is_set():
             executor.spin_once(timeout_sec=0.2)
     finally:
+        node.stop()
+        # A canceled job is still answered: rclpy sends that from the executor.
+        answered = time.monotonic() + ANSWER_SECONDS
+        while time.monotonic() < answered:
+            executor.spin_once(timeout_sec=0.05)
         node.close()
         executor.shutdown(timeout_sec=STOP_SECONDS)
         rclpy.shutdown()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any, TypeVar
@@ -194,7 +195,7 @@ class Services:
                 content = build_report(
                     session.scene,
                     result,
-                    views={"used": report.num_views, "rejected": dict(session.rejected)},
+                    views={"used": report.num_views, "rejected": dict(Counter(session.rejected) + run.dropped)},
                     settings={"learner": report.learner, "device": settings.device, "refine": asdict(refine)},
                     seconds=run.watch.seconds,
                     plys=names,
@@ -208,7 +209,7 @@ class Services:
         """Forget codes and views, and clear the clouds."""
         workspace = self.workspace
         with workspace.slot.take("reset"), workspace.run("reset") as run:
-            response.num_views_dropped = workspace.session.reset() if workspace.has_scene else 0
+            response.num_views_dropped = workspace.reset()
             self._outputs().clear(self._header(run))
 
     def _select(self, request: Any, run: Run) -> tuple[Selection, RefineSettings]:

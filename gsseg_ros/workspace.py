@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -41,6 +42,8 @@ class Run:
         When it began.
     revision : int
         Its number, counted from 1.
+    dropped : Counter of str
+        As that of the workspace, when it began.
     watch : Stopwatch
         Seconds of its stages.
     """
@@ -48,6 +51,7 @@ class Run:
     job: str
     stamp: Time
     revision: int
+    dropped: Counter[str]
     watch: Stopwatch = field(default_factory=Stopwatch)
     _started: float = field(default_factory=time.perf_counter)
 
@@ -70,12 +74,15 @@ class Workspace:
         Whether the node's lifecycle state is active.
     last_job : str
         What the last job was, and how it ended.
+    dropped : Counter of str
+        Masks that never came to be views, by reason, since the scene was loaded or reset.
     """
 
     def __init__(self, settings: Settings, now: Callable[[], Time]) -> None:
         self.settings, self.slot = settings, JobSlot()
         self.active = False
         self.last_job = "none"
+        self.dropped: Counter[str] = Counter()
         self._now = now
         self._session: LiveSession | None = None
         self._lock = threading.Lock()
@@ -117,8 +124,14 @@ class Workspace:
         settings = self.settings
         scene = GaussianScene.load(path)
         session = LiveSession(scene, settings.names_by_id, max_views=settings.max_views, device=settings.device)
+        self.dropped = Counter()
         session.prepare(RefineSettings(k=settings.k))
         self._session = session
+
+    def reset(self) -> int:
+        """Forget codes and views, if there is a scene; return how many views were forgotten."""
+        self.dropped = Counter()
+        return self._session.reset() if self._session is not None else 0
 
     def close(self) -> None:
         """Forget the scene."""
@@ -134,7 +147,7 @@ class Workspace:
         """Give a run its number; if it fails, that number is skipped."""
         with self._lock:
             self._revision += 1
-            run = Run(job, self._now(), self._revision)
+            run = Run(job, self._now(), self._revision, Counter(self.dropped))
         try:
             yield run
         except Exception as error:

@@ -27,6 +27,7 @@ from gsseg_core.cameras import Camera
 from gsseg_core.errors import GssegError, IntrinsicsError, MaskFormatError, PoseError, SceneValueError
 from gsseg_core.masks import UNKNOWN
 from gsseg_ros.conversions import (
+    array_from_point,
     arrays_from_cloud,
     camera_from_messages,
     camera_info,
@@ -38,11 +39,13 @@ from gsseg_ros.conversions import (
     mask_image,
     matrix_from_pose,
     matrix_from_transform,
+    picture_from_image,
     pose_from_matrix,
     rgb_image,
     stamp_message,
     stamp_ns,
     topic_tokens,
+    viewpoint_messages,
 )
 from gsseg_ros.frames import Similarity, rigid, rotation_from_quaternion
 
@@ -427,3 +430,33 @@ def test_topic_tokens_stay_close_to_the_names() -> None:
 
 def test_a_token_made_unique_does_not_meet_a_third_class() -> None:
     assert topic_tokens({1: "a", 2: "a_3", 3: "a"}) == {1: "a", 2: "a_3", 3: "a_3_3"}
+
+
+def test_pictures_and_confidences_come_back_as_they_were() -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)
+    np.testing.assert_array_equal(picture_from_image(rgb_image(pixels, HEADER), "overlay"), pixels)
+    confidence = np.random.default_rng(1).random((5, 7), np.float32)
+    np.testing.assert_array_equal(picture_from_image(confidence_image(confidence, HEADER), "confidence"), confidence)
+
+
+def test_a_picture_of_another_kind_or_cut_short_is_refused() -> None:
+    assert "'mono8'" in refusal(
+        MaskFormatError, picture_from_image, mask_image(np.zeros((2, 2), int), HEADER, 8), "/some/topic"
+    )
+    message = rgb_image(np.zeros((2, 2, 3), np.uint8), HEADER)
+    message.data = message.data[:-1]
+    assert "11 bytes" in refusal(MaskFormatError, picture_from_image, message, "/some/topic")
+
+
+def test_a_viewpoint_comes_back_as_the_camera_it_was() -> None:
+    pose = rigid(rotation_from_quaternion(0.1, 0.7, -0.1, 0.7), (1.0, -2.0, 3.0))
+    camera = Camera("viewpoint", 64, 48, K, pose)
+    message, info = viewpoint_messages(camera)
+    assert message.header.frame_id == ""
+    back = camera_from_messages("viewpoint", info, matrix_from_pose(message.pose, "viewpoint"), IDENTITY, "viewpoint")
+    np.testing.assert_allclose(back.world_to_camera, pose, atol=1e-12)
+    assert (back.K == K).all() and (back.width, back.height) == (64, 48)
+
+
+def test_a_point_is_an_array() -> None:
+    np.testing.assert_array_equal(array_from_point(Point(x=1.0, y=2.0, z=3.0)), [1, 2, 3])

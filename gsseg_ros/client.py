@@ -1,0 +1,402 @@
+"""Drive the segmentation node from any Python program or notebook: requests block, arrays come back.
+
+with SegmentationClient() as client:
+    client.wait_until_active()
+    client.learn()
+    mug = client.segment().objects["mug"]
+    print(mug.points, mug.confidence)
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from gsseg_msgs.action import Learn
+from gsseg_msgs.srv import Export, LoadScene, LoadState, RenderView, Reset, SaveState, Segment
+from lifecycle_msgs.msg import State
+from lifecycle_msgs.srv import GetState
+from rclpy.action import ActionClient
+from rclpy.context import Context
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import PointCloud2
+
+from gsseg_ros.client_calls import Calls, LearnGoal
+from gsseg_ros.client_results import (
+    Exported,
+    LearnResult,
+    LoadedScene,
+    LoadedState,
+    RenderedView,
+    SavedState,
+    SegmentedObject,
+    SegmentResult,
+    Viewpoint,
+    seconds_of,
+)
+from gsseg_ros.conversions import (
+    array_from_point,
+    arrays_from_cloud,
+    labels_from_image,
+    picture_from_image,
+    stamp_ns,
+    viewpoint_messages,
+)
+from gsseg_ros.errors import NodeUnavailableError, SegmentationError
+from gsseg_ros.spinner import Spinner
+
+__all__ = [
+    "Exported", "LearnResult", "LoadedScene", "LoadedState", "NodeUnavailableError", "RenderedView", "SavedState",
+    "SegmentResult", "SegmentationClient", "SegmentationError", "SegmentedObject", "Viewpoint",
+]  # fmt: skip
+
+_SERVICES = {
+    Segment: "segment", RenderView: "render_view", LoadScene: "load_scene", SaveState: "save_state",
+    LoadState: "load_state", Export: "export", Reset: "reset", GetState: "get_state",
+}  # fmt: skip
+
+# Reliable, for large clouds do not arrive otherwise; latched, so that a cloud is not lost that was sent before the two
+# ends had found each other; deep enough that one of another client does not push it out.
+_CLOUD_QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+ASK_SECONDS, POLL_SECONDS = 2.0, 0.2
+"""Until a question for the node's state is asked again, unanswered and answered."""
+
+
+class SegmentationClient:
+    """Talks to a segmentation node. Its methods block, and may be called from several threads.
+
+    Every method raises `SegmentationError` where the node answers that it failed, and `NodeUnavailableError`, which is
+    a TimeoutError, where there is no node or no answer in time; the message says what to check. Paths are those of the
+    node's machine, below its parameter `data_root`, absolute or relative to that.
+
+    Parameters
+    ----------
+    node_name : str
+        Name of the node, with its namespace if it has one: "robot1/gsseg".
+    context : rclpy.context.Context, optional
+        Of the program, if the client is to live there; by default it has one of its own.
+    domain_id : int, optional
+        ROS domain, if not that of the environment.
+    find_timeout : float
+        Seconds to look for the node before it is taken for absent.
+    """
+
+    def __init__(
+        self,
+        node_name: str = "gsseg",
+        *,
+        context: Context | None = None,
+        domain_id: int | None = None,
+        find_timeout: float = 10.0,
+    ) -> None:
+        self._name = "/" + node_name.strip("/")
+        self._spinner = Spinner("gsseg_client", context, domain_id)
+        self._calls = Calls(self._spinner, self._name, find_timeout)
+        node = self._spinner.node
+        self._clients = {kind: node.create_client(kind, f"{self._name}/{name}") for kind, name in _SERVICES.items()}
+        self._learn: Any = ActionClient(node, Learn, f"{self._name}/learn")
+        self._clouds: dict[int, PointCloud2] = {}
+        self._awaiting_clouds = 0
+        self._lock = threading.Lock()
+        self._cloud_topic = node.create_subscription(PointCloud2, f"{self._name}/cloud", self._on_cloud, _CLOUD_QOS)
+        self._diagnostics: Any = None
+        self._statuses: deque[Any] = deque(maxlen=10)
+        self._learning: set[LearnGoal] = set()
+
+    def __enter__(self) -> SegmentationClient:
+        """Do nothing: it is ready."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close it."""
+        self.close()
+
+    def close(self) -> None:
+        """Take the client away; the node goes on."""
+        self._spinner.close()
+
+    def wait_until_active(self, timeout: float = 120.0) -> None:
+        """Wait until the node is there and active. At its first start after installing, kernels compile for a minute.
+
+        Raises
+        ------
+        NodeUnavailableError
+            It is not, within `timeout` seconds.
+        """
+        deadline = time.monotonic() + timeout
+        client, state = self._clients[GetState], "not answering"
+        if not self._spinner.wait_for(client.service_is_ready, timeout):
+            raise self._calls.absent(f"service {client.srv_name}", timeout)
+        while time.monotonic() < deadline:
+            # A node that starts up does not answer before it is active; asked again, for it may have been started anew.
+            asked = self._spinner.run(lambda: client.call_async(GetState.Request()))
+            if self._spinner.wait_for(asked.done, min(ASK_SECONDS, deadline - time.monotonic())):
+                state = asked.result().current_state.label
+                if asked.result().current_state.id == State.PRIMARY_STATE_ACTIVE:
+                    return
+                self._spinner.wait_for(lambda: False, min(POLL_SECONDS, deadline - time.monotonic()))
+            client.remove_pending_request(asked)
+        raise NodeUnavailableError(
+            f"{self._name} is {state} after {timeout:g} s; expected active: its log says why it could not be "
+            "configured, or it waits for a lifecycle manager (parameter autostart)"
+        )
+
+    def wait_for_views(self, count: int, timeout: float = 60.0, on_views: Callable[[int], object] | None = None) -> int:
+        """Wait until the node has fused so many views; it says once a second how many it has.
+
+        Parameters
+        ----------
+        count : int
+            Views since the scene was loaded or reset.
+        timeout : float
+            Seconds.
+        on_views : callable, optional
+            Called with their number whenever the node says it.
+
+        Returns
+        -------
+        int
+            Views fused.
+
+        Raises
+        ------
+        NodeUnavailableError
+            They were not, in time; the message says what the node has to say about its inputs.
+        """
+        deadline, views = time.monotonic() + timeout, 0
+        if self._diagnostics is None:
+            self._diagnostics = self._spinner.node.create_subscription(
+                DiagnosticArray, "/diagnostics", self._on_diagnostics, 10
+            )
+        said = None
+        self._statuses.clear()
+        while self._spinner.wait_for(lambda: self._statuses, deadline - time.monotonic()):
+            said = self._statuses.popleft()
+            values = {value.key: value.value for value in said.values}
+            views = int(values.get("views fused", 0))
+            if on_views is not None:
+                on_views(views)
+            if views >= count:
+                return views
+        if said is None:
+            raise self._calls.absent("its status on /diagnostics", timeout)
+        rejected = [f"{key}: {value}" for key, value in values.items() if key.startswith("rejected ")]
+        raise NodeUnavailableError(
+            f"{self._name} has fused {views} of {count} views after {timeout:g} s; it says: "
+            + "; ".join([said.message, *rejected])
+        )
+
+    def learn(
+        self,
+        dataset_path: str | os.PathLike[str] = "",
+        learner: str = "em",
+        num_views: int = 0,
+        max_steps: int = 0,
+        on_feedback: Callable[[str, int, int, float], object] | None = None,
+        *,
+        timeout: float = 3600.0,
+    ) -> LearnResult:
+        """Learn the best codes. Ctrl-C, an error in `on_feedback`, or running out of time cancels it.
+
+        Parameters
+        ----------
+        dataset_path : path
+            Folder of a dataset, to learn from its train views; by default from the views that the node received.
+        learner : str
+            "em", "votes" or "gradient".
+        num_views : int
+            Use this many views, spread evenly; 0: all.
+        max_steps : int
+            Stop after this many steps; 0: when it converges.
+        on_feedback : callable, optional
+            Called in this thread with stage, done, total, loss (nats per pixel, NaN at first), ten times a second.
+        timeout : float
+            Seconds.
+
+        Raises
+        ------
+        SegmentationError
+            Among others BUSY where another job is running, and CANCELED after `cancel`; then nothing has changed.
+        """
+        for name, count in (("num_views", num_views), ("max_steps", max_steps)):
+            if not 0 <= count < 2**32:
+                raise ValueError(f"{name} is {count}; expected a whole number from 0")
+        goal = Learn.Goal(
+            dataset_path=os.fspath(dataset_path), learner=learner, num_views=int(num_views), max_steps=int(max_steps)
+        )
+        deadline = time.monotonic() + timeout
+        self._calls.find(self._learn.server_is_ready, f"action {self._name}/learn", timeout)
+        running = LearnGoal(self._calls, self._learn, goal)
+        self._learning.add(running)
+        try:
+            result = running.run(on_feedback, deadline)
+        finally:
+            self._learning.discard(running)
+        return LearnResult(result.report, result.num_steps, result.converged, result.loss)
+
+    def cancel(self) -> bool:
+        """Cancel the `learn` that another thread is in, which then raises a CANCELED `SegmentationError` there.
+
+        Returns
+        -------
+        bool
+            Whether there was one. It may yet come to its end, if it was about to.
+        """
+        running = list(self._learning)
+        for goal in running:
+            goal.cancel()
+        return bool(running)
+
+    def segment(
+        self,
+        classes: Sequence[str | int] = (),
+        min_confidence: float = 0.0,
+        refine: bool = True,
+        filter: bool = True,
+        viewpoint: Viewpoint | None = None,
+        *,
+        timeout: float = 60.0,
+    ) -> SegmentResult:
+        """Get every object of the scene; the node publishes them, too.
+
+        Parameters
+        ----------
+        classes : sequence of str or int
+            Names or numbers of the classes wanted; by default all.
+        min_confidence : float
+            Leave out Gaussians less sure than this, 0 to 1.
+        refine, filter : bool
+            Whether codes are refined by their neighbours, and whether outliers are then removed.
+        viewpoint : Viewpoint, optional
+            Where to draw a label image from, too.
+        timeout : float
+            Seconds.
+        """
+        deadline = time.monotonic() + timeout
+        request = Segment.Request(
+            classes=_names(classes),
+            min_confidence=float(min_confidence),
+            skip_refinement=not refine,
+            skip_filter=not filter,
+        )
+        if viewpoint is not None:
+            request.viewpoint_pose, request.viewpoint_camera = viewpoint_messages(viewpoint.camera)
+        with self._keeping_clouds():
+            answer = self._call(Segment, request, timeout)
+            cloud = arrays_from_cloud(self._cloud_of(stamp_ns(answer.report.header.stamp), deadline))
+        labels = labels_from_image(answer.label_image, "label_image") if viewpoint is not None else None
+        return SegmentResult(cloud.points, cloud.labels, cloud.confidence, cloud.rgb, answer.report, labels)
+
+    def render_view(
+        self,
+        viewpoint: Viewpoint,
+        refine: bool = True,
+        filter: bool = True,
+        with_confidence: bool = False,
+        with_overlay: bool = False,
+        *,
+        timeout: float = 60.0,
+    ) -> RenderedView:
+        """Get what a viewpoint sees: label image, and on request confidence and a picture."""
+        pose, info = viewpoint_messages(viewpoint.camera)
+        request = RenderView.Request(
+            viewpoint_pose=pose,
+            viewpoint_camera=info,
+            skip_refinement=not refine,
+            skip_filter=not filter,
+            with_confidence=with_confidence,
+            with_overlay=with_overlay,
+        )
+        answer = self._call(RenderView, request, timeout)
+        return RenderedView(
+            labels_from_image(answer.label_image, "label_image"),
+            picture_from_image(answer.confidence_image, "confidence_image") if with_confidence else None,
+            picture_from_image(answer.overlay_image, "overlay_image") if with_overlay else None,
+            seconds_of(answer.stages),
+        )
+
+    def load_scene(self, path: str | os.PathLike[str] = "", *, timeout: float = 120.0) -> LoadedScene:
+        """Load another scene, and forget views and codes; by default the node's `scene_path` again."""
+        answer = self._call(LoadScene, LoadScene.Request(path=os.fspath(path)), timeout)
+        box = array_from_point(answer.box_min), array_from_point(answer.box_max)
+        return LoadedScene(Path(answer.path), answer.scene_hash, answer.num_gaussians, box)
+
+    def save_state(self, path: str | os.PathLike[str] = "", *, timeout: float = 60.0) -> SavedState:
+        """Save votes, views and codes; by default in gsseg_state.npz in `data_root`."""
+        answer = self._call(SaveState, SaveState.Request(path=os.fspath(path)), timeout)
+        return SavedState(Path(answer.path), answer.num_bytes, answer.num_views)
+
+    def load_state(self, path: str | os.PathLike[str] = "", *, timeout: float = 60.0) -> LoadedState:
+        """Load what was saved, in place of what the node knows."""
+        answer = self._call(LoadState, LoadState.Request(path=os.fspath(path)), timeout)
+        return LoadedState(Path(answer.path), dict(enumerate(answer.class_names)), answer.num_views)
+
+    def export(
+        self,
+        directory: str | os.PathLike[str] = "",
+        classes: Sequence[str | int] = (),
+        min_confidence: float = 0.0,
+        refine: bool = True,
+        filter: bool = True,
+        *,
+        timeout: float = 120.0,
+    ) -> Exported:
+        """Write segmentation.npz, one PLY per class, and report.json; by default to gsseg_export in `data_root`."""
+        request = Export.Request(
+            directory=os.fspath(directory),
+            classes=_names(classes),
+            min_confidence=float(min_confidence),
+            skip_refinement=not refine,
+            skip_filter=not filter,
+        )
+        answer = self._call(Export, request, timeout)
+        folder = Path(answer.directory)
+        return Exported(folder, [folder / name for name in answer.files], answer.report)
+
+    def reset(self, *, timeout: float = 30.0) -> int:
+        """Forget views and codes, and clear the clouds; return how many views were forgotten."""
+        return int(self._call(Reset, Reset.Request(), timeout).num_views_dropped)
+
+    def _call(self, kind: Any, request: Any, timeout: float) -> Any:
+        return self._calls.call(self._clients[kind], request, timeout)
+
+    @contextlib.contextmanager
+    def _keeping_clouds(self) -> Iterator[None]:
+        with self._lock:
+            self._awaiting_clouds += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._awaiting_clouds -= 1
+                if not self._awaiting_clouds:
+                    self._clouds.clear()
+
+    def _cloud_of(self, stamp: int, deadline: float) -> PointCloud2:
+        if not self._spinner.wait_for(lambda: stamp in self._clouds, deadline - time.monotonic()):
+            raise NodeUnavailableError(
+                f"{self._cloud_topic.topic_name}: segment was answered, but its cloud did not come in time "
+                f"({self._cloud_topic.get_publisher_count()} publishers, {len(self._clouds)} other clouds); did "
+                "another request replace it, or does a qos_override make it best effort or volatile?"
+            )
+        return self._clouds[stamp]
+
+    def _on_cloud(self, message: PointCloud2) -> None:
+        with self._lock:
+            if self._awaiting_clouds:
+                self._clouds[stamp_ns(message.header.stamp)] = message
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        self._statuses.extend(status for status in message.status if status.name == self._name)
+
+
+def _names(classes: Sequence[str | int]) -> list[str]:
+    return [classes] if isinstance(classes, str) else [str(name) for name in classes]

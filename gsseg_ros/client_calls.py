@@ -1,0 +1,161 @@
+"""Requests to the node, from being sent to being answered: what is not there is named, what failed is raised."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from gsseg_msgs.action import Learn
+from rclpy.action import ActionClient
+
+from gsseg_ros.errors import NodeUnavailableError, SegmentationError, error_name
+from gsseg_ros.spinner import Spinner
+
+GRACE_SECONDS = 1.0
+"""For an answer on its way from a node that has just ended."""
+
+CANCEL_SECONDS = 5.0
+"""How long a goal that is given up may take to end."""
+
+
+class Calls:
+    """Calls services of one node.
+
+    Parameters
+    ----------
+    spinner : Spinner
+        Whose node asks.
+    node_name : str
+        Full name of the node that is asked.
+    find_timeout : float
+        Seconds to look for the node before it is taken for absent.
+    """
+
+    def __init__(self, spinner: Spinner, node_name: str, find_timeout: float) -> None:
+        self.spinner, self.node_name, self.find_timeout = spinner, node_name, find_timeout
+
+    def call(self, client: Any, request: Any, timeout: float) -> Any:
+        """Call a service and return the response, which is no error.
+
+        Raises
+        ------
+        SegmentationError
+            The node answered an error.
+        NodeUnavailableError
+            There is no such service, or no answer in time.
+        """
+        deadline = time.monotonic() + timeout
+        self.find(client.service_is_ready, f"service {client.srv_name}", timeout)
+        answer = self.spinner.run(lambda: client.call_async(request))
+        try:
+            self.settle(answer.done, client.service_is_ready, client.srv_name, deadline)
+            return checked(answer.result())
+        finally:
+            client.remove_pending_request(answer)
+
+    def find(self, ready: Callable[[], bool], what: str, timeout: float) -> None:
+        """Wait until something of the node is there; raises `NodeUnavailableError`."""
+        timeout = min(timeout, self.find_timeout)
+        if not self.spinner.wait_for(ready, timeout):
+            raise self.absent(what, timeout)
+
+    def absent(self, what: str, timeout: float) -> NodeUnavailableError:
+        """Make the error that says what was not there and what to check."""
+        node = self.spinner.node
+        others = sorted(
+            f"{namespace.rstrip('/')}/{name}"
+            for name, namespace in node.get_node_names_and_namespaces()
+            if name != node.get_name()
+        )
+        return NodeUnavailableError(
+            f"{self.node_name}: {what} was not there within {timeout:g} s; check that segment_node runs, under this "
+            f"name, and with this ROS_DOMAIN_ID ({node.context.get_domain_id()}), ROS_AUTOMATIC_DISCOVERY_RANGE and "
+            f"RMW_IMPLEMENTATION; nodes seen: {', '.join(others) or 'none'}"
+        )
+
+    def settle(self, settled: Callable[[], object], ready: Callable[[], bool], what: str, deadline: float) -> None:
+        """Wait for something that a request brings about, for as long as the node is there.
+
+        Raises
+        ------
+        NodeUnavailableError
+            The node has gone, or the time is over.
+        """
+        in_time = self.spinner.wait_for(lambda: settled() or not ready(), deadline - time.monotonic())
+        if not settled() and not self.spinner.wait_for(settled, GRACE_SECONDS if in_time else 0.0):
+            why = "went away" if in_time else "did not answer in time"
+            raise NodeUnavailableError(
+                f"{self.node_name} {why} during {what}; check its log, and whether it still runs"
+            )
+
+
+class LearnGoal:
+    """A goal of the action `~/learn`, from being sent to its result."""
+
+    def __init__(self, calls: Calls, action: ActionClient, goal: Learn.Goal) -> None:
+        self._calls, self._action, self._goal = calls, action, goal
+        self._feedback: deque[Any] = deque()
+        self._accepting: Any = None
+        self._cancel_asked = self._cancel_sent = False
+
+    def cancel(self) -> None:
+        """Have it canceled, from any thread."""
+        self._cancel_asked = True
+        self._calls.spinner.wake()
+
+    def run(self, on_feedback: Callable[[str, int, int, float], object] | None, deadline: float) -> Learn.Result:
+        """Send it and wait for the result, which is no error; on any exception the goal is canceled."""
+        try:
+            self._calls.spinner.run(self._send)
+            self._settle(self._accepting.done, deadline)
+            handle = self._accepting.result()
+            result = self._calls.spinner.run(handle.get_result_async)
+            while self._feedback or not result.done():
+                self._settle(lambda: result.done() or self._feedback or self._to_be_canceled, deadline)
+                if self._to_be_canceled:
+                    self._cancel_sent = True
+                    self._calls.spinner.run(handle.cancel_goal_async)
+                self._tell(on_feedback)
+        except BaseException:
+            self._give_up()
+            raise
+        return checked(result.result().result)
+
+    @property
+    def _to_be_canceled(self) -> bool:
+        return self._cancel_asked and not self._cancel_sent
+
+    def _send(self) -> None:
+        self._accepting = self._action.send_goal_async(
+            self._goal, lambda message: self._feedback.append(message.feedback)
+        )
+
+    def _settle(self, settled: Callable[[], object], deadline: float) -> None:
+        self._calls.settle(settled, self._action.server_is_ready, "learn", deadline)
+
+    def _tell(self, on_feedback: Callable[[str, int, int, float], object] | None) -> None:
+        while self._feedback:
+            feedback = self._feedback.popleft()
+            if on_feedback is not None:
+                on_feedback(feedback.stage, feedback.done, feedback.total, feedback.loss)
+
+    def _give_up(self) -> None:
+        """Cancel, and wait a little for the end, so that the node is free for the next goal."""
+        spinner = self._calls.spinner
+        if self._accepting is None:
+            return
+        with contextlib.suppress(Exception):
+            spinner.wait_for(self._accepting.done, CANCEL_SECONDS)
+            handle = self._accepting.result()
+            spinner.run(handle.cancel_goal_async)
+            spinner.wait_for(spinner.run(handle.get_result_async).done, CANCEL_SECONDS)
+
+
+def checked(answer: Any) -> Any:
+    """Return an answer (a Response or Result); raises `SegmentationError` if it is an error."""
+    if answer.error_code:
+        raise SegmentationError(answer.error_code, error_name(answer.error_code, type(answer)), answer.error_msg)
+    return answer
