@@ -118,6 +118,7 @@ def _segment(options: argparse.Namespace) -> int:
     if options.scheduler:
         raise SettingsError("--scheduler is not in this version; expected a run on this machine")
     refine = RefineSettings(k=options.k, beta=options.beta, cluster=not options.no_knn, filter=not options.no_filter)
+    _load_kernels(options.quiet, options.device)
     with progress_bars(options.quiet) as progress:
         report = pipeline.segment(
             options.scene,
@@ -137,9 +138,16 @@ def _segment(options: argparse.Namespace) -> int:
     return 0
 
 
+def _load_kernels(quiet: bool, device: str = "cpu") -> None:
+    from gsseg_core.warm_up import warm_up
+
+    warm_up(device, lambda text: None if quiet else print(f"gsseg: {text}", file=sys.stderr))
+
+
 def _render(options: argparse.Namespace) -> int:
     from gsseg_core import pipeline
 
+    _load_kernels(options.quiet, options.device)
     with progress_bars(options.quiet) as progress:
         paths = pipeline.render(
             options.scene,
@@ -171,6 +179,7 @@ def _eval(options: argparse.Namespace) -> int:
 def _demo(options: argparse.Namespace) -> int:
     from gsseg_core.demo import run_demo
 
+    _load_kernels(options.quiet)
     with progress_bars(options.quiet) as progress:
         summary = run_demo(options.out, seed=options.seed, progress=progress)
     print(summary)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import time
+import threading
+from collections.abc import Callable
 
 import numpy as np
 
@@ -13,13 +14,26 @@ from gsseg_core.operator import make_operator
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
+SLOW = 1.5
+"""Seconds after which it is plain that kernels are compiled and not just loaded."""
 
-def warm_up(device: str = "cpu") -> float:
-    """Take a few Gaussians through everything that a session does; return the seconds that it took.
 
-    About a second when the kernels are in the cache, and up to a minute at the first time after an installation.
+def warm_up(device: str = "cpu", say: Callable[[str], object] = lambda text: None) -> None:
+    """Take a few Gaussians through everything that segmenting does, so that all its kernels are there.
+
+    That takes a fifth of a second when they are in the cache, and up to a minute at the first time after an
+    installation; then `say` is told.
     """
-    started = time.perf_counter()
+    slow = threading.Timer(SLOW, say, ["compiling kernels, a minute; only the first run after installing does this"])
+    slow.daemon = True
+    slow.start()
+    try:
+        _segment_something(device)
+    finally:
+        slow.cancel()
+
+
+def _segment_something(device: str) -> None:
     means = np.stack([np.arange(16) % 4 - 1.5, np.arange(16) // 4 - 1.5, np.full(16, 4.0)], axis=1)
     ones = np.ones(16)
     scene = GaussianScene.from_arrays(
@@ -34,4 +48,3 @@ def warm_up(device: str = "cpu") -> float:
     operator = make_operator(scene, camera, device)
     result.render(operator)
     operator.render(scene.colors(camera.center))
-    return time.perf_counter() - started

@@ -75,8 +75,7 @@ class SegmentNode(LifecycleNode):
         """Read the parameters and load the scene."""
         try:
             self.workspace.settings = settings = Settings.read(self)
-            self.get_logger().info("loading kernels; at the first start after installing they are compiled (a minute)")
-            warm_up(settings.device)
+            warm_up(settings.device, self.get_logger().info)
             if settings.scene_path:
                 self.workspace.load_scene(self.workspace.scene_path())
         except GssegError as error:
