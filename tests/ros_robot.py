@@ -1,0 +1,350 @@
+"""A robot for the tests of the segmentation node: it publishes posed masks, asks the node, and reads what it says."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ros_helpers import PATIENCE, Process, Ros
+from small_scenes import NAMES, as_3dgs, balls_on_a_table, look_at, write_dataset
+
+pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
+
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from gsseg_msgs.action import Learn
+from gsseg_msgs.srv import Export, LoadScene, LoadState, RenderView, Reset, SaveState, Segment
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from nav_msgs.msg import Odometry
+from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
+from rclpy.action import ActionClient
+from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
+
+from gsseg_core.dataset import View
+from gsseg_core.live import LiveSession
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segmentation import Segmentation
+from gsseg_ros.conversions import camera_info, mask_image, pose_from_matrix, stamp_message
+from gsseg_ros.frames import Similarity
+
+KINDS = {"mask": Image, "camera_info": CameraInfo, "pose": PoseStamped, "odometry": Odometry}
+SERVICES = {
+    "segment": Segment, "render_view": RenderView, "load_scene": LoadScene, "save_state": SaveState,
+    "load_state": LoadState, "export": Export, "reset": Reset, "change_state": ChangeState, "get_state": GetState,
+    "describe_parameters": DescribeParameters, "get_parameters": GetParameters, "list_parameters": ListParameters,
+    "set_parameters": SetParameters,
+}  # fmt: skip
+RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+CLASSES = list(NAMES.values())
+IDENTITY = Similarity(np.eye(3), np.zeros(3), 1.0)
+SECOND = 1_000_000_000
+STEP = SECOND // 10
+"""Nanoseconds from one mask to the next."""
+
+
+@dataclass
+class Goal:
+    """A goal of `~/learn` that was accepted."""
+
+    handle: Any
+    future: Any
+    feedback: list[Any] = field(default_factory=list)
+
+    @property
+    def stages(self) -> list[str]:
+        """Stages in the order in which feedback named them."""
+        return list(dict.fromkeys(message.stage for message in self.feedback))
+
+
+class Robot:
+    """Publishes for one node and calls it.
+
+    Parameters
+    ----------
+    ros : Ros
+        Where.
+    namespace : str
+        Of the node and of its inputs; "" or "/somewhere".
+    """
+
+    def __init__(self, ros: Ros, namespace: str = "") -> None:
+        self.ros, self.namespace, self.name = ros, namespace, f"{namespace}/gsseg"
+        self.publishers = {
+            topic: ros.node.create_publisher(kind, f"{namespace}/{topic}", RELIABLE) for topic, kind in KINDS.items()
+        }
+        self._clients: dict[str, Any] = {}
+        self._learner: ActionClient | None = None
+        self.received_status = ros.collect(DiagnosticArray, "/diagnostics", RELIABLE)
+        self.stamp = 1000 * SECOND
+        self.process: Process | None = None
+
+    # The node
+
+    def start(self, parameters: dict[str, Any] | None = None, *arguments: str, lossless: bool = True) -> Process:
+        """Start the node, without waiting for it; `lossless`: it hears all that is sent, however busy the machine."""
+        overrides = {"reliability": "reliable", "depth": 1000} if lossless else {}
+        qos = {
+            f"qos_overrides.{self.namespace}/{topic}.subscription.{policy}": value
+            for topic in KINDS
+            for policy, value in overrides.items()
+        }
+        if self.namespace:
+            arguments = ("-r", f"__ns:={self.namespace}", *arguments)
+        self.process = self.ros.start("segment_node", {**(parameters or {}), **qos}, *arguments)
+        return self.process
+
+    def started(self, parameters: dict[str, Any] | None = None, *arguments: str, lossless: bool = True) -> Robot:
+        """Start the node and wait until it is active and listens to this robot."""
+        self.start(parameters, *arguments, lossless=lossless)
+        self.wait_active()
+        return self
+
+    def wait_active(self) -> None:
+        """Wait until the node is active and its inputs are connected."""
+        assert self.process is not None
+        self.process.wait_for("active: listening", timeout=120)  # Compiles its kernels after an installation.
+        self.ros.wait_until(
+            lambda: all(self.publishers[topic].get_subscription_count() for topic in ("mask", "camera_info")),
+            "the node's subscriptions",
+        )
+
+    def change(self, transition: str) -> bool:
+        """Ask for a lifecycle transition, such as "configure"; returns whether it succeeded."""
+        number = getattr(Transition, f"TRANSITION_{transition.upper()}")
+        return bool(self.ask("change_state", transition=Transition(id=number)).success)
+
+    @property
+    def state(self) -> str:
+        """Lifecycle state."""
+        return str(self.ask("get_state").current_state.label)
+
+    def shutdown(self) -> bool:
+        """Ask for the shutdown that belongs to the lifecycle state."""
+        return self.change(f"{self.state}_shutdown")
+
+    # Requests
+
+    def ask(self, service: str, **fields: Any) -> Any:
+        """Call a service of the node and return the response."""
+        return self.ros.result(self.send(service, **fields), f"the answer of {service}")
+
+    def send(self, service: str, **fields: Any) -> Any:
+        """Call a service of the node and return the future."""
+        if service not in self._clients:
+            self._clients[service] = self.ros.node.create_client(SERVICES[service], f"{self.name}/{service}")
+        client = self._clients[service]
+        self.ros.wait_until(client.service_is_ready, f"service {service}")
+        return client.call_async(SERVICES[service].Request(**fields))
+
+    def done(self, service: str, **fields: Any) -> Any:
+        """Call a service, which must work."""
+        response = self.ask(service, **fields)
+        assert response.error_code == 0, response.error_msg
+        return response
+
+    def goal(self, **fields: Any) -> Goal:
+        """Send a goal of `~/learn`, which is accepted."""
+        if self._learner is None:
+            self._learner = ActionClient(self.ros.node, Learn, f"{self.name}/learn")
+        self.ros.wait_until(self._learner.server_is_ready, "the action")
+        feedback: list[Any] = []
+        sent = self._learner.send_goal_async(Learn.Goal(**fields), lambda message: feedback.append(message.feedback))
+        handle = self.ros.result(sent, "the goal to be accepted")
+        assert handle.accepted
+        return Goal(handle, handle.get_result_async(), feedback)
+
+    def outcome(self, goal: Goal, timeout: float = PATIENCE) -> tuple[int, Any]:
+        """Wait for the end of a goal; returns status and result."""
+        answer = self.ros.result(goal.future, "the result", timeout)
+        return answer.status, answer.result
+
+    def learn(self, **fields: Any) -> tuple[int, Any]:
+        """Send a goal and wait for its end; returns status and result."""
+        return self.outcome(self.goal(**fields))
+
+    def begin(self, stage: str = "", **fields: Any) -> Goal:
+        """Send a goal and wait until it works, at the stage if one is given."""
+        goal = self.goal(**fields)
+        self.ros.wait_until(lambda: stage in goal.stages if stage else goal.feedback, f"feedback {stage}")
+        return goal
+
+    def cancel(self, goal: Goal) -> tuple[int, Any]:
+        """Cancel a goal and wait for its end; returns status and result."""
+        answer = self.ros.result(goal.handle.cancel_goal_async(), "the answer to the cancel")
+        assert len(answer.goals_canceling) == 1
+        return self.outcome(goal, timeout=10)
+
+    def exported(self, folder: Path, **fields: Any) -> Segmentation:
+        """Export to a folder and read the segmentation back."""
+        response = self.done("export", directory=str(folder), **fields)
+        return Segmentation.load(folder / "segmentation.npz", GaussianScene.load(response.report.scene_path))
+
+    # Parameters
+
+    def set(self, name: str, value: Any) -> tuple[bool, str]:
+        """Set a parameter; returns whether it was taken, and why not."""
+        (result,) = self.ask("set_parameters", parameters=[Parameter(name, value=value).to_parameter_msg()]).results
+        return bool(result.successful), str(result.reason)
+
+    def get(self, name: str) -> Any:
+        """Value of a parameter."""
+        (value,) = self.ask("get_parameters", names=[name]).values
+        return parameter_value_to_python(value)
+
+    # Views
+
+    def next_stamp(self) -> int:
+        """A stamp later than all before."""
+        self.stamp += STEP
+        return self.stamp
+
+    def publish(self, messages: dict[str, Any]) -> None:
+        """Publish messages by topic, the mask last."""
+        for topic in sorted(messages, key=lambda topic: topic == "mask"):
+            self.publishers[topic].publish(messages[topic])
+
+    def drive(self, views: Iterable[View], similarity: Similarity = IDENTITY) -> list[int]:
+        """Publish some views; returns their stamps."""
+        stamps = []
+        for view in views:
+            stamps.append(self.next_stamp())
+            self.publish(messages(view, stamps[-1], similarity))
+        return stamps
+
+    def fuse(self, views: Iterable[View]) -> None:
+        """Publish some views, and wait until as many more are fused; nothing must have been learnt yet."""
+        views = list(views)
+        response = self.ask("segment")
+        before = response.report.num_views if response.error_code == 0 else 0
+        self.drive(views)
+        self.ros.wait_until(
+            lambda: self.ask("segment").report.num_views == before + len(views), f"{len(views)} views to be fused"
+        )
+
+    # What the node says by itself
+
+    def latched(self, *topics: tuple[Any, str]) -> list[Any]:
+        """What somebody gets who subscribes only now, of each topic (type and name below the node's)."""
+        heard: list[list[Any]] = [[] for _ in topics]
+        subscriptions = [
+            self.ros.node.create_subscription(kind, f"{self.name}/{topic}", messages.append, LATCHED)
+            for (kind, topic), messages in zip(topics, heard, strict=True)
+        ]
+        try:
+            self.ros.wait_until(lambda: all(heard), f"the latched messages of {[topic for _, topic in topics]}")
+        finally:
+            for subscription in subscriptions:
+                self.ros.node.destroy_subscription(subscription)
+        return [messages[-1] for messages in heard]
+
+    def status(self) -> dict[str, str]:
+        """What `/diagnostics` said last of this node; empty before the first time."""
+        for array in reversed(self.received_status):
+            for status in array.status:
+                if status.name == self.name:
+                    return {value.key: value.value for value in status.values} | {"message": status.message}
+        return {}
+
+    def wait_for_status(self, condition: Callable[[dict[str, str]], Any], what: str) -> dict[str, str]:
+        """Wait until `/diagnostics` says something; returns all that it says then."""
+        last: dict[str, str] = {}
+
+        def holds() -> bool:
+            nonlocal last
+            last = self.status()
+            return bool(last and condition(last))
+
+        try:
+            self.ros.wait_until(holds, what)
+        except pytest.fail.Exception as failure:
+            pytest.fail(f"{failure}\nlast status: {json.dumps(last, indent=1)}")
+        return last
+
+
+@contextmanager
+def private_ros(folder: Path) -> Iterator[Ros]:
+    """A `Ros` for a whole module, as the fixture `ros` is one for a test."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        patch.setenv("ROS_LOG_DIR", str(folder / "ros_log"))
+        ros = Ros(folder)
+        try:
+            yield ros
+        finally:
+            ros.close()
+
+
+def messages(view: View, stamp: int, similarity: Similarity = IDENTITY) -> dict[str, Any]:
+    """Mask, camera_info and pose of a view."""
+    header = Header(stamp=stamp_message(stamp), frame_id="camera")
+    in_map = Header(stamp=header.stamp, frame_id="map")
+    return {
+        "mask": mask_image(view.read_labels(), header, 8),
+        "camera_info": camera_info(view.camera, header),
+        "pose": PoseStamped(
+            header=in_map, pose=pose_from_matrix(similarity.camera_in_map(view.camera.world_to_camera))
+        ),
+    }
+
+
+def viewpoint(view: View) -> dict[str, Any]:
+    """Fields of a request that asks for the viewpoint of a view."""
+    sent = messages(view, 7 * SECOND)
+    return {"viewpoint_pose": sent["pose"], "viewpoint_camera": sent["camera_info"]}
+
+
+def core_session(scene: GaussianScene, views: Iterable[View], names: Iterable[str] = CLASSES) -> LiveSession:
+    """What the node has to come to, by the core alone."""
+    session = LiveSession(scene, dict(enumerate(names)))
+    for view in views:
+        assert session.fuse(view) is None
+    return session
+
+
+def renamed(views: Iterable[View]) -> list[View]:
+    """The same views, each under a name of its own."""
+    return [replace(view, camera=replace(view.camera, name=str(i))) for i, view in enumerate(views)]
+
+
+def assert_same(found: Segmentation, expected: Segmentation) -> None:
+    """Same labels, and the same codes but for what a pose loses on its way through a quaternion."""
+    np.testing.assert_array_equal(found.labels, expected.labels)
+    np.testing.assert_allclose(found.probabilities, expected.probabilities, atol=1e-4)
+    assert found.class_names == expected.class_names
+
+
+def write_long_dataset(folder: Path, count: int = 3000) -> Path:
+    """A dataset of the balls on their table from which to learn takes many seconds: many views of a few masks."""
+    scene, truth = balls_on_a_table()
+    angles = np.linspace(0, 2 * np.pi, 6, endpoint=False)
+    cameras = [
+        look_at(f"view{i}", np.array([3 * np.cos(a), 3 * np.sin(a), 3.0]), 320, 240, 275.0)
+        for i, a in enumerate(angles)
+    ]
+    write_dataset(folder, scene, truth, cameras, NAMES)
+    (folder / "split.json").unlink()
+    entries = []
+    for i in range(count):
+        camera, name = cameras[i % len(cameras)], f"{i:05d}"
+        entries.append({**as_3dgs(camera), "img_name": name})
+        (folder / "labels" / f"{name}.png").symlink_to(f"{camera.name}.png")
+    (folder / "cameras.json").write_text(json.dumps(entries))
+    return folder
+
+
+def copied(folder: Path, target: Path) -> Path:
+    """A copy of a dataset, to be broken."""
+    shutil.copytree(folder, target)
+    return target
