@@ -84,6 +84,9 @@ def _verdict(workspace: Workspace, inputs: Inputs | None) -> tuple[bytes, str]:
         return DiagnosticStatus.WARN, "not active"
     if not workspace.has_scene:
         return DiagnosticStatus.WARN, "no scene is loaded"
+    refused_at, why = inputs.last_refusal
+    if time.monotonic() - refused_at < COMPLAIN_PERIOD:
+        return DiagnosticStatus.WARN, why
     complaints = missing_inputs(inputs)
     if complaints:
         return DiagnosticStatus.WARN, complaints[0]
@@ -117,6 +120,7 @@ def _input_values(inputs: Inputs) -> dict[str, object]:
     values["masks waiting for pose or camera_info"] = inputs.pairing.waiting
     values["masks waiting to be fused"] = inputs.worker.waiting
     values["queue drops"] = inputs.worker.dropped
+    values["poses refused"] = inputs.refused_poses
     values["out of order"] = inputs.pairing.out_of_order
     values["time jumps"] = inputs.pairing.time_jumps
     return values

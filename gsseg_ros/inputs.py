@@ -39,6 +39,10 @@ class Inputs:
         Views that were fused.
     rejected : Counter of str
         Masks that were not, by reason.
+    refused_poses : int
+        Poses that could not be used.
+    last_refusal : (float, str)
+        When the last of these came (s, `time.monotonic`), and what was wrong with it.
     policies : dict of str to str
         By full name of the topic: quality of service of the subscription, overrides included.
     """
@@ -48,6 +52,8 @@ class Inputs:
         self._node, self._workspace = node, workspace
         self.accepted = 0
         self.rejected: Counter[str] = Counter()
+        self.refused_poses = 0
+        self.last_refusal = (-COMPLAIN_PERIOD, "")
         self.arrivals: dict[str, tuple[int, float]] = {}
         self.policies: dict[str, str] = {}
         self.started = time.monotonic()
@@ -121,9 +127,9 @@ class Inputs:
         self._add_pose(topic, message.header, message.pose)
 
     def _on_odometry(self, topic: str, message: Odometry) -> None:
-        self._add_pose(topic, message.header, message.pose.pose, with_camera=True)
+        self._add_pose(topic, message.header, message.pose.pose)
 
-    def _add_pose(self, topic: str, header: Any, pose: Any, with_camera: bool = False) -> None:
+    def _add_pose(self, topic: str, header: Any, pose: Any) -> None:
         map_frame = self._workspace.settings.map_frame
         try:
             if header.frame_id not in ("", map_frame):
@@ -132,10 +138,10 @@ class Inputs:
                 )
             matrix = matrix_from_pose(pose, topic)
         except PoseError as error:
-            self.complain("pose", str(error))
+            self.refused_poses += 1
+            self.last_refusal = (time.monotonic(), str(error))
+            self.complain(f"pose {str(error)[:60]}", str(error))
             return
-        if with_camera:
-            matrix = matrix @ self._workspace.settings.camera_in_base
         self.pairing.add_pose(stamp_ns(header.stamp), matrix)
 
     def _expire(self) -> None:
@@ -171,7 +177,10 @@ class Inputs:
         session = workspace.session
         (topic, mask), (info_topic, info) = paired.mask, paired.camera_info
         labels = labels_from_image(mask, topic)
-        camera = camera_from_messages(paired.name, info, paired.pose, workspace.settings.scene_to_map, info_topic)
+        settings, pose = workspace.settings, paired.pose
+        if settings.pose_source == "odometry":
+            pose = pose @ settings.camera_in_base
+        camera = camera_from_messages(paired.name, info, pose, settings.scene_to_map, info_topic)
         return session.fuse(View.from_arrays(camera, labels))
 
 

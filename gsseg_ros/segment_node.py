@@ -6,6 +6,7 @@ import signal
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -189,6 +190,14 @@ class SegmentNode(LifecycleNode):
         self._dropped_before = dict(inputs.pairing.dropped)
 
 
+def _spin_once(executor: MultiThreadedExecutor, node: SegmentNode) -> None:
+    try:
+        executor.spin_once(timeout_sec=0.2)
+    except Exception as error:
+        # An error in one callback is raised here, where it would end all the others.
+        node.get_logger().error(f"unexpected {type(error).__name__}: {error}\n{traceback.format_exc()}")
+
+
 def main(args: list[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM; returns the exit code: 0, or 2 for arguments that cannot be used."""
     # rclpy's own handlers would take the context away under a running job, and its spin() does not always notice.
@@ -206,7 +215,7 @@ def main(args: list[str] | None = None) -> int:
     try:
         node.autostart()
         while not stop.is_set():
-            executor.spin_once(timeout_sec=0.2)
+            _spin_once(executor, node)
     finally:
         node.stop()
         # A canceled job is still answered: rclpy sends that from the executor.

@@ -190,6 +190,8 @@ class Workspace:
         path = self.path(request, default)
         if not os.path.exists(path):  # Path.exists raises an error where a name is too long.
             raise MissingFileError(f"{path}: does not exist")
+        if not (path.is_file() or path.is_dir()):
+            raise MissingFileError(f"{path}: is neither a file nor a folder, and reading it might never end")
         return path
 
 

@@ -233,7 +233,7 @@ def test_an_odometry_is_interpolated_and_carries_the_camera(
         for when, part in ((stamp - STEP // 4, -1), (stamp + STEP // 4, 1)):
             odometry = Odometry(header=Header(stamp=stamp_message(when), frame_id="map"), child_frame_id="base")
             odometry.pose.pose = pose_from_matrix(
-                camera @ turned(part * 0.2, 1, part * 0.1) @ np.linalg.inv(camera_in_base)
+                camera @ np.linalg.inv(camera_in_base) @ turned(part * 0.2, 1, part * 0.1)
             )
             robot.publish({"odometry": odometry})
         robot.publish(sent)
@@ -470,15 +470,16 @@ def test_of_too_many_masks_at_once_the_oldest_are_dropped_and_counted(
     robot.publish({"camera_info": messages(view, robot.next_stamp())["camera_info"]})
 
     def all_counted(status: dict[str, str]) -> bool:
-        return int(status["views accepted"]) + int(status["queue drops"]) == 10
+        # On a busy machine a pose may come too late for its mask.
+        rejected = sum(int(count) for key, count in status.items() if key.startswith("rejected "))
+        return int(status["views accepted"]) + rejected == 10
 
     status = robot.wait_for_status(all_counted, "all masks to be fused or dropped")
     assert int(status["queue drops"]) >= 1
     assert status["rejected queue_full"] == status["queue drops"]
     report = robot.done("segment").report
-    assert dict(zip(report.rejection_reasons, report.rejection_counts, strict=True)) == {
-        "queue_full": int(status["queue drops"])
-    }
+    counts = dict(zip(report.rejection_reasons, report.rejection_counts, strict=True))
+    assert counts["queue_full"] == int(status["queue drops"])
 
 
 # What the node says of its inputs
