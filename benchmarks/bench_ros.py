@@ -63,9 +63,9 @@ class Robot:
         self.clouds: dict[str, tuple[int, float]] = {}
         self._subscriptions: dict[str, object] = {}
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
-        executor = SingleThreadedExecutor()
-        executor.add_node(self.node)
-        threading.Thread(target=executor.spin, daemon=True).start()
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self.node)
+        threading.Thread(target=self._executor.spin, daemon=True).start()
 
     @contextmanager
     def running(self, module: str, parameters: Mapping[str, Any]) -> Iterator[subprocess.Popen[bytes]]:
@@ -93,6 +93,12 @@ class Robot:
             if time.monotonic() > deadline:
                 raise TimeoutError(what)
             time.sleep(0.002)
+
+    def spun(self, work: Callable[[], Any]) -> Any:
+        """Do something in the thread that spins: an action's client loses answers that overtake its own calls."""
+        task = self._executor.create_task(work)
+        self.wait(task.done, "the spinning thread")
+        return task.result()
 
     def call(self, kind: Any, name: str, request: Any) -> Any:
         """Call a service of the node; any error ends the benchmark."""
@@ -141,13 +147,13 @@ class Robot:
         client, seen = ActionClient(self.node, Learn, "/gsseg/learn"), []
         self.wait(client.server_is_ready, "learn")
         started = time.perf_counter()
-        goal = client.send_goal_async(Learn.Goal(), feedback_callback=lambda m: seen.append(m.feedback.stage))
+        goal = self.spun(lambda: client.send_goal_async(Learn.Goal(), lambda m: seen.append(m.feedback.stage)))
         self.wait(goal.done, "goal")
-        result = goal.result().get_result_async()
+        result = self.spun(goal.result().get_result_async)
         if cancel_after is not None:
             self.wait(lambda: seen.count("em") >= cancel_after, "feedback")
             started = time.perf_counter()
-            goal.result().cancel_goal_async()
+            self.spun(goal.result().cancel_goal_async)
         self.wait(result.done, "result")
         seconds = time.perf_counter() - started
         client.destroy()

@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
 
 DATA = Path(os.environ.get("GSSEG_DATA") or Path(__file__).parents[2] / "shared" / "data")
 _NO_DATA = "real data not found"
+
+
+def pytest_configure() -> None:
+    """Let processes that tests start hear SIGINT: a test run in the background is deaf to it, and they inherit that."""
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture

@@ -183,6 +183,15 @@ class Ros:
         self.wait_until(future.done, what, timeout)
         return future.result()
 
+    def run(self, work: Callable[[], Any]) -> Any:
+        """Do something in the thread that spins, and return its result.
+
+        An action's client loses an answer that comes before the call that asked for it has returned; so that call must
+        not run beside the spinning.
+        """
+        task = self.executor.create_task(work)
+        return self.result(task, "the spinning thread")
+
     def call(self, kind: Any, name: str, request: Any, timeout: float = PATIENCE) -> Any:
         """Call a service once it is there and return the response."""
         client = self.node.create_client(kind, name)

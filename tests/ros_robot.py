@@ -160,10 +160,11 @@ class Robot:
             self._learner = ActionClient(self.ros.node, Learn, f"{self.name}/learn")
         self.ros.wait_until(self._learner.server_is_ready, "the action")
         feedback: list[Any] = []
-        sent = self._learner.send_goal_async(Learn.Goal(**fields), lambda message: feedback.append(message.feedback))
+        learner, goal = self._learner, Learn.Goal(**fields)
+        sent = self.ros.run(lambda: learner.send_goal_async(goal, lambda message: feedback.append(message.feedback)))
         handle = self.ros.result(sent, "the goal to be accepted")
         assert handle.accepted
-        return Goal(handle, handle.get_result_async(), feedback)
+        return Goal(handle, self.ros.run(handle.get_result_async), feedback)
 
     def outcome(self, goal: Goal, timeout: float = PATIENCE) -> tuple[int, Any]:
         """Wait for the end of a goal; returns status and result."""
@@ -182,7 +183,7 @@ class Robot:
 
     def cancel(self, goal: Goal) -> tuple[int, Any]:
         """Cancel a goal and wait for its end; returns status and result."""
-        answer = self.ros.result(goal.handle.cancel_goal_async(), "the answer to the cancel")
+        answer = self.ros.result(self.ros.run(goal.handle.cancel_goal_async), "the answer to the cancel")
         assert len(answer.goals_canceling) == 1
         return self.outcome(goal, timeout=10)
 
