@@ -69,7 +69,9 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--ids", choices=("global", "per-view"), default="global", help="whether an id means the same in every view"
     )
-    command.add_argument("--scheduler", metavar="ADDRESS", help="distribute the work (not in this version)")
+    command.add_argument(
+        "--scheduler", metavar="ADDRESS", help="learn on the workers of this Dask scheduler (em and votes)"
+    )
     command.set_defaults(run=_segment)
 
     command = commands.add_parser("render", help="render label maps and overlays of a segmentation")
@@ -115,8 +117,6 @@ def _segment(options: argparse.Namespace) -> int:
         raise SettingsError(
             "--ids per-view is not in this version; expected global: ids that mean the same in every view"
         )
-    if options.scheduler:
-        raise SettingsError("--scheduler is not in this version; expected a run on this machine")
     refine = RefineSettings(k=options.k, beta=options.beta, cluster=not options.no_knn, filter=not options.no_filter)
     _load_kernels(options.quiet, options.device)
     with progress_bars(options.quiet) as progress:
@@ -130,6 +130,7 @@ def _segment(options: argparse.Namespace) -> int:
             refine=refine,
             device=options.device,
             seed=options.seed,
+            scheduler=options.scheduler,
             progress=progress,
         )
     from gsseg_core.tables import segment_summary

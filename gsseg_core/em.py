@@ -9,35 +9,39 @@ probability (Dawid & Skene 1979, who had examiners in place of views)
 A view in which a chair was missed or taken for a table has that in R_v, and so its pixels are no evidence against the
 chair.
 
-The objective. The log of the posterior, in nats:
+The objective. With the error models fixed, the log of the posterior of the codes, in nats:
 
-    J(q, R) = sum_v sum_p log p_v(y_p | p)
-            + prior_weight sum_i sum_k m_i[k] log q_i[k]
-            + sum_v sum_k a_v[k] log R_v[k, k].
+    J(q) = sum_v sum_p log p_v(y_p | p) + prior_weight sum_i sum_k m_i[k] log q_i[k].
 
-m_i is the mean of the votes' codes over the nearest Gaussians: objects are continuous in space. a_v[k] counts
-pseudo-pixels in which the segmenter was right, a share of those that class k fills in view v by the votes' codes.
-
-The step, with B_v[i, y] = sum over the pixels p seen as y of w_v[p, i] / p_v(y | p). Each factor is the exact maximiser
-of the usual lower bound of J at the old values, so J never falls:
+m_i is the mean of the votes' codes over the nearest Gaussians: objects are continuous in space. The step, with
+B_v[i, y] = sum over the pixels p seen as y of w_v[p, i] / p_v(y | p), is the exact maximiser of the usual lower bound
+of J at the old values, so J never falls:
 
     q_i[k]     <- normalise( q_i[k] sum_v sum_y C_v[k, y] B_v[i, y] + prior_weight m_i[k] )
-    R_v[k, y]  <- normalise( (1 - outliers) R_v[k, y] sum_i q_i[k] B_v[i, y] + a_v[k] [y = k] )
 
-with the left-over transmittance as one more Gaussian of class 0 in the second. Only B_v needs the rasteriser, and its
-cost does not depend on the number of classes.
+Only B_v needs the rasteriser, and its cost does not depend on the number of classes.
+
+The error models. Codes that have learnt from a mask agree with its errors, the more so the longer they learn, and find
+nothing wrong with it. So a view's model is learnt from codes that have not seen this view: q^-v is the step above
+without the summand of v, and with B_v taken at q^-v
+
+    R_v[k, y]  <- normalise( (1 - outliers) R_v[k, y] sum_i q^-v_i[k] B_v[i, y] + a_v[k] [y = k] )
+
+with the left-over transmittance as one more Gaussian of class 0. a_v[k] counts pseudo-pixels in which the segmenter was
+right, a share of those that class k fills in view v by the votes of the others. At first q^-v are these votes' codes;
+once the codes have converged the models are learnt anew in this way, and then the codes once more.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from gsseg_core.errors import SettingsError
-from gsseg_core.gaussian_kernels import collect, mix, tally
+from gsseg_core.gaussian_kernels import GAIN_UNIT, add_votes, collect, improve, mix, tally
 from gsseg_core.learner import VOTE_UNIT, Learner, Progress, normalise, silent
 from gsseg_core.neighbours import neighbours_of
 from gsseg_core.operator import Observation
@@ -56,6 +60,8 @@ class EMSettings:
         Stop when a step gains less than this, in nats per labelled pixel.
     errors : bool
         Learn what the segmenter got wrong in each view; without, every mask is taken at its word.
+    refits : int
+        How often error models are learnt anew once the codes have converged, and the codes then once more.
     error_prior : float
         Pseudo-pixels in which a class was labelled right, as a share of the pixels that it fills in the view.
     outliers : float
@@ -69,6 +75,7 @@ class EMSettings:
     max_steps: int = 30
     tolerance: float = 0.005
     errors: bool = True
+    refits: int = 1
     error_prior: float = 0.3
     outliers: float = 1e-3
     prior_weight: float = 3.0
@@ -80,8 +87,8 @@ class EMSettings:
             raise SettingsError(f"em: max_steps is {self.max_steps}, prior_k {self.prior_k}; expected at least 1")
         if not 0 < self.outliers < 1:
             raise SettingsError(f"em: outliers is {self.outliers}; expected a share in (0, 1)")
-        if min(self.tolerance, self.error_prior, self.prior_weight) < 0:
-            raise SettingsError("em: tolerance, error_prior or prior_weight is negative; expected 0 or more")
+        if min(self.tolerance, self.error_prior, self.prior_weight, self.refits) < 0:
+            raise SettingsError("em: tolerance, error_prior, prior_weight or refits is negative; expected 0 or more")
 
 
 @dataclass
@@ -98,19 +105,22 @@ class ErrorModel:
         a_v of the classes that occur, in px.
     outliers : float
         Share of pixels labelled by chance.
+    num_pixels : int
+        Pixels with a label.
     """
 
     classes: np.ndarray
     confusion: np.ndarray
     right: np.ndarray
     outliers: float
+    num_pixels: int
 
     @classmethod
-    def trusting(cls, classes: np.ndarray, num_classes: int, outliers: float) -> ErrorModel:
+    def trusting(cls, classes: np.ndarray, num_classes: int, outliers: float, num_pixels: int) -> ErrorModel:
         """Believe that every label is right."""
         confusion = np.zeros((num_classes, len(classes)), np.float32)
         confusion[classes, np.arange(len(classes))] = 1.0
-        return cls(classes, confusion, np.zeros(len(classes)), outliers)
+        return cls(classes, confusion, np.zeros(len(classes)), outliers, num_pixels)
 
     @classmethod
     def from_counts(
@@ -119,11 +129,12 @@ class ErrorModel:
         counts: np.ndarray,  # (K, L) px of each class under each label
         prior: float,
         outliers: float,
+        num_pixels: int,
     ) -> ErrorModel:
         """Start from what the codes so far say of the mask."""
         right = prior * counts[classes].sum(axis=1)
         uniform = np.full(counts.shape, 1.0 / len(classes), np.float32)
-        model = cls(classes, uniform, right, outliers)
+        model = cls(classes, uniform, right, outliers, num_pixels)
         model.maximise(counts)
         return model
 
@@ -131,13 +142,6 @@ class ErrorModel:
     def likelihood(self) -> np.ndarray:
         """C_v: probability of each label given the class, (K, L) float32."""
         return (1 - self.outliers) * self.confusion + np.float32(self.outliers / len(self.classes))
-
-    @property
-    def log_prior(self) -> float:
-        """Log density of the prior of R_v, up to a constant, in nats."""
-        diagonal = self.confusion[self.classes, np.arange(len(self.classes))]
-        told = self.right > 0
-        return float(self.right[told] @ np.log(diagonal[told].astype(np.float64)))
 
     def maximise(
         self,
@@ -159,7 +163,9 @@ class EMLearner(Learner):
     error_models_ : dict of str to ErrorModel
         After `fit`: what each view's segmenter got wrong.
     history_ : list of float
-        After `fit`: J per labelled pixel, in nats, of what went into each step; it never falls.
+        After `fit`: J per labelled pixel, in nats, of what went into each step; within a round it never falls.
+    rounds_ : list of int
+        After `fit`: steps with each set of error models.
     """
 
     def __init__(
@@ -187,55 +193,96 @@ class EMLearner(Learner):
         prior = settings.prior_weight * self._smooth(self.vote_codes())
         # Votes are the first step; with the prior counted in, the objective is finite from the start.
         codes = normalise(self._votes.astype(np.float32) * np.float32(VOTE_UNIT) + prior)
-        models, pixels = {}, 0
-        for name, observation in self._observations():
-            progress("em", 0, settings.max_steps)
-            models[name] = self._first_model(codes, observation)
-            pixels += observation.num_pixels
-        self.history_ = history = []
-        for done in range(settings.max_steps):
-            codes, objective = self._step(codes, prior, models, partial(progress, "em", done, settings.max_steps))
-            history.append(objective / pixels)
-            self.converged_ = bool(done and history[-1] - history[-2] < settings.tolerance)
-            if self.converged_:
+        history: list[float] = []
+        self.history_ = history
+        tell = partial(progress, "em", 0, settings.max_steps)
+        models = self._first_models(self._votes, tell)
+        pixels = sum(model.num_pixels for model in models.values())
+        self.rounds_ = rounds = [0]
+        while len(history) < settings.max_steps:
+            tell = partial(progress, "em", len(history), settings.max_steps)
+            gains, told = self._gains(codes, models, tell)
+            history.append((_log_prior(codes, prior) + sum(told[name] for name in self.views)) / pixels)
+            rounds[-1] += 1
+            self.converged_ = rounds[-1] > 1 and history[-1] - history[-2] < settings.tolerance
+            if self.converged_ and (len(rounds) > settings.refits or not settings.errors):
+                improve(codes, gains, prior)
                 break
+            if self.converged_:
+                self._refit(np.stack([codes, gains * np.float32(GAIN_UNIT), prior]), models, tell)
+                rounds.append(0)
+            improve(codes, gains, prior)
         progress("em", settings.max_steps, settings.max_steps)
         codes[~self.observed_] = 0.0
         self.codes_, self.error_models_ = codes, models
         return self
 
-    def _first_model(self, codes: np.ndarray, observation: Observation) -> ErrorModel:
-        settings, classes = self.settings, observation.classes
-        if not settings.errors:
-            return ErrorModel.trusting(classes, self.num_classes, settings.outliers)
-        counts = tally(codes, observation.ids, observation.votes())
-        return ErrorModel.from_counts(classes, counts, settings.error_prior, settings.outliers)
+    def _first_models(
+        self,
+        votes: np.ndarray,  # (N, K) int64
+        tell: Callable[[], None],
+        names: Iterable[str] | None = None,
+    ) -> dict[str, ErrorModel]:
+        """Start an error model for each view, or for some, from what the votes of the others make of its mask."""
+        models = {}
+        for name, observation in self._observations(names):
+            tell()
+            models[name] = self._first_model(votes, observation)
+        return models
 
-    def _step(
+    def _first_model(self, votes: np.ndarray, observation: Observation) -> ErrorModel:
+        settings, classes, pixels = self.settings, observation.classes, observation.num_pixels
+        if not settings.errors:
+            return ErrorModel.trusting(classes, self.num_classes, settings.outliers, pixels)
+        own = observation.votes()
+        counts = tally(*_of_others(votes, observation.ids, classes, own), own)
+        return ErrorModel.from_counts(classes, counts, settings.error_prior, settings.outliers, pixels)
+
+    def _gains(
         self,
         codes: np.ndarray,  # (N, K)
-        prior: np.ndarray,  # (N, K) px
         models: dict[str, ErrorModel],
         tell: Callable[[], None],
-    ) -> tuple[np.ndarray, float]:
-        """One step over all views: better codes, better models in place, and J of what came in."""
-        told = prior > 0
-        objective = float((prior[told] * np.log(codes[told])).sum(dtype=np.float64))
-        gains = np.zeros_like(codes)
-        for name, observation in self._observations():
+    ) -> tuple[np.ndarray, dict[str, float]]:
+        """Sum over the views of these models what they say of the codes.
+
+        Returns
+        -------
+        gains : (N, K) int64
+            sum_v sum_y C_v[k, y] B_v[i, y], in units of `GAIN_UNIT`.
+        told : dict of str to float
+            The part of J that is each view's own, at the codes and models that came in.
+        """
+        gains, told = np.zeros(codes.shape, np.int64), {}
+        for name, observation in self._observations(models):
             tell()  # after each view, so that whoever listens can stop the work at once
             model = models[name]
-            objective += model.log_prior
             likelihood = np.ascontiguousarray(model.likelihood.T)
             shares = observation.shares(mix(codes, observation.ids, likelihood), likelihood[:, 0])
-            objective += shares.log_likelihood
-            counts = collect(codes, observation.ids, likelihood, shares.gaussians, gains)
-            if self.settings.errors:
-                counts[0] += shares.rest
-                model.maximise(counts * (1 - model.outliers) * model.confusion)
-        gains *= codes
-        gains += prior
-        return normalise(gains), objective
+            told[name] = shares.log_likelihood
+            collect(observation.ids, likelihood, shares.gaussians, gains)
+        return gains, told
+
+    def _refit(
+        self,
+        state: np.ndarray,  # (3, N, K) float32: codes, the gains of a step, prior
+        models: dict[str, ErrorModel],
+        tell: Callable[[], None],
+    ) -> dict[str, ErrorModel]:
+        """Learn each view's error model anew, from the codes that the step would give without this view."""
+        for name, observation in self._observations(models):
+            tell()
+            model, ids = models[name], observation.ids
+            codes, gains, prior = (part[ids] for part in state)
+            likelihood, here = np.ascontiguousarray(model.likelihood.T), np.arange(len(ids), dtype=np.int32)
+            shares = observation.shares(mix(codes, here, likelihood), likelihood[:, 0])
+            codes *= np.maximum(gains - shares.gaussians @ likelihood, 0.0)
+            codes = normalise(codes + prior)
+            shares = observation.shares(mix(codes, here, likelihood), likelihood[:, 0])
+            counts = tally(codes, here, shares.gaussians)
+            counts[0] += shares.rest
+            model.maximise(counts * (1 - model.outliers) * model.confusion)
+        return models
 
     def _smooth(
         self,
@@ -248,3 +295,24 @@ class EMLearner(Learner):
             ids, means = neighbours.mean_codes(votes, self.observed_, np.ones(len(votes), bool))
             smooth[ids] = normalise(means)
         return smooth
+
+
+def _of_others(
+    votes: np.ndarray,  # (N, K) int64, of all views
+    ids: np.ndarray,  # (M,)
+    classes: np.ndarray,  # (L,)
+    own: np.ndarray,  # (M, L) float32, of one of them
+) -> tuple[np.ndarray, np.ndarray]:
+    """Codes (M, K) by the votes of all views but one, for the Gaussians that this one sees; and their numbers."""
+    others = np.ascontiguousarray(votes[ids])
+    here = np.arange(len(ids), dtype=np.int32)
+    add_votes(others, here, classes, own, 1 / VOTE_UNIT, -1)
+    return normalise(others.astype(np.float32)), here
+
+
+def _log_prior(
+    codes: np.ndarray,  # (N, K)
+    prior: np.ndarray,  # (N, K) px
+) -> float:
+    told = prior > 0
+    return float((prior[told] * np.log(codes[told])).sum(dtype=np.float64))

@@ -78,5 +78,9 @@ class SettingsError(GssegError):
     """A setting has an impossible value."""
 
 
+class SchedulerError(GssegError):
+    """A Dask scheduler does not answer, or its workers are missing or cannot do the work."""
+
+
 class NoCodesError(GssegError):
     """Nothing has been learnt or fused yet that could be shown or saved."""

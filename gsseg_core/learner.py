@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -103,6 +103,13 @@ class Learner(ABC):
         self.views[view.name] = view
         self._keep(view.name, observation)
         return True
+
+    def observe_all(self, views: Sequence[View], progress: Progress = silent) -> None:
+        """Add views, as `observe` does; the error that one of them raises ends it."""
+        for done, view in enumerate(views):
+            progress("observe", done, len(views))
+            self.observe(view)
+        progress("observe", len(views), len(views))
 
     def retract(self, name: str) -> None:
         """Take a view's votes back, exactly.
@@ -207,7 +214,7 @@ class Learner(ABC):
             )
 
     def _count(self, observation: Observation, sign: int) -> None:
-        add_votes(self._votes, observation.ids, observation.classes, observation.votes(), 1 / VOTE_UNIT, sign)
+        count_votes(self._votes, observation, sign)
 
     def _keep(self, name: str, observation: Observation) -> None:
         used = sum(kept.nbytes for kept in self._prepared.values())
@@ -217,7 +224,9 @@ class Learner(ABC):
     def _observation(self, name: str) -> Observation:
         if name not in self._prepared:
             view = self.views[name]
-            return make_operator(self.scene, view.camera, self.device).observe(view.read_labels())
+            observation = make_operator(self.scene, view.camera, self.device).observe(view.read_labels())
+            self._keep(name, observation)
+            return observation
         return self._prepared[name]
 
     def _observations(self, names: Iterable[str] | None = None) -> Iterator[tuple[str, Observation]]:
@@ -230,6 +239,15 @@ class Learner(ABC):
             reasons = ", ".join(f"{count} {why}" for why, count in self.reject_summary().items()) or "none was given"
             raise NoUsableViewsError(f"no view to learn from ({reasons}); expected posed views with label images")
         self.observed_ = self._votes.sum(axis=1) > 0
+
+
+def count_votes(
+    total: np.ndarray,  # (N, K) int64, added to
+    observation: Observation,
+    sign: int = 1,
+) -> None:
+    """Add a view's votes, or take them away, in units of `VOTE_UNIT`."""
+    add_votes(total, observation.ids, observation.classes, observation.votes(), 1 / VOTE_UNIT, sign)
 
 
 def normalise(

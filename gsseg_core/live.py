@@ -240,10 +240,7 @@ class LiveSession:
             report(stage, done, total, teacher.loss)
 
         with watch.stage("observe"):
-            for done, view in enumerate(views):
-                progress("observe", done, len(views))
-                teacher.observe(view)
-            progress("observe", len(views), len(views))
+            teacher.observe_all(views, progress)
         with watch.stage("learn"):
             teacher.fit(progress)
         learnt = Learnt(learner, teacher.codes_, len(teacher.views))

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gsseg_core.dataset import Dataset, spread
 from gsseg_core.em import EMLearner, EMSettings
@@ -21,7 +22,13 @@ from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.votes import VoteLearner
 
+if TYPE_CHECKING:
+    from distributed import Client
+
 LEARNERS = ("em", "votes", "gradient")
+
+DISTRIBUTED = ("em", "votes")
+"""Learners that sum over views, and so can do it on many machines."""
 
 PICTURED_VIEWS = 12
 """Views that `segment` draws, spread evenly over the dataset."""
@@ -35,6 +42,7 @@ def make_learner(
     max_steps: int | None = None,
     seed: int = 0,
     device: str = "cpu",
+    client: Client | None = None,
 ) -> Learner:
     """Make a learner by its name, with its default settings.
 
@@ -52,14 +60,23 @@ def make_learner(
         For the gradient learner, which draws views at random.
     device : str
         Where views are rendered.
+    client : distributed.Client, optional
+        Have the workers of this Dask cluster do it.
 
     Raises
     ------
     SettingsError
-        There is no such learner.
+        There is no such learner, or it cannot be distributed.
     """
+    em = EMSettings(max_steps=max_steps or EMSettings.max_steps)
+    if client is not None and name in DISTRIBUTED:
+        from gsseg_core.distributed import DistributedEM, DistributedVotes
+
+        if name == "em":
+            return DistributedEM(client, scene, num_classes, em, device=device)
+        return DistributedVotes(client, scene, num_classes, device=device)
     if name == "em":
-        return EMLearner(scene, num_classes, EMSettings(max_steps=max_steps or EMSettings.max_steps), device=device)
+        return EMLearner(scene, num_classes, em, device=device)
     if name == "votes":
         return VoteLearner(scene, num_classes, device=device)
     if name == "gradient":
@@ -82,6 +99,7 @@ def segment(
     refine: RefineSettings | None = None,
     device: str = "cpu",
     seed: int = 0,
+    scheduler: str | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Learn from the train views of a dataset, refine, and write everything into `out`.
@@ -102,6 +120,8 @@ def segment(
         Learn from this many train views, spread evenly; from all by default.
     refine : RefineSettings, optional
         The paper's by default.
+    scheduler : str, optional
+        Address of a Dask scheduler whose workers learn; everything else is done here.
 
     Returns
     -------
@@ -113,23 +133,31 @@ def segment(
     GssegError
         Whatever is wrong with the input; see `gsseg_core.errors`.
     """
+    if scheduler is not None and learner not in DISTRIBUTED:
+        raise SettingsError(
+            f"scheduler {scheduler}: the learner {learner} takes one view after the other, each at the codes that the "
+            f"one before it left, so there is nothing to share out; expected one of {', '.join(DISTRIBUTED)}"
+        )
     refine = refine or RefineSettings()
     watch = Stopwatch()
-    with watch.stage("load"):
-        scene = GaussianScene.load(scene_path)
-        dataset = Dataset(data, labels)
-        train = spread(dataset.views("train"), views)
-        teacher = make_learner(learner, scene, dataset.num_classes, seed=seed, device=device)
-    with watch.stage("observe"):
-        for done, view in enumerate(train):
-            progress("observe", done, len(train))
-            teacher.observe(view)
-        progress("observe", len(train), len(train))
-    with watch.stage("learn"):
-        try:
-            teacher.fit(progress)
-        except NoUsableViewsError as error:
-            raise NoUsableViewsError(f"{data}: {error}") from error
+    with ExitStack() as stack:
+        with watch.stage("load"):
+            client = None
+            if scheduler is not None:
+                from gsseg_core.scheduler import connected
+
+                client = stack.enter_context(connected(scheduler))
+            scene = GaussianScene.load(scene_path)
+            dataset = Dataset(data, labels)
+            train = spread(dataset.views("train"), views)
+            teacher = make_learner(learner, scene, dataset.num_classes, seed=seed, device=device, client=client)
+        with watch.stage("observe"):
+            teacher.observe_all(train, progress)
+        with watch.stage("learn"):
+            try:
+                teacher.fit(progress)
+            except NoUsableViewsError as error:
+                raise NoUsableViewsError(f"{data}: {error}") from error
     with watch.stage("refine"):
         result = Segmentation.from_codes(scene, teacher.codes_, dataset.class_names, refine)
     out = Path(out)
@@ -145,7 +173,7 @@ def segment(
         views={"used": len(teacher.views), "rejected": teacher.reject_summary(), "names": teacher.rejected},
         settings={
             "learner": learner, "labels": labels, "views": views, "device": device, "seed": seed,
-            "refine": asdict(refine), **_settings_of(teacher),
+            "scheduler": scheduler, "refine": asdict(refine), **_settings_of(teacher),
         },
         objective=teacher.history_,
         plys={k: str(path.relative_to(out)) for k, path in plys.items()},

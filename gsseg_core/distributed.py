@@ -1,0 +1,277 @@
+"""Votes and EM on the workers of a Dask cluster: both are sums over views, and a sum can be taken anywhere.
+
+Each worker holds the geometry of the scene and its share of the views, prepared. In a step it gets the codes and the
+error models of its views. What it sums up meets the sums of the others pairwise, on the workers, in a tree whose root
+comes back here. These are sums of whole numbers, so they do not depend on who did what, and the result is the one of a
+single machine, bit for bit.
+
+Codes and error models are always here, too, so that whatever goes with a lost worker can be done again elsewhere.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import CancelledError
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from gsseg_core.dataset import View
+from gsseg_core.em import EMLearner, ErrorModel
+from gsseg_core.errors import GssegError, SchedulerError
+from gsseg_core.learner import Learner, Progress, silent
+from gsseg_core.scene import GaussianScene
+from gsseg_core.scheduler import UNREACHABLE, check_workers, find_workers, name_of
+from gsseg_core.shard import (
+    NotHereError,
+    Part,
+    add,
+    digest_of,
+    geometry,
+    load,
+    prepare,
+    refit_models,
+    start_models,
+    sum_gains,
+    sum_votes,
+)
+from gsseg_core.votes import VoteLearner
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+ATTEMPTS = 5
+"""How often a sum is begun anew where Dask cannot make good by itself what was lost."""
+
+_POLL = 0.01  # s
+
+
+class _LostError(Exception):
+    """What a worker had is gone, or is to be sent in another way: begin anew."""
+
+
+class _Share(NamedTuple):
+    worker: str
+    shard: Future
+    views: dict[str, View]
+
+
+class _OnWorkers(Learner):
+    """What the two learners below share: views are dealt to the workers, and sums over them come back."""
+
+    def __init__(self, client: Client, scene: GaussianScene, num_classes: int, *rest: Any, **settings: Any) -> None:
+        super().__init__(scene, num_classes, *rest, **settings)
+        self._client = client
+        self._scenes: dict[str, Future] = {}
+        self._shares: list[_Share] = []
+        self._dealt: tuple[dict[str, int], int] = {}, 0
+        self._by_path = self._direct = True
+
+    def observe(self, view: View) -> bool:
+        """Add a view and its votes."""
+        self.observe_all([view])
+        return self.views.get(view.name) is view
+
+    def observe_all(self, views: Sequence[View], progress: Progress = silent) -> None:
+        """Add views and their votes; after an error in one of them nothing has changed."""
+        named = {view.name: view for view in views}
+        if named:
+            votes, why = self._sum(sum_votes, named, lambda done: progress("observe", done, len(named)))
+            for name, view in named.items():
+                if why[name]:
+                    self.rejected[name] = why[name]
+                    continue
+                if name in self.views:
+                    self.retract(name)
+                self.rejected.pop(name, None)
+                self.views[name] = view
+            self._votes += votes
+        progress("observe", len(named), len(named))
+
+    def _sum(
+        self,
+        task: Callable[..., Part],
+        views: Mapping[str, View],
+        tell: Callable[[int], None],
+        models: Mapping[str, ErrorModel] | None = None,
+        codes: np.ndarray | None = None,  # (N, K)
+    ) -> Part:
+        """Sum up what a task makes of these views; `tell` is called with how many of them are done, time and again.
+
+        Raises
+        ------
+        SchedulerError
+            The scheduler is lost, or all workers, or results again and again.
+        GssegError
+            What was wrong with a view.
+        """
+        for _ in range(ATTEMPTS):
+            used: list[Future] = []
+            try:
+                return self._try_to_sum(used, task, views, tell, models or {}, codes)
+            except (_LostError, CancelledError):
+                self._shares = []
+            finally:
+                # Also where `tell` has ended the work: what nobody waits for any more is not begun.
+                for future in used:
+                    future.release()
+        raise SchedulerError(f"{name_of(self._client)}: lost results {ATTEMPTS} times; expected workers that stay")
+
+    def _try_to_sum(
+        self,
+        used: list[Future],
+        task: Callable[..., Part],
+        views: Mapping[str, View],
+        tell: Callable[[int], None],
+        models: Mapping[str, ErrorModel],
+        codes: np.ndarray | None,
+    ) -> Part:
+        shares = self._deal(views, tell)
+        if codes is not None:
+            used.append(self._send(codes))
+        given, parts = list(used), []
+        for share in shares:
+            wanted = {name: models.get(name) for name in share.views if name in views}
+            parts.append(self._submit(share.worker, task, share.shard, wanted, *given))
+        used += parts
+        sums = parts
+        while len(sums) > 1:  # What is between leaves and root lives only as long as it is needed there.
+            pairs = zip(sums[::2], sums[1::2], strict=False)
+            sums = [self._client.submit(add, *pair, pure=False) for pair in pairs] + sums[len(sums) // 2 * 2 :]
+        used += sums
+        sizes = {part.key: len(share.views) for part, share in zip(parts, shares, strict=True)}
+        self._wait(used, lambda: tell(sum(sizes[part.key] for part in parts if part.done())))
+        for future in used:
+            self._check(future)
+        total: Part = self._client.gather(sums[0], direct=self._direct)
+        return total
+
+    def _deal(self, views: Mapping[str, View], tell: Callable[[int], None]) -> list[_Share]:
+        """Have every worker prepare its share of the views, unless they have them."""
+        held = {name: view for share in self._shares for name, view in share.views.items()}
+        workers = find_workers(self._client)
+        if self._dealt == (workers, self.num_classes) and all(held.get(n) is view for n, view in views.items()):
+            return self._shares
+        check_workers(self._client, workers.keys() - self._dealt[0].keys())
+        self._place_scene(workers, tell)
+        settings = self.num_classes, getattr(self, "settings", None), self.device, self.memory_budget
+        names, threads = list(views), np.cumsum([0, *workers.values()])
+        cuts = np.rint(threads * len(names) / threads[-1]).astype(int)
+        self._shares, self._dealt = [], (workers, self.num_classes)
+        for worker, first, last in zip(workers, cuts, cuts[1:], strict=False):
+            if first < last:
+                part = {name: views[name] for name in names[first:last]}
+                sent = [_by_path(view) if self._by_path else _packed(view) for view in part.values()]
+                shard = self._submit(worker, prepare, self._scenes[worker], sent, *settings)
+                self._shares.append(_Share(worker, shard, part))
+        return self._shares
+
+    def _place_scene(self, workers: Mapping[str, int], tell: Callable[[int], None]) -> None:
+        """See to it that each worker has the scene: from a file of its own if that is the same one, else from here."""
+        self._scenes = {w: f for w, f in self._scenes.items() if w in workers and f.status == "finished"}
+        absent = [worker for worker in workers if worker not in self._scenes]
+        if self.scene.path is not None and absent:
+            path = str(self.scene.path.resolve())
+            tried = {worker: self._submit(worker, load, path, self.scene.digest) for worker in absent}
+            self._wait(tried.values(), lambda: tell(0))
+            self._scenes |= {worker: future for worker, future in tried.items() if future.status == "finished"}
+            absent = [worker for worker in absent if worker not in self._scenes]
+        if absent:
+            self._scenes |= dict.fromkeys(absent, self._send(geometry(self.scene), absent))
+
+    def _submit(self, worker: str, task: Callable[..., Any], *inputs: Any) -> Future:
+        """Run a task on this worker, or elsewhere should it be lost."""
+        import dask
+
+        # A share's masks and error models may exceed the 10 MB from which on Dask warns.
+        with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 TB"}):
+            return self._client.submit(task, *inputs, workers=[worker], allow_other_workers=True, pure=False)
+
+    def _send(self, value: Any, workers: list[str] | None = None) -> Future:
+        """Put a value on these workers, or on all; they hand it on to each other in a tree."""
+        try:
+            sent: Future = self._client.scatter(value, workers, broadcast=True, direct=self._direct, hash=False)
+            return sent
+        except UNREACHABLE as error:
+            self._direct = False  # Perhaps only the scheduler can reach the workers.
+            raise _LostError from error
+
+    def _check(self, future: Future) -> None:
+        if future.status == "error":
+            error = future.exception()
+            if isinstance(error, NotHereError):
+                self._by_path = False  # As for a scene, its place is looked for anew in any case.
+                raise _LostError from error
+            if isinstance(error, GssegError):
+                raise error
+            raise SchedulerError(
+                f"{name_of(self._client)}: a worker failed with {type(error).__name__} ({error}); its log says more"
+            ) from error
+        if future.status != "finished":
+            raise _LostError
+
+    def _wait(self, futures: Iterable[Future], tell: Callable[[], None]) -> None:
+        looked = time.monotonic()
+        while any(future.status == "pending" for future in futures):
+            tell()
+            time.sleep(_POLL)
+            if time.monotonic() - looked > 1:
+                find_workers(self._client)
+                looked = time.monotonic()
+
+
+class DistributedVotes(_OnWorkers, VoteLearner):
+    """`VoteLearner` on the workers of a Dask cluster: `DistributedVotes(client, scene, num_classes)`.
+
+    The scene must be the same that the workers find under its path; else it is sent to them. `memory_budget` is that of
+    each worker. Views are best added together, by `observe_all`.
+    """
+
+
+class DistributedEM(_OnWorkers, EMLearner):
+    """`EMLearner` on the workers of a Dask cluster: `DistributedEM(client, scene, num_classes, settings)`.
+
+    `memory_budget` is that of each worker. Views are best added together, by `observe_all`.
+    """
+
+    def _first_models(
+        self,
+        votes: np.ndarray,  # (N, K)
+        tell: Callable[[], None],
+        names: Iterable[str] | None = None,
+    ) -> dict[str, ErrorModel]:
+        models = self._sum(start_models, self.views, lambda done: tell(), codes=votes)[1]
+        return {name: models[name] for name in self.views}
+
+    def _gains(
+        self,
+        codes: np.ndarray,  # (N, K)
+        models: dict[str, ErrorModel],
+        tell: Callable[[], None],
+    ) -> tuple[np.ndarray, dict[str, float]]:
+        return self._sum(sum_gains, self.views, lambda done: tell(), models, codes)
+
+    def _refit(
+        self,
+        state: np.ndarray,  # (3, N, K)
+        models: dict[str, ErrorModel],
+        tell: Callable[[], None],
+    ) -> dict[str, ErrorModel]:
+        models.update(self._sum(refit_models, self.views, lambda done: tell(), models, state)[1])
+        return models
+
+
+def _by_path(view: View) -> tuple[View, str | None]:
+    """Make a view of which a worker reads the mask from its own files, if they are the same; its digest tells."""
+    if view.mask_path is None:
+        return view, None
+    return replace(view, mask_path=view.mask_path.resolve()), digest_of(view.mask_path)
+
+
+def _packed(view: View) -> tuple[View, None]:
+    """Make a view that has its mask with it."""
+    if view.mask_path is None:
+        return view, None
+    return View.from_arrays(view.camera, view.read_labels(), view.class_names), None

@@ -1,0 +1,117 @@
+"""A connection to a Dask cluster that can do gsseg's work."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import re
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from typing import TYPE_CHECKING
+
+from gsseg_core.errors import SchedulerError, SettingsError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+PATIENCE = 10.0
+"""Seconds to wait for a scheduler to answer, and for a worker when there is none."""
+
+UNREACHABLE = (OSError, TimeoutError, asyncio.TimeoutError)
+"""What Dask raises when nobody answers."""
+
+
+@contextmanager
+def connected(address: str) -> Iterator[Client]:
+    """Connect to a Dask scheduler.
+
+    Raises
+    ------
+    SettingsError
+        Dask is not installed, or this is no address.
+    SchedulerError
+        No scheduler answers, it has no workers, or gsseg is missing there or is another version.
+    """
+    if not re.fullmatch(r"(tcp://)?([^\s:/\[\]]+|\[[^\s/\[\]]+\]):\d{1,5}", address):
+        raise SettingsError(f"scheduler is {address!r}; expected an address such as tcp://host:8786")
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise SettingsError(
+            f"scheduler {address}: needs Dask, which is not installed; expected: pip install 'gsseg[distributed]'"
+        ) from error
+    # What it would tell is raised as an error anyway.
+    log = logging.getLogger("distributed.client")
+    level = log.level
+    log.setLevel(logging.CRITICAL)
+    try:
+        client = Client(address, timeout=PATIENCE, set_as_default=False)
+    except UNREACHABLE as error:
+        log.setLevel(level)
+        raise SchedulerError(
+            f"scheduler {address}: does not answer within {PATIENCE:g} s; expected the address that `dask scheduler` "
+            "prints, such as tcp://host:8786"
+        ) from error
+    try:
+        _check_version(f"scheduler {address}", client.run_on_scheduler(_probe()))
+        check_workers(client, find_workers(client))
+        yield client
+    finally:
+        client.close()
+        log.setLevel(level)
+
+
+def find_workers(client: Client) -> dict[str, int]:
+    """List the threads of each worker by its address; when there is none, wait for one.
+
+    Raises
+    ------
+    SchedulerError
+        None comes, or the scheduler is lost.
+    """
+    start = time.monotonic()
+    while time.monotonic() - start <= PATIENCE:
+        try:
+            workers = client.nthreads()
+        except UNREACHABLE as error:
+            raise SchedulerError(f"{name_of(client)}: does not answer any more; expected one that stays") from error
+        if workers:
+            return dict(sorted(workers.items()))
+        time.sleep(0.1)
+    raise SchedulerError(f"{name_of(client)}: has no workers; expected at least one, started by `dask worker ADDRESS`")
+
+
+def check_workers(client: Client, workers: Iterable[str]) -> None:
+    """See whether these workers have this version of gsseg; raise `SchedulerError` if not."""
+    asked = list(workers)
+    for worker, found in (client.run(_probe(), workers=asked, on_error="return") if asked else {}).items():
+        if not isinstance(found, Exception):  # Else it was lost just now.
+            _check_version(f"{name_of(client)}: worker {worker}", found)
+
+
+def _check_version(where: str, found: str | None) -> None:
+    expected = version("gsseg")
+    if found != expected:
+        raise SchedulerError(
+            f"{where} has {f'gsseg {found}' if found else 'no gsseg'}; expected gsseg {expected}, as here"
+        )
+
+
+def _probe() -> Callable[[], str | None]:
+    # Nested, so that it travels as code and not by its name, which means nothing where there is no gsseg.
+    def installed() -> str | None:
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            return version("gsseg")
+        except PackageNotFoundError:
+            return None
+
+    return installed
+
+
+def name_of(client: Client) -> str:
+    """Return what messages call the scheduler."""
+    return f"scheduler {getattr(client.scheduler, 'address', '')}"

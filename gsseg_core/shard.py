@@ -1,0 +1,156 @@
+"""What a worker does in a distributed run (`distributed.py`): hold some of the views and sum over them.
+
+A task leaves its inputs as they are, so that it can be run again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+
+from gsseg_core.dataset import View
+from gsseg_core.em import EMLearner, EMSettings, ErrorModel
+from gsseg_core.errors import GssegError
+from gsseg_core.learner import count_votes
+from gsseg_core.scene import GaussianScene
+
+Part = tuple[Any, dict[str, Any]]
+"""A sum over some views, (N, K) int64 or None, and by view what else came out."""
+
+_BUSY = threading.Lock()
+
+
+class NotHereError(Exception):
+    """A worker does not have a file, or has another one under that path."""
+
+
+class Shard(EMLearner):
+    """Some of the views, prepared. Sent elsewhere or spilled to disk, it takes along only what they are prepared of."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the prepared views behind."""
+        return {**self.__dict__, "_prepared": {}}
+
+    def __sizeof__(self) -> int:
+        """Tell Dask how much memory is in use."""
+        return sum(observation.nbytes for observation in self._prepared.values())
+
+
+def load(path: str, digest: str) -> GaussianScene:
+    """Load the geometry of a scene from a file of the worker; `NotHereError` if it has another digest."""
+    try:
+        scene = GaussianScene.load(path)
+    except GssegError as error:
+        raise NotHereError(path) from error
+    if scene.digest != digest:
+        raise NotHereError(path)
+    return geometry(scene)
+
+
+def geometry(scene: GaussianScene) -> GaussianScene:
+    """Leave out the vertices, which hold colours and all else that no learner needs."""
+    return replace(scene, vertices=scene.vertices[:0])
+
+
+def digest_of(path: Path) -> str | None:
+    """SHA-256 of a file, None if it cannot be read."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return None
+
+
+def prepare(
+    scene: GaussianScene,
+    views: Sequence[tuple[View, str | None]],
+    num_classes: int,
+    settings: EMSettings | None,
+    device: str,
+    memory_budget: int,
+) -> Shard:
+    """Prepare views; `NotHereError` where a mask's file is not the one with the digest beside the view."""
+    shard = Shard(scene, num_classes, settings, device=device, memory_budget=memory_budget)
+    shard._votes = shard._votes[:0].copy()
+    with _all_threads():
+        for view, digest in views:
+            if digest is not None and view.mask_path is not None and digest_of(view.mask_path) != digest:
+                raise NotHereError(str(view.mask_path))
+            observation, why = shard._open(view)
+            if observation is None:
+                shard.rejected[view.name] = why
+            else:
+                shard.views[view.name] = view
+                shard._keep(view.name, observation)
+    return shard
+
+
+def sum_votes(shard: Shard, wanted: dict[str, Any]) -> Part:
+    """Count votes; beside them, why a view was rejected, or ""."""
+    votes = np.zeros((len(shard.scene), shard.num_classes), np.int64)
+    with _all_threads():
+        for _, observation in shard._observations(name for name in wanted if name in shard.views):
+            count_votes(votes, observation)
+    return votes, {name: shard.rejected.get(name, "") for name in wanted}
+
+
+def start_models(
+    shard: Shard,
+    wanted: dict[str, Any],
+    votes: np.ndarray,  # (N, K) int64
+) -> Part:
+    """Make the first error model of each view."""
+    with _all_threads():
+        return None, shard._first_models(_as_compiled_for(votes), _go_on, wanted)
+
+
+def sum_gains(
+    shard: Shard,
+    models: dict[str, ErrorModel],
+    codes: np.ndarray,  # (N, K)
+) -> Part:
+    """Sum up gains; beside them, each view's part of J."""
+    with _all_threads():
+        return shard._gains(_as_compiled_for(codes), models, _go_on)
+
+
+def refit_models(
+    shard: Shard,
+    models: dict[str, ErrorModel],
+    state: np.ndarray,  # (3, N, K)
+) -> Part:
+    """Learn the views' error models anew."""
+    with _all_threads():
+        return None, shard._refit(_as_compiled_for(state), deepcopy(models), _go_on)
+
+
+def add(one: Part, two: Part) -> Part:
+    """Add two sums over different views."""
+    return None if one[0] is None else one[0] + two[0], {**one[1], **two[1]}
+
+
+@contextmanager
+def _all_threads() -> Iterator[None]:
+    """One task at a time, with as many threads as the worker was started with."""
+    from distributed import get_worker
+
+    with _BUSY:
+        most: int = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+        numba.set_num_threads(min(get_worker().state.nthreads, most))
+        yield
+
+
+def _as_compiled_for(codes: np.ndarray) -> np.ndarray:
+    """Kernels would be compiled once more for arrays that cannot be written to, as those from the network may be."""
+    return np.require(codes, requirements=["C", "W"])
+
+
+def _go_on() -> None: ...
