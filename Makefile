@@ -15,7 +15,7 @@ MSGS := $(wildcard msg_defs/*.* msg_defs/action/* msg_defs/msg/* msg_defs/srv/*)
 # Both builders of the messages obey it; without it one of them compiles file after file.
 export CMAKE_BUILD_PARALLEL_LEVEL ?= $(shell nproc 2>/dev/null || echo 1)
 
-.PHONY: help demo demo-local test colcon results clean
+.PHONY: help demo demo-local test colcon results bench clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{ printf "%-16s %s\n", $$1, $$2 }'
@@ -38,10 +38,13 @@ colcon: $(COLCON_READY)  ## build both packages with colcon, as a robot does, an
 results: $(READY)  ## measure again what docs/results.md shows
 	$(BIN)/python benchmarks/results.py
 
+bench: $(READY)  ## measure speed, memory and peers: BENCHMARK.md, compared with the last BENCHMARK.json (25 minutes)
+	$(BIN)/python benchmarks/bench.py
+
 clean:  ## remove the environments, the caches, what was built and the demo's output
-	rm -rf $(VENV) $(COLCON_VENV) .colcon build install log demo_out results_out gsseg.egg-info
+	rm -rf $(VENV) $(COLCON_VENV) .venv-peers .colcon build install log demo_out results_out gsseg.egg-info
 	rm -rf .hypothesis .mypy_cache .pytest_cache .ruff_cache
-	find gsseg_core gsseg_ros tests -name __pycache__ -prune -exec rm -rf {} +
+	find benchmarks gsseg_core gsseg_ros tests -name __pycache__ -prune -exec rm -rf {} +
 
 define check-python
 @$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(None if (3, 10) <= v <= (3, 13) else \

@@ -209,7 +209,7 @@ class EMLearner(Learner):
                 improve(codes, gains, prior)
                 break
             if self.converged_:
-                self._refit(np.stack([codes, gains * np.float32(GAIN_UNIT), prior]), models, tell)
+                self._refit(np.stack([codes, gains.astype(np.float32) * np.float32(GAIN_UNIT), prior]), models, tell)
                 rounds.append(0)
             improve(codes, gains, prior)
         progress("em", settings.max_steps, settings.max_steps)

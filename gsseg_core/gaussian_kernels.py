@@ -2,25 +2,44 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numba as nb
 import numpy as np
+from llvmlite import ir
+from numba.core import types
+
+from gsseg_core.lanes import intrinsic
 
 BLOCKS = 16
 """Counts are summed in this many parts, then together, so that they do not depend on the number of threads."""
 
 GAIN_UNIT = 2.0**-24
-"""Gains are rounded to whole multiples of this, in px, once per view: their sum does not depend on which views are
-added first, nor on where."""
+"""Gains are sums of whole multiples of this, in px: they do not depend on which views are added first, nor on where."""
 
 _GAIN_UNIT = np.float32(GAIN_UNIT)
 
-_MAX_GAIN = np.float32(2**27 - 8)
-"""Most that one view can give a Gaussian, in px. More comes about only where a class is all but ruled out for it, and
-then it is just lifted less in this step."""
+_MAX_GAIN = 2.0**27 - 8
+"""Most that one label of one view can give a Gaussian, in px. More comes about only where a class is all but ruled out
+for it, and then it is just lifted less in this step."""
 
-# The spacing of float64 there is GAIN_UNIT: what is added to it is rounded to whole units, which are its last bits.
-_ROUND = 1.5 * 2**28
-_ROUND_BITS = np.float64(_ROUND).view(np.int64)
+# Float64 are as far apart here as GAIN_UNIT: what is added to this is rounded to whole units, which are its last bits.
+_ROUND = 1.5 * 2.0**28
+_ROUND_BITS = int(np.float64(_ROUND).view(np.int64))
+
+
+@intrinsic
+def in_units(_: Any, __: Any) -> Any:
+    """Round pixels, float32 of at least 0, to int64 in units of GAIN_UNIT, by instructions that vector units have."""
+
+    def write(_: Any, llvm: Any, __: Any, arguments: Sequence[Any]) -> Any:
+        most, double, bits = ir.Constant(ir.FloatType(), _MAX_GAIN), ir.DoubleType(), ir.IntType(64)
+        pixels = llvm.select(llvm.fcmp_ordered("<", arguments[0], most), arguments[0], most)
+        shifted = llvm.fadd(llvm.fpext(pixels, double), ir.Constant(double, _ROUND))
+        return llvm.sub(llvm.bitcast(shifted, bits), ir.Constant(bits, _ROUND_BITS))
+
+    return types.int64(types.float32), write
 
 
 @nb.njit(parallel=True, nogil=True, cache=True, fastmath={"contract", "reassoc"})
@@ -52,25 +71,13 @@ def collect(
 
     Most Gaussians are seen under one label or two, so most of the products are skipped.
     """
-    many, classes = likelihood.shape
-    for block in nb.prange(BLOCKS):
-        row, rounded = np.empty(classes, np.float32), np.empty(classes)
-        bits = rounded.view(np.int64)
-        for m in range(ids.shape[0] * block // BLOCKS, ids.shape[0] * (block + 1) // BLOCKS):
-            gain = gains[ids[m]]
-            row[:] = 0.0
-            seen = False
-            for y in range(many):
-                share = shares[m, y]
-                if share > 0:
-                    seen = True
-                    for k in range(classes):
-                        row[k] += share * likelihood[y, k]
-            if seen:
-                for k in range(classes):
-                    rounded[k] = (row[k] if row[k] < _MAX_GAIN else _MAX_GAIN) + _ROUND
-                for k in range(classes):
-                    gain[k] += bits[k] - _ROUND_BITS
+    for m in nb.prange(ids.shape[0]):
+        gain = gains[ids[m]]
+        for y in range(likelihood.shape[0]):
+            share = shares[m, y]
+            if share > 0:
+                for k in range(likelihood.shape[1]):
+                    gain[k] += in_units(share * likelihood[y, k])
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
