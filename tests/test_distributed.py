@@ -310,9 +310,9 @@ def test_the_documented_commands_make_a_cluster_and_its_loss_is_one_clear_error(
             with pytest.raises(SchedulerError, match="has no workers"), scheduler.connected(address):
                 pass
             with subprocess.Popen([*dask, "worker", address, "--no-dashboard", "--nthreads", "1"], **quiet) as worker:
-                monkeypatch.setattr(scheduler, "PATIENCE", 20.0)
+                with distributed.Client(address, set_as_default=False) as client:
+                    client.wait_for_workers(1, timeout=20)
                 with scheduler.connected(address) as client:
-                    monkeypatch.setattr(scheduler, "PATIENCE", 1.0)
                     there = DistributedEM(client, SCENE, NUM_CLASSES, SETTINGS)
                     there.observe_all(VIEWS)
                     assert_same(there, taught(EMLearner(SCENE, NUM_CLASSES, SETTINGS), VIEWS))

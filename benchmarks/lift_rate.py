@@ -1,0 +1,191 @@
+"""Useful pairs per second of the lift, beside what the processor could do at most.
+
+A *pair* is a non-zero weight of W: one Gaussian in one pixel. The lift blends a view and sums its weights by label. Its
+work is counted here in *evaluations*: one Gaussian over the sixteen pixels of one row of a tile, whether or not any of
+them is reached. Operations per evaluation, from `lanes.blend_row`, each on sixteen numbers:
+
+| step                                  | fma | add, sub, mul | other                    |
+| ------------------------------------- | --- | ------------- | ------------------------ |
+| log2 of alpha: peak - wide * (c-x)^2  | 1   | 2             |                          |
+| alpha = 2^that                        | 5   | 1             | round, convert, shift, + |
+| alpha <= 0.99                         |     |               | min                      |
+| counts it? is the ray open, still?    |     |               | 3 compares               |
+| weight = alpha T, T = T - weight      |     | 2             |                          |
+
+That is 6 + 5 + 8 = 19 vector instructions and 6 * 2 + 5 = 17 floating-point operations a pixel. Summing by label adds
+one fma for each label in the row where a Gaussian was hit (`lanes.add_product`), and per entry and label a sum of
+sixteen numbers, 15 additions in 4 steps (`lanes.take_sum`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numba as nb
+import numpy as np
+from llvmlite import ir
+from machine import once
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+
+from gsseg_core.lanes import ALPHA_MAX, LANES, LOG_ALPHA_MIN, T_MIN
+from gsseg_core.projection import HEIGHT, LOG_OPACITY, SHEAR, WIDTH, Y_REACH, Projected, U, V
+from gsseg_core.tiles import TILE, Tiles
+
+FLOPS, INSTRUCTIONS = 17, 19  # of one evaluation, per pixel and per sixteen
+SUM_FLOPS, SUM_INSTRUCTIONS = 15, 4  # of one sum of sixteen
+CHAINS = (8, 10, 12)
+
+
+class Work(NamedTuple):
+    """What lifting one view takes.
+
+    Attributes
+    ----------
+    pairs : int
+        Non-zero weights.
+    evaluations : int
+        Rows of sixteen pixels that were blended.
+    records : int
+        Those with a non-zero weight.
+    products : int
+        Records times the labels in their row.
+    sums : int
+        Gaussians in a tile with at least one record.
+    """
+
+    pairs: int
+    evaluations: int
+    records: int
+    products: int
+    sums: int
+
+    @property
+    def flops(self) -> int:
+        """Floating-point operations, a fused multiply-add being two."""
+        return LANES * (FLOPS * self.evaluations + 2 * self.products) + SUM_FLOPS * self.sums
+
+    @property
+    def instructions(self) -> int:
+        """Vector instructions on sixteen numbers."""
+        return INSTRUCTIONS * self.evaluations + self.products + SUM_INSTRUCTIONS * self.sums
+
+
+def count_work(
+    projected: Projected,
+    tiles: Tiles,
+    width: int,
+    height: int,
+    labels: np.ndarray | None = None,  # (H, W)
+) -> Work:
+    """Count by going through the pixels one by one, with an exponential of its own.
+
+    Alphas within rounding of 1/255 may fall on the other side than the operator's, about one pair in a million.
+    """
+    if labels is None:
+        labels = np.zeros((height, width), np.int32)
+    counts = np.zeros((tiles.columns * tiles.rows, len(Work._fields)), np.int64)
+    _count(tiles.columns, projected.table, tiles.start, tiles.entries, labels.astype(np.int32), counts)
+    return Work(*counts.sum(axis=0).tolist())
+
+
+@nb.njit(parallel=True, cache=True)
+def _count(
+    columns: int,
+    table: np.ndarray,  # (M, 8)
+    start: np.ndarray,  # (T + 1,)
+    entries: np.ndarray,  # (E,)
+    labels: np.ndarray,  # (H, W)
+    counts: np.ndarray,  # (T, 5) out, as in Work
+) -> None:
+    height, width = labels.shape
+    for tile in nb.prange(start.shape[0] - 1):
+        left, top = (tile % columns) * TILE, (tile // columns) * TILE
+        rays = np.ones((TILE, TILE), np.float32)
+        live, many = np.ones(TILE, np.bool_), np.zeros(TILE, np.int64)
+        for r in range(TILE):
+            live[r] = top + r < height
+            for c in range(TILE):
+                if not live[r] or left + c >= width:
+                    rays[r, c] = 0.0
+                    continue
+                seen = labels[top + r, left + c]
+                new = seen >= 0
+                for before in range(c):
+                    new = new and labels[top + r, left + before] != seen
+                many[r] += new
+        for e in range(start[tile], start[tile + 1]):
+            g = entries[e]
+            u, v = table[g, U] - np.float32(left + 0.5), table[g, V] - np.float32(top + 0.5)
+            reach, any_hit = table[g, Y_REACH], False
+            for r in range(max(0, int(np.ceil(v - reach))), min(TILE, int(np.floor(v + reach)) + 1)):
+                if not live[r]:
+                    continue
+                dy = np.float32(r) - v
+                peak = table[g, LOG_OPACITY] - table[g, HEIGHT] * dy * dy
+                x = u + table[g, SHEAR] * dy
+                hits, still = 0, False
+                for c in range(TILE):
+                    power = peak - table[g, WIDTH] * (np.float32(c) - x) ** 2
+                    if power >= np.float32(LOG_ALPHA_MIN) and rays[r, c] >= np.float32(T_MIN):
+                        hits += 1
+                        rays[r, c] *= 1 - min(np.float32(2.0) ** power, np.float32(ALPHA_MAX))
+                    still = still or rays[r, c] >= np.float32(T_MIN)
+                live[r] = still
+                any_hit = any_hit or hits > 0
+                counts[tile, 0] += hits
+                counts[tile, 1] += 1
+                counts[tile, 2] += hits > 0
+                counts[tile, 3] += many[r] * (hits > 0)
+            counts[tile, 4] += any_hit
+
+
+def _fma_kernel(chains: int) -> Callable[[int], float]:
+    """Compile a loop of independent fused multiply-adds on sixteen numbers, all in registers."""
+
+    @intrinsic
+    def spin(typing: Any, start: Any, rounds: Any) -> Any:
+        row = ir.VectorType(ir.FloatType(), LANES)
+
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            insert: Any = cgutils.get_or_insert_function
+            fma = insert(builder.module, ir.FunctionType(row, [row] * 3), f"llvm.fma.v{LANES}f32")
+            zero = ir.Constant(ir.IntType(32), 0)
+            single = builder.insert_element(ir.Constant(row, ir.Undefined), arguments[0], zero)
+            value = builder.shuffle_vector(single, single, ir.Constant(ir.VectorType(ir.IntType(32), LANES), None))
+            slots = [cgutils.alloca_once_value(builder, value) for _ in range(chains)]
+            with cgutils.for_range(builder, arguments[1]):
+                for slot in slots:
+                    builder.store(builder.call(fma, [builder.load(slot), value, value]), slot)
+            total = builder.load(slots[0])
+            for slot in slots[1:]:
+                total = builder.fadd(total, builder.load(slot))
+            return builder.extract_element(total, zero)
+
+        return types.float32(types.float32, types.int64), generate
+
+    @nb.njit(parallel=True, nogil=True)
+    def run(rounds: int) -> float:
+        threads = nb.get_num_threads()
+        out = np.zeros(threads, np.float32)
+        for thread in nb.prange(threads):
+            out[thread] = spin(np.float32(0.5), rounds)
+        return out.sum()
+
+    return run
+
+
+def fma_peak(seconds: float = 0.3, repeats: int = 5) -> float:
+    """Fused multiply-adds on sixteen numbers that all threads together reach, per second: the best that was seen."""
+    best = 0.0
+    for chains in CHAINS:
+        kernel, rounds = _fma_kernel(chains), 1 << 16
+        kernel(rounds)
+        while (spent := once(lambda: kernel(rounds))) < seconds / 4:  # noqa: B023 - called at once
+            rounds *= 2
+        rounds = int(rounds * seconds / spent)
+        for _ in range(repeats):
+            spent = once(lambda: kernel(rounds))  # noqa: B023
+            best = max(best, nb.get_num_threads() * chains * rounds / spent)
+    return best

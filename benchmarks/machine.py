@@ -1,0 +1,95 @@
+"""What measurements are made with: where things lie, what machine this is, how long and how much."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import resource
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+DATA = Path(os.environ.get("GSSEG_DATA") or REPOSITORY.parent / "shared" / "data")
+LIBRARIES = ("numpy", "numba", "llvmlite", "scipy", "torch", "pillow")
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Median, least and most of several runs."""
+
+    median: float
+    least: float
+    most: float
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Timing:
+        """Summarise the runs."""
+        return cls(statistics.median(values), min(values), max(values))
+
+
+def timed(job: Callable[[], object], runs: int, *, warm: bool = True) -> list[float]:
+    """Seconds of each run of a job, after one that does not count."""
+    if warm:
+        job()
+    return [once(job) for _ in range(runs)]
+
+
+def once(job: Callable[[], object]) -> float:
+    """Seconds of a single run."""
+    start = time.perf_counter()
+    job()
+    return time.perf_counter() - start
+
+
+def peak_memory() -> float:
+    """Most memory that this process has had in use, in GiB."""
+    # Not getrusage where it can be helped: a child's count starts with what its parent held when it was forked.
+    status = Path("/proc/self/status")
+    if status.is_file():
+        return int(status.read_text().split("VmHWM:")[1].split()[0]) / 2**20
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+def describe() -> dict[str, Any]:
+    """Name the machine and the versions."""
+    return {
+        "processor": processor(),
+        "cores": os.cpu_count(),
+        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "load_before": round(os.getloadavg()[0], 2),
+        **{name: version(name) for name in LIBRARIES},
+    }
+
+
+def version(name: str) -> str:
+    """Version of an installed package."""
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def processor() -> str:
+    """Name of the processor."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
+    fields = [line.split(":", 1) for line in lines if ":" in line]
+    known = {key.strip(): value.strip() for key, value in reversed(fields)}
+    name = known.get("model name", platform.processor() or platform.machine())
+    family = f" (family {known['cpu family']}, model {known['model']})" if "cpu family" in known else ""
+    wide = " with AVX-512" if "avx512f" in known.get("flags", "").split() else ""
+    return f"{name}{family}{wide}"
+
+
+def drop_from_page_cache(path: Path) -> None:
+    """Have the next reader of a file fetch it from the disk."""
+    with open(path, "rb") as file:
+        os.fsync(file.fileno())
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)

@@ -1,0 +1,154 @@
+"""Seconds of each stage of the work on one dataset, each apart, in the order in which the work is done."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from machine import drop_from_page_cache, once, timed
+
+from gsseg_core.cameras import Camera
+from gsseg_core.dataset import Dataset, View, spread
+from gsseg_core.depth_sort import sort_by_depth
+from gsseg_core.em import EMLearner
+from gsseg_core.export import export_classes
+from gsseg_core.neighbours import Neighbours
+from gsseg_core.operator import make_operator
+from gsseg_core.projection import project
+from gsseg_core.refine import cluster, statistical_filter
+from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segmentation import Segmentation
+from gsseg_core.tiles import assign
+from gsseg_core.votes import VoteLearner
+
+Times = dict[str, list[float]]
+"""Seconds of each run of each stage, or other numbers of it."""
+
+
+def measure_stages(folder: Path, runs: int, sampled: int, labels: str = "labels") -> Times:
+    """Time everything on a dataset; what belongs to one view is averaged over some of them."""
+    path = folder / "scene.ply"
+    times: Times = {"load": timed(lambda: GaussianScene.load(path), runs)}
+    times["load, from disk"] = [_from_disk(path) for _ in range(runs)]
+    scene, data = GaussianScene.load(path), Dataset(folder, labels)
+    chosen = spread([view for view in data.views("train") if view.has_mask], sampled)
+    if not chosen:  # A scene without masks can be rendered all the same.
+        chosen = [_unlabelled(view) for view in spread(data.views("all"), sampled)]
+        times |= _view_stages(scene, chosen, 1, runs)
+        return times
+    times |= _view_stages(scene, chosen, data.num_classes, runs)
+    times["fuse one mask"] = _fuse(scene, data, runs, sampled)
+    times |= _learning(scene, data)
+    times |= _refinement(path, data, runs)
+    return times
+
+
+def _from_disk(path: Path) -> float:
+    drop_from_page_cache(path)
+    return once(lambda: GaussianScene.load(path))
+
+
+def _unlabelled(view: View) -> View:
+    return View.from_arrays(view.camera, np.zeros((view.camera.height, view.camera.width), np.int32))
+
+
+def _view_stages(scene: GaussianScene, views: list[View], num_classes: int, runs: int) -> Times:
+    """Stages of one view: each run takes all of them, one after the other."""
+    codes = np.random.default_rng(0).dirichlet(np.ones(num_classes), len(scene)).astype(np.float32)
+    stages: dict[str, list[Callable[[], object]]] = {}
+
+    def add(name: str, job: Callable[[], object]) -> None:
+        stages.setdefault(name, []).append(job)
+
+    for view in views:
+        camera, mask = view.camera, view.read_labels()
+        projected, operator = project(scene, camera), make_operator(scene, camera)
+        observation, depths = operator.observe(mask), _depths(scene, camera, projected.ids)
+        mine = np.ascontiguousarray(codes[observation.ids][:, observation.classes])
+        rest = np.ones(len(observation.classes), np.float32)
+        add("project and sort", lambda c=camera: project(scene, c))
+        add("of this, sort", lambda d=depths: sort_by_depth(d))
+        add("bin", lambda p=projected, c=camera: assign(p, c.width, c.height))
+        add("blend", operator.transmittance)
+        add(f"render {num_classes} classes", lambda o=operator: o.render(codes))
+        add("tie to its mask", lambda o=operator, m=mask: o.observe(m))
+        add("lift", observation.votes)
+        add("shares", lambda o=observation, q=mine, r=rest: o.shares(q, r))
+        add("adjoint, 3 channels", lambda o=operator, m=mask: o.adjoint(np.repeat(m[..., None], 3, axis=2)))
+    return {name: _averaged(jobs, runs) for name, jobs in stages.items()}
+
+
+def _averaged(jobs: list[Callable[[], object]], runs: int) -> list[float]:
+    rows = [timed(job, runs) for job in jobs]
+    return [sum(row) / len(rows) for row in zip(*rows, strict=True)]
+
+
+def _depths(scene: GaussianScene, camera: Camera, ids: np.ndarray) -> np.ndarray:
+    """Depths of what a view shows, in the order of the scene."""
+    pose = camera.world_to_camera
+    return (scene.means[np.sort(ids)] @ pose[2, :3] + pose[2, 3]).astype(np.float32)
+
+
+def _fuse(scene: GaussianScene, data: Dataset, runs: int, sampled: int) -> list[float]:
+    """Seconds from a mask in memory to votes that hold it, per mask."""
+    views = [View.from_arrays(v.camera, v.read_labels()) for v in spread(data.views("train"), sampled)]
+    seconds = []
+    for _ in range(runs + 1):
+        learner = VoteLearner(scene, data.num_classes)
+        for view in views:  # Memory that is touched for the first time is slow, and a robot that runs has it.
+            learner.observe(view)
+        for view in views:
+            learner.retract(view.name)
+        seconds.append(once(lambda: [learner.observe(v) for v in views]) / len(views))  # noqa: B023 - called at once
+    return seconds[1:]
+
+
+def _learning(scene: GaussianScene, data: Dataset) -> Times:
+    """EM over all train views until it converges; of its steps, all between the first and the last."""
+    learner = EMLearner(scene, data.num_classes)
+    prepare = once(lambda: [learner.observe(view) for view in data.views("train")])
+    marks: dict[int, float] = {}
+
+    def progress(stage: str, done: int, total: int) -> None:
+        if stage == "em":
+            marks.setdefault(done, time.perf_counter())
+
+    fit = once(lambda: learner.fit(progress))
+    steps = len(learner.history_)
+    starts = [marks[done] for done in sorted(marks) if 0 < done < steps]
+    each = np.diff(starts).tolist() or [fit / steps]
+    return {"read and observe all views": [prepare], "EM step": each, "EM, all steps": [fit], "EM steps": [steps]}
+
+
+def _refinement(path: Path, data: Dataset, runs: int) -> Times:
+    """Stages after learning, on the codes of votes."""
+    settings, times = RefineSettings(), {}
+    scene = GaussianScene.load(path)
+    learner = VoteLearner(scene, data.num_classes)
+    for view in data.views("train"):
+        learner.observe(view)
+    codes = learner.fit().codes_
+    observed, names = learner.observed_, data.class_names
+    # The first call on a scene finds the neighbours; the later ones have them.
+    fresh = [GaussianScene.load(path) for _ in range(runs)]
+    times["segment, first call"] = [once(lambda s=s: Segmentation.from_codes(s, codes, names)) for s in fresh]
+    del fresh
+    times["segment, later calls"] = timed(lambda: Segmentation.from_codes(scene, codes, names), runs)
+    result = Segmentation.from_codes(scene, codes, names)
+    known = Neighbours.find(scene.means, settings.k)
+    times["neighbours"] = timed(lambda: Neighbours.find(scene.means, settings.k), runs)
+    times["KNN"] = timed(lambda: cluster(scene.means, codes, observed, settings.k, settings.beta, known), runs)
+    times["filter"] = timed(
+        lambda: statistical_filter(
+            scene.means, result.labels, settings.k, settings.filter_sigmas, data.num_classes, known
+        ),
+        runs,
+    )
+    with tempfile.TemporaryDirectory() as out:
+        times["export one PLY per class"] = timed(lambda: export_classes(scene, result, f"{out}/classes"), runs)
+        times["save segmentation.npz"] = timed(lambda: result.save(f"{out}/segmentation.npz"), runs)
+    return times
