@@ -47,7 +47,8 @@ setup(
         "tqdm>=4.64",
     ],
     extras_require={
-        "dev": ["hypothesis>=6.100", "mypy>=1.15", "pytest>=8", "pyyaml>=6.0", "ruff>=0.9", "scikit-learn>=1.5"],
+        "distributed": ["dask>=2024.8", "distributed>=2024.8"],
+        "dev": ["distributed>=2024.8", "hypothesis>=6.100", "mypy>=1.15", "pytest>=8", "pyyaml>=6.0", "ruff>=0.9", "scikit-learn>=1.5"],
         # ROS 2 Jazzy as wheels, for a machine without one from apt. Exact, because gsseg_msgs is compiled against them.
         "ros": [
             "ros-jazzy-common-interfaces==5.3.6",
