@@ -197,6 +197,9 @@ class _OnWorkers(Learner):
         except UNREACHABLE as error:
             self._direct = False  # Perhaps only the scheduler can reach the workers.
             raise _LostError from error
+        except (AssertionError, LookupError, ValueError) as error:
+            # What Dask's scheduler raises, in one place or another, if it hears just then that a worker has gone.
+            raise _LostError from error
 
     def _check(self, future: Future) -> None:
         if future.status == "error":

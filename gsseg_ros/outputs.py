@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Mapping
 
 import numpy as np
 from gsseg_msgs.msg import SegmentationReport
+from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNode
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -16,6 +18,9 @@ from std_msgs.msg import Header
 
 from gsseg_ros.conversions import cloud, topic_tokens
 from gsseg_ros.reports import Selection
+
+FLOW_SECONDS = 0.5
+"""How long the clouds of one run wait, all together, for subscribers to take in those before."""
 
 
 class Outputs:
@@ -51,16 +56,16 @@ class Outputs:
         """Publish one cloud per class that was asked for, empty ones for all others, and that of all objects."""
         tokens = topic_tokens(selection.result.class_names)
         with self._lock:
-            filled = set()
+            flow, filled = _Flow(), set()
             for k in selection.chosen:
                 message = selection.class_cloud(k, header)
-                self._class(tokens[k]).publish(message)
+                flow.publish(self._class(tokens[k]), message)
                 if message.width:
                     filled.add(tokens[k])
             for token in self._filled - {tokens[k] for k in selection.chosen}:
-                self._class(token).publish(_empty(header))
+                flow.publish(self._class(token), _empty(header))
             self._filled = filled
-            self._cloud.publish(selection.objects_cloud(header))
+            flow.publish(self._cloud, selection.objects_cloud(header))
 
     def publish_report(self, report: SegmentationReport) -> None:
         """Publish the report of a run."""
@@ -99,3 +104,22 @@ def latched() -> QoSProfile:
 def _empty(header: Header) -> PointCloud2:
     nothing = np.empty((0, 3), np.float32)
     return cloud(header, nothing, nothing.astype(np.uint8), np.empty(0, np.int32), np.empty(0, np.float32))
+
+
+class _Flow:
+    """Publishes clouds one after the other, each once the one before has arrived.
+
+    All at once they overflow the buffers between the two processes; what is lost there is sent again only when the
+    middleware next asks for it, seconds later. A subscriber that does not answer is not waited for beyond a limit, over
+    all the clouds together.
+    """
+
+    def __init__(self) -> None:
+        self._patience = FLOW_SECONDS
+
+    def publish(self, publisher: Publisher, message: PointCloud2) -> None:
+        publisher.publish(message)
+        if self._patience > 0 and message.width and publisher.get_subscription_count():
+            started = time.monotonic()
+            publisher.wait_for_all_acked(Duration(seconds=self._patience))
+            self._patience -= time.monotonic() - started
