@@ -46,6 +46,7 @@ def test_the_policy_lists_exactly_what_the_running_node_has(ros: Ros, tmp_path: 
     wanted = ((graph.get_publisher_names_and_types_by_node, "topic", "publish"),
               (graph.get_subscriber_names_and_types_by_node, "topic", "subscribe"),
               (graph.get_service_names_and_types_by_node, "service", "reply"))  # fmt: skip
+    ros.wait_until(lambda: "gsseg" in graph.get_node_names(), "the node")
     ros.wait_until(lambda: len(names(graph.get_service_names_and_types_by_node)) >= 19, "the node's services")
     for ask, kind, permission in wanted:
         policy = listed(kind, permission)
