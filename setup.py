@@ -49,9 +49,14 @@ setup(
     extras_require={
         "distributed": ["dask>=2024.8", "distributed>=2024.8"],
         "dev": [
-            "distributed>=2024.8", "hypothesis>=6.100", "mypy>=1.15", "pytest>=8", "pyyaml>=6.0", "ruff>=0.9",
+            "distributed>=2024.8",
+            "hypothesis>=6.100",
+            "mypy>=1.15",
+            "pytest>=8",
+            "pyyaml>=6.0",
+            "ruff>=0.9",
             "scikit-learn>=1.5",
-        ],  # fmt: skip
+        ],
         # ROS 2 Jazzy as wheels, for a machine without one from apt. Exact, because gsseg_msgs is compiled against them.
         "ros": [
             "ros-jazzy-common-interfaces==5.3.6",

@@ -23,13 +23,14 @@ from gsseg_core.em import EMLearner, ErrorModel
 from gsseg_core.errors import GssegError, SchedulerError
 from gsseg_core.learner import Learner, Progress, silent
 from gsseg_core.scene import GaussianScene
-from gsseg_core.scheduler import UNREACHABLE, check_workers, find_workers, name_of
+from gsseg_core.scheduler import PATIENCE, UNREACHABLE, check_workers, find_workers, name_of
 from gsseg_core.shard import (
     NotHereError,
     Part,
     add,
     digest_of,
     geometry,
+    hand_on,
     load,
     prepare,
     refit_models,
@@ -129,11 +130,12 @@ class _OnWorkers(Learner):
         codes: np.ndarray | None,
     ) -> Part:
         shares = self._deal(views, tell)
-        if codes is not None:
-            used.append(self._send(codes))
-        given, parts = list(used), []
+        copies = {} if codes is None else self._send(codes, [share.worker for share in shares])
+        used += copies.values()
+        parts = []
         for share in shares:
             wanted = {name: models.get(name) for name in share.views if name in views}
+            given = [copies[share.worker]] if copies else []
             parts.append(self._submit(share.worker, task, share.shard, wanted, *given))
         used += parts
         sums = parts
@@ -179,7 +181,7 @@ class _OnWorkers(Learner):
             self._scenes |= {worker: future for worker, future in tried.items() if future.status == "finished"}
             absent = [worker for worker in absent if worker not in self._scenes]
         if absent:
-            self._scenes |= dict.fromkeys(absent, self._send(geometry(self.scene), absent))
+            self._scenes |= self._send(geometry(self.scene), absent)
 
     def _submit(self, worker: str, task: Callable[..., Any], *inputs: Any) -> Future:
         """Run a task on this worker, or elsewhere should it be lost."""
@@ -189,17 +191,22 @@ class _OnWorkers(Learner):
         with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 TB"}):
             return self._client.submit(task, *inputs, workers=[worker], allow_other_workers=True, pure=False)
 
-    def _send(self, value: Any, workers: list[str] | None = None) -> Future:
-        """Put a value on these workers, or on all; they hand it on to each other in a tree."""
+    def _send(self, value: Any, workers: list[str]) -> dict[str, Future]:
+        """Put a value on each of these workers: on the first one from here, and from there on along a tree."""
         try:
-            sent: Future = self._client.scatter(value, workers, broadcast=True, direct=self._direct, hash=False)
-            return sent
+            copies: list[Future] = [
+                self._client.scatter(value, workers[:1], direct=self._direct, hash=False, timeout=PATIENCE)
+            ]
         except UNREACHABLE as error:
             self._direct = False  # Perhaps only the scheduler can reach the workers.
             raise _LostError from error
         except (AssertionError, LookupError, ValueError) as error:
-            # What Dask's scheduler raises, in one place or another, if it hears just then that a worker has gone.
+            # What Dask's scheduler raises, in one place or another, if it hears just then that the worker has gone.
             raise _LostError from error
+        # Dask's own broadcast may wait for ever for a worker that has gone.
+        for i, worker in enumerate(workers[1:]):
+            copies.append(self._submit(worker, hand_on, copies[i // 2]))
+        return dict(zip(workers, copies, strict=True))
 
     def _check(self, future: Future) -> None:
         if future.status == "error":

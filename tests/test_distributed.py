@@ -41,7 +41,7 @@ Told = tuple[str, int, int]
 def address() -> Iterator[str]:
     """A scheduler with three workers, each a process of one thread, which come back when they are killed."""
     with distributed.LocalCluster(
-        processes=True, n_workers=3, threads_per_worker=1, dashboard_address=None, silence_logs=50
+        processes=True, n_workers=3, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=50
     ) as cluster:
         yield cluster.scheduler_address
 
@@ -303,7 +303,16 @@ def test_the_documented_commands_make_a_cluster_and_its_loss_is_one_clear_error(
     monkeypatch.setattr(scheduler, "PATIENCE", 1.0)
     dask, quiet = [sys.executable, "-m", "dask"], {"stderr": subprocess.DEVNULL, "stdout": subprocess.DEVNULL}
     found = tmp_path / "scheduler.json"
-    options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(found)]
+    options = [
+        "--host",
+        "127.0.0.1",
+        "--port",
+        "0",
+        "--dashboard-address",
+        "127.0.0.1:0",
+        "--scheduler-file",
+        str(found),
+    ]
     with subprocess.Popen([*dask, "scheduler", *options], **quiet) as first:
         try:
             address = written(found)
