@@ -56,6 +56,7 @@ setup(
             "pyyaml>=6.0",
             "ruff>=0.9",
             "scikit-learn>=1.5",
+            "threadpoolctl>=3.1",
         ],
         # ROS 2 Jazzy as wheels, for a machine without one from apt. Exact, because gsseg_msgs is compiled against them.
         "ros": [

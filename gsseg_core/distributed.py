@@ -97,7 +97,7 @@ class _OnWorkers(Learner):
         views: Mapping[str, View],
         tell: Callable[[int], None],
         models: Mapping[str, ErrorModel] | None = None,
-        codes: np.ndarray | None = None,  # (N, K)
+        *arrays: np.ndarray,  # each (N, K)
     ) -> Part:
         """Sum up what a task makes of these views; `tell` is called with how many of them are done, time and again.
 
@@ -111,7 +111,7 @@ class _OnWorkers(Learner):
         for _ in range(ATTEMPTS):
             used: list[Future] = []
             try:
-                return self._try_to_sum(used, task, views, tell, models or {}, codes)
+                return self._try_to_sum(used, task, views, tell, models or {}, arrays)
             except (_LostError, CancelledError):
                 self._shares = []
             finally:
@@ -127,16 +127,15 @@ class _OnWorkers(Learner):
         views: Mapping[str, View],
         tell: Callable[[int], None],
         models: Mapping[str, ErrorModel],
-        codes: np.ndarray | None,
+        arrays: Sequence[np.ndarray],
     ) -> Part:
         shares = self._deal(views, tell)
-        copies = {} if codes is None else self._send(codes, [share.worker for share in shares])
-        used += copies.values()
+        copies = [self._send(array, [share.worker for share in shares]) for array in arrays]
+        used += [future for copy in copies for future in copy.values()]
         parts = []
         for share in shares:
             wanted = {name: models.get(name) for name in share.views if name in views}
-            given = [copies[share.worker]] if copies else []
-            parts.append(self._submit(share.worker, task, share.shard, wanted, *given))
+            parts.append(self._submit(share.worker, task, share.shard, wanted, *(c[share.worker] for c in copies)))
         used += parts
         sums = parts
         while len(sums) > 1:  # What is between leaves and root lives only as long as it is needed there.
@@ -252,7 +251,7 @@ class DistributedEM(_OnWorkers, EMLearner):
         tell: Callable[[], None],
         names: Iterable[str] | None = None,
     ) -> dict[str, ErrorModel]:
-        models = self._sum(start_models, self.views, lambda done: tell(), codes=votes)[1]
+        models = self._sum(start_models, self.views, lambda done: tell(), None, votes)[1]
         return {name: models[name] for name in self.views}
 
     def _gains(
@@ -265,11 +264,13 @@ class DistributedEM(_OnWorkers, EMLearner):
 
     def _refit(
         self,
-        state: np.ndarray,  # (3, N, K)
+        codes: np.ndarray,  # (N, K)
+        gains: np.ndarray,  # (N, K) int64
+        prior: np.ndarray,  # (N, K)
         models: dict[str, ErrorModel],
         tell: Callable[[], None],
     ) -> dict[str, ErrorModel]:
-        models.update(self._sum(refit_models, self.views, lambda done: tell(), models, state)[1])
+        models.update(self._sum(refit_models, self.views, lambda done: tell(), models, codes, gains, prior)[1])
         return models
 
 

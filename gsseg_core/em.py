@@ -41,7 +41,7 @@ from functools import partial
 import numpy as np
 
 from gsseg_core.errors import SettingsError
-from gsseg_core.gaussian_kernels import GAIN_UNIT, add_votes, collect, improve, mix, tally
+from gsseg_core.gaussian_kernels import add_votes, collect, improve, mix, tally
 from gsseg_core.learner import VOTE_UNIT, Learner, Progress, normalise, silent
 from gsseg_core.neighbours import neighbours_of
 from gsseg_core.operator import Observation
@@ -209,7 +209,7 @@ class EMLearner(Learner):
                 improve(codes, gains, prior)
                 break
             if self.converged_:
-                self._refit(np.stack([codes, gains.astype(np.float32) * np.float32(GAIN_UNIT), prior]), models, tell)
+                self._refit(codes, gains, prior, models, tell)
                 rounds.append(0)
             improve(codes, gains, prior)
         progress("em", settings.max_steps, settings.max_steps)
@@ -265,7 +265,9 @@ class EMLearner(Learner):
 
     def _refit(
         self,
-        state: np.ndarray,  # (3, N, K) float32: codes, the gains of a step, prior
+        codes: np.ndarray,  # (N, K)
+        gains: np.ndarray,  # (N, K) int64, of a step at these codes and models
+        prior: np.ndarray,  # (N, K) px
         models: dict[str, ErrorModel],
         tell: Callable[[], None],
     ) -> dict[str, ErrorModel]:
@@ -273,13 +275,14 @@ class EMLearner(Learner):
         for name, observation in self._observations(models):
             tell()
             model, ids = models[name], observation.ids
-            codes, gains, prior = (part[ids] for part in state)
             likelihood, here = np.ascontiguousarray(model.likelihood.T), np.arange(len(ids), dtype=np.int32)
-            shares = observation.shares(mix(codes, here, likelihood), likelihood[:, 0])
-            codes *= np.maximum(gains - shares.gaussians @ likelihood, 0.0)
-            codes = normalise(codes + prior)
-            shares = observation.shares(mix(codes, here, likelihood), likelihood[:, 0])
-            counts = tally(codes, here, shares.gaussians)
+            shares = observation.shares(mix(codes, ids, likelihood), likelihood[:, 0])
+            own = np.zeros((len(ids), codes.shape[1]), np.int64)
+            collect(here, likelihood, shares.gaussians, own)  # Exactly what the view has given to the gains.
+            without = codes[ids]
+            improve(without, gains[ids] - own, prior[ids])
+            shares = observation.shares(mix(without, here, likelihood), likelihood[:, 0])
+            counts = tally(without, here, shares.gaussians)
             counts[0] += shares.rest
             model.maximise(counts * (1 - model.outliers) * model.confusion)
         return models

@@ -125,11 +125,13 @@ def sum_gains(
 def refit_models(
     shard: Shard,
     models: dict[str, ErrorModel],
-    state: np.ndarray,  # (3, N, K)
+    codes: np.ndarray,  # (N, K)
+    gains: np.ndarray,  # (N, K) int64
+    prior: np.ndarray,  # (N, K)
 ) -> Part:
     """Learn the views' error models anew."""
     with _all_threads():
-        return None, shard._refit(_as_compiled_for(state), deepcopy(models), _go_on)
+        return None, shard._refit(_as_compiled_for(codes), gains, prior, deepcopy(models), _go_on)
 
 
 def hand_on(value: Any) -> Any:

@@ -27,6 +27,7 @@ from gsseg_core.scene import GaussianScene
 from gsseg_core.votes import VoteLearner
 
 distributed = pytest.importorskip("distributed", reason="Dask is not installed")
+dask = pytest.importorskip("dask")
 
 from gsseg_core.distributed import DistributedEM, DistributedVotes  # noqa: E402
 
@@ -129,8 +130,11 @@ def changed(client: Any, workers: Iterable[str], module: str, name: str, value: 
     client.run(undo)
 
 
-@pytest.mark.parametrize("many", [1, 2])
-def test_the_views_of_killed_workers_are_done_again_elsewhere(client: Any, tmp_path: Path, many: int) -> None:
+@pytest.mark.parametrize("many", [1, 3], ids=["one", "all"])
+def test_the_views_of_killed_workers_are_done_again_elsewhere(
+    client: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, many: int
+) -> None:
+    monkeypatch.setattr(scheduler, "PATIENCE", 30.0)
     here = taught(EMLearner(SCENE, NUM_CLASSES, SETTINGS), VIEWS).fit()
     there = DistributedEM(client, SCENE, NUM_CLASSES, SETTINGS)
     there.observe_all(VIEWS)
@@ -301,7 +305,7 @@ def test_the_documented_commands_make_a_cluster_and_its_loss_is_one_clear_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(scheduler, "PATIENCE", 1.0)
-    dask, quiet = [sys.executable, "-m", "dask"], {"stderr": subprocess.DEVNULL, "stdout": subprocess.DEVNULL}
+    run, quiet = [sys.executable, "-m", "dask"], {"stderr": subprocess.DEVNULL, "stdout": subprocess.DEVNULL}
     found = tmp_path / "scheduler.json"
     options = [
         "--host",
@@ -313,12 +317,12 @@ def test_the_documented_commands_make_a_cluster_and_its_loss_is_one_clear_error(
         "--scheduler-file",
         str(found),
     ]
-    with subprocess.Popen([*dask, "scheduler", *options], **quiet) as first:
+    with subprocess.Popen([*run, "scheduler", *options], **quiet) as first:
         try:
             address = written(found)
             with pytest.raises(SchedulerError, match="has no workers"), scheduler.connected(address):
                 pass
-            with subprocess.Popen([*dask, "worker", address, "--no-dashboard", "--nthreads", "1"], **quiet) as worker:
+            with subprocess.Popen([*run, "worker", address, "--no-dashboard", "--nthreads", "1"], **quiet) as worker:
                 with distributed.Client(address, set_as_default=False) as client:
                     client.wait_for_workers(1, timeout=20)
                 with scheduler.connected(address) as client:

@@ -9,7 +9,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, mean_iou, taught, wrong_views
+from small_scenes import (
+    NUM_CLASSES,
+    balls_on_a_table,
+    clean_views,
+    look_at,
+    many_classes,
+    mean_iou,
+    taught,
+    true_labels,
+    wrong_views,
+)
+from threadpoolctl import threadpool_limits
 
 from gsseg_core.dataset import View
 from gsseg_core.em import EMLearner, EMSettings
@@ -200,6 +211,18 @@ def test_what_was_all_but_ruled_out_does_not_overflow_the_sums() -> None:
     np.testing.assert_allclose(gains * GAIN_UNIT, [[255 * 2.0**27, 255.0]], rtol=1e-6)
     improve(codes, gains, np.zeros_like(codes))
     np.testing.assert_allclose(codes, [[1.0, 0.0]], atol=1e-6)
+
+
+def test_the_number_of_threads_does_not_matter_not_even_to_the_last_bit() -> None:
+    scene, truth = many_classes(300)
+    cameras = [look_at(f"v{i}", np.array([0.2 * i, 0.1, 3.5]), 320, 240, 330.0) for i in range(3)]
+    views = [View.from_arrays(camera, true_labels(scene, truth, camera)) for camera in cameras]
+    fits = []
+    for threads in (1, 2):
+        with threadpool_limits(threads):
+            fits.append(taught(EMLearner(scene, 300), views).fit())
+    np.testing.assert_array_equal(fits[0].codes_, fits[1].codes_)
+    assert fits[0].history_ == fits[1].history_
 
 
 def test_fitting_twice_gives_the_same_bits() -> None:
