@@ -58,6 +58,9 @@ setup(
             "scikit-learn>=1.5",
             "threadpoolctl>=3.1",
         ],
+        # The view operator on CUDA. Below 1.6, since docs/gpu.md bounds what the rules of this version change. gsplat
+        # imports packaging without asking for it.
+        "gsplat": ["gsplat>=1.5.3,<1.6", "packaging>=21", "torch>=2.3"],
         # ROS 2 Jazzy as wheels, for a machine without one from apt. Exact, because gsseg_msgs is compiled against them.
         "ros": [
             "ros-jazzy-common-interfaces==5.3.6",

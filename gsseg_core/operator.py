@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
@@ -267,13 +268,33 @@ class ViewOperator(ABC):
 def make_operator(scene: GaussianScene, camera: Camera, device: str = "cpu") -> ViewOperator:
     """Make the operator of a view on a device.
 
+    Parameters
+    ----------
+    scene : GaussianScene
+        What is seen.
+    camera : Camera
+        Where from.
+    device : str
+        'cpu'; 'cuda', the first GPU; or 'cuda:1' and so on, another one. See docs/gpu.md.
+
     Raises
     ------
     SettingsError
-        There is no such device.
+        There is no such device, or what it needs is not installed.
     """
-    if device != "cpu":
-        raise SettingsError(f"device is {device!r}; expected 'cpu', the only one that this version can use")
-    from gsseg_core.tile_operator import TileOperator
+    if device == "cpu":
+        from gsseg_core.tile_operator import TileOperator
 
-    return TileOperator(scene, camera)
+        return TileOperator(scene, camera)
+    if not re.fullmatch(r"cuda(:[0-9]+)?", device):
+        raise SettingsError(f"device is {device!r}; expected 'cpu', 'cuda' or 'cuda:' and the number of a GPU")
+    try:
+        from gsseg_core.gsplat_operator import GsplatOperator, load_gsplat
+    except ModuleNotFoundError as missing:
+        if missing.name != "torch":
+            raise
+        raise SettingsError(
+            f"device is {device!r}, and PyTorch is missing; expected a CUDA build of it and gsplat: "
+            "pip install 'gsseg[gsplat]'"
+        ) from missing
+    return GsplatOperator(scene, camera, device, load_gsplat(device))

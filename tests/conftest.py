@@ -5,11 +5,16 @@ from __future__ import annotations
 import os
 import signal
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
+if TYPE_CHECKING:
+    from operator_backends import Backend
+
 DATA = Path(os.environ.get("GSSEG_DATA") or Path(__file__).parents[2] / "shared" / "data")
 _NO_DATA = "real data not found"
+_NO_GPU = "no GPU for gsplat"
 
 
 def pytest_configure() -> None:
@@ -26,8 +31,25 @@ def real_data() -> Path:
     return DATA
 
 
+@pytest.fixture(scope="session", params=["cpu", "plain", "cuda"])
+def backend(request: pytest.FixtureRequest) -> Backend:
+    """Each implementation of the view operator; the tests of one that cannot run here are skipped."""
+    from operator_backends import BACKENDS, why_missing  # It imports torch, which most tests do without.
+
+    why = why_missing(request.param)
+    if why:
+        pytest.skip(f"{_NO_GPU}: {why}")
+    return BACKENDS[request.param]
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say how many tests had to do without the real scenes: a skip must not look like a pass."""
-    skips = [report for report in terminalreporter.stats.get("skipped", []) if _NO_DATA in str(report.longrepr)]
-    if skips:
-        terminalreporter.write_line(f"{len(skips)} tests skipped: real data not found under {DATA} (set GSSEG_DATA)")
+    """Say how many tests had to do without the real scenes or a GPU: a skip must not look like a pass."""
+    skips = [str(report.longrepr) for report in terminalreporter.stats.get("skipped", [])]
+    without = {
+        _NO_DATA: f"real data not found under {DATA} (set GSSEG_DATA)",
+        _NO_GPU: "no GPU that gsplat can use, so the operator on CUDA was not tested (docs/gpu.md)",
+    }
+    for reason, text in without.items():
+        count = sum(reason in skip for skip in skips)
+        if count:
+            terminalreporter.write_line(f"{count} tests skipped: {text}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -31,16 +32,9 @@ class NaiveView(NamedTuple):
 
 def naive_view(scene: GaussianScene, camera: Camera, rounding: float = 1e-4) -> NaiveView:
     """Blend a scene into a view; `rounding` is the relative error up to which a threshold is a matter of luck."""
-    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
-    weights = np.zeros((len(pixels), len(scene)))
-    transmittance, slack = np.ones(len(pixels)), np.zeros(len(pixels))
-
-    centres = scene.means.astype(np.float64) @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    for i in np.argsort(centres[:, 2], kind="stable"):
-        if centres[i, 2] < 0.01:
-            continue
-        alpha = _alpha(scene, camera, i, centres[i], pixels)
+    weights = np.zeros((camera.height * camera.width, len(scene)))
+    transmittance, slack = np.ones(len(weights)), np.zeros(len(weights))
+    for i, alpha in _alphas(scene, camera, scene.opacities):
         going_on = transmittance >= 1e-4
         doubtful = going_on & (np.abs(alpha * 255 - 1) < rounding)
         slack[doubtful] += (transmittance * alpha)[doubtful]
@@ -52,18 +46,53 @@ def naive_view(scene: GaussianScene, camera: Camera, rounding: float = 1e-4) -> 
     return NaiveView(weights, transmittance, slack)
 
 
+def naive_gsplat_view(scene: GaussianScene, camera: Camera, rounding: float = 1e-3) -> NaiveView:
+    """Blend as gsplat does, by the rules of docs/gpu.md.
+
+    Opacity instead of alpha is cut off at 0.99, and a ray ends before the Gaussian that would bring it to 1e-4. Where a
+    threshold is in doubt, slack is 1: anything goes.
+    """
+    weights = np.zeros((camera.height * camera.width, len(scene)))
+    transmittance, slack = np.ones(len(weights)), np.zeros(len(weights))
+    going_on = np.ones(len(weights), bool)
+    for i, alpha in _alphas(scene, camera, np.minimum(scene.opacities, 0.99)):
+        slack[going_on & (np.abs(alpha * 255 - 1) < rounding)] = 1.0
+        alpha[alpha < 1 / 255] = 0.0
+        behind = transmittance * (1 - alpha)
+        slack[going_on & (np.abs(behind * 1e4 - 1) < rounding)] = 1.0
+        going_on &= behind > 1e-4
+        weights[:, i] = np.where(going_on, alpha * transmittance, 0.0)
+        transmittance[going_on] = behind[going_on]
+    return NaiveView(weights, transmittance, slack)
+
+
+def _alphas(
+    scene: GaussianScene,
+    camera: Camera,
+    opacities: np.ndarray,  # (N,)
+) -> Iterator[tuple[int, np.ndarray]]:
+    """Give each Gaussian that is drawn and its alpha in all pixels, (P,), nearest first."""
+    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    pixels = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    centres = scene.means.astype(np.float64) @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    for i in np.argsort(centres[:, 2], kind="stable"):
+        if centres[i, 2] >= 0.01:
+            yield i, _alpha(scene, camera, i, centres[i], pixels, opacities[i])
+
+
 def _alpha(
     scene: GaussianScene,
     camera: Camera,
     i: int,
     centre: np.ndarray,  # (3,) in the camera's frame
     pixels: np.ndarray,  # (P, 2) px
+    opacity: float,
 ) -> np.ndarray:
     covariance = projected_covariance(scene, camera, i, centre)
     x, y, z = centre
     offset = pixels - [camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy]
     squared = np.einsum("pa,ab,pb->p", offset, np.linalg.inv(covariance), offset)
-    return np.minimum(0.99, np.float64(scene.opacities[i]) * np.exp(-squared / 2))
+    return np.minimum(0.99, np.float64(opacity) * np.exp(-squared / 2))
 
 
 def projected_covariance(

@@ -1,0 +1,357 @@
+"""The view operator on a GPU: gsplat's CUDA kernels render, and their backward pass is the adjoint.
+
+gsplat blends by the formulas of docs/conventions.md, but for two rules of its own; docs/gpu.md says what they change.
+Projection and tiles are found once per view; a product then is one call of `rasterize_to_pixels` for each 32 channels,
+an adjoint that and its backward pass with respect to the colours.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import threading
+import warnings
+from collections.abc import Iterator
+from types import ModuleType
+from typing import NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+
+from gsseg_core.cameras import Camera
+from gsseg_core.errors import SceneValueError, SettingsError
+from gsseg_core.lanes import ALPHA_MAX, T_MIN
+from gsseg_core.operator import Blended, Observation, Shares, ViewOperator, Weights
+from gsseg_core.projection import ALPHA_MIN, DILATION, NEAR
+from gsseg_core.scene import GaussianScene
+
+TILE = 16
+"""Side of the tiles that gsplat is asked for, in px."""
+
+CHUNK = 32
+"""Channels that go through gsplat at once. Its backward pass keeps them in shared memory, and 32 fit on every GPU."""
+
+_TINY = 1e-30  # the floor of a likelihood, as on the CPU
+
+
+@functools.cache
+def load_gsplat(device: str) -> ModuleType:
+    """Import gsplat for a GPU; the first time on a machine, it compiles its kernels, which takes minutes.
+
+    Raises
+    ------
+    SettingsError
+        There is no such GPU, or gsplat is not installed or cannot be compiled.
+    """
+    with warnings.catch_warnings():  # A CUDA build of PyTorch warns where there is no driver; the error below says it.
+        warnings.simplefilter("ignore")
+        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if count == 0:
+        raise SettingsError(
+            f"device is {device!r}, but PyTorch {torch.__version__} sees no GPU; expected an NVIDIA GPU, its driver "
+            "and a CUDA build of PyTorch, or the device 'cpu'"
+        )
+    if int(device.partition(":")[2] or 0) >= count:
+        raise SettingsError(
+            f"device is {device!r}, but PyTorch sees {count} GPUs; expected 'cuda:0' to 'cuda:{count - 1}'"
+        )
+    try:
+        gsplat = importlib.import_module("gsplat")
+        # Its functions look for the compiled kernels at their first call; here it can be said what is missing.
+        kernels = importlib.import_module("gsplat.cuda._backend")._C
+    except ModuleNotFoundError as missing:
+        raise SettingsError(
+            f"device is {device!r}, and the package {missing.name!r} is missing; expected gsplat: "
+            "pip install 'gsseg[gsplat]'"
+        ) from missing
+    except (ImportError, OSError, RuntimeError) as error:
+        first = (str(error).splitlines() or ["no reason given"])[0]
+        raise SettingsError(
+            f"device is {device!r}, but gsplat's CUDA kernels do not compile or load: {first}"
+        ) from error
+    if kernels is None:
+        raise SettingsError(
+            f"device is {device!r}, but gsplat is not compiled and finds no CUDA toolkit; expected nvcc on the PATH, "
+            "of the CUDA version that PyTorch was built for"
+        )
+    return gsplat
+
+
+class _SceneTensors(NamedTuple):
+    """A scene on a device.
+
+    Opacities are cut off at 0.99 here, because gsplat lets alpha rise to 0.999: see docs/gpu.md.
+    """
+
+    means: torch.Tensor  # (N, 3)
+    quats: torch.Tensor  # (N, 4)
+    scales: torch.Tensor  # (N, 3)
+    opacities: torch.Tensor  # (N,)
+
+
+_KNOWN: WeakKeyDictionary[GaussianScene, dict[str, _SceneTensors]] = WeakKeyDictionary()
+_MOVING = threading.Lock()
+
+
+def _tensors_of(scene: GaussianScene, device: str) -> _SceneTensors:
+    """Copy a scene to a device, once: its tensors are kept with it."""
+    with _MOVING:
+        known = _KNOWN.setdefault(scene, {})
+        if device not in known:
+            opacities = np.minimum(scene.opacities, ALPHA_MAX)
+            arrays = (scene.means, scene.quats, scene.scales, opacities)
+            known[device] = _SceneTensors(*(_tensor(array, device) for array in arrays))
+        return known[device]
+
+
+def _tensor(array: np.ndarray, device: str) -> torch.Tensor:
+    return torch.tensor(np.ascontiguousarray(array, np.float32), device=device)
+
+
+class GsplatOperator(ViewOperator):
+    """W of one view on a GPU, remade by gsplat at every product and never stored.
+
+    Arrays go in and come out as on the CPU; what is kept of the view, about 28 bytes per visible Gaussian and 4 per
+    tile that it touches, lies on the GPU. Renders are the same from run to run and in any order of the Gaussians.
+    Adjoints are not quite: gsplat adds up gradients in whatever order its threads arrive, so their last bits differ.
+
+    Parameters
+    ----------
+    scene : GaussianScene
+        It is copied to the device once, for all its views.
+    camera : Camera
+        Where from.
+    device : str
+        Name of a PyTorch device.
+    gsplat : module
+        Where gsplat's functions are.
+    """
+
+    def __init__(self, scene: GaussianScene, camera: Camera, device: str, gsplat: ModuleType) -> None:
+        self.camera = camera
+        self.num_gaussians = len(scene)
+        self.device = device
+        self._gsplat = gsplat
+        with torch.no_grad():
+            self._project(_tensors_of(scene, device))
+
+    def _project(self, scene: _SceneTensors) -> None:
+        camera = self.camera
+        # World coordinates may be large, and gsplat transforms them in float32: seen from the camera they are small.
+        centre = torch.tensor(camera.center, dtype=torch.float64, device=self.device)
+        rotation = np.eye(4)
+        rotation[:3, :3] = camera.world_to_camera[:3, :3]
+        radii, means2d, depths, conics, _ = self._gsplat.fully_fused_projection(
+            (scene.means.double() - centre).float(), None, scene.quats, scene.scales,
+            _tensor(rotation, self.device)[None], _tensor(camera.K, self.device)[None], camera.width, camera.height,
+            eps2d=DILATION, near_plane=NEAR, radius_clip=0.0, opacities=scene.opacities,
+        )  # fmt: skip
+        # Where the radii are zero, gsplat leaves all else unwritten. A conic overflows only for a Gaussian so large and
+        # so far askew that float32 has no number for its extent.
+        visible = (radii[0] > 0).all(dim=1) & conics[0].isfinite().all(dim=1)
+        rows = visible.nonzero()[:, 0]
+        keys = torch.cat([scene.opacities[rows, None], conics[0, rows], means2d[0, rows], depths[0, rows, None]], dim=1)
+        # By depth, and where that is the same by shape and place, so that the order in the scene matters only to twins.
+        order = torch.arange(len(rows), device=self.device)
+        for key in keys.unbind(dim=1):
+            order = order[torch.argsort(key[order], stable=True)]
+        rows = rows[order]
+
+        self.ids = rows.cpu().numpy().astype(np.int32)
+        self._means2d, self._conics = means2d[:, rows].contiguous(), conics[:, rows].contiguous()
+        self._opacities = scene.opacities[None, rows].contiguous()
+        columns, lines = -(-camera.width // TILE), -(-camera.height // TILE)
+        if len(rows) == 0:  # gsplat's kernels are not started for nothing.
+            self._offsets = torch.zeros((1, lines, columns), dtype=torch.int32, device=self.device)
+            self._entries = torch.zeros(0, dtype=torch.int32, device=self.device)
+            return
+        # Its sort by tile and depth keeps the order of equal depths.
+        _, tile_and_depth, self._entries = self._gsplat.isect_tiles(
+            self._means2d, radii[:, rows].contiguous(), depths[:, rows].contiguous(), TILE, columns, lines
+        )
+        self._offsets = self._gsplat.isect_offset_encode(tile_and_depth, 1, columns, lines)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it holds, in bytes, most of it on the GPU."""
+        held = (self._means2d, self._conics, self._opacities, self._offsets, self._entries)
+        return self.ids.nbytes + sum(tensor.nbytes for tensor in held)
+
+    def rasterise(
+        self,
+        codes: torch.Tensor,  # (M, C), C from 1 to CHUNK
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Blend codes of the visible Gaussians: image (H, W, C), differentiable, and transmittance left over (H, W)."""
+        height, width = self.camera.height, self.camera.width
+        if len(codes) == 0:
+            return codes.new_zeros((height, width, codes.shape[1])), codes.new_ones((height, width))
+        image, opacity = self._gsplat.rasterize_to_pixels(
+            self._means2d, self._conics, codes[None], self._opacities, width, height, TILE, self._offsets, self._entries
+        )
+        return image[0], 1 - opacity.detach()[0, :, :, 0]
+
+    def _blend(self, codes: np.ndarray) -> Blended:
+        codes = codes[self.ids]
+        image = np.empty((self.camera.height, self.camera.width, codes.shape[1]), np.float32)
+        left_over = None
+        with torch.no_grad():
+            for k in chunks(codes.shape[1]):
+                part, left_over = self.rasterise(_tensor(codes[:, k], self.device))
+                image[..., k] = part.cpu().numpy()
+            if left_over is None:  # No channel at all, which gsplat cannot do.
+                _, left_over = self.rasterise(torch.zeros((len(self.ids), 1), device=self.device))
+        return Blended(image, left_over.cpu().numpy())
+
+    def _adjoint(self, residual: np.ndarray) -> np.ndarray:
+        out = np.zeros((self.num_gaussians, residual.shape[2]), np.float32)
+        for k in chunks(residual.shape[2]):
+            out[self.ids, k] = self.carry_back(_tensor(residual[..., k], self.device)).cpu().numpy()
+        return out
+
+    def carry_back(
+        self,
+        residual: torch.Tensor,  # (H, W, C), C from 1 to CHUNK
+    ) -> torch.Tensor:
+        """Carry values of pixels back to the visible Gaussians, (M, C)."""
+        codes = torch.zeros((len(self.ids), residual.shape[2]), device=self.device)
+        with torch.enable_grad():  # Whoever calls may have turned gradients off.
+            image, _ = self.rasterise(codes.requires_grad_())
+        return gradient(image, codes, residual)
+
+    def _weights(self, pixel: tuple[int, int] | None) -> Weights:
+        """List W, or only the row of W of one pixel. Written in PyTorch by gsplat's rules, since it lists none."""
+        height, width, columns = self.camera.height, self.camera.width, self._offsets.shape[2]
+        begins = [*self._offsets.flatten().tolist(), len(self._entries)]
+        tiles = range(len(begins) - 1)
+        if pixel is not None:
+            tile = pixel[0] // TILE * columns + pixel[1] // TILE
+            tiles = range(tile, tile + 1)
+        pixels, rows, weights = [np.empty(0, np.int32)], [np.empty(0, np.int32)], [np.empty(0, np.float32)]
+        for tile in tiles:
+            top, left = tile // columns * TILE, tile % columns * TILE
+            r, c = (place.ravel() for place in np.mgrid[top : min(top + TILE, height), left : min(left + TILE, width)])
+            if pixel is not None:
+                r, c = np.array(pixel)[:, None]
+            entries = self._entries[begins[tile] : begins[tile + 1]].long()
+            here = self._weights_of(entries, _tensor(np.stack([c, r], axis=1) + 0.5, self.device))
+            p, e = here.nonzero(as_tuple=True)
+            pixels.append((r * width + c)[p.cpu().numpy()].astype(np.int32))
+            rows.append(entries[e].cpu().numpy().astype(np.int32))
+            weights.append(here[p, e].cpu().numpy())
+        listed = np.concatenate(pixels)
+        # Entries of a tile are sorted by depth; a stable sort by pixel keeps that order within each.
+        order = np.argsort(listed, kind="stable")
+        return Weights(listed[order], self.ids[np.concatenate(rows)[order]], np.concatenate(weights)[order])
+
+    def _weights_of(
+        self,
+        entries: torch.Tensor,  # (E,) visible Gaussians of one tile, nearest first
+        pixels: torch.Tensor,  # (P, 2) centres of pixels, x and y
+    ) -> torch.Tensor:
+        """Weights of a tile's Gaussians in some of its pixels, (P, E)."""
+        dx, dy = (self._means2d[0, entries] - pixels[:, None]).unbind(dim=2)
+        xx, xy, yy = self._conics[0, entries].unbind(dim=1)
+        half_squared = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
+        alpha = self._opacities[0, entries] * torch.exp(-half_squared)
+        alpha[(half_squared < 0) | (alpha < ALPHA_MIN)] = 0
+        behind = torch.cumprod(1 - alpha, dim=1)
+        before = torch.cat([torch.ones_like(behind[:, :1]), behind], dim=1)[:, :-1]
+        return alpha * before * (behind > T_MIN)
+
+    def _observe(self, labels: np.ndarray) -> Observation:
+        return GsplatObservation(self, labels)
+
+
+class GsplatObservation(Observation):
+    """A view and its mask on a GPU."""
+
+    def __init__(
+        self,
+        operator: GsplatOperator,
+        labels: np.ndarray,  # (H, W)
+    ) -> None:
+        self._operator = operator
+        self.ids = operator.ids
+        known = labels >= 0
+        self.classes = np.unique(labels[known]).astype(np.int32)
+        self.num_pixels = int(known.sum())
+        local = np.where(known, np.searchsorted(self.classes, labels), -1)
+        self._labels = torch.tensor(local, dtype=torch.int32, device=operator.device)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it holds, in bytes, the operator's included; most of it on the GPU."""
+        return self._operator.nbytes + self._labels.nbytes
+
+    def votes(self) -> np.ndarray:
+        """Sum the weights by label: W^T onehot(y), (M, L) float32."""
+        out = np.empty((len(self.ids), len(self.classes)), np.float32)
+        for k in chunks(len(self.classes)):
+            out[:, k] = self._operator.carry_back(self._one_hot(k)).cpu().numpy()
+        return out
+
+    def shares(
+        self,
+        codes: np.ndarray,  # (M, L)
+        rest: np.ndarray,  # (L,)
+    ) -> Shares:
+        """Share one vote per labelled pixel among the Gaussians that made it."""
+        codes, rest = np.asarray(codes), np.asarray(rest)
+        expected = (len(self.ids), len(self.classes))
+        if codes.shape != expected or rest.shape != expected[1:]:
+            raise SceneValueError(
+                f"view '{self._operator.camera.name}': codes and rest have shapes {codes.shape} and {rest.shape}; "
+                f"expected {expected} and {expected[1:]}"
+            )
+        out, total, log_likelihood = np.empty(expected, np.float32), np.zeros(len(rest)), 0.0
+        for k in chunks(len(rest)):
+            # A pixel's label lies in one chunk, so each chunk has all that its pixels need.
+            gaussians, spare, logs = self._share(codes[:, k], rest[k], self._one_hot(k))
+            out[:, k] = gaussians.cpu().numpy()
+            total[k] = spare.cpu().numpy()
+            log_likelihood += float(logs)
+        return Shares(out, total, log_likelihood)
+
+    def _share(
+        self,
+        codes: np.ndarray,  # (M, C)
+        rest: np.ndarray,  # (C,)
+        one_hot: torch.Tensor,  # (H, W, C)
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        device = self._operator.device
+        carried = _tensor(codes, device)
+        with torch.enable_grad():
+            image, left_over = self._operator.rasterise(carried.requires_grad_())
+        with torch.no_grad():
+            labelled = one_hot.any(dim=2)
+            likelihood = ((image + left_over[..., None] * _tensor(rest, device)) * one_hot).sum(dim=2)
+            # A pixel that nothing explains has no share to give, at any codes; its term is held at a floor.
+            inverse = torch.where(labelled & (likelihood > _TINY), 1 / likelihood, 0)
+            logs = likelihood[labelled].clamp_min(_TINY).double().log().sum()
+            residual = one_hot * inverse[..., None]
+            spare = (residual * left_over[..., None]).double().sum(dim=(0, 1))
+        return gradient(image, carried, residual), spare, logs
+
+    def _one_hot(self, labels: slice) -> torch.Tensor:
+        """Mark the pixels of some labels, one channel each: (H, W, C)."""
+        chosen = torch.arange(labels.start, labels.stop, device=self._labels.device)
+        return (self._labels[..., None] == chosen).float()
+
+
+def gradient(
+    image: torch.Tensor,  # (H, W, C)
+    codes: torch.Tensor,  # (M, C), of which the image was made
+    residual: torch.Tensor,  # (H, W, C)
+) -> torch.Tensor:
+    """Carry a residual back through a render: the gradient of <image, residual> with respect to the codes, (M, C)."""
+    if len(codes) == 0:
+        return torch.zeros_like(codes)
+    (carried,) = torch.autograd.grad(image, codes, residual)
+    return carried
+
+
+def chunks(channels: int) -> Iterator[slice]:
+    """Cut channels into slices of at most `CHUNK`."""
+    for k in range(0, channels, CHUNK):
+        yield slice(k, min(k + CHUNK, channels))

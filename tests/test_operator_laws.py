@@ -1,0 +1,229 @@
+"""Laws that hold for the view operator, whatever the scene, by every implementation that is present."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from operator_backends import CPU
+from operator_cases import dense, make_camera, make_scene, moved, random_mask, random_view, rigid, spread
+
+from gsseg_core.cameras import Camera
+
+views = st.fixed_dictionaries(
+    {
+        "seed": st.integers(0, 2**32 - 1),
+        "n": st.integers(1, 80),
+        "width": st.integers(1, 40),
+        "height": st.integers(1, 40),
+    }
+)
+few = settings(deadline=None, max_examples=15)
+RENDERED = ("ids", "render", "transmittance", "weights", "gaussians")
+
+
+@few
+@given(views, st.integers(1, 40))
+def test_adjoint_is_the_transpose_of_render(backend, view, channels):
+    scene, camera = random_view(**view)
+    operator = backend.make(scene, camera)
+    rng = np.random.default_rng(view["seed"])
+    codes = rng.normal(size=(len(scene), channels)).astype(np.float32)
+    residual = rng.normal(size=(camera.height, camera.width, channels)).astype(np.float32)
+    left = (operator.render(codes).astype(np.float64) * residual).sum()
+    right = (codes * operator.adjoint(residual).astype(np.float64)).sum()
+    size = (operator.render(np.abs(codes)) * np.abs(residual)).sum()
+    assert abs(left - right) <= backend.sum * size
+
+
+@few
+@given(views)
+def test_rows_sum_to_one_minus_the_transmittance_left_over(backend, view):
+    scene, camera = random_view(**view)
+    operator = backend.make(scene, camera)
+    total = operator.render(np.ones((len(scene), 1)))[..., 0]
+    np.testing.assert_allclose(total, 1 - operator.transmittance(), atol=backend.sum)
+    np.testing.assert_allclose(dense(operator).sum(axis=1).reshape(total.shape), total, atol=backend.sum)
+
+
+@few
+@given(views, st.floats(-3, 3), st.floats(-3, 3))
+def test_render_and_adjoint_are_linear(backend, view, a, b):
+    scene, camera = random_view(**view)
+    operator = backend.make(scene, camera)
+    rng = np.random.default_rng(view["seed"])
+    p, q = rng.uniform(-1, 1, (2, len(scene), 3))
+    np.testing.assert_allclose(
+        operator.render(a * p + b * q), a * operator.render(p) + b * operator.render(q), atol=5 * backend.sum
+    )
+    r, s = rng.uniform(-1, 1, (2, camera.height, camera.width, 3))
+    np.testing.assert_allclose(
+        operator.adjoint(a * r + b * s),
+        a * operator.adjoint(r) + b * operator.adjoint(s),
+        atol=5 * backend.sum * (1 + operator.visibility().max()),
+    )
+
+
+def everything(operator, codes, residual, mask):
+    """Every result, the rows of Gaussians in the order of the scene."""
+    seen = operator.observe(mask)
+    # Codes that depend on the Gaussian alone, whatever its place in the order.
+    share = seen.shares(codes[seen.ids][:, : len(seen.classes)], np.full(len(seen.classes), 0.3))
+    return {
+        "ids": operator.ids,
+        "render": operator.render(codes),
+        "adjoint": operator.adjoint(residual),
+        "transmittance": operator.transmittance(),
+        "weights": operator.weights().weights,
+        "gaussians": operator.weights().gaussians,
+        "votes": spread(operator, seen, seen.votes(), 9),
+        "shares": spread(operator, seen, share.gaussians, 9),
+        "rest": share.rest,
+        "log likelihood": share.log_likelihood,
+    }
+
+
+def inputs(scene, camera, seed):
+    rng = np.random.default_rng(seed)
+    codes = rng.random((len(scene), 9)).astype(np.float32)
+    residual = rng.normal(size=(camera.height, camera.width, 3)).astype(np.float32)
+    return codes, residual, random_mask(seed, camera.width, camera.height, ids=(0, 2, 3, 8))
+
+
+def assert_same_in_any_order(backend, scene, camera, seed):
+    codes, residual, mask = inputs(scene, camera, seed)
+    order = np.random.default_rng(seed + 1).permutation(len(scene))
+    first = everything(backend.make(scene, camera), codes, residual, mask)
+    second = everything(backend.make(scene.subset(order), camera), codes[order], residual, mask)
+    for name in ("ids", "gaussians"):
+        second[name] = order[second[name]]
+    for name in ("adjoint", "votes", "shares"):
+        first[name] = first[name][order]
+    for name, expected in first.items():
+        if backend.exact or name in RENDERED:
+            np.testing.assert_array_equal(second[name], expected, err_msg=name)
+        else:
+            near = 5 * backend.sum
+            np.testing.assert_allclose(second[name], expected, rtol=near, atol=near, err_msg=name)
+
+
+@few
+@given(views)
+def test_the_order_of_the_gaussians_changes_nothing(backend, view):
+    assert_same_in_any_order(backend, *random_view(**view), view["seed"])
+
+
+def test_the_order_of_many_gaussians_changes_nothing(backend):
+    assert_same_in_any_order(backend, *random_view(11, 3000, 70, 50), 11)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_order_of_gaussians_at_the_same_depth_changes_nothing(backend, seed):
+    rng = np.random.default_rng(seed)
+    n = 200
+    means = np.c_[rng.uniform(-1, 1, (n, 2)), rng.choice([1.5, 2.0, 4.0], n)]
+    means[: n // 2] = means[rng.integers(0, 5, n // 2)]  # some in the very same place
+    scene = make_scene(means, rng.normal(size=(n, 4)), rng.uniform(0.02, 0.5, (n, 3)), rng.uniform(0.1, 0.9, n))
+    assert_same_in_any_order(backend, scene, make_camera(37, 21), seed)
+
+
+def test_the_order_of_twins_changes_no_pixel_when_their_codes_are_the_same(backend):
+    scene, camera = random_view(13, 60)
+    twice = scene.subset(np.arange(120) // 2)
+    codes = np.random.default_rng(13).random((60, 4))[np.arange(120) // 2]
+    order = np.random.default_rng(14).permutation(120)
+    first, second = backend.make(twice, camera), backend.make(twice.subset(order), camera)
+    np.testing.assert_array_equal(first.render(codes), second.render(codes[order]))
+    np.testing.assert_array_equal(first.transmittance(), second.transmittance())
+
+
+def test_runs_and_numbers_of_threads_change_no_bit_on_the_cpu():
+    scene, camera = random_view(15, 2000, 90, 70)
+    arguments = inputs(scene, camera, 15)
+    threads = numba.get_num_threads()
+    try:
+        results = []
+        for count in (1, min(2, numba.config.NUMBA_NUM_THREADS), numba.config.NUMBA_NUM_THREADS, 1):
+            numba.set_num_threads(count)
+            results.append(everything(CPU.make(scene, camera), *arguments))
+    finally:
+        numba.set_num_threads(threads)
+    for other in results[1:]:
+        for name, expected in results[0].items():
+            np.testing.assert_array_equal(other[name], expected, err_msg=name)
+
+
+@few
+@given(views)
+def test_moving_scene_and_camera_together_changes_nothing(backend, view):
+    scene, camera = random_view(**view)
+    motion = rigid(np.random.default_rng(view["seed"] + 1))
+    there = Camera("there", camera.width, camera.height, camera.K, camera.world_to_camera @ np.linalg.inv(motion))
+    # Positions and rotations are rounded to float32 once more, in another place.
+    slack = backend.naive(scene, camera, rounding=0.01).slack
+    here, moved_weights = dense(backend.make(scene, camera)), dense(backend.make(moved(scene, motion), there))
+    assert (np.abs(here - moved_weights) <= 2e-4 + 10 * backend.weight + slack[:, None]).all()
+
+
+@few
+@given(views, st.data())
+def test_votes_of_a_mask_are_the_sum_of_the_votes_of_its_parts(backend, view, data):
+    scene, camera = random_view(**view)
+    operator = backend.make(scene, camera)
+    mask = random_mask(view["seed"], camera.width, camera.height, ids=(0, 2, 3, 8))
+    share = data.draw(st.floats(0, 1))
+    in_first = np.random.default_rng(view["seed"]).random(mask.shape) < share
+    whole, first, second = (
+        spread(operator, seen, seen.votes(), 9)
+        for seen in map(operator.observe, (mask, np.where(in_first, mask, -1), np.where(in_first, -1, mask)))
+    )
+    np.testing.assert_allclose(first + second, whole, rtol=5 * backend.sum, atol=backend.sum)
+
+
+@few
+@given(views)
+def test_votes_are_the_adjoint_of_the_one_hot_mask(backend, view):
+    scene, camera = random_view(**view)
+    operator = backend.make(scene, camera)
+    mask = random_mask(view["seed"], camera.width, camera.height, ids=(0, 2, 3, 8))
+    seen = operator.observe(mask)
+    one_hot = (mask[..., None] == np.arange(9)).astype(np.float32)
+    np.testing.assert_allclose(
+        spread(operator, seen, seen.votes(), 9), operator.adjoint(one_hot), rtol=5 * backend.sum, atol=backend.sum
+    )
+
+
+@few
+@given(views)
+def test_every_labelled_pixel_shares_out_one_vote(backend, view):
+    scene, camera = random_view(**view)
+    seen = backend.make(scene, camera).observe(random_mask(view["seed"], camera.width, camera.height))
+    rng = np.random.default_rng(view["seed"])
+    codes, rest = rng.uniform(0.01, 1, (len(seen.ids), len(seen.classes))), rng.uniform(0.01, 1, len(seen.classes))
+    share = seen.shares(codes, rest)
+    assert (codes * share.gaussians).sum() + rest @ share.rest == pytest.approx(seen.num_pixels, rel=5 * backend.sum)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_shares_are_the_gradient_of_the_log_likelihood(backend, seed):
+    scene, camera = random_view(seed)
+    seen = backend.make(scene, camera).observe(random_mask(seed))
+    rng = np.random.default_rng(seed)
+    codes, rest = rng.uniform(0.2, 1, (len(seen.ids), len(seen.classes))), rng.uniform(0.2, 1, len(seen.classes))
+    share = seen.shares(codes, rest)
+
+    def slope(along_codes, along_rest, step=0.01):
+        ahead = seen.shares(codes + step * along_codes, rest + step * along_rest).log_likelihood
+        back = seen.shares(codes - step * along_codes, rest - step * along_rest).log_likelihood
+        return (ahead - back) / (2 * step)
+
+    for _ in range(5):
+        along_codes, along_rest = rng.uniform(0, 1, codes.shape), rng.uniform(0, 1, rest.shape)
+        expected = (share.gaussians * along_codes).sum() + share.rest @ along_rest
+        assert slope(along_codes, along_rest) == pytest.approx(expected, rel=1e-3 + backend.sum)
+    for i, j in [np.unravel_index(share.gaussians.argmax(), codes.shape), (len(codes) // 2, 1)]:
+        one = np.zeros_like(codes)
+        one[i, j] = 1
+        assert slope(one, np.zeros_like(rest)) == pytest.approx(share.gaussians[i, j], rel=5e-3, abs=5e-3)
