@@ -234,8 +234,7 @@ class EMLearner(Learner):
         settings, classes, pixels = self.settings, observation.classes, observation.num_pixels
         if not settings.errors:
             return ErrorModel.trusting(classes, self.num_classes, settings.outliers, pixels)
-        own = observation.votes()
-        counts = tally(*_of_others(votes, observation.ids, classes, own), own)
+        counts = _counted(votes, observation)
         return ErrorModel.from_counts(classes, counts, settings.error_prior, settings.outliers, pixels)
 
     def _gains(
@@ -258,9 +257,10 @@ class EMLearner(Learner):
             tell()  # after each view, so that whoever listens can stop the work at once
             model = models[name]
             likelihood = np.ascontiguousarray(model.likelihood.T)
-            shares = observation.shares(mix(codes, observation.ids, likelihood), likelihood[:, 0])
+            seen = observation.ids, observation.start, observation.labels
+            shares = observation.shares(mix(codes, *seen, likelihood), likelihood[:, 0])
             told[name] = shares.log_likelihood
-            collect(observation.ids, likelihood, shares.gaussians, gains)
+            collect(*seen, likelihood, shares.sightings, gains)
         return gains, told
 
     def _refit(
@@ -275,14 +275,16 @@ class EMLearner(Learner):
         for name, observation in self._observations(models):
             tell()
             model, ids = models[name], observation.ids
-            likelihood, here = np.ascontiguousarray(model.likelihood.T), np.arange(len(ids), dtype=np.int32)
-            shares = observation.shares(mix(codes, ids, likelihood), likelihood[:, 0])
+            likelihood = np.ascontiguousarray(model.likelihood.T)
+            seen = observation.start, observation.labels
+            here = np.arange(len(ids), dtype=np.int32)
+            shares = observation.shares(mix(codes, ids, *seen, likelihood), likelihood[:, 0])
             own = np.zeros((len(ids), codes.shape[1]), np.int64)
-            collect(here, likelihood, shares.gaussians, own)  # Exactly what the view has given to the gains.
+            collect(here, *seen, likelihood, shares.sightings, own)  # Exactly what the view has given to the gains.
             without = codes[ids]
             improve(without, gains[ids] - own, prior[ids])
-            shares = observation.shares(mix(without, here, likelihood), likelihood[:, 0])
-            counts = tally(without, here, shares.gaussians)
+            shares = observation.shares(mix(without, here, *seen, likelihood), likelihood[:, 0])
+            counts = tally(without, here, *seen, shares.sightings, len(model.classes))
             counts[0] += shares.rest
             model.maximise(counts * (1 - model.outliers) * model.confusion)
         return models
@@ -300,17 +302,16 @@ class EMLearner(Learner):
         return smooth
 
 
-def _of_others(
+def _counted(
     votes: np.ndarray,  # (N, K) int64, of all views
-    ids: np.ndarray,  # (M,)
-    classes: np.ndarray,  # (L,)
-    own: np.ndarray,  # (M, L) float32, of one of them
-) -> tuple[np.ndarray, np.ndarray]:
-    """Codes (M, K) by the votes of all views but one, for the Gaussians that this one sees; and their numbers."""
-    others = np.ascontiguousarray(votes[ids])
-    here = np.arange(len(ids), dtype=np.int32)
-    add_votes(others, here, classes, own, 1 / VOTE_UNIT, -1)
-    return normalise(others.astype(np.float32)), here
+    observation: Observation,
+) -> np.ndarray:
+    """Count the pixels (K, L) of each class under each label of a view, by the votes of all the others."""
+    others, own = np.ascontiguousarray(votes[observation.ids]), observation.votes()
+    here = np.arange(len(others), dtype=np.int32)
+    add_votes(others, here, observation.start, observation.classes[observation.labels], own, 1 / VOTE_UNIT, -1)
+    codes = normalise(others.astype(np.float32))
+    return tally(codes, here, observation.start, observation.labels, own, len(observation.classes))
 
 
 def _log_prior(

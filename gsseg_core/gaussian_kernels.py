@@ -46,38 +46,39 @@ def in_units(_: Any, __: Any) -> Any:
 def mix(
     codes: np.ndarray,  # (N, K) float32
     ids: np.ndarray,  # (M,) int32
+    start: np.ndarray,  # (M + 1,)
+    labels: np.ndarray,  # (P,) int32
     likelihood: np.ndarray,  # (L, K) float32
 ) -> np.ndarray:
-    """Return what each visible Gaussian says of each label, codes[ids] @ likelihood.T: (M, L) float32."""
-    out = np.empty((ids.shape[0], likelihood.shape[0]), np.float32)
+    """Return what each Gaussian says of the labels under which it is seen, codes[i] . likelihood[y]: (P,) float32."""
+    out = np.empty(labels.shape[0], np.float32)
     for m in nb.prange(ids.shape[0]):
         row = codes[ids[m]]
-        for y in range(likelihood.shape[0]):
+        for s in range(start[m], start[m + 1]):
+            told = likelihood[labels[s]]
             total = np.float32(0.0)
             for k in range(row.shape[0]):
-                total += row[k] * likelihood[y, k]
-            out[m, y] = total
+                total += row[k] * told[k]
+            out[s] = total
     return out
 
 
 @nb.njit(parallel=True, nogil=True, cache=True, fastmath={"contract"})
 def collect(
     ids: np.ndarray,  # (M,) int32, distinct
+    start: np.ndarray,  # (M + 1,)
+    labels: np.ndarray,  # (P,) int32
     likelihood: np.ndarray,  # (L, K) float32
-    shares: np.ndarray,  # (M, L) float32
+    shares: np.ndarray,  # (P,) float32
     gains: np.ndarray,  # (N, K) int64, in units of GAIN_UNIT, added to
 ) -> None:
-    """Add shares @ likelihood to the gains of the visible Gaussians.
-
-    Most Gaussians are seen under one label or two, so most of the products are skipped.
-    """
+    """Add to the gains of each Gaussian its shares times the likelihoods of their labels."""
     for m in nb.prange(ids.shape[0]):
         gain = gains[ids[m]]
-        for y in range(likelihood.shape[0]):
-            share = shares[m, y]
-            if share > 0:
-                for k in range(likelihood.shape[1]):
-                    gain[k] += in_units(share * likelihood[y, k])
+        for s in range(start[m], start[m + 1]):
+            share, told = shares[s], likelihood[labels[s]]
+            for k in range(told.shape[0]):
+                gain[k] += in_units(share * told[k])
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
@@ -101,20 +102,22 @@ def improve(
 def tally(
     codes: np.ndarray,  # (N, K) float32
     ids: np.ndarray,  # (M,) int32
-    shares: np.ndarray,  # (M, L) float32
+    start: np.ndarray,  # (M + 1,)
+    labels: np.ndarray,  # (P,) int32
+    shares: np.ndarray,  # (P,) float32
+    many: int,
 ) -> np.ndarray:
-    """Return codes[ids].T @ shares, (K, L) float64: how much of each class lies under each label."""
-    many, classes = shares.shape[1], codes.shape[1]
+    """Return the sum over the sightings of codes[i] times share, by label, (K, L) float64: what lies under each."""
+    classes = codes.shape[1]
     parts = np.zeros((BLOCKS, many, classes))
     for block in nb.prange(BLOCKS):
         part = parts[block]
         for m in range(ids.shape[0] * block // BLOCKS, ids.shape[0] * (block + 1) // BLOCKS):
             code = codes[ids[m]]
-            for y in range(many):
-                share = shares[m, y]
-                if share > 0:
-                    for k in range(classes):
-                        part[y, k] += share * code[k]
+            for s in range(start[m], start[m + 1]):
+                row = part[labels[s]]
+                for k in range(classes):
+                    row[k] += shares[s] * code[k]
     counts: np.ndarray = parts.sum(axis=0).T
     return counts
 
@@ -123,13 +126,14 @@ def tally(
 def add_votes(
     total: np.ndarray,  # (N, K) int64, added to
     ids: np.ndarray,  # (M,) int32, distinct
-    classes: np.ndarray,  # (L,) int32, distinct
-    votes: np.ndarray,  # (M, L) float32
+    start: np.ndarray,  # (M + 1,)
+    classes: np.ndarray,  # (P,) int32: class of each sighting
+    votes: np.ndarray,  # (P,) float32
     units: float,  # per vote; a power of 2
     sign: int,
 ) -> None:
     """Add a view's votes, or take them away, in whole units."""
     for m in nb.prange(ids.shape[0]):
         row = total[ids[m]]
-        for y in range(classes.shape[0]):
-            row[classes[y]] += sign * np.int64(np.rint(np.float64(votes[m, y]) * units))
+        for s in range(start[m], start[m + 1]):
+            row[classes[s]] += sign * np.int64(np.rint(np.float64(votes[s]) * units))

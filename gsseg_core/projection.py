@@ -19,6 +19,7 @@ import numpy as np
 
 from gsseg_core.cameras import Camera
 from gsseg_core.depth_sort import sort_by_depth
+from gsseg_core.lanes import HEIGHT, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
 from gsseg_core.scene import GaussianScene
 
 NEAR = 0.01
@@ -35,9 +36,6 @@ FRUSTUM_MARGIN = 0.3
 
 REACH_MAX = 1e6
 """A reach is cut off here, in px: far beyond any image, and safely an integer."""
-
-# Columns of the table of projected Gaussians.
-U, V, SHEAR, WIDTH, HEIGHT, LOG_OPACITY, Y_REACH, X_TURN = range(8)
 
 HALF_LOG2E = 0.5 / np.log(2.0)
 

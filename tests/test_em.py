@@ -205,9 +205,9 @@ def test_sums_over_views_do_not_depend_on_order_or_grouping(groups: list[int], o
 
 def test_what_was_all_but_ruled_out_does_not_overflow_the_sums() -> None:
     codes, gains = np.full((1, 2), 0.5, np.float32), np.zeros((1, 2), np.int64)
-    share, likelihood = np.array([[1e30]], np.float32), np.array([[1.0, 1e-30]], np.float32)
+    share, likelihood = np.array([1e30], np.float32), np.array([[1.0, 1e-30]], np.float32)
     for _ in range(255):
-        collect(np.zeros(1, np.int32), likelihood, share, gains)
+        collect(np.zeros(1, np.int32), np.array([0, 1]), np.zeros(1, np.int32), likelihood, share, gains)
     np.testing.assert_allclose(gains * GAIN_UNIT, [[255 * 2.0**27, 255.0]], rtol=1e-6)
     improve(codes, gains, np.zeros_like(codes))
     np.testing.assert_allclose(codes, [[1.0, 0.0]], atol=1e-6)
