@@ -153,13 +153,14 @@ def _lift_tile(
             weight, bits = blend_row(rays, r, lines, table[g, WIDTH])
             if not bits & _OPEN:
                 live &= ~(1 << r)
-            hit |= np.int64(bits > _OPEN) << r
+            touched = bits >> LANES
             for span in range(span_start[tile * TILE + r], span_start[tile * TILE + r + 1]):
                 if slots[span] != current:
                     if current >= 0:
                         sums[(e - first) * many + current] += sum_row(apart)
                     current, apart = np.int64(slots[span]), nothing()
                 apart = add_where(apart, weight, np.int64(lanes[span]))
+                hit |= np.int64(touched & lanes[span] > 0) << r
         if current >= 0:
             sums[(e - first) * many + current] += sum_row(apart)
         reached[e] = hit
