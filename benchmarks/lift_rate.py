@@ -29,8 +29,20 @@ from machine import once
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from gsseg_core.lanes import ALPHA_MAX, LANES, LOG_ALPHA_MIN, T_MIN
-from gsseg_core.projection import HEIGHT, LOG_OPACITY, SHEAR, WIDTH, Y_REACH, Projected, U, V
+from gsseg_core.lanes import (
+    ALPHA_MAX,
+    HEIGHT,
+    LANES,
+    LOG_ALPHA_MIN,
+    LOG_OPACITY,
+    SHEAR,
+    T_MIN,
+    WIDTH,
+    Y_REACH,
+    U,
+    V,
+)
+from gsseg_core.projection import Projected
 from gsseg_core.tiles import TILE, Tiles
 
 FLOPS, INSTRUCTIONS = 17, 19  # of one evaluation, per pixel and per sixteen

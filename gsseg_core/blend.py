@@ -13,14 +13,29 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from gsseg_core.lanes import LOG_ALPHA_MIN, blend_row, prefetch
-from gsseg_core.projection import HEIGHT, LOG_OPACITY, SHEAR, WIDTH, Y_REACH, U, V
+from gsseg_core.lanes import LANES, WIDTH, aim, blend_row, first_bit, prefetch, store_row
 from gsseg_core.tiles import TILE
-
-_CUT = np.float32(LOG_ALPHA_MIN)
 
 AHEAD = 12
 """Entries between the one that is blended and the one that is fetched from memory."""
+
+_OPEN = (1 << LANES) - 1
+
+
+@nb.njit(inline="always")
+def open_rays(
+    tile: int,
+    columns: int,  # tiles across
+    width: int,  # px
+    height: int,  # px
+    transmittance: np.ndarray,  # (16, 16) float32 out
+) -> tuple[np.float32, np.float32, int]:
+    """Begin with a tile: the pixel centre of its corner, and a bit for each of its rows that is in the image."""
+    left, top = (tile % columns) * TILE, (tile // columns) * TILE
+    for r in range(TILE):
+        for c in range(TILE):
+            transmittance[r, c] = 1.0 if top + r < height and left + c < width else 0.0
+    return np.float32(left + 0.5), np.float32(top + 0.5), (1 << min(TILE, height - top)) - 1
 
 
 @nb.njit(fastmath={"contract"}, error_model="numpy")
@@ -39,35 +54,23 @@ def blend_tile(
     ends: np.ndarray,  # (last - first,) int32 out: one past the last record of each entry
 ) -> int:
     """Make the records of one tile; returns how many of its entries were blended before every ray had ended."""
-    left, top = (tile % columns) * TILE, (tile // columns) * TILE
-    live = np.zeros(TILE, np.bool_)
-    live_rows = 0
-    for r in range(TILE):
-        inside = top + r < height
-        live[r] = inside
-        live_rows += inside
-        for c in range(TILE):
-            transmittance[r, c] = 1.0 if inside and left + c < width else 0.0
+    left, top, live = open_rays(tile, columns, width, height, transmittance)
+    lines = np.empty((2, TILE), np.float32)
     n = 0
     for e in range(first, last):
         prefetch(table, entries[min(e + AHEAD, last - 1)])
         g = entries[e]
-        u, v = table[g, U] - np.float32(left + 0.5), table[g, V] - np.float32(top + 0.5)
-        shear, wide, high, log_opacity = table[g, SHEAR], table[g, WIDTH], table[g, HEIGHT], table[g, LOG_OPACITY]
-        reach = table[g, Y_REACH]
-        for r in range(max(0, int(np.ceil(v - reach))), min(TILE, int(np.floor(v + reach)) + 1)):
-            if not live[r]:
-                continue
-            dy = np.float32(r) - v
-            peak = log_opacity - high * dy * dy
-            x = u + shear * dy
-            bits = blend_row(transmittance, r, weights, n, x, peak, wide)
+        reached = aim(table, g, left, top, lines) & live
+        while reached:
+            r = first_bit(reached)
+            reached &= reached - 1
+            weight, bits = blend_row(transmittance, r, lines, table[g, WIDTH])
+            store_row(weights, n, weight)
             rows[n] = r
-            n += int(bits >= np.uint32(65536))
-            if not bits & np.uint32(65535):
-                live[r] = False
-                live_rows -= 1
+            n += bits > _OPEN
+            if not bits & _OPEN:
+                live &= ~(1 << r)
         ends[e - first] = n
-        if live_rows == 0:
+        if not live:
             return e - first + 1
     return last - first

@@ -22,6 +22,7 @@ from gsseg_core.dataset import View
 from gsseg_core.em import EMLearner, ErrorModel
 from gsseg_core.errors import GssegError, SchedulerError
 from gsseg_core.learner import Learner, Progress, silent
+from gsseg_core.rows import Rows
 from gsseg_core.scene import GaussianScene
 from gsseg_core.scheduler import PATIENCE, UNREACHABLE, check_workers, find_workers, name_of
 from gsseg_core.shard import (
@@ -97,7 +98,7 @@ class _OnWorkers(Learner):
         views: Mapping[str, View],
         tell: Callable[[int], None],
         models: Mapping[str, ErrorModel] | None = None,
-        *arrays: np.ndarray,  # each (N, K)
+        *values: Any,
     ) -> Part:
         """Sum up what a task makes of these views; `tell` is called with how many of them are done, time and again.
 
@@ -111,7 +112,7 @@ class _OnWorkers(Learner):
         for _ in range(ATTEMPTS):
             used: list[Future] = []
             try:
-                return self._try_to_sum(used, task, views, tell, models or {}, arrays)
+                return self._try_to_sum(used, task, views, tell, models or {}, values)
             except (_LostError, CancelledError):
                 self._shares = []
             finally:
@@ -127,10 +128,10 @@ class _OnWorkers(Learner):
         views: Mapping[str, View],
         tell: Callable[[int], None],
         models: Mapping[str, ErrorModel],
-        arrays: Sequence[np.ndarray],
+        values: Sequence[Any],
     ) -> Part:
         shares = self._deal(views, tell)
-        copies = [self._send(array, [share.worker for share in shares]) for array in arrays]
+        copies = [self._send(value, [share.worker for share in shares]) for value in values]
         used += [future for copy in copies for future in copy.values()]
         parts = []
         for share in shares:
@@ -193,9 +194,10 @@ class _OnWorkers(Learner):
     def _send(self, value: Any, workers: list[str]) -> dict[str, Future]:
         """Put a value on each of these workers: on the first one from here, and from there on along a tree."""
         try:
-            copies: list[Future] = [
-                self._client.scatter(value, workers[:1], direct=self._direct, hash=False, timeout=PATIENCE)
-            ]
+            # In a list, since of a tuple Dask would send every element by itself.
+            copies: list[Future] = self._client.scatter(
+                [value], workers[:1], direct=self._direct, hash=False, timeout=PATIENCE
+            )
         except UNREACHABLE as error:
             self._direct = False  # Perhaps only the scheduler can reach the workers.
             raise _LostError from error
@@ -247,7 +249,7 @@ class DistributedEM(_OnWorkers, EMLearner):
 
     def _first_models(
         self,
-        votes: np.ndarray,  # (N, K)
+        votes: Rows,  # int64
         tell: Callable[[], None],
         names: Iterable[str] | None = None,
     ) -> dict[str, ErrorModel]:
@@ -256,7 +258,7 @@ class DistributedEM(_OnWorkers, EMLearner):
 
     def _gains(
         self,
-        codes: np.ndarray,  # (N, K)
+        codes: Rows,
         models: dict[str, ErrorModel],
         tell: Callable[[], None],
     ) -> tuple[np.ndarray, dict[str, float]]:
@@ -264,9 +266,9 @@ class DistributedEM(_OnWorkers, EMLearner):
 
     def _refit(
         self,
-        codes: np.ndarray,  # (N, K)
-        gains: np.ndarray,  # (N, K) int64
-        prior: np.ndarray,  # (N, K)
+        codes: Rows,
+        gains: np.ndarray,  # (Z,) int64
+        prior: np.ndarray,  # (Z,) px
         models: dict[str, ErrorModel],
         tell: Callable[[], None],
     ) -> dict[str, ErrorModel]:

@@ -41,10 +41,11 @@ from functools import partial
 import numpy as np
 
 from gsseg_core.errors import SettingsError
-from gsseg_core.gaussian_kernels import add_votes, collect, improve, mix, tally
-from gsseg_core.learner import VOTE_UNIT, Learner, Progress, normalise, silent
+from gsseg_core.gaussian_kernels import collect, improve, mix, take_votes, tally
+from gsseg_core.learner import VOTE_UNIT, Learner, Progress, silent
 from gsseg_core.neighbours import neighbours_of
 from gsseg_core.operator import Observation
+from gsseg_core.rows import Rows
 from gsseg_core.scene import GaussianScene
 
 
@@ -190,36 +191,38 @@ class EMLearner(Learner):
         """Step until a step gains less than the tolerance."""
         settings = self.settings
         self._begin()
-        prior = settings.prior_weight * self._smooth(self.vote_codes())
-        # Votes are the first step; with the prior counted in, the objective is finite from the start.
-        codes = normalise(self._votes.astype(np.float32) * np.float32(VOTE_UNIT) + prior)
+        votes = Rows.of(self._votes)
+        counted, prior = votes.united(self._smooth(votes))
+        # Votes are the first step; with the prior counted in, the objective is finite from the start. What is zero now
+        # is zero after every step, so the codes keep these places.
+        codes = counted.with_values(counted.values.astype(np.float32) * np.float32(VOTE_UNIT) + prior.values).normalised()
         history: list[float] = []
         self.history_ = history
         tell = partial(progress, "em", 0, settings.max_steps)
-        models = self._first_models(self._votes, tell)
+        models = self._first_models(votes, tell)
         pixels = sum(model.num_pixels for model in models.values())
         self.rounds_ = rounds = [0]
         while len(history) < settings.max_steps:
             tell = partial(progress, "em", len(history), settings.max_steps)
             gains, told = self._gains(codes, models, tell)
-            history.append((_log_prior(codes, prior) + sum(told[name] for name in self.views)) / pixels)
+            history.append((_log_prior(codes.values, prior.values) + sum(told[name] for name in self.views)) / pixels)
             rounds[-1] += 1
             self.converged_ = rounds[-1] > 1 and history[-1] - history[-2] < settings.tolerance
             if self.converged_ and (len(rounds) > settings.refits or not settings.errors):
-                improve(codes, gains, prior)
+                improve(codes.start, codes.values, gains, prior.values)
                 break
             if self.converged_:
-                self._refit(codes, gains, prior, models, tell)
+                self._refit(codes, gains, prior.values, models, tell)
                 rounds.append(0)
-            improve(codes, gains, prior)
+            improve(codes.start, codes.values, gains, prior.values)
         progress("em", settings.max_steps, settings.max_steps)
-        codes[~self.observed_] = 0.0
-        self.codes_, self.error_models_ = codes, models
+        self.codes_, self.error_models_ = codes.dense(self.num_classes), models
+        self.codes_[~self.observed_] = 0.0
         return self
 
     def _first_models(
         self,
-        votes: np.ndarray,  # (N, K) int64
+        votes: Rows,  # int64
         tell: Callable[[], None],
         names: Iterable[str] | None = None,
     ) -> dict[str, ErrorModel]:
@@ -230,17 +233,24 @@ class EMLearner(Learner):
             models[name] = self._first_model(votes, observation)
         return models
 
-    def _first_model(self, votes: np.ndarray, observation: Observation) -> ErrorModel:
+    def _first_model(self, votes: Rows, observation: Observation) -> ErrorModel:
         settings, classes, pixels = self.settings, observation.classes, observation.num_pixels
         if not settings.errors:
             return ErrorModel.trusting(classes, self.num_classes, settings.outliers, pixels)
-        own = observation.votes()
-        counts = tally(*_of_others(votes, observation.ids, classes, own), own)
+        counts = self._counted(votes, observation)
         return ErrorModel.from_counts(classes, counts, settings.error_prior, settings.outliers, pixels)
+
+    def _counted(self, votes: Rows, observation: Observation) -> np.ndarray:
+        """Count the pixels (K, L) of each class under each label of a view, by the votes of all the others."""
+        places, own = votes.places(observation.ids), observation.votes()
+        others = places.with_values(votes.values[places.values])
+        take_votes(*others, observation.start, observation.classes[observation.labels], own, 1 / VOTE_UNIT)
+        codes = others.with_values(others.values.astype(np.float32)).normalised()
+        return tally(*codes, observation.start, observation.labels, own, self.num_classes, len(observation.classes))
 
     def _gains(
         self,
-        codes: np.ndarray,  # (N, K)
+        codes: Rows,
         models: dict[str, ErrorModel],
         tell: Callable[[], None],
     ) -> tuple[np.ndarray, dict[str, float]]:
@@ -248,74 +258,62 @@ class EMLearner(Learner):
 
         Returns
         -------
-        gains : (N, K) int64
-            sum_v sum_y C_v[k, y] B_v[i, y], in units of `GAIN_UNIT`.
+        gains : (Z,) int64
+            sum_v sum_y C_v[k, y] B_v[i, y], in units of `GAIN_UNIT`, for each entry of the codes.
         told : dict of str to float
             The part of J that is each view's own, at the codes and models that came in.
         """
-        gains, told = np.zeros(codes.shape, np.int64), {}
+        gains, told = np.zeros(len(codes.values), np.int64), {}
         for name, observation in self._observations(models):
             tell()  # after each view, so that whoever listens can stop the work at once
-            model = models[name]
-            likelihood = np.ascontiguousarray(model.likelihood.T)
-            shares = observation.shares(mix(codes, observation.ids, likelihood), likelihood[:, 0])
+            likelihood = np.ascontiguousarray(models[name].likelihood.T)
+            seen = observation.ids, observation.start, observation.labels, likelihood
+            shares = observation.shares(mix(*codes, *seen), likelihood[:, 0])
             told[name] = shares.log_likelihood
-            collect(observation.ids, likelihood, shares.gaussians, gains)
+            collect(codes.start, codes.classes, gains, *seen, shares.sightings)
         return gains, told
 
     def _refit(
         self,
-        codes: np.ndarray,  # (N, K)
-        gains: np.ndarray,  # (N, K) int64, of a step at these codes and models
-        prior: np.ndarray,  # (N, K) px
+        codes: Rows,
+        gains: np.ndarray,  # (Z,) int64, of a step at these codes and models
+        prior: np.ndarray,  # (Z,) px
         models: dict[str, ErrorModel],
         tell: Callable[[], None],
     ) -> dict[str, ErrorModel]:
         """Learn each view's error model anew, from the codes that the step would give without this view."""
         for name, observation in self._observations(models):
             tell()
-            model, ids = models[name], observation.ids
-            likelihood, here = np.ascontiguousarray(model.likelihood.T), np.arange(len(ids), dtype=np.int32)
-            shares = observation.shares(mix(codes, ids, likelihood), likelihood[:, 0])
-            own = np.zeros((len(ids), codes.shape[1]), np.int64)
-            collect(here, likelihood, shares.gaussians, own)  # Exactly what the view has given to the gains.
-            without = codes[ids]
-            improve(without, gains[ids] - own, prior[ids])
-            shares = observation.shares(mix(without, here, likelihood), likelihood[:, 0])
-            counts = tally(without, here, shares.gaussians)
+            model, (start, classes, places) = models[name], codes.places(observation.ids)
+            likelihood = np.ascontiguousarray(model.likelihood.T)
+            here = np.arange(len(observation.ids), dtype=np.int32)
+            seen = here, observation.start, observation.labels, likelihood
+            without, own = codes.values[places], np.zeros(len(places), np.int64)
+            shares = observation.shares(mix(start, classes, without, *seen), likelihood[:, 0])
+            collect(start, classes, own, *seen, shares.sightings)  # Exactly what the view has given to the gains.
+            improve(start, without, gains[places] - own, prior[places])
+            shares = observation.shares(mix(start, classes, without, *seen), likelihood[:, 0])
+            counts = tally(
+                start, classes, without, observation.start, observation.labels, shares.sightings,
+                self.num_classes, len(model.classes),
+            )  # fmt: skip
             counts[0] += shares.rest
             model.maximise(counts * (1 - model.outliers) * model.confusion)
         return models
 
-    def _smooth(
-        self,
-        votes: np.ndarray,  # (N, K)
-    ) -> np.ndarray:
-        """Mean code of those of the nearest Gaussians that were observed; rows of zeros where none was."""
-        smooth = np.zeros_like(votes)
+    def _smooth(self, votes: Rows) -> Rows:
+        """Weigh the mean code of those of the nearest Gaussians that were observed; rows without where none was."""
         neighbours = neighbours_of(self.scene, self.settings.prior_k)
-        if neighbours is not None:
-            ids, means = neighbours.mean_codes(votes, self.observed_, np.ones(len(votes), bool))
-            smooth[ids] = normalise(means)
-        return smooth
-
-
-def _of_others(
-    votes: np.ndarray,  # (N, K) int64, of all views
-    ids: np.ndarray,  # (M,)
-    classes: np.ndarray,  # (L,)
-    own: np.ndarray,  # (M, L) float32, of one of them
-) -> tuple[np.ndarray, np.ndarray]:
-    """Codes (M, K) by the votes of all views but one, for the Gaussians that this one sees; and their numbers."""
-    others = np.ascontiguousarray(votes[ids])
-    here = np.arange(len(ids), dtype=np.int32)
-    add_votes(others, here, classes, own, 1 / VOTE_UNIT, -1)
-    return normalise(others.astype(np.float32)), here
+        if neighbours is None or self.settings.prior_weight == 0:
+            return Rows(np.zeros_like(votes.start), np.empty(0, np.uint32), np.empty(0, np.float32))
+        codes = votes.with_values(votes.values.astype(np.float32) * np.float32(VOTE_UNIT)).normalised()
+        smooth = neighbours.mean_codes(codes, self.observed_, self.num_classes).normalised()
+        return smooth.with_values(np.float32(self.settings.prior_weight) * smooth.values)
 
 
 def _log_prior(
-    codes: np.ndarray,  # (N, K)
-    prior: np.ndarray,  # (N, K) px
+    codes: np.ndarray,  # (Z,)
+    prior: np.ndarray,  # (Z,) px
 ) -> float:
     told = prior > 0
     return float((prior[told] * np.log(codes[told])).sum(dtype=np.float64))

@@ -44,92 +44,120 @@ def in_units(_: Any, __: Any) -> Any:
 
 @nb.njit(parallel=True, nogil=True, cache=True, fastmath={"contract", "reassoc"})
 def mix(
-    codes: np.ndarray,  # (N, K) float32
+    rows: np.ndarray,  # (N + 1,) codes, as `Rows`
+    classes: np.ndarray,  # (Z,) uint32
+    codes: np.ndarray,  # (Z,) float32
     ids: np.ndarray,  # (M,) int32
+    start: np.ndarray,  # (M + 1,)
+    labels: np.ndarray,  # (P,) int32
     likelihood: np.ndarray,  # (L, K) float32
 ) -> np.ndarray:
-    """Return what each visible Gaussian says of each label, codes[ids] @ likelihood.T: (M, L) float32."""
-    out = np.empty((ids.shape[0], likelihood.shape[0]), np.float32)
+    """Return what each Gaussian says of the labels under which it is seen, codes[i] . likelihood[y]: (P,) float32."""
+    out = np.empty(labels.shape[0], np.float32)
     for m in nb.prange(ids.shape[0]):
-        row = codes[ids[m]]
-        for y in range(likelihood.shape[0]):
-            total = np.float32(0.0)
-            for k in range(row.shape[0]):
-                total += row[k] * likelihood[y, k]
-            out[m, y] = total
+        mine = slice(rows[ids[m]], rows[ids[m] + 1])
+        code, which = codes[mine], classes[mine]
+        for s in range(start[m], start[m + 1]):
+            told, total = likelihood[labels[s]], np.float32(0.0)
+            for z in range(code.shape[0]):
+                total += code[z] * told[which[z]]
+            out[s] = total
     return out
 
 
-@nb.njit(parallel=True, nogil=True, cache=True, fastmath={"contract"})
+@nb.njit(parallel=True, nogil=True, cache=True)
 def collect(
+    rows: np.ndarray,  # (N + 1,) gains, as `Rows`
+    classes: np.ndarray,  # (Z,)
+    gains: np.ndarray,  # (Z,) int64, in units of GAIN_UNIT, added to
     ids: np.ndarray,  # (M,) int32, distinct
+    start: np.ndarray,  # (M + 1,)
+    labels: np.ndarray,  # (P,) int32
     likelihood: np.ndarray,  # (L, K) float32
-    shares: np.ndarray,  # (M, L) float32
-    gains: np.ndarray,  # (N, K) int64, in units of GAIN_UNIT, added to
+    shares: np.ndarray,  # (P,) float32
 ) -> None:
-    """Add shares @ likelihood to the gains of the visible Gaussians.
-
-    Most Gaussians are seen under one label or two, so most of the products are skipped.
-    """
+    """Add to the gains of each Gaussian its shares times the likelihoods of their labels."""
     for m in nb.prange(ids.shape[0]):
-        gain = gains[ids[m]]
-        for y in range(likelihood.shape[0]):
-            share = shares[m, y]
-            if share > 0:
-                for k in range(likelihood.shape[1]):
-                    gain[k] += in_units(share * likelihood[y, k])
+        mine = slice(rows[ids[m]], rows[ids[m] + 1])
+        gain, which = gains[mine], classes[mine]
+        for s in range(start[m], start[m + 1]):
+            told, share = likelihood[labels[s]], shares[s]
+            for z in range(gain.shape[0]):
+                gain[z] += in_units(share * told[which[z]])
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def improve(
-    codes: np.ndarray,  # (N, K) float32, changed in place
-    gains: np.ndarray,  # (N, K) int64, in units of GAIN_UNIT
-    prior: np.ndarray,  # (N, K) float32, px
+    rows: np.ndarray,  # (N + 1,) all three, as `Rows`
+    codes: np.ndarray,  # (Z,) float32, changed in place
+    gains: np.ndarray,  # (Z,) int64, in units of GAIN_UNIT
+    prior: np.ndarray,  # (Z,) float32, px
 ) -> None:
     """Set the codes to normalise(codes * gains + prior); rows of zeros stay zero."""
-    for i in nb.prange(codes.shape[0]):
-        code, total = codes[i], np.float32(0.0)
-        for k in range(codes.shape[1]):
-            code[k] = code[k] * (np.float32(gains[i, k]) * _GAIN_UNIT) + prior[i, k]
-            total += code[k]
+    for i in nb.prange(rows.shape[0] - 1):
+        total = np.float32(0.0)
+        for z in range(rows[i], rows[i + 1]):
+            codes[z] = codes[z] * (np.float32(gains[z]) * _GAIN_UNIT) + prior[z]
+            total += codes[z]
         if total > 0:
-            for k in range(codes.shape[1]):
-                code[k] /= total
+            for z in range(rows[i], rows[i + 1]):
+                codes[z] /= total
 
 
-@nb.njit(parallel=True, nogil=True, cache=True, fastmath={"contract"})
+@nb.njit(parallel=True, nogil=True, cache=True)
 def tally(
-    codes: np.ndarray,  # (N, K) float32
-    ids: np.ndarray,  # (M,) int32
-    shares: np.ndarray,  # (M, L) float32
+    rows: np.ndarray,  # (M + 1,) codes, as `Rows`
+    classes: np.ndarray,  # (Z,)
+    codes: np.ndarray,  # (Z,) float32
+    start: np.ndarray,  # (M + 1,)
+    labels: np.ndarray,  # (P,) int32
+    shares: np.ndarray,  # (P,) float32
+    num_classes: int,
+    num_labels: int,
 ) -> np.ndarray:
-    """Return codes[ids].T @ shares, (K, L) float64: how much of each class lies under each label."""
-    many, classes = shares.shape[1], codes.shape[1]
-    parts = np.zeros((BLOCKS, many, classes))
+    """Return the sum over the sightings of codes[i] times share, by label, (K, L) float64: what lies under each."""
+    many = start.shape[0] - 1
+    parts = np.zeros((BLOCKS, num_classes, num_labels))
     for block in nb.prange(BLOCKS):
         part = parts[block]
-        for m in range(ids.shape[0] * block // BLOCKS, ids.shape[0] * (block + 1) // BLOCKS):
-            code = codes[ids[m]]
-            for y in range(many):
-                share = shares[m, y]
-                if share > 0:
-                    for k in range(classes):
-                        part[y, k] += share * code[k]
-    counts: np.ndarray = parts.sum(axis=0).T
+        for m in range(many * block // BLOCKS, many * (block + 1) // BLOCKS):
+            for s in range(start[m], start[m + 1]):
+                for z in range(rows[m], rows[m + 1]):
+                    part[classes[z], labels[s]] += shares[s] * codes[z]
+    counts: np.ndarray = parts.sum(axis=0)
     return counts
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def take_votes(
+    rows: np.ndarray,  # (M + 1,) votes, as `Rows`
+    classes: np.ndarray,  # (Z,)
+    total: np.ndarray,  # (Z,) int64, taken from
+    start: np.ndarray,  # (M + 1,)
+    sighted: np.ndarray,  # (P,) class of each sighting
+    votes: np.ndarray,  # (P,) float32
+    units: float,  # per vote; a power of 2
+) -> None:
+    """Take a view's votes away from those of all, row by row."""
+    for m in nb.prange(start.shape[0] - 1):
+        for s in range(start[m], start[m + 1]):
+            for z in range(rows[m], rows[m + 1]):
+                if classes[z] == np.uint32(sighted[s]):
+                    total[z] -= np.int64(np.rint(np.float64(votes[s]) * units))
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def add_votes(
     total: np.ndarray,  # (N, K) int64, added to
     ids: np.ndarray,  # (M,) int32, distinct
-    classes: np.ndarray,  # (L,) int32, distinct
-    votes: np.ndarray,  # (M, L) float32
+    start: np.ndarray,  # (M + 1,)
+    classes: np.ndarray,  # (P,) int32: class of each sighting
+    votes: np.ndarray,  # (P,) float32
     units: float,  # per vote; a power of 2
     sign: int,
 ) -> None:
     """Add a view's votes, or take them away, in whole units."""
     for m in nb.prange(ids.shape[0]):
         row = total[ids[m]]
-        for y in range(classes.shape[0]):
-            row[classes[y]] += sign * np.int64(np.rint(np.float64(votes[m, y]) * units))
+        for s in range(start[m], start[m + 1]):
+            row[classes[s]] += sign * np.int64(np.rint(np.float64(votes[s]) * units))

@@ -128,15 +128,15 @@ class _CrossEntropy(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, probabilities: torch.Tensor, observation: Observation) -> torch.Tensor:
-        classes, ids = observation.classes, observation.ids
-        codes = probabilities.detach().numpy()[ids[:, None], classes]
-        shares = observation.shares(codes, (classes == 0).astype(np.float32))
+        rows, classes = np.repeat(observation.ids, np.diff(observation.start)), observation.classes[observation.labels]
+        said = probabilities.detach().numpy()[rows, classes]
+        shares = observation.shares(said, (observation.classes == 0).astype(np.float32))
         scale = 1.0 / (observation.num_pixels * probabilities.shape[1])
-        ctx.shape, ctx.observation, ctx.gradient = probabilities.shape, observation, -scale * shares.gaussians
+        ctx.shape, ctx.where, ctx.gradient = probabilities.shape, (rows, classes), -scale * shares.sightings
         return torch.tensor(-scale * shares.log_likelihood, dtype=probabilities.dtype)
 
     @staticmethod
     def backward(ctx: Any, upstream: torch.Tensor) -> tuple[torch.Tensor, None]:
         gradient = np.zeros(ctx.shape, np.float32)
-        gradient[ctx.observation.ids[:, None], ctx.observation.classes] = ctx.gradient
+        gradient[ctx.where] = ctx.gradient
         return upstream * torch.from_numpy(gradient), None

@@ -18,6 +18,7 @@ from typing import Any
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic as typed_intrinsic
+from numba.extending import models, register_model
 
 # Callers give all arguments but the first, which its types do not know.
 intrinsic: Any = typed_intrinsic
@@ -31,7 +32,10 @@ LOG_ALPHA_MIN = -math.log2(255.0)
 T_MIN = 1e-4
 """A ray ends when its transmittance falls below this."""
 
-_F32, _I32 = ir.FloatType(), ir.IntType(32)
+# Columns of the table of projected Gaussians.
+U, V, SHEAR, WIDTH, HEIGHT, LOG_OPACITY, Y_REACH, X_TURN = range(8)
+
+_F32, _I32, _I64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 _ROW, _BITS = ir.VectorType(_F32, LANES), ir.VectorType(_I32, LANES)
 _COLUMNS = ir.Constant(_ROW, [float(i) for i in range(LANES)])
 
@@ -46,6 +50,22 @@ _EXP2 = (
 )
 
 
+class _RowType(types.Type):
+    """Sixteen float32 in a register."""
+
+    def __init__(self) -> None:
+        super().__init__(name="Row")
+
+
+_row_type = _RowType()
+
+
+@register_model(_RowType)
+class _RowModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, _ROW)
+
+
 class _Builder:
     """Writes operations on rows of sixteen into the code of one function."""
 
@@ -55,12 +75,33 @@ class _Builder:
 
     def row(self, position: int) -> Any:
         """Address of a row: argument `position` is the array, the next one the row's number."""
-        kind = self.signature.args[position]
-        array = self.context.make_array(kind)(self.context, self.llvm, self.arguments[position])
-        number = self.arguments[position + 1]
+        return self.address(position, self.arguments[position + 1])
+
+    def address(self, position: int, number: Any) -> Any:
+        """Address of a row of the array that is argument `position`."""
         first = self.llvm.mul(number, ir.Constant(number.type, LANES))
-        address = self.llvm.gep(array.data, [first], source_etype=_F32)
-        return self.llvm.bitcast(address, ir.PointerType(_ROW))
+        return self.llvm.bitcast(self.element(position, first), ir.PointerType(_ROW))
+
+    def element(self, position: int, number: Any) -> Any:
+        """Address of one entry of the array that is argument `position`."""
+        array = self.context.make_array(self.signature.args[position])(self.context, self.llvm, self.arguments[position])
+        return self.llvm.gep(array.data, [number], source_etype=_F32)
+
+    def columns(self, position: int) -> Callable[[int], Any]:
+        """Columns of a row of eight: argument `position` is the array, the next one the row's number."""
+        number = self.arguments[position + 1]
+        first = self.llvm.mul(number, ir.Constant(number.type, 8))
+
+        def column(j: int) -> Any:
+            place = self.llvm.add(first, ir.Constant(number.type, j))
+            return self.llvm.load(self.element(position, place), align=4, typ=_F32)
+
+        return column
+
+    def one_of(self, position: int, i: int, number: Any) -> Any:
+        """Entry `number` of row i, sixteen times."""
+        place = self.llvm.add(number, ir.Constant(number.type, i * LANES))
+        return self.spread(self.llvm.load(self.element(position, place), align=4, typ=_F32))
 
     def load(self, address: Any) -> Any:
         """Read a row; NumPy aligns arrays to 16 bytes only."""
@@ -72,9 +113,35 @@ class _Builder:
 
     def scalar(self, position: int) -> Any:
         """Argument `position`, a float32, sixteen times."""
+        return self.spread(self.arguments[position])
+
+    def spread(self, value: Any) -> Any:
+        """Sixteen times a float32."""
         undefined, first = ir.Constant(_ROW, ir.Undefined), ir.Constant(_I32, 0)
-        single = self.llvm.insert_element(undefined, self.arguments[position], first)
+        single = self.llvm.insert_element(undefined, value, first)
         return self.llvm.shuffle_vector(single, undefined, ir.Constant(_BITS, [0] * LANES))
+
+    def bits(self, lanes: Any) -> Any:
+        """Sixteen truth values as the low bits of an int64."""
+        return self.llvm.zext(self.llvm.bitcast(lanes, ir.IntType(LANES)), _I64)
+
+    def lanes(self, position: int) -> Any:
+        """Low bits of argument `position`, an int64, as sixteen truth values."""
+        low = self.llvm.trunc(self.arguments[position], ir.IntType(LANES))
+        return self.llvm.bitcast(low, ir.VectorType(ir.IntType(1), LANES))
+
+    def least(self, a: Any, b: Any) -> Any:
+        """Take the smaller one in each lane."""
+        return self.llvm.select(self.llvm.fcmp_ordered("<", a, b), a, b)
+
+    def most(self, a: Any, b: Any) -> Any:
+        """Take the larger one in each lane."""
+        return self.llvm.select(self.llvm.fcmp_ordered(">", a, b), a, b)
+
+    def rint(self, a: Any) -> Any:
+        """Round to whole numbers."""
+        # Not by adding and subtracting a large number, which a caller compiled with fastmath would cancel.
+        return self.llvm.call(self._instruction("rint", _ROW, [_ROW]), [a])
 
     def fma(self, a: Any, b: Any, c: Any) -> Any:
         """Multiply and add, a * b + c, with one rounding."""
@@ -93,8 +160,7 @@ class _Builder:
     def exp2(self, power: Any) -> Any:
         """2^power for powers in [-126, 127]; anything for others."""
         llvm = self.llvm
-        # Not by adding and subtracting a large number, which a caller compiled with fastmath would cancel.
-        whole = llvm.call(self._instruction("rint", _ROW, [_ROW]), [power])
+        whole = self.rint(power)
         f = llvm.fsub(power, whole)
         value = _row(_EXP2[-1])
         for coefficient in _EXP2[-2::-1]:
@@ -109,35 +175,157 @@ def _row(value: float) -> Any:
 
 
 @intrinsic
-def blend_row(
-    typing: Any, rays: Any, r: Any, records: Any, n: Any, x: Any, peak: Any, wide: Any
-) -> tuple[Any, Callable[..., Any]]:
-    """Blend one Gaussian into row r of the rays: write its weights to record n, return whether a ray is still open.
+def aim(typing: Any, table: Any, g: Any, left: Any, top: Any, lines: Any) -> tuple[Any, Callable[..., Any]]:
+    """Tell which rows of a tile a Gaussian reaches: bit r is set if alpha is at least 1/255 at some pixel of row r.
 
-    In column c its log2 of alpha is peak - wide * (c - x)^2; below that of 1/255 alpha counts as 0.
+    The tile's first pixel has its centre at (left, top). For each row, lines[0] gets the column of the largest alpha,
+    and lines[1] what log2 of alpha would be there.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         row = _Builder(context, builder, signature, arguments)
-        offset = builder.fsub(_COLUMNS, row.scalar(4))
-        power = row.fma(builder.fneg(row.scalar(6)), builder.fmul(offset, offset), row.scalar(5))
+        column = row.columns(0)
+        dy = builder.fsub(_COLUMNS, row.spread(builder.fsub(column(V), arguments[3])))
+        x = row.fma(row.spread(column(SHEAR)), dy, row.spread(builder.fsub(column(U), arguments[2])))
+        high = row.spread(builder.fneg(column(HEIGHT)))
+        peak = row.fma(high, builder.fmul(dy, dy), row.spread(column(LOG_OPACITY)))
+        row.store(x, row.address(4, ir.Constant(_I64, 0)))
+        row.store(peak, row.address(4, ir.Constant(_I64, 1)))
+        # No pixel of the row is nearer than this one, and its alpha is computed as `blend_row` does: so the bit says
+        # exactly what will be found there.
+        nearest = row.rint(row.least(row.most(x, _row(0.0)), _row(LANES - 1.0)))
+        offset = builder.fsub(nearest, x)
+        power = row.fma(row.spread(builder.fneg(column(WIDTH))), builder.fmul(offset, offset), peak)
+        return row.bits(builder.fcmp_ordered(">=", power, _row(LOG_ALPHA_MIN)))
+
+    number = types.float32
+    return types.int64(table, types.intp, number, number, lines), generate
+
+
+@intrinsic
+def first_bit(typing: Any, bits: Any) -> tuple[Any, Callable[..., Any]]:
+    """Position of the lowest bit that is set; there must be one."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
+
+    return types.int64(types.int64), generate
+
+
+@intrinsic
+def count_bits(typing: Any, bits: Any) -> tuple[Any, Callable[..., Any]]:
+    """How many bits are set."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.ctpop(arguments[0])
+
+    return types.int64(types.int64), generate
+
+
+@intrinsic
+def blend_row(typing: Any, rays: Any, r: Any, lines: Any, wide: Any) -> tuple[Any, Callable[..., Any]]:
+    """Blend one Gaussian into row r of the rays.
+
+    In column c its log2 of alpha is peak - wide * (c - x)^2, with x and peak from `aim`; below that of 1/255 alpha
+    counts as 0. Returns its weights, and bits: the low sixteen say which rays are still open, the next which ones were hit.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        row = _Builder(context, builder, signature, arguments)
+        offset = builder.fsub(_COLUMNS, row.one_of(2, 0, arguments[1]))
+        peak = row.one_of(2, 1, arguments[1])
+        power = row.fma(row.spread(builder.fneg(arguments[3])), builder.fmul(offset, offset), peak)
         alpha = row.exp2(power)
         alpha = builder.select(builder.fcmp_ordered("<", alpha, _row(ALPHA_MAX)), alpha, _row(ALPHA_MAX))
         address = row.row(0)
         before = row.load(address)
-        counts = builder.and_(
+        hit = builder.and_(
             builder.fcmp_ordered(">=", power, _row(LOG_ALPHA_MIN)), builder.fcmp_ordered(">=", before, _row(T_MIN))
         )
-        weight = builder.select(counts, builder.fmul(alpha, before), _row(0.0))
+        weight = builder.select(hit, builder.fmul(alpha, before), _row(0.0))
         after = builder.fsub(before, weight)
-        row.store(weight, row.row(2))
         row.store(after, address)
-        open_rays = builder.bitcast(builder.fcmp_ordered(">=", after, _row(T_MIN)), ir.IntType(LANES))
-        hit = builder.bitcast(counts, ir.IntType(LANES))
-        return builder.or_(builder.shl(builder.zext(hit, _I32), ir.Constant(_I32, 16)), builder.zext(open_rays, _I32))
+        still_open = row.bits(builder.fcmp_ordered(">=", after, _row(T_MIN)))
+        bits = builder.or_(builder.shl(row.bits(hit), ir.Constant(_I64, LANES)), still_open)
+        return context.make_tuple(builder, signature.return_type, [weight, bits])
 
-    number = types.float32
-    return types.uint32(rays, r, records, n, number, number, number), generate
+    return types.Tuple((_row_type, types.int64))(rays, r, lines, types.float32), generate
+
+
+@intrinsic
+def nothing(typing: Any) -> tuple[Any, Callable[..., Any]]:
+    """Sixteen zeros."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return _row(0.0)
+
+    return _row_type(), generate
+
+
+@intrinsic
+def store_row(typing: Any, target: Any, i: Any, a: Any) -> tuple[Any, Callable[..., Any]]:
+    """Set target[i] to sixteen numbers."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        row = _Builder(context, builder, signature, arguments)
+        row.store(arguments[2], row.row(0))
+        return context.get_dummy_value()
+
+    return types.void(target, i, a), generate
+
+
+@intrinsic
+def load_row(typing: Any, source: Any, i: Any) -> tuple[Any, Callable[..., Any]]:
+    """Read source[i]."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        row = _Builder(context, builder, signature, arguments)
+        return row.load(row.row(0))
+
+    return _row_type(source, i), generate
+
+
+@intrinsic
+def add_where(typing: Any, total: Any, a: Any, lanes: Any) -> tuple[Any, Callable[..., Any]]:
+    """Add two rows in the lanes of the bits that are set; elsewhere the first stays."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        row = _Builder(context, builder, signature, arguments)
+        return builder.select(row.lanes(2), builder.fadd(arguments[0], arguments[1]), arguments[0])
+
+    return _row_type(total, a, types.int64), generate
+
+
+@intrinsic
+def add_product_where(typing: Any, total: Any, a: Any, b: Any, lanes: Any) -> tuple[Any, Callable[..., Any]]:
+    """Add a product of two rows in the lanes of the bits that are set."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        row = _Builder(context, builder, signature, arguments)
+        return builder.select(row.lanes(3), row.fma(arguments[1], arguments[2], arguments[0]), arguments[0])
+
+    return _row_type(total, a, b, types.int64), generate
+
+
+@intrinsic
+def add_scaled_where(typing: Any, total: Any, a: Any, factor: Any, lanes: Any) -> tuple[Any, Callable[..., Any]]:
+    """Add a multiple of a row in the lanes of the bits that are set."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        row = _Builder(context, builder, signature, arguments)
+        return builder.select(row.lanes(3), row.fma(row.scalar(2), arguments[1], arguments[0]), arguments[0])
+
+    return _row_type(total, a, types.float32, types.int64), generate
+
+
+@intrinsic
+def sum_row(typing: Any, a: Any) -> tuple[Any, Callable[..., Any]]:
+    """Sum of the sixteen."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return _Builder(context, builder, signature, arguments).sum(arguments[0])
+
+    return types.float32(a), generate
 
 
 @intrinsic
@@ -162,49 +350,6 @@ def add_scaled(typing: Any, target: Any, i: Any, a: Any, j: Any, factor: Any) ->
         return context.get_dummy_value()
 
     return types.void(target, i, a, j, types.float32), generate
-
-
-@intrinsic
-def add_product(typing: Any, target: Any, i: Any, a: Any, j: Any, b: Any, k: Any) -> tuple[Any, Callable[..., Any]]:
-    """Add a[j] * b[k] to target[i]."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        row = _Builder(context, builder, signature, arguments)
-        address = row.row(0)
-        row.store(row.fma(row.load(row.row(2)), row.load(row.row(4)), row.load(address)), address)
-        return context.get_dummy_value()
-
-    return types.void(target, i, a, j, b, k), generate
-
-
-@intrinsic
-def add_scaled_product(
-    typing: Any, target: Any, i: Any, a: Any, j: Any, b: Any, k: Any, factor: Any
-) -> tuple[Any, Callable[..., Any]]:
-    """Add factor * a[j] * b[k] to target[i]."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        row = _Builder(context, builder, signature, arguments)
-        address = row.row(0)
-        product = builder.fmul(row.load(row.row(2)), row.load(row.row(4)))
-        row.store(row.fma(row.scalar(6), product, row.load(address)), address)
-        return context.get_dummy_value()
-
-    return types.void(target, i, a, j, b, k, types.float32), generate
-
-
-@intrinsic
-def take_sum(typing: Any, a: Any, i: Any) -> tuple[Any, Callable[..., Any]]:
-    """Sum of a[i] over the sixteen; a[i] is zero afterwards."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        row = _Builder(context, builder, signature, arguments)
-        address = row.row(0)
-        total = row.sum(row.load(address))
-        row.store(_row(0.0), address)
-        return total
-
-    return types.float32(a, i), generate
 
 
 @intrinsic

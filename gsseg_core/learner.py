@@ -247,7 +247,8 @@ def count_votes(
     sign: int = 1,
 ) -> None:
     """Add a view's votes, or take them away, in units of `VOTE_UNIT`."""
-    add_votes(total, observation.ids, observation.classes, observation.votes(), 1 / VOTE_UNIT, sign)
+    classes = observation.classes[observation.labels]
+    add_votes(total, observation.ids, observation.start, classes, observation.votes(), 1 / VOTE_UNIT, sign)
 
 
 def normalise(

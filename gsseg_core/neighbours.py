@@ -18,6 +18,7 @@ from weakref import WeakKeyDictionary
 import numba as nb
 import numpy as np
 
+from gsseg_core.rows import Rows
 from gsseg_core.scene import GaussianScene
 
 LEAF = 16
@@ -30,6 +31,7 @@ CODE_UNIT = 2.0**-24
 """Codes are summed in steps of this, which is the precision of a float32 near 1."""
 
 SUBTREE = 8  # levels of a subtree that one thread builds alone: about 4000 points
+BLOCK = 1 << 16  # points whose mean codes are written out at once
 CHUNK = 256  # consecutive queries of one thread, each bounded by the one before
 SLACK = np.float32(1.00001)  # covers float32 rounding in a bound
 TINY = np.float32(1e-30)
@@ -69,26 +71,33 @@ class Neighbours:
 
     def mean_codes(
         self,
-        codes: np.ndarray,  # (N, K) float32 in [0, 1]
+        codes: Rows,  # N rows of K classes, float32 in [0, 1]
         counted: np.ndarray,  # (N,) bool
-        wanted: np.ndarray,  # (N,) bool
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Mean code of those of the k nearest others that are counted, for the points wanted; order as of the scene.
+        num_classes: int,
+        wanted: np.ndarray | None = None,  # (N,) bool
+    ) -> Rows:
+        """Mean code of those of the k nearest others that are counted, for all points or for those wanted.
 
         Returns
         -------
-        ids : (M,) int32
-            Points that are wanted and have such neighbours.
-        means : (M, K) float32
-            Their neighbours' mean codes.
+        Rows
+            N rows; one without entries where there is no such neighbour, or the point is not wanted.
         """
         order, tree = self.tree.order, self.tree
-        places = np.flatnonzero(wanted[order]).astype(np.int32)
-        units = np.zeros(codes.shape, np.int32)
-        units[counted[order]] = np.rint(codes[order[counted[order]]] * np.float32(1 / CODE_UNIT))
-        out = np.empty((len(places), codes.shape[1]), np.float32)
-        found = average(tree.points, tree.boxes, units, counted[order], places, self.radii, self.k, out)
-        return order[places[found]], out[found]
+        of_points = codes.places(order)
+        units = np.rint(codes.values[of_points.values] * np.float32(1 / CODE_UNIT)).astype(np.int32)
+        asked = np.arange(len(order)) if wanted is None else np.flatnonzero(wanted[order])
+        # A block at a time is written out in full, so that of all the codes only what is not zero is ever in memory.
+        parts = []
+        for first in range(0, max(len(asked), 1), BLOCK):
+            places = asked[first : first + BLOCK].astype(np.int32)
+            out = np.zeros((len(places), num_classes), np.float32)
+            average(
+                tree.points, tree.boxes, of_points.start, of_points.classes, units, counted[order], places,
+                self.radii, self.k, out,
+            )  # fmt: skip
+            parts.append(Rows.of(out))
+        return Rows.joined(parts).moved(order[asked], len(order))
 
     def mean_distances(
         self,
@@ -340,20 +349,18 @@ def _smallest(values: np.ndarray, n: int, k: int) -> np.float32:
 def average(
     points: np.ndarray,  # (3, n)
     boxes: np.ndarray,  # (2 L, 6)
-    units: np.ndarray,  # (n, K) int32, codes in steps of CODE_UNIT, 0 for points that do not count
+    rows: np.ndarray,  # (n + 1,) codes, as `Rows`
+    classes: np.ndarray,  # (Z,)
+    units: np.ndarray,  # (Z,) int32, in steps of CODE_UNIT
     counted: np.ndarray,  # (n,) bool
     places: np.ndarray,  # (M,) int32
     radii: np.ndarray,  # (n,), squared distance to the k-th nearest other
     k: int,
-    out: np.ndarray,  # (M, K), written where found
-) -> np.ndarray:
-    """Mean code of the k nearest others that count; those exactly at the radius share the places that are left.
-
-    Returns which of the M have any such neighbour.
-    """
+    out: np.ndarray,  # (M, K) in: zeros; out: mean codes, zeros where no neighbour counts
+) -> None:
+    """Mean code of the k nearest others that count; those exactly at the radius share the places that are left."""
     leaves, n = boxes.shape[0] // 2, points.shape[1]
-    m, num_classes = places.shape[0], units.shape[1]
-    found = np.zeros(m, np.bool_)
+    m, num_classes = places.shape[0], out.shape[1]
     for chunk in nb.prange((m + CHUNK - 1) // CHUNK):
         sums = np.empty((2, num_classes), np.int64)  # inside the radius, and on it
         counts = np.empty((2, 2), np.int64)  # the same, and of these the ones that count
@@ -380,15 +387,13 @@ def average(
                         counts[tied, 0] += 1
                         if counted[i]:
                             counts[tied, 1] += 1
-                            for c in range(num_classes):
-                                sums[tied, c] += units[i, c]
+                            for e in range(rows[i], rows[i + 1]):
+                                sums[tied, classes[e]] += units[e]
             if counts[0, 1] + counts[1, 1] > 0:
                 share = (k - counts[0, 0]) / counts[1, 0]
                 total = (counts[0, 1] + share * counts[1, 1]) / CODE_UNIT
                 for c in range(num_classes):
                     out[q, c] = (sums[0, c] + share * sums[1, c]) / total
-                found[q] = True
-    return found
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)

@@ -51,15 +51,15 @@ class Shares(NamedTuple):
 
     Attributes
     ----------
-    gaussians : (M, L) float32
-        Sum over the pixels of each label of w[p, i] / likelihood[p].
+    sightings : (P,) float32
+        For each, the sum over the pixels of its label of w[p, i] / likelihood[p].
     rest : (L,) float64
         The same for what the rays had left over, T_end[p] / likelihood[p].
     log_likelihood : float
         Sum over the labelled pixels of log likelihood[p], natural.
     """
 
-    gaussians: np.ndarray
+    sightings: np.ndarray
     rest: np.ndarray
     log_likelihood: float
 
@@ -67,13 +67,19 @@ class Shares(NamedTuple):
 class Observation(ABC):
     """A view with its mask: W cut down, in each pixel, to the label that was seen there.
 
-    It serves votes, the paper's loss and its gradient, and every step of EM, at a cost that does not depend on the
-    number of classes.
+    A *sighting* is a Gaussian with one of the labels under which this view sees it, that is with a weight above zero in
+    some pixel of that label. Most Gaussians are seen under one label only, so there are about as many sightings as
+    Gaussians that are seen, however many labels the mask has. Votes, the paper's loss and its gradient, and every step
+    of EM need one number per sighting.
 
     Attributes
     ----------
     ids : (M,) int32
-        Gaussians that reach the image, as indices in the scene.
+        Gaussians that some labelled pixel sees, as indices in the scene.
+    start : (M + 1,) int64
+        Sightings of ids[m] are start[m] to start[m + 1].
+    labels : (P,) int32
+        Label of each sighting, as its position in `classes`.
     classes : (L,) int32
         Labels that occur in the mask, ascending.
     num_pixels : int
@@ -81,6 +87,8 @@ class Observation(ABC):
     """
 
     ids: np.ndarray
+    start: np.ndarray
+    labels: np.ndarray
     classes: np.ndarray
     num_pixels: int
 
@@ -91,31 +99,30 @@ class Observation(ABC):
 
     @abstractmethod
     def votes(self) -> np.ndarray:
-        """Weights summed by label: W^T onehot(y), (M, L) float32."""
+        """Sum of weights of each sighting, the entries of W^T onehot(y) that are not zero: (P,) float32, in px."""
 
     @abstractmethod
     def shares(
         self,
-        codes: np.ndarray,  # (M, L)
+        said: np.ndarray,  # (P,)
         rest: np.ndarray,  # (L,)
     ) -> Shares:
         """Share one vote per labelled pixel among the Gaussians that made it.
 
-        With likelihood[p] = (W codes)[p, y_p] + T_end[p] rest[y_p], the share of Gaussian i in label y is the sum over
-        the pixels of that label of w[p, i] / likelihood[p]. It is the gradient of the log likelihood with respect to
-        codes[i, y].
+        With likelihood[p] = (W said)[p, y_p] + T_end[p] rest[y_p], the share of a sighting is the sum over the pixels
+        of its label of w[p, i] / likelihood[p]. It is the gradient of the log likelihood with respect to what was said.
 
         Parameters
         ----------
-        codes : (M, L) float32
-            What each Gaussian says of each label in `classes`, at least 0.
+        said : (P,) float32
+            What each Gaussian says of the label under which it is seen, at least 0.
         rest : (L,) float32
             What the background says of each label.
 
         Raises
         ------
         SceneValueError
-            The codes are not of these shapes.
+            They are not of these shapes.
         """
 
 

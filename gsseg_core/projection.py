@@ -19,6 +19,7 @@ import numpy as np
 
 from gsseg_core.cameras import Camera
 from gsseg_core.depth_sort import sort_by_depth
+from gsseg_core.lanes import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
 from gsseg_core.scene import GaussianScene
 
 NEAR = 0.01
@@ -36,15 +37,20 @@ FRUSTUM_MARGIN = 0.3
 REACH_MAX = 1e6
 """A reach is cut off here, in px: far beyond any image, and safely an integer."""
 
-# Columns of the table of projected Gaussians.
-U, V, SHEAR, WIDTH, HEIGHT, LOG_OPACITY, Y_REACH, X_TURN = range(8)
-
 HALF_LOG2E = 0.5 / np.log(2.0)
 
 LARGEST_REACH = np.sqrt(2.0 * np.log(255.0))
 """Standard deviations at which a Gaussian of opacity 1 falls to 1/255."""
 
 ROOT = np.sqrt(DILATION)
+
+_ALPHA_MIN = np.float32(ALPHA_MIN)
+
+BLOCK = 256
+"""Gaussians that are looked at together before those among them that may be visible are projected."""
+
+SHORT = 32
+"""Gaussians at one depth, at most, that are sorted by insertion."""
 
 CHUNKS = 16
 """Parts of the scene that are projected beside each other."""
@@ -93,13 +99,45 @@ def _break_ties(
     depth: np.ndarray,  # (N,)
     table: np.ndarray,  # (N, 8)
 ) -> None:
-    equal = np.flatnonzero(np.diff(depth[rows[order]]) == 0)
-    if len(equal) == 0:
-        return
-    tied = np.union1d(equal, equal + 1)
-    group = rows[order[tied]]
-    keys = (*table[group].T[::-1], depth[group])
-    order[tied] = order[tied][np.lexsort(keys)]
+    left = _break_short_ties(order, rows, depth, table)
+    if len(left):
+        group = rows[order[left]]
+        keys = (*table[group].T[::-1], depth[group])
+        order[left] = order[left][np.lexsort(keys)]
+
+
+@nb.njit(nogil=True, cache=True)
+def _break_short_ties(order: np.ndarray, rows: np.ndarray, depth: np.ndarray, table: np.ndarray) -> np.ndarray:
+    """Sort runs of equal depth by their rows of the table; returns the places of those too long for it."""
+    many = order.shape[0]
+    left, n = np.empty(many, np.int64), 0
+    first = 0
+    while first < many:
+        own = depth[rows[order[first]]]
+        last = first + 1
+        while last < many and depth[rows[order[last]]] == own:
+            last += 1
+        if last - first > SHORT:
+            for m in range(first, last):
+                left[n] = m
+                n += 1
+        else:
+            for m in range(first + 1, last):
+                moving, free = order[m], m
+                while free > first and _is_before(table[rows[moving]], table[rows[order[free - 1]]]):
+                    order[free] = order[free - 1]
+                    free -= 1
+                order[free] = moving
+        first = last
+    return left[:n].copy()
+
+
+@nb.njit
+def _is_before(one: np.ndarray, other: np.ndarray) -> bool:
+    for j in range(one.shape[0]):
+        if one[j] != other[j]:
+            return bool(one[j] < other[j])
+    return False
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
@@ -128,15 +166,68 @@ def _project(
     ids: np.ndarray,  # (N,) out, the same
     found: np.ndarray,  # (CHUNKS,) out: how many
 ) -> None:
+    limits = _limits(K, width, height)
     for chunk in nb.prange(CHUNKS):
         first, last = chunk * means.shape[0] // CHUNKS, (chunk + 1) * means.shape[0] // CHUNKS
+        near = np.empty(BLOCK, np.bool_)
         n = first
-        for i in range(first, last):
-            z = _project_one(i, means, quats, scales, opacities, viewmat, K, width, height, table[n])
-            if z > 0:
-                depth[n], ids[n] = z, i
-                n += 1
+        for begin in range(first, last, BLOCK):
+            end = min(begin + BLOCK, last)
+            _find_near(means[begin:end], scales[begin:end], opacities[begin:end], viewmat, K, width, height, limits, near)
+            for i in range(begin, end):
+                if near[i - begin]:
+                    z = _project_one(i, means, quats, scales, opacities, viewmat, K, width, height, limits, table[n])
+                    if z > 0:
+                        depth[n], ids[n] = z, i
+                        n += 1
         found[chunk] = n - first
+
+
+@nb.njit
+def _limits(
+    K: np.ndarray,  # (3, 3)
+    width: float,
+    height: float,
+) -> tuple[float, float, float, float]:
+    """Between which x / z and y / z the camera is linearised."""
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
+    return -cx / fx - margin_x, (width - cx) / fx + margin_x, -cy / fy - margin_y, (height - cy) / fy + margin_y
+
+
+@nb.njit(error_model="numpy", fastmath={"contract", "nnan", "ninf", "nsz"})
+def _find_near(
+    means: np.ndarray,  # (B, 3)
+    scales: np.ndarray,  # (B, 3)
+    opacities: np.ndarray,  # (B,)
+    viewmat: np.ndarray,  # (4, 4)
+    K: np.ndarray,  # (3, 3)
+    width: float,
+    height: float,
+    limits: tuple[float, float, float, float],
+    near: np.ndarray,  # (BLOCK,) bool out
+) -> None:
+    """Throw out most of what is off the image before the costly part, by instructions for several Gaussians at once.
+
+    The reach is bounded by the longest axis and opacity 1, with sqrt(a^2 + b^2) <= |a| + |b|, twice.
+    """
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    r00, r01, r02, tx = viewmat[0, 0], viewmat[0, 1], viewmat[0, 2], viewmat[0, 3]
+    r10, r11, r12, ty = viewmat[1, 0], viewmat[1, 1], viewmat[1, 2], viewmat[1, 3]
+    r20, r21, r22, tz = viewmat[2, 0], viewmat[2, 1], viewmat[2, 2], viewmat[2, 3]
+    x_low, x_high, y_low, y_high = limits
+    for i in range(means.shape[0]):
+        mx, my, mz = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+        z = r20 * mx + r21 * my + r22 * mz + tz
+        ahead = z >= NEAR
+        z = z if ahead else 1.0
+        x, y = (r00 * mx + r01 * my + r02 * mz + tx) / z, (r10 * mx + r11 * my + r12 * mz + ty) / z
+        u, v = fx * x + cx, fy * y + cy
+        longest = np.float64(max(scales[i, 0], max(scales[i, 1], scales[i, 2]))) / z
+        bound_x = LARGEST_REACH * (longest * fx * (1.0 + abs(min(max(x, x_low), x_high))) + ROOT)
+        bound_y = LARGEST_REACH * (longest * fy * (1.0 + abs(min(max(y, y_low), y_high))) + ROOT)
+        across = (u + bound_x >= 0.0) & (u - bound_x <= width)
+        near[i] = ahead & (opacities[i] >= _ALPHA_MIN) & across & (v + bound_y >= 0.0) & (v - bound_y <= height)
 
 
 @nb.njit(error_model="numpy")
@@ -150,32 +241,20 @@ def _project_one(
     K: np.ndarray,
     width: float,
     height: float,
+    limits: tuple[float, float, float, float],
     out: np.ndarray,  # (8,) a row of the table
 ) -> float:
     """Project one Gaussian; returns its depth, 0 if it is not visible."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
-    x_low, x_high = -cx / fx - margin_x, (width - cx) / fx + margin_x
-    y_low, y_high = -cy / fy - margin_y, (height - cy) / fy + margin_y
-    opacity = np.float64(opacities[i])
+    x_low, x_high, y_low, y_high = limits
+    log_opacity = np.log2(np.float64(opacities[i]))
     mx, my, mz = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
     z = viewmat[2, 0] * mx + viewmat[2, 1] * my + viewmat[2, 2] * mz + viewmat[2, 3]
-    if z < NEAR or opacity < ALPHA_MIN:
-        return 0.0
     x = (viewmat[0, 0] * mx + viewmat[0, 1] * my + viewmat[0, 2] * mz + viewmat[0, 3]) / z
     y = (viewmat[1, 0] * mx + viewmat[1, 1] * my + viewmat[1, 2] * mz + viewmat[1, 3]) / z
     u, v = fx * x + cx, fy * y + cy
-
-    # A bound of the reach, by the longest axis and opacity 1, throws out most of what is off the image before the
-    # costly part. It uses sqrt(a^2 + b^2) <= |a| + |b|, twice.
     xc, yc = min(max(x, x_low), x_high), min(max(y, y_low), y_high)
-    longest = np.float64(max(scales[i, 0], max(scales[i, 1], scales[i, 2]))) / z
-    bound_x = LARGEST_REACH * (longest * fx * (1.0 + abs(xc)) + ROOT)
-    bound_y = LARGEST_REACH * (longest * fy * (1.0 + abs(yc)) + ROOT)
-    if u + bound_x < 0.0 or u - bound_x > width or v + bound_y < 0.0 or v - bound_y > height:
-        return 0.0
-
-    cut = 2.0 * np.log(opacity * 255.0)
+    cut = max((log_opacity - LOG_ALPHA_MIN) / HALF_LOG2E, 0.0)
     # Rows of J R_view, with J the Jacobian of the pinhole projection.
     ax = (fx / z) * (viewmat[0, 0] - xc * viewmat[2, 0])
     ay = (fx / z) * (viewmat[0, 1] - xc * viewmat[2, 1])
@@ -212,7 +291,7 @@ def _project_one(
     # var(x|y) = S_xx - S_xy^2 / S_yy is at least the dilation; rounding must not bring it below.
     out[WIDTH] = HALF_LOG2E / max(sxx - sxy * sxy / syy, DILATION)
     out[HEIGHT] = HALF_LOG2E / syy
-    out[LOG_OPACITY] = np.log2(opacity)
+    out[LOG_OPACITY] = log_opacity
     out[Y_REACH] = reach_y
     out[X_TURN] = min(max(sxy * np.sqrt(cut / sxx), -REACH_MAX), REACH_MAX)
     return float(z)

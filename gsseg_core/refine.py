@@ -12,6 +12,7 @@ import numpy as np
 
 from gsseg_core.neighbours import Neighbours, Tree, nearest, scaled
 from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.rows import Rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +77,11 @@ def cluster(
     wanted = ~observed | (codes.max(axis=1, initial=0) < beta)
     refined, changed = codes.copy(), np.zeros(len(codes), bool)
     if len(means) > 1 and wanted.any() and observed.any():
-        ids, refined_rows = (neighbours or Neighbours.find(means, k)).mean_codes(codes, observed, wanted)
-        refined[ids], changed[ids] = refined_rows, True
+        known = neighbours or Neighbours.find(means, k)
+        found = known.mean_codes(Rows.of(codes), observed, codes.shape[1], wanted)
+        changed = np.diff(found.start) > 0
+        refined[changed] = 0.0
+        found.write(refined)
     return Clustered(refined, changed)
 
 

@@ -21,10 +21,11 @@ from gsseg_core.dataset import View
 from gsseg_core.em import EMLearner, EMSettings, ErrorModel
 from gsseg_core.errors import GssegError
 from gsseg_core.learner import count_votes
+from gsseg_core.rows import Rows
 from gsseg_core.scene import GaussianScene
 
 Part = tuple[Any, dict[str, Any]]
-"""A sum over some views, (N, K) int64 or None, and by view what else came out."""
+"""A sum over some views, of int64, or None, and by view what else came out."""
 
 _BUSY = threading.Lock()
 
@@ -105,7 +106,7 @@ def sum_votes(shard: Shard, wanted: dict[str, Any]) -> Part:
 def start_models(
     shard: Shard,
     wanted: dict[str, Any],
-    votes: np.ndarray,  # (N, K) int64
+    votes: Rows,  # int64
 ) -> Part:
     """Make the first error model of each view."""
     with _all_threads():
@@ -115,7 +116,7 @@ def start_models(
 def sum_gains(
     shard: Shard,
     models: dict[str, ErrorModel],
-    codes: np.ndarray,  # (N, K)
+    codes: Rows,
 ) -> Part:
     """Sum up gains; beside them, each view's part of J."""
     with _all_threads():
@@ -125,9 +126,9 @@ def sum_gains(
 def refit_models(
     shard: Shard,
     models: dict[str, ErrorModel],
-    codes: np.ndarray,  # (N, K)
-    gains: np.ndarray,  # (N, K) int64
-    prior: np.ndarray,  # (N, K)
+    codes: Rows,
+    gains: np.ndarray,  # (Z,) int64
+    prior: np.ndarray,  # (Z,)
 ) -> Part:
     """Learn the views' error models anew."""
     with _all_threads():
@@ -155,9 +156,9 @@ def _all_threads() -> Iterator[None]:
         yield
 
 
-def _as_compiled_for(codes: np.ndarray) -> np.ndarray:
+def _as_compiled_for(rows: Rows) -> Rows:
     """Kernels would be compiled once more for arrays that cannot be written to, as those from the network may be."""
-    return np.require(codes, requirements=["C", "W"])
+    return Rows(*(np.require(array, requirements=["C", "W"]) for array in rows))
 
 
 def _go_on() -> None: ...

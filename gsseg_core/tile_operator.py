@@ -6,10 +6,10 @@ import numpy as np
 
 from gsseg_core import products
 from gsseg_core.cameras import Camera
-from gsseg_core.errors import SceneValueError
-from gsseg_core.operator import Blended, Observation, Shares, ViewOperator, Weights
+from gsseg_core.operator import Blended, Observation, ViewOperator, Weights
 from gsseg_core.projection import project
 from gsseg_core.scene import GaussianScene
+from gsseg_core.tile_observation import TileObservation
 from gsseg_core.tiles import TILE, assign
 
 
@@ -70,78 +70,4 @@ class TileOperator(ViewOperator):
         return Weights(pixels[order], self.ids[rows[order]], weights[order])
 
     def _observe(self, labels: np.ndarray) -> Observation:
-        return TileObservation(self, labels)
-
-
-class TileObservation(Observation):
-    """A view and its mask on the CPU."""
-
-    def __init__(
-        self,
-        operator: TileOperator,
-        labels: np.ndarray,  # (H, W)
-    ) -> None:
-        tiles = operator._tiles
-        self.ids = operator.ids
-        self._camera, self._table, self._tiles = operator.camera, operator._table, tiles
-        self.classes = np.unique(labels[labels >= 0]).astype(np.int32)
-        position = np.full(max(self.classes.max(initial=0) + 1, 1), -1, np.int32)
-        position[self.classes] = np.arange(len(self.classes))
-        local = np.where(labels >= 0, position[np.maximum(labels, 0)], -1).astype(np.int32)
-        self._label_start, self._present, self._slots = products.tile_labels(
-            local, tiles.columns, tiles.rows, len(self.classes)
-        )
-        self.num_pixels = int((labels >= 0).sum())
-        entries = np.diff(tiles.start)
-        self._slot_start = np.concatenate([[0], np.cumsum(entries * np.diff(self._label_start))])
-        self._entry_tile = np.repeat(np.arange(len(entries), dtype=np.int32), entries)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory that it holds, in bytes, the operator's included."""
-        tiles = self._tiles
-        held = (self._table, self.ids, tiles.start, tiles.entries, tiles.gaussian_start, tiles.gaussian_entries,
-                self._label_start, self._present, self._slots, self._slot_start, self._entry_tile)  # fmt: skip
-        return sum(array.nbytes for array in held)
-
-    def votes(self) -> np.ndarray:
-        """Sum the weights by label: W^T onehot(y), (M, L) float32."""
-        shape = (len(self.ids), len(self.classes))
-        return self._share(np.empty(shape, np.float32), np.zeros(shape[1], np.float32), divide=False).gaussians
-
-    def shares(
-        self,
-        codes: np.ndarray,  # (M, L)
-        rest: np.ndarray,  # (L,)
-    ) -> Shares:
-        """Share one vote per labelled pixel among the Gaussians that made it."""
-        codes, rest = np.ascontiguousarray(codes, np.float32), np.ascontiguousarray(rest, np.float32)
-        expected = (len(self.ids), len(self.classes))
-        if codes.shape != expected or rest.shape != expected[1:]:
-            raise SceneValueError(
-                f"view '{self._camera.name}': codes and rest have shapes {codes.shape} and {rest.shape}; "
-                f"expected {expected} and {expected[1:]}"
-            )
-        return self._share(codes, rest, divide=True)
-
-    def _share(
-        self,
-        codes: np.ndarray,  # (M, L)
-        rest: np.ndarray,  # (L,)
-        divide: bool,
-    ) -> Shares:
-        tiles = self._tiles
-        logs, left_over = np.zeros(len(self._slots)), np.zeros(len(self._present))
-        sums = np.empty(self._slot_start[-1], np.float32)
-        out = np.empty(codes.shape, np.float32)
-        products.labelled(
-            tiles.columns, self._camera.width, self._camera.height, self._table, tiles.start, tiles.entries,
-            self._label_start, self._present, self._slots, codes, rest, divide, self._slot_start,
-            logs, left_over, sums,
-        )  # fmt: skip
-        products.reduce_labelled(
-            tiles.start, tiles.gaussian_start, tiles.gaussian_entries, self._entry_tile,
-            self._label_start, self._present, self._slot_start, sums, out,
-        )  # fmt: skip
-        total = np.bincount(self._present, weights=left_over, minlength=codes.shape[1])
-        return Shares(out, total, float(logs.sum()))
+        return TileObservation(self.camera, self.ids, self._table, self._tiles, labels)

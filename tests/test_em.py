@@ -28,6 +28,7 @@ from gsseg_core.errors import SettingsError
 from gsseg_core.gaussian_kernels import GAIN_UNIT, collect, improve
 from gsseg_core.operator import make_operator
 from gsseg_core.scene import GaussianScene
+from gsseg_core.rows import Rows
 from gsseg_core.votes import VoteLearner
 
 SCENE, TRUTH = balls_on_a_table()
@@ -191,8 +192,8 @@ def test_the_order_of_the_gaussians_does_not_matter() -> None:
 @given(groups=st.lists(st.integers(0, 2), min_size=6, max_size=6), order=st.permutations(range(6)))
 def test_sums_over_views_do_not_depend_on_order_or_grouping(groups: list[int], order: list[int]) -> None:
     learner = taught(EMLearner(SCENE, NUM_CLASSES), wrong_views(6))
-    codes, names = learner.vote_codes() + np.float32(0.01), list(learner.views)
-    models = learner._first_models(codes, lambda: None)
+    codes, names = Rows.of(learner.vote_codes() + np.float32(0.01)), list(learner.views)
+    models = learner._first_models(Rows.of(learner._votes), lambda: None)
     whole, told = learner._gains(codes, deepcopy(models), lambda: None)
     parts = np.zeros_like(whole)
     for group in set(groups):
@@ -204,13 +205,15 @@ def test_sums_over_views_do_not_depend_on_order_or_grouping(groups: list[int], o
 
 
 def test_what_was_all_but_ruled_out_does_not_overflow_the_sums() -> None:
-    codes, gains = np.full((1, 2), 0.5, np.float32), np.zeros((1, 2), np.int64)
-    share, likelihood = np.array([[1e30]], np.float32), np.array([[1.0, 1e-30]], np.float32)
+    rows, classes = np.array([0, 2]), np.array([0, 1], np.int32)
+    codes, gains = np.full(2, 0.5, np.float32), np.zeros(2, np.int64)
+    one, start, label = np.zeros(1, np.int32), np.array([0, 1]), np.zeros(1, np.int32)
+    share, likelihood = np.array([1e30], np.float32), np.array([[1.0, 1e-30]], np.float32)
     for _ in range(255):
-        collect(np.zeros(1, np.int32), likelihood, share, gains)
-    np.testing.assert_allclose(gains * GAIN_UNIT, [[255 * 2.0**27, 255.0]], rtol=1e-6)
-    improve(codes, gains, np.zeros_like(codes))
-    np.testing.assert_allclose(codes, [[1.0, 0.0]], atol=1e-6)
+        collect(rows, classes, gains, one, start, label, likelihood, share)
+    np.testing.assert_allclose(gains * GAIN_UNIT, [255 * 2.0**27, 255.0], rtol=1e-6)
+    improve(rows, codes, gains, np.zeros_like(codes))
+    np.testing.assert_allclose(codes, [1.0, 0.0], atol=1e-6)
 
 
 def test_the_number_of_threads_does_not_matter_not_even_to_the_last_bit() -> None:

@@ -1,0 +1,199 @@
+"""Codes without their zeros: of K classes, a Gaussian has votes for a few, and so have those around it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+
+
+_NONE = np.uint32(2**32 - 1)
+
+
+class Rows(NamedTuple):
+    """Entries of an (N, K) array, row by row; all others are zero. What several of them share, they hold in common.
+
+    Attributes
+    ----------
+    start : (N + 1,) int64
+        Entries of row i are start[i] to start[i + 1].
+    classes : (Z,) uint32
+        Column of each entry, ascending in a row.
+    values : (Z,)
+        The entries.
+    """
+
+    start: np.ndarray
+    classes: np.ndarray
+    values: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        array: np.ndarray,  # (N, K)
+    ) -> Rows:
+        """Keep the entries above zero."""
+        array = np.ascontiguousarray(array)
+        start = np.zeros(len(array) + 1, np.int64)
+        _count(array, start[1:])
+        np.cumsum(start, out=start)
+        rows = cls(start, np.empty(start[-1], np.uint32), np.empty(start[-1], array.dtype))
+        _fill(array, *rows)
+        return rows
+
+    @classmethod
+    def joined(
+        cls,
+        parts: Sequence[Rows],  # at least one
+    ) -> Rows:
+        """Put rows below each other."""
+        lengths = np.concatenate([np.diff(part.start) for part in parts])
+        return cls(
+            np.concatenate([[0], np.cumsum(lengths)]),
+            np.concatenate([part.classes for part in parts]),
+            np.concatenate([part.values for part in parts]),
+        )
+
+    def with_values(self, values: np.ndarray) -> Rows:
+        """Have other entries in the same places."""
+        return self._replace(values=values)
+
+    def dense(self, num_classes: int) -> np.ndarray:
+        """Write out, zeros and all: (N, K)."""
+        out = np.zeros((len(self.start) - 1, num_classes), self.values.dtype)
+        self.write(out)
+        return out
+
+    def write(
+        self,
+        out: np.ndarray,  # (N, K)
+    ) -> None:
+        """Write the entries into an array, and leave the rest of it as it is."""
+        _write(*self, out)
+
+    def united(self, other: Rows) -> tuple[Rows, Rows]:
+        """Give both the places of either, filled up with zeros."""
+        start = np.zeros_like(self.start)
+        _count_united(self.start, self.classes, other.start, other.classes, start[1:])
+        np.cumsum(start, out=start)
+        classes = np.empty(start[-1], np.uint32)
+        values = np.empty(start[-1], self.values.dtype), np.empty(start[-1], other.values.dtype)
+        _unite(*self, *other, start, classes, *values)
+        return Rows(start, classes, values[0]), Rows(start, classes, values[1])
+
+    def moved(
+        self,
+        ids: np.ndarray,  # (N,) distinct
+        count: int,
+    ) -> Rows:
+        """Make row ids[i], of `count` rows, of row i; the others have no entries."""
+        source = np.full(count, -1, np.int64)
+        source[ids] = np.arange(len(ids))
+        start = np.zeros(count + 1, np.int64)
+        start[1:][ids] = np.diff(self.start)
+        np.cumsum(start, out=start)
+        places = self.places(source[source >= 0]).values
+        return Rows(start, self.classes[places], self.values[places])
+
+    def normalised(self) -> Rows:
+        """Scale each row of float32 to sum 1, in place; rows of zeros stay zero."""
+        _normalise(self.start, self.values)
+        return self
+
+    def places(
+        self,
+        ids: np.ndarray,  # (M,)
+    ) -> Rows:
+        """Of some rows, where in `values` their entries stand, as values: (Z',) int64."""
+        lengths = (self.start[1:] - self.start[:-1])[ids]
+        start = np.concatenate([[0], np.cumsum(lengths)])
+        places = np.empty(start[-1], np.int64)
+        _place(self.start, ids, start, places)
+        return Rows(start, self.classes[places], places)
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _count(array: np.ndarray, counts: np.ndarray) -> None:
+    for i in nb.prange(array.shape[0]):
+        n = 0
+        for k in range(array.shape[1]):
+            n += array[i, k] > 0
+        counts[i] = n
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _fill(array: np.ndarray, start: np.ndarray, classes: np.ndarray, values: np.ndarray) -> None:
+    for i in nb.prange(array.shape[0]):
+        z = start[i]
+        if z < start[i + 1]:
+            for k in range(array.shape[1]):
+                if array[i, k] > 0:
+                    classes[z], values[z] = k, array[i, k]
+                    z += 1
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _write(start: np.ndarray, classes: np.ndarray, values: np.ndarray, out: np.ndarray) -> None:
+    for i in nb.prange(out.shape[0]):
+        for z in range(start[i], start[i + 1]):
+            out[i, classes[z]] = values[z]
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _normalise(start: np.ndarray, values: np.ndarray) -> None:
+    for i in nb.prange(start.shape[0] - 1):
+        total = np.float32(0.0)
+        for z in range(start[i], start[i + 1]):
+            total += values[z]
+        if total > 0:
+            for z in range(start[i], start[i + 1]):
+                values[z] /= total
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _place(start: np.ndarray, ids: np.ndarray, part_start: np.ndarray, places: np.ndarray) -> None:
+    for m in nb.prange(ids.shape[0]):
+        for j in range(part_start[m + 1] - part_start[m]):
+            places[part_start[m] + j] = start[ids[m]] + j
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _count_united(
+    start: np.ndarray, classes: np.ndarray, other_start: np.ndarray, other_classes: np.ndarray, counts: np.ndarray
+) -> None:
+    for i in nb.prange(counts.shape[0]):
+        a, b, n = start[i], other_start[i], 0
+        while a < start[i + 1] or b < other_start[i + 1]:
+            first = classes[a] if a < start[i + 1] else _NONE
+            second = other_classes[b] if b < other_start[i + 1] else _NONE
+            a += first <= second
+            b += second <= first
+            n += 1
+        counts[i] = n
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _unite(
+    start: np.ndarray,
+    classes: np.ndarray,
+    values: np.ndarray,
+    other_start: np.ndarray,
+    other_classes: np.ndarray,
+    other_values: np.ndarray,
+    united_start: np.ndarray,
+    united_classes: np.ndarray,
+    united_values: np.ndarray,
+    united_other: np.ndarray,
+) -> None:
+    for i in nb.prange(start.shape[0] - 1):
+        a, b = start[i], other_start[i]
+        for z in range(united_start[i], united_start[i + 1]):
+            first = classes[a] if a < start[i + 1] else _NONE
+            second = other_classes[b] if b < other_start[i + 1] else _NONE
+            united_classes[z] = min(first, second)
+            united_values[z] = values[a] if first <= second else 0
+            united_other[z] = other_values[b] if second <= first else 0
+            a += first <= second
+            b += second <= first

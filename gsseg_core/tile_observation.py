@@ -1,0 +1,133 @@
+"""A view with its mask on the CPU: lifted once, and then only what was seen."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsseg_core import sightings
+from gsseg_core.cameras import Camera
+from gsseg_core.errors import SceneValueError
+from gsseg_core.lift import Labels, cut_labels, lift
+from gsseg_core.operator import Observation, Shares
+from gsseg_core.tiles import Tiles
+
+
+class TileObservation(Observation):
+    """W of one view, cut down to the Gaussians that its labelled pixels see; remade from them in every product.
+
+    Holds about 40 bytes per Gaussian that is seen and 18 per tile in which it is.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        ids: np.ndarray,  # (M,)
+        table: np.ndarray,  # (M, 8)
+        tiles: Tiles,
+        labels: np.ndarray,  # (H, W)
+    ) -> None:
+        self._camera = camera
+        areas = np.bincount(np.maximum(labels, -1).ravel() + 1, minlength=1)[1:]
+        self.classes = np.flatnonzero(areas).astype(np.int32)
+        self.num_pixels = int(areas.sum())
+        self._columns, self._labels = tiles.columns, _cut(labels, self.classes, tiles)
+        self._lift(ids, table, tiles)
+
+    def _lift(self, ids: np.ndarray, table: np.ndarray, tiles: Tiles) -> None:
+        mask, camera = self._labels, self._camera
+        many = np.diff(mask.start)
+        slot_start = _starts(np.diff(tiles.start) * many)
+        reached, sums = np.empty(len(tiles.entries), np.uint16), np.empty(slot_start[-1], np.float32)
+        counts = np.empty((len(many), 3), np.int64)
+        lift(
+            tiles.columns, camera.width, camera.height, table, tiles.start, tiles.entries,
+            mask.start, mask.span_start, mask.slots, mask.lanes, slot_start, reached, sums, counts,
+        )  # fmt: skip
+        self._start, self._slot_start = _starts(counts[:, 0]), _starts(counts[:, 0] * many)
+        self._records = counts[:, 1].copy()
+        kept, self._rows = np.empty((len(reached), 2), np.int32), np.empty(self._start[-1], np.uint16)
+        sightings.keep_entries(tiles.start, reached, self._start, kept, self._rows)
+
+        # A Gaussian has at most as many labels as sums, and each entry one sum, but for so many in all:
+        extra = counts[:, 2].sum() - counts[:, 0].sum()
+        chunks = np.arange(sightings.CHUNKS + 1) * len(ids) // sightings.CHUNKS
+        room = tiles.gaussian_start[chunks] + extra * np.arange(len(chunks))
+        found = np.empty((sightings.CHUNKS, 2), np.int64)
+        gaussians, label_counts = np.empty(len(ids), np.int32), np.empty(len(ids), np.int32)
+        labels, votes = np.empty(room[-1], np.int32), np.empty(room[-1], np.float32)
+        self._entries, self._sighting = np.empty(self._start[-1], np.int32), np.empty(self._slot_start[-1], np.int32)
+        sightings.number_sightings(
+            tiles.gaussian_start, tiles.gaussian_entries, kept, tiles.start, slot_start, sums, self._start,
+            self._slot_start, mask.start, mask.present, len(self.classes), room, found, gaussians, label_counts,
+            labels, votes, self._entries, self._sighting,
+        )  # fmt: skip
+        before = np.cumsum(found, axis=0) - found
+        sightings.settle(self._entries, before[:, 0])
+        sightings.settle(self._sighting, before[:, 1])
+        seen = _joined(gaussians, chunks, found[:, 0])
+        self.ids, self._table = ids[seen], table[seen]
+        self.start = _starts(_joined(label_counts, chunks, found[:, 0]))
+        self.labels, self._votes = _joined(labels, room, found[:, 1]), _joined(votes, room, found[:, 1])
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it holds, in bytes."""
+        mask = self._labels
+        held = (self.ids, self.start, self.labels, self._votes, self._table, self._start, self._entries, self._rows,
+                self._records, self._slot_start, self._sighting, mask.start, mask.present, mask.span_start, mask.slots,
+                mask.lanes)  # fmt: skip
+        return sum(array.nbytes for array in held)
+
+    def votes(self) -> np.ndarray:
+        """Weights summed by sighting, (P,) float32."""
+        return self._votes
+
+    def shares(
+        self,
+        said: np.ndarray,  # (P,)
+        rest: np.ndarray,  # (L,)
+    ) -> Shares:
+        """Share one vote per labelled pixel among the sightings that made it."""
+        said, rest = np.ascontiguousarray(said, np.float32), np.ascontiguousarray(rest, np.float32)
+        if said.shape != self.labels.shape or rest.shape != self.classes.shape:
+            raise SceneValueError(
+                f"view '{self._camera.name}': said and rest have shapes {said.shape} and {rest.shape}; "
+                f"expected {self.labels.shape} and {self.classes.shape}"
+            )
+        mask, camera = self._labels, self._camera
+        logs, left_over = np.zeros(len(self._records)), np.zeros(len(mask.present))
+        sums, parts = np.empty(self._slot_start[-1], np.float32), np.empty((sightings.PARTS, len(said)), np.float32)
+        sightings.share(
+            self._columns, camera.width, camera.height, self._table, self._start, self._entries, self._rows,
+            self._records, mask.start, mask.present, mask.span_start, mask.slots, mask.lanes, self._slot_start,
+            self._sighting, said, rest, logs, left_over, sums,
+        )  # fmt: skip
+        sightings.add_up(self._slot_start, self._sighting, sums, parts)
+        total = np.bincount(mask.present, weights=left_over, minlength=len(rest))
+        return Shares(parts.sum(axis=0), total, float(logs.sum()))
+
+
+def _cut(
+    labels: np.ndarray,  # (H, W)
+    classes: np.ndarray,  # (L,)
+    tiles: Tiles,
+) -> Labels:
+    """Number the labels that occur, and cut the mask into tiles."""
+    position = np.full(max(classes.max(initial=0) + 1, 1), -1, np.int32)
+    position[classes] = np.arange(len(classes))
+    local = np.where(labels >= 0, position[np.maximum(labels, 0)], -1).astype(np.int32)
+    return Labels(*cut_labels(local, tiles.columns, tiles.rows, len(classes)))
+
+
+def _starts(counts: np.ndarray) -> np.ndarray:
+    """Where each of several parts begins, and the last one ends."""
+    return np.concatenate([[0], np.cumsum(counts)])
+
+
+def _joined(
+    values: np.ndarray,
+    begins: np.ndarray,  # (CHUNKS + 1,)
+    counts: np.ndarray,  # (CHUNKS,)
+) -> np.ndarray:
+    """Put together what each chunk has written to its own part of the values."""
+    return np.concatenate([values[begin : begin + count] for begin, count in zip(begins, counts, strict=False)])
