@@ -94,15 +94,16 @@ def _lift_view(scene: GaussianScene, view: View, runs: int) -> dict[str, Any]:
     def first() -> np.ndarray:
         return first_lift(splats, tiles, local, many)
 
-    votes = observation.votes()
+    votes = np.zeros((len(operator.ids), many), np.float32)
+    votes[np.isin(operator.ids, observation.ids)] = observation.dense(observation.votes())
     return {
         "pairs": pairs,
         "evaluations": work.evaluations,
         "flops": work.flops,
         "instructions": work.instructions,
         "difference": float(np.abs(first() - votes).sum() / votes.sum()),
-        "lift": timed(observation.votes, runs),
-        "all": timed(lambda: make_operator(scene, camera).observe(mask).votes(), runs),
+        "lift": timed(lambda: operator.observe(mask), runs),
+        "all": timed(lambda: make_operator(scene, camera).observe(mask), runs),
         "first": timed(first, runs),
     }
 
@@ -145,12 +146,11 @@ def torch_step(folder: str) -> dict[str, float]:
     view = data.views("train")[0]
     plain, mask = PlainTorch(scene, data.num_classes), view.read_labels()
     ours = make_operator(scene, view.camera).observe(mask)
-    shape = (len(ours.ids), len(ours.classes))
-    codes = np.full(shape, 1 / data.num_classes, np.float32)
-    rest = np.ones(shape[1], np.float32)
+    said = np.full(len(ours.labels), 1 / data.num_classes, np.float32)
+    rest = np.ones(len(ours.classes), np.float32)
     return {
         "PyTorch": once(lambda: plain.step(view.camera, mask)),
-        "ours": min(timed(lambda: ours.shares(codes, rest), 3)),
+        "ours": min(timed(lambda: ours.shares(said, rest), 3)),
     }
 
 

@@ -68,15 +68,14 @@ def _view_stages(scene: GaussianScene, views: list[View], num_classes: int, runs
         camera, mask = view.camera, view.read_labels()
         projected, operator = project(scene, camera), make_operator(scene, camera)
         observation, depths = operator.observe(mask), _depths(scene, camera, projected.ids)
-        mine = np.ascontiguousarray(codes[observation.ids][:, observation.classes])
+        mine = codes[observation.ids[observation.rows], observation.classes[observation.labels]]
         rest = np.ones(len(observation.classes), np.float32)
         add("project and sort", lambda c=camera: project(scene, c))
         add("of this, sort", lambda d=depths: sort_by_depth(d))
         add("bin", lambda p=projected, c=camera: assign(p, c.width, c.height))
         add("blend", operator.transmittance)
         add(f"render {num_classes} classes", lambda o=operator: o.render(codes))
-        add("tie to its mask", lambda o=operator, m=mask: o.observe(m))
-        add("lift", observation.votes)
+        add("lift", lambda o=operator, m=mask: o.observe(m))
         add("shares", lambda o=observation, q=mine, r=rest: o.shares(q, r))
         add("adjoint, 3 channels", lambda o=operator, m=mask: o.adjoint(np.repeat(m[..., None], 3, axis=2)))
     return {name: _averaged(jobs, runs) for name, jobs in stages.items()}

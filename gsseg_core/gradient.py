@@ -128,7 +128,7 @@ class _CrossEntropy(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, probabilities: torch.Tensor, observation: Observation) -> torch.Tensor:
-        rows, classes = np.repeat(observation.ids, np.diff(observation.start)), observation.classes[observation.labels]
+        rows, classes = observation.ids[observation.rows], observation.classes[observation.labels]
         said = probabilities.detach().numpy()[rows, classes]
         shares = observation.shares(said, (observation.classes == 0).astype(np.float32))
         scale = 1.0 / (observation.num_pixels * probabilities.shape[1])

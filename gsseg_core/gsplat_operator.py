@@ -272,46 +272,59 @@ class GsplatObservation(Observation):
         labels: np.ndarray,  # (H, W)
     ) -> None:
         self._operator = operator
-        self.ids = operator.ids
         known = labels >= 0
         self.classes = np.unique(labels[known]).astype(np.int32)
         self.num_pixels = int(known.sum())
         local = np.where(known, np.searchsorted(self.classes, labels), -1)
         self._labels = torch.tensor(local, dtype=torch.int32, device=operator.device)
+        votes = self._lift()
+        seen = votes > 0
+        self._visible = np.flatnonzero(seen.any(axis=1))
+        self.ids, seen = operator.ids[self._visible], seen[self._visible]
+        self.start = np.concatenate([[0], np.cumsum(seen.sum(axis=1))])
+        self.labels = seen.nonzero()[1].astype(np.int32)
+        self._votes = votes[self._visible][seen]
 
     @property
     def nbytes(self) -> int:
         """Memory that it holds, in bytes, the operator's included; most of it on the GPU."""
-        return self._operator.nbytes + self._labels.nbytes
+        held = (self._visible, self.ids, self.start, self.labels, self._votes)
+        return self._operator.nbytes + self._labels.nbytes + sum(array.nbytes for array in held)
 
     def votes(self) -> np.ndarray:
-        """Sum the weights by label: W^T onehot(y), (M, L) float32."""
-        out = np.empty((len(self.ids), len(self.classes)), np.float32)
+        """Weights summed by sighting, (P,) float32."""
+        return self._votes
+
+    def _lift(self) -> np.ndarray:
+        """Sum the weights of all that is visible by label: W^T onehot(y), (V, L) float32."""
+        out = np.empty((len(self._operator.ids), len(self.classes)), np.float32)
         for k in chunks(len(self.classes)):
             out[:, k] = self._operator.carry_back(self._one_hot(k)).cpu().numpy()
         return out
 
     def shares(
         self,
-        codes: np.ndarray,  # (M, L)
+        said: np.ndarray,  # (P,)
         rest: np.ndarray,  # (L,)
     ) -> Shares:
-        """Share one vote per labelled pixel among the Gaussians that made it."""
-        codes, rest = np.asarray(codes), np.asarray(rest)
-        expected = (len(self.ids), len(self.classes))
-        if codes.shape != expected or rest.shape != expected[1:]:
+        """Share one vote per labelled pixel among the sightings that made it."""
+        said, rest = np.asarray(said), np.asarray(rest)
+        if said.shape != self.labels.shape or rest.shape != self.classes.shape:
             raise SceneValueError(
-                f"view '{self._operator.camera.name}': codes and rest have shapes {codes.shape} and {rest.shape}; "
-                f"expected {expected} and {expected[1:]}"
+                f"view '{self._operator.camera.name}': said and rest have shapes {said.shape} and {rest.shape}; "
+                f"expected {self.labels.shape} and {self.classes.shape}"
             )
-        out, total, log_likelihood = np.empty(expected, np.float32), np.zeros(len(rest)), 0.0
+        rows = self._visible[self.rows]
+        codes = np.zeros((len(self._operator.ids), len(rest)), np.float32)
+        codes[rows, self.labels] = said
+        out, total, log_likelihood = np.empty_like(codes), np.zeros(len(rest)), 0.0
         for k in chunks(len(rest)):
             # A pixel's label lies in one chunk, so each chunk has all that its pixels need.
             gaussians, spare, logs = self._share(codes[:, k], rest[k], self._one_hot(k))
             out[:, k] = gaussians.cpu().numpy()
             total[k] = spare.cpu().numpy()
             log_likelihood += float(logs)
-        return Shares(out, total, log_likelihood)
+        return Shares(out[rows, self.labels], total, log_likelihood)
 
     def _share(
         self,

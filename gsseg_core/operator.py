@@ -97,6 +97,20 @@ class Observation(ABC):
     def nbytes(self) -> int:
         """Memory that it holds, in bytes."""
 
+    @property
+    def rows(self) -> np.ndarray:
+        """Which of `ids` each sighting is of, (P,) int64."""
+        return np.repeat(np.arange(len(self.ids)), np.diff(self.start))
+
+    def dense(
+        self,
+        values: np.ndarray,  # (P,)
+    ) -> np.ndarray:
+        """Write one number per sighting out by Gaussian and label, (M, L); zero where there is no sighting."""
+        out = np.zeros((len(self.ids), len(self.classes)), values.dtype)
+        out[self.rows, self.labels] = values
+        return out
+
     @abstractmethod
     def votes(self) -> np.ndarray:
         """Sum of weights of each sighting, the entries of W^T onehot(y) that are not zero: (P,) float32, in px."""

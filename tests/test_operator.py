@@ -68,6 +68,15 @@ def test_visibility_agrees_with_the_naive_rasteriser(backend, seed):
     assert (np.abs(operator.visibility() - expected) <= backend.sum * (1 + expected) + doubt).all()
 
 
+def assert_sightings_are_what_labelled_pixels_see(seen, mask, weights, ids):
+    sees = np.zeros((weights.shape[1], len(seen.classes)), bool)
+    for j, label in enumerate(seen.classes):
+        sees[:, j] = (weights[mask.ravel() == label] > 0).any(axis=0)
+    np.testing.assert_array_equal(seen.ids, ids[sees[ids].any(axis=1)])
+    np.testing.assert_array_equal(seen.start, np.concatenate([[0], np.cumsum(sees[seen.ids].sum(axis=1))]))
+    np.testing.assert_array_equal(seen.dense(np.ones(len(seen.labels))), sees[seen.ids])
+
+
 @pytest.mark.parametrize(("width", "height"), SIZES)
 @pytest.mark.parametrize(("seed", "n"), [*enumerate(COUNTS)])
 def test_votes_and_shares_agree_with_the_naive_rasteriser(backend, seed, n, width, height):
@@ -79,23 +88,22 @@ def test_votes_and_shares_agree_with_the_naive_rasteriser(backend, seed, n, widt
     assert seen.classes.tolist() == sorted(set(mask[mask >= 0]))
     assert seen.num_pixels == (mask >= 0).sum()
     assert seen.nbytes > 0
-    np.testing.assert_array_equal(seen.ids, operator.ids)
+    assert_sightings_are_what_labelled_pixels_see(seen, mask, dense(operator), operator.ids)
 
     rng = np.random.default_rng(seed)
     codes = rng.uniform(0.1, 1, (len(seen.ids), len(seen.classes)))
     rest = rng.uniform(0.1, 1, len(seen.classes))
-    share = seen.shares(codes, rest)
+    share = seen.shares(codes[seen.rows, seen.labels], rest)
     likelihood = naive.weights[:, seen.ids] @ codes + np.outer(naive.transmittance, rest)
     near, log_likelihood = 30 * backend.sum, 0.0
-    votes = seen.votes()
-    assert votes.shape == share.gaussians.shape == (len(seen.ids), len(seen.classes))
-    assert votes.dtype == share.gaussians.dtype == np.float32
+    assert seen.votes().dtype == share.sightings.dtype == np.float32
+    votes, shares = seen.dense(seen.votes()), seen.dense(share.sightings)
     for j, label in enumerate(seen.classes):
         pixels = np.flatnonzero(mask == label)
         counted = naive.weights[pixels][:, seen.ids].sum(axis=0)
         np.testing.assert_allclose(votes[:, j], counted, rtol=backend.sum, atol=3 * backend.sum)
         shared = (naive.weights[pixels] / likelihood[pixels, j, None]).sum(axis=0)[seen.ids]
-        np.testing.assert_allclose(share.gaussians[:, j], shared, rtol=near, atol=near)
+        np.testing.assert_allclose(shares[:, j], shared, rtol=near, atol=near)
         spare = (naive.transmittance[pixels] / likelihood[pixels, j]).sum()
         np.testing.assert_allclose(share.rest[j], spare, rtol=near, atol=near)
         log_likelihood += np.log(likelihood[pixels, j]).sum()
@@ -163,14 +171,14 @@ def test_the_row_of_one_pixel_is_that_row_of_all_weights(backend):
 def test_label_ids_may_be_large_and_every_pixel_may_have_its_own(backend):
     scene, camera = random_view(7)
     operator = backend.make(scene, camera)
-    weights = dense(operator)[:, operator.ids]
     mask = 60000 + np.random.default_rng(7).permutation(37 * 21).reshape(21, 37).astype(np.int32)
     seen = operator.observe(mask)
     pixel_of = np.argsort(mask.ravel())
     np.testing.assert_array_equal(seen.classes, mask.ravel()[pixel_of])
-    np.testing.assert_allclose(seen.votes(), weights[pixel_of].T, rtol=backend.sum, atol=backend.weight)
-    share = seen.shares(np.full((len(seen.ids), 37 * 21), 0.25), np.full(37 * 21, 0.25))
-    np.testing.assert_allclose(share.gaussians, 4 * weights[pixel_of].T, rtol=5 * backend.sum, atol=4 * backend.weight)
+    weights = dense(operator)[:, seen.ids][pixel_of].T
+    np.testing.assert_allclose(seen.dense(seen.votes()), weights, rtol=backend.sum, atol=backend.weight)
+    share = seen.dense(seen.shares(np.full(len(seen.labels), 0.25), np.full(37 * 21, 0.25)).sightings)
+    np.testing.assert_allclose(share, 4 * weights, rtol=5 * backend.sum, atol=4 * backend.weight)
 
 
 def test_a_mask_with_all_pixels_unknown_gives_no_evidence(backend):
@@ -178,9 +186,9 @@ def test_a_mask_with_all_pixels_unknown_gives_no_evidence(backend):
     seen = backend.make(scene, camera).observe(np.full((21, 37), -1, np.int32))
     assert seen.num_pixels == 0
     assert len(seen.classes) == 0
-    assert seen.votes().shape == (len(seen.ids), 0)
-    share = seen.shares(np.empty((len(seen.ids), 0)), np.empty(0))
-    assert share.gaussians.shape == (len(seen.ids), 0)
+    assert seen.ids.shape == seen.votes().shape == (0,)
+    share = seen.shares(np.empty(0), np.empty(0))
+    assert share.sightings.shape == (0,)
     assert share.rest.shape == (0,)
     assert share.log_likelihood == 0
 
@@ -188,8 +196,8 @@ def test_a_mask_with_all_pixels_unknown_gives_no_evidence(backend):
 def test_a_pixel_that_nothing_explains_gives_no_share_and_a_finite_likelihood(backend):
     scene, camera = random_view(9)
     seen = backend.make(scene, camera).observe(random_mask(9))
-    share = seen.shares(np.zeros((len(seen.ids), len(seen.classes))), np.zeros(len(seen.classes)))
-    assert not share.gaussians.any()
+    share = seen.shares(np.zeros(len(seen.labels)), np.zeros(len(seen.classes)))
+    assert not share.sightings.any()
     assert not share.rest.any()
     assert np.isfinite(share.log_likelihood)
 
@@ -206,8 +214,8 @@ def test_a_view_that_sees_nothing_is_all_transmittance(backend, width, height):
     assert len(operator.weights().pixels) == len(operator.weights(0, 0).pixels) == 0
     mask = np.full((height, width), 3, np.int32)
     seen = operator.observe(mask)
-    assert seen.votes().shape == (0, 1)
-    share = seen.shares(np.empty((0, 1)), np.array([0.5]))
+    assert seen.votes().shape == (0,)
+    share = seen.shares(np.empty(0), np.array([0.5]))
     assert share.rest == pytest.approx(2 * mask.size)
     assert share.log_likelihood == pytest.approx(mask.size * np.log(0.5))
 
@@ -234,7 +242,7 @@ def test_images_of_another_size_are_refused(backend):
 def test_codes_of_another_shape_than_the_observation_are_refused(backend):
     camera, scene = make_camera(20, 20), one_gaussian()
     seen = backend.make(scene, camera).observe(np.zeros((20, 20), np.int32))
-    with pytest.raises(SceneValueError, match=r"expected \(1, 1\) and \(1,\)"):
+    with pytest.raises(SceneValueError, match=r"expected \(1,\) and \(1,\)"):
         seen.shares(np.ones((5, 3), np.float32), np.ones(7, np.float32))
 
 

@@ -70,7 +70,7 @@ def everything(operator, codes, residual, mask):
     """Every result, the rows of Gaussians in the order of the scene."""
     seen = operator.observe(mask)
     # Codes that depend on the Gaussian alone, whatever its place in the order.
-    share = seen.shares(codes[seen.ids][:, : len(seen.classes)], np.full(len(seen.classes), 0.3))
+    share = seen.shares(codes[seen.ids[seen.rows], seen.labels], np.full(len(seen.classes), 0.3))
     return {
         "ids": operator.ids,
         "render": operator.render(codes),
@@ -79,7 +79,7 @@ def everything(operator, codes, residual, mask):
         "weights": operator.weights().weights,
         "gaussians": operator.weights().gaussians,
         "votes": spread(operator, seen, seen.votes(), 9),
-        "shares": spread(operator, seen, share.gaussians, 9),
+        "shares": spread(operator, seen, share.sightings, 9),
         "rest": share.rest,
         "log likelihood": share.log_likelihood,
     }
@@ -201,9 +201,9 @@ def test_every_labelled_pixel_shares_out_one_vote(backend, view):
     scene, camera = random_view(**view)
     seen = backend.make(scene, camera).observe(random_mask(view["seed"], camera.width, camera.height))
     rng = np.random.default_rng(view["seed"])
-    codes, rest = rng.uniform(0.01, 1, (len(seen.ids), len(seen.classes))), rng.uniform(0.01, 1, len(seen.classes))
-    share = seen.shares(codes, rest)
-    assert (codes * share.gaussians).sum() + rest @ share.rest == pytest.approx(seen.num_pixels, rel=5 * backend.sum)
+    said, rest = rng.uniform(0.01, 1, len(seen.labels)), rng.uniform(0.01, 1, len(seen.classes))
+    share = seen.shares(said, rest)
+    assert (said * share.sightings).sum() + rest @ share.rest == pytest.approx(seen.num_pixels, rel=5 * backend.sum)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -211,19 +211,19 @@ def test_shares_are_the_gradient_of_the_log_likelihood(backend, seed):
     scene, camera = random_view(seed)
     seen = backend.make(scene, camera).observe(random_mask(seed))
     rng = np.random.default_rng(seed)
-    codes, rest = rng.uniform(0.2, 1, (len(seen.ids), len(seen.classes))), rng.uniform(0.2, 1, len(seen.classes))
-    share = seen.shares(codes, rest)
+    said, rest = rng.uniform(0.2, 1, len(seen.labels)), rng.uniform(0.2, 1, len(seen.classes))
+    share = seen.shares(said, rest)
 
-    def slope(along_codes, along_rest, step=0.01):
-        ahead = seen.shares(codes + step * along_codes, rest + step * along_rest).log_likelihood
-        back = seen.shares(codes - step * along_codes, rest - step * along_rest).log_likelihood
+    def slope(along_said, along_rest, step=0.01):
+        ahead = seen.shares(said + step * along_said, rest + step * along_rest).log_likelihood
+        back = seen.shares(said - step * along_said, rest - step * along_rest).log_likelihood
         return (ahead - back) / (2 * step)
 
     for _ in range(5):
-        along_codes, along_rest = rng.uniform(0, 1, codes.shape), rng.uniform(0, 1, rest.shape)
-        expected = (share.gaussians * along_codes).sum() + share.rest @ along_rest
-        assert slope(along_codes, along_rest) == pytest.approx(expected, rel=1e-3 + backend.sum)
-    for i, j in [np.unravel_index(share.gaussians.argmax(), codes.shape), (len(codes) // 2, 1)]:
-        one = np.zeros_like(codes)
-        one[i, j] = 1
-        assert slope(one, np.zeros_like(rest)) == pytest.approx(share.gaussians[i, j], rel=5e-3, abs=5e-3)
+        along_said, along_rest = rng.uniform(0, 1, said.shape), rng.uniform(0, 1, rest.shape)
+        expected = (share.sightings * along_said).sum() + share.rest @ along_rest
+        assert slope(along_said, along_rest) == pytest.approx(expected, rel=1e-3 + backend.sum)
+    for i in [share.sightings.argmax(), len(said) // 2]:
+        one = np.zeros_like(said)
+        one[i] = 1
+        assert slope(one, np.zeros_like(rest)) == pytest.approx(share.sightings[i], rel=5e-3, abs=5e-3)
