@@ -129,6 +129,20 @@ def tally(
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
+def share_votes(
+    votes: np.ndarray,  # (N, K) int64
+    codes: np.ndarray,  # (N, K) float32 out
+) -> None:
+    """Divide each row of votes by its sum; rows of zeros stay zero."""
+    for i in nb.prange(votes.shape[0]):
+        total = np.int64(0)
+        for k in range(votes.shape[1]):
+            total += votes[i, k]
+        for k in range(votes.shape[1]):
+            codes[i, k] = votes[i, k] / total if total > 0 else 0.0
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
 def take_votes(
     rows: np.ndarray,  # (M + 1,) votes, as `Rows`
     classes: np.ndarray,  # (Z,)

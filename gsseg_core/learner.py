@@ -12,7 +12,7 @@ import numpy as np
 
 from gsseg_core.dataset import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
-from gsseg_core.gaussian_kernels import add_votes
+from gsseg_core.gaussian_kernels import add_votes, share_votes
 from gsseg_core.operator import Observation, make_operator
 from gsseg_core.scene import GaussianScene
 from gsseg_core.state_file import State
@@ -189,7 +189,9 @@ class Learner(ABC):
 
     def vote_codes(self) -> np.ndarray:
         """Votes as probabilities, (N, K) float32; a row of zeros where no labelled pixel saw the Gaussian."""
-        return normalise(self._votes.astype(np.float32) * np.float32(VOTE_UNIT))
+        codes = np.empty(self._votes.shape, np.float32)
+        share_votes(self._votes, codes)
+        return codes
 
     def reject_summary(self) -> dict[str, int]:
         """Count the rejected views by reason."""
