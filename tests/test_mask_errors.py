@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import zlib
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -101,6 +104,50 @@ def test_one_kind_of_error_does_not_change_the_draws_of_another() -> None:
     assert 0 < (plain != blobbed).mean() < 0.05
 
 
+def test_exchanged_objects_pair_up_and_keep_all_labels() -> None:
+    labels = make_grid()
+    rng, exchanged = np.random.default_rng(0), 0.0
+    for _ in range(100):
+        wrong = corrupt(labels, rng, replace(NONE, exchanged=0.4))
+        seen = [int(wrong[labels == k][0]) for k in range(1, 31)]
+        assert sorted(seen) == list(range(1, 31))
+        assert all(seen[seen[k - 1] - 1] == k for k in range(1, 31))
+        assert all((wrong[labels == k] == seen[k - 1]).all() for k in range(1, 31))
+        exchanged += np.mean(np.array(seen) != np.arange(1, 31)) / 100
+    assert exchanged == pytest.approx(0.4, abs=0.05)
+
+
+def test_no_object_of_a_bad_frame_has_its_own_label() -> None:
+    labels = make_grid()
+    rng, settings = np.random.default_rng(0), replace(NONE, bad_frame=0.3)
+    frames = [corrupt(labels, rng, settings) for _ in range(200)]
+    bad = [frame for frame in frames if (frame != labels).any()]
+    assert len(bad) / len(frames) == pytest.approx(0.3, abs=0.08)
+    assert all((frame[labels > 0] != labels[labels > 0]).all() and (frame[labels == 0] == 0).all() for frame in bad)
+
+
+def test_a_shifted_map_is_moved_as_a_whole_and_no_further_than_asked() -> None:
+    labels = make_grid()
+    wrong = corrupt(labels, np.random.default_rng(1), replace(NONE, shift_px=9))
+    moves = [(y, x) for y in range(-9, 10) for x in range(-9, 10)]
+    inside = slice(9, -9), slice(9, -9)
+    same = [move for move in moves if (np.roll(labels, move, (0, 1))[inside] == wrong[inside]).all()]
+    assert len(same) == 1 and 0 < np.hypot(*same[0]) <= 9.5
+    assert np.isin(wrong, labels).all()
+
+
+def test_what_is_missed_gets_the_label_of_most_pixels_where_none_is_given() -> None:
+    labels = np.pad(np.full((4, 4), 3, np.int32), 6, constant_values=7)
+    wrong = corrupt(labels, np.random.default_rng(0), replace(NONE, missed=1.0, missed_label=None))
+    assert (wrong == 7).all()
+
+
+def test_a_seed_gives_the_masks_that_it_gave_before_there_were_more_kinds() -> None:
+    rng, settings = np.random.default_rng(11), MaskErrors(holes=0.3, blobs=2)
+    sums = [zlib.crc32(corrupt(make_grid(), rng, settings).tobytes()) for _ in range(3)]
+    assert sums == [2270022631, 720714654, 242888160]
+
+
 @hypothesis_settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 10**6), height=st.integers(1, 12), width=st.integers(1, 12), classes=st.integers(1, 4))
 def test_unknown_stays_unknown_and_labels_stay_labels_on_any_map(
@@ -108,7 +155,7 @@ def test_unknown_stays_unknown_and_labels_stay_labels_on_any_map(
 ) -> None:
     rng = np.random.default_rng(seed)
     labels = rng.integers(UNKNOWN, classes, (height, width))
-    wrong = corrupt(labels, rng, MaskErrors(missed=0.3, swapped=0.3, edge_px=4, holes=0.5, blobs=2))
+    wrong = corrupt(labels, rng, MaskErrors(0.3, 0.3, 4, 0.5, blobs=2, exchanged=0.5, bad_frame=0.2, shift_px=3))
     assert wrong.shape == labels.shape
     assert (wrong[labels == UNKNOWN] == UNKNOWN).all()
     assert np.isin(wrong, [UNKNOWN, 0, *np.unique(labels)]).all()
@@ -116,7 +163,15 @@ def test_unknown_stays_unknown_and_labels_stay_labels_on_any_map(
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"missed": -0.1}, {"swapped": 1.5}, {"missed": 0.6, "swapped": 0.6}, {"edge_px": -1}, {"blobs": float("nan")}],
+    [
+        {"missed": -0.1},
+        {"swapped": 1.5},
+        {"missed": 0.6, "swapped": 0.6},
+        {"edge_px": -1},
+        {"blobs": float("nan")},
+        {"exchanged": 2},
+        {"shift_px": -1},
+    ],
 )
 def test_impossible_settings_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(SettingsError, match=next(iter(wrong))):

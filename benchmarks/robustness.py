@@ -1,0 +1,346 @@
+"""Measure what docs/robustness.md shows, and write it: how wrong masks and poses may be, and what is noticed of it.
+
+Usage: python benchmarks/robustness.py [--quick] [--data FOLDER] [--out docs/robustness.md]
+
+FOLDER holds `replica_apartment/` (default: the environment variable GSSEG_DATA, else ../shared/data); without it, only
+the demo scene is measured. Plots go to `pictures/` beside the document, pictures of the real scene to `results_out/`,
+outside version control. About 25 minutes on two cores; `--quick` takes five, with fewer views and strengths, and writes
+to `results_out/` alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jobs import hard_votes
+from machine import DATA, REPOSITORY
+from PIL import Image
+from plots import Axis, draw_panels
+from results import machine, markdown, points, score
+from robustness_text import BAR, CURVES, HEADER, RELIABILITY
+from scipy.stats import spearmanr
+
+from gsseg_core.atomic import write_atomically
+from gsseg_core.dataset import Dataset, View, spread
+from gsseg_core.demo_scene import build_demo
+from gsseg_core.em import EMLearner, EMSettings
+from gsseg_core.learner import Learner
+from gsseg_core.mask_errors import MaskErrors
+from gsseg_core.pipeline import make_learner
+from gsseg_core.reliability import OtherViews, check_views, draw_worst_views
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segmentation import Segmentation
+from gsseg_core.view_errors import STRONGEST, PoseErrors, corrupt_views, errors_at, typical_depth
+from gsseg_core.warm_up import warm_up
+
+EM, PLAIN, GRADIENT, VOTES, HARD = "em", "em without error model", "gradient", "votes", "FlashSplat's rule"
+LEARNERS = (EM, PLAIN, GRADIENT, VOTES, HARD)
+STRENGTHS = (0.25, 0.5, 0.75, 1.0)
+BAD_SHARE = 0.2
+REALISTIC = MaskErrors()
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A scene to measure on.
+
+    Attributes
+    ----------
+    name : str
+        What it is called in tables.
+    scene : GaussianScene
+        N Gaussians.
+    data : Dataset
+        Names and number of the classes.
+    train, test : list of View
+        With true masks.
+    curve_views : int
+        How many of the train views the curves learn from.
+    strengths, gradient_strengths : sequence of float
+        Where the curves have points, and where the gradient learner, which is slow, has some.
+    missed_label : int or None
+        What is written where an object was missed, as in `MaskErrors`.
+    given : list of View
+        The train views with wrong masks that came with the scene, if any.
+    """
+
+    name: str
+    scene: GaussianScene
+    data: Dataset
+    train: list[View]
+    test: list[View]
+    curve_views: int
+    strengths: Sequence[float] = STRENGTHS
+    gradient_strengths: Sequence[float] = STRENGTHS
+    missed_label: int | None = 0
+    given: Sequence[View] = ()
+
+    @property
+    def realistic(self) -> MaskErrors:
+        """A quarter of the objects wrong in every view, edges off by up to 3 px."""
+        return replace(REALISTIC, missed_label=self.missed_label)
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one learner made of some views: mIoU in the test views, and the seconds that it took to learn."""
+
+    miou: float
+    seconds: float
+
+
+def main() -> int:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", default=DATA, type=Path, help="folder that holds replica_apartment/")
+    parser.add_argument("--out", type=Path, help="document to write")
+    parser.add_argument("--quick", action="store_true", help="fewer views and strengths, to see that all works")
+    options = parser.parse_args()
+    aside = REPOSITORY / "results_out"
+    out = options.out or (aside / "robustness.md" if options.quick else REPOSITORY / "docs/robustness.md")
+    start = time.perf_counter()
+    warm_up()
+    with tempfile.TemporaryDirectory() as folder:
+        benches = list(open_benches(Path(folder), options.data / "replica_apartment", options.quick))
+        sections = [measure_bar(benches), measure_curves(benches, out.parent / "pictures", aside)]
+        sections.append(measure_reliability(benches, out.parent / "pictures", aside))
+    minutes = (time.perf_counter() - start) / 60
+    header = HEADER.format(machine=machine(), minutes=f"{minutes:.0f}", quick=" --quick" * options.quick)
+    out.write_text("\n".join([header, *sections]), encoding="utf-8")
+    print(f"{out}: {minutes:.1f} minutes")
+    return 0
+
+
+def open_benches(folder: Path, real: Path, quick: bool) -> Iterator[Bench]:
+    """Build the demo scene in a folder; open the real one, if it is there."""
+    demo = build_demo(folder)
+    data = Dataset(folder, "labels_true")
+    fewer = (0.5, 1.0)
+    train, test = data.views("train"), data.views("test")
+    if quick:
+        yield Bench("demo scene", demo.scene, data, train[::3], test, len(train), fewer, fewer[1:])
+    else:
+        yield Bench("demo scene", demo.scene, data, train, test, len(train))
+    if not real.is_dir():
+        print(f"{real}: not there; measuring the demo scene only")
+        return
+    data = Dataset(real)
+    scene, train, test = GaussianScene.load(real / "scene.ply"), data.views("train"), data.views("test")
+    given = Dataset(real, "labels_noisy").views("train")
+    if quick:
+        yield Bench("real scene", scene, data, train[::5], test, 21, fewer[1:], (), None, given[::5])
+    else:
+        yield Bench("real scene", scene, data, train, test, 53, STRENGTHS, fewer, None, given)
+
+
+def learn(bench: Bench, views: Sequence[View], names: Sequence[str] = LEARNERS) -> dict[str, Run]:
+    """Learn from views with each of these learners, and score rendered label maps of the test views."""
+    runs = {}
+    for name in names:
+        start = time.perf_counter()
+        learner = taught(name, bench, views)
+        codes = hard_votes(learner.codes_, 0.0) if name == HARD else learner.codes_
+        seconds = time.perf_counter() - start
+        result = Segmentation.from_codes(bench.scene, codes, bench.data.class_names)
+        runs[name] = Run(score(result, bench.scene, bench.test).mean_iou, seconds)
+    return runs
+
+
+def taught(name: str, bench: Bench, views: Sequence[View]) -> Learner:
+    """Return a learner that has learnt from views."""
+    learner: Learner
+    if name == PLAIN:
+        learner = EMLearner(bench.scene, bench.data.num_classes, EMSettings(errors=False))
+    else:
+        learner = make_learner("votes" if name == HARD else name, bench.scene, bench.data.num_classes)
+    learner.observe_all(views)
+    return learner.fit()
+
+
+def right_share(views: Sequence[View], truth: Sequence[View]) -> list[float]:
+    """Share of the right pixels in the mask of each view."""
+    return [float((a.read_labels() == b.read_labels()).mean()) for a, b in zip(views, truth, strict=True)]
+
+
+def tell(bench: Bench, what: str, runs: Mapping[str, Run]) -> None:
+    """Print what has just been measured."""
+    print(f"{bench.name}, {what}: " + ", ".join(f"{name} {run.miou:.4f}" for name, run in runs.items()), flush=True)
+
+
+# The bar
+
+
+def measure_bar(benches: Sequence[Bench]) -> str:
+    """Measure what realistic errors cost each learner, how long each takes, and then what each error costs alone."""
+    rows, alone = [], []
+    for bench in benches:
+        clean = learn(bench, bench.train)
+        tell(bench, "true masks", clean)
+        drawn = {f"drawn, seed {seed}": corrupt_views(bench.train, seed, bench.realistic) for seed in (0, 1)}
+        sets = {"as they came": bench.given, **drawn} if bench.given else drawn
+        first = next(iter(sets))
+        for title, views in sets.items():
+            wrong = learn(bench, views, LEARNERS if title == first else (EM, PLAIN, VOTES, HARD))
+            tell(bench, f"wrong masks {title}", wrong)
+            rows += [
+                [
+                    f"{bench.name}, {title}", name, points(clean[name].miou), points(run.miou),
+                    f"{100 * (clean[name].miou - run.miou):.1f}", f"{clean[name].seconds:.1f}", f"{run.seconds:.1f}",
+                ]
+                for name, run in wrong.items()
+            ]  # fmt: skip
+        alone += [[bench.name, *row] for row in measure_parts(bench, clean)]
+    header = ["masks", "learner", "true masks: mIoU", "wrong masks: mIoU", "points lost", "true: s", "wrong: s"]
+    parts = ["scene", "error", "right pixels", EM, "points lost", PLAIN, VOTES]
+    return BAR.format(table=markdown(header, rows), parts=markdown(parts, alone))
+
+
+def measure_parts(bench: Bench, clean: Mapping[str, Run]) -> Iterator[list[str]]:
+    """Measure each part of the realistic errors alone."""
+    whole = bench.realistic
+    none = replace(whole, missed=0.0, swapped=0.0, edge_px=0)
+    parts = {
+        f"{100 * whole.missed:.0f} % missed": replace(none, missed=whole.missed),
+        f"{100 * whole.swapped:.0f} % with a wrong id": replace(none, swapped=whole.swapped),
+        f"{100 * (whole.missed + whole.swapped):.0f} % in swapped pairs": replace(
+            none, exchanged=whole.missed + whole.swapped
+        ),
+        f"edges off by up to {whole.edge_px} px": replace(none, edge_px=whole.edge_px),
+    }
+    for title, errors in parts.items():
+        views = corrupt_views(bench.train, 0, errors)
+        runs = learn(bench, views, (EM, PLAIN, VOTES))
+        tell(bench, title, runs)
+        lost = 100 * (clean[EM].miou - runs[EM].miou)
+        share = np.mean(right_share(views, bench.train))
+        yield [
+            title,
+            points(share),
+            points(runs[EM].miou),
+            f"{lost:.1f}",
+            points(runs[PLAIN].miou),
+            points(runs[VOTES].miou),
+        ]
+
+
+# Curves
+
+
+def measure_curves(benches: Sequence[Bench], pictures: Path, aside: Path) -> str:
+    """Measure mIoU against each kind and strength of error, with all learners; plot and tabulate it."""
+    texts = []
+    for bench in benches:
+        train = spread(bench.train, bench.curve_views)
+        depth = typical_depth(bench.scene, [view.camera for view in train])
+        clean = learn(bench, train)
+        tell(bench, "curves, true masks", clean)
+        rows = [curve_row("no errors", 0.0, 1.0, clean)]
+        curves: dict[str, dict[str, list[tuple[float, float]]]] = {}
+        spent: dict[str, list[float]] = {name: [run.seconds] for name, run in clean.items()}
+        for kind in STRONGEST:
+            curves[kind] = {name: [(0.0, run.miou)] for name, run in clean.items()}
+            for strength in bench.strengths:
+                errors = errors_at(kind, strength, missed_label=bench.missed_label, depth=depth)
+                views = corrupt_views(train, 0, *errors)
+                names = [name for name in LEARNERS if name != GRADIENT or strength in bench.gradient_strengths]
+                runs = learn(bench, views, names)
+                tell(bench, f"{kind} {strength:g}", runs)
+                rows.append(curve_row(kind, strength, float(np.mean(right_share(views, train))), runs))
+                for name, run in runs.items():
+                    curves[kind][name].append((strength, run.miou))
+                    spent[name].append(run.seconds)
+        plot = f"robustness_{bench.name.split()[0]}.svg"
+        draw_panels(pictures / plot, curves, Axis("strength", 0, 1, 0.25), Axis("mIoU", 0, 1, 0.25))
+        aside.mkdir(exist_ok=True)
+        (aside / f"robustness_{bench.name.split()[0]}.json").write_text(json.dumps({"mIoU": curves, "seconds": spent}))
+        seconds = {name: float(np.median(values)) for name, values in spent.items()}
+        table = markdown(["error", "strength", "right pixels", *LEARNERS], rows)
+        texts.append(
+            CURVES.format(
+                title=bench.name.capitalize(),
+                views=len(train),
+                tests=len(bench.test),
+                plot=plot,
+                table=table,
+                seconds=markdown(list(seconds), [[f"{value:.1f}" for value in seconds.values()]]),
+                ratio=f"{seconds[EM] / seconds[PLAIN]:.1f}",
+            )
+        )
+    kinds = markdown(["error", "strength 1"], [[kind, meaning] for kind, meaning in STRONGEST.items()])
+    return f"## mIoU by kind and strength of error\n\n{kinds}\n\n" + "\n".join(texts)
+
+
+def curve_row(kind: str, strength: float, right: float, runs: Mapping[str, Run]) -> list[str]:
+    """One line of the table."""
+    scores = [points(runs[name].miou) if name in runs else "" for name in LEARNERS]
+    return [kind, f"{strength:g}", points(right), *scores]
+
+
+# Reliability
+
+
+def measure_reliability(benches: Sequence[Bench], pictures: Path, aside: Path) -> str:
+    """Compare the reliability of views with their true share of right pixels, where some frames are bad."""
+    rows = []
+    plots: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for bench in benches:
+        views = with_bad_frames(bench, 0)
+        learner = taught(EM, bench, views)
+        assert isinstance(learner, EMLearner)
+        start = time.perf_counter()
+        checks = check_views(learner)
+        seconds = time.perf_counter() - start
+        told = np.array([check.reliability for check in checks])
+        true = np.array(right_share(views, bench.train))
+        many = round(BAD_SHARE * len(views))
+        found = len(set(np.argsort(told)[:many]) & set(np.argsort(true)[:many]))
+        error = told - true
+        rows.append([
+            bench.name, str(len(views)), f"{spearmanr(told, true).statistic:.3f}", f"{found} of {many}",
+            f"{100 * error.mean():+.1f}", f"{100 * abs(error).mean():.1f}", f"{100 * abs(error).max():.1f}",
+            f"{seconds:.1f}",
+        ])  # fmt: skip
+        print(f"{bench.name}, reliability: {rows[-1]}", flush=True)
+        plots[bench.name] = {"views": list(zip(true.tolist(), told.tolist(), strict=True))}
+        # The real scene may be looked at, but not handed on.
+        folder = pictures if bench.name.startswith("demo") else aside
+        save_small(folder / "worst_views.png", draw_worst_views(OtherViews(learner), checks, 2))
+    share = Axis("true share of right pixels", 0, 1, 0.25)
+    draw_panels(pictures / "reliability.svg", plots, share, replace(share, name="reliability"), lines=False)
+    header = ["scene", "views", "rank correlation", "worst found", "bias", "mean error", "largest error", "seconds"]
+    return RELIABILITY.format(table=markdown(header, rows))
+
+
+def with_bad_frames(bench: Bench, seed: int) -> list[View]:
+    """Corrupt all views a little, up to what is realistic, and a fifth of them badly, each in its own way."""
+    rng = np.random.default_rng(seed)
+    bad = set(rng.choice(len(bench.train), round(BAD_SHARE * len(bench.train)), replace=False).tolist())
+    views = []
+    for i, view in enumerate(bench.train):
+        little, much, kind = rng.random(), rng.uniform(0.5, 1.0), rng.integers(4)
+        whole = bench.realistic
+        errors = replace(
+            whole, missed=little * whole.missed, swapped=little * whole.swapped, edge_px=round(little * whole.edge_px)
+        )
+        worse = [{"exchanged": much}, {"bad_frame": 1.0}, {"missed": much, "swapped": 0.0}, {"shift_px": 60 * much}]
+        errors = replace(errors, **worse[kind]) if i in bad else errors
+        views += corrupt_views([view], int(rng.integers(1 << 31)), errors, PoseErrors())
+    return views
+
+
+def save_small(path: Path, image: np.ndarray) -> None:
+    """Write a picture with as many colours as a document needs."""
+    with write_atomically(path) as temporary:
+        Image.fromarray(image).quantize(96, dither=Image.Dither.NONE).save(temporary, format="PNG", optimize=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

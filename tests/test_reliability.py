@@ -1,0 +1,133 @@
+"""How far views can be trusted: bad frames come first, shares are close to the truth, and reports say what is wrong."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, taught
+
+from gsseg_core.dataset import View
+from gsseg_core.em import EMLearner
+from gsseg_core.mask_errors import MaskErrors
+from gsseg_core.masks import UNKNOWN
+from gsseg_core.reliability import (
+    OtherViews,
+    ViewCheck,
+    check_views,
+    draw_worst_views,
+    reliability_report,
+    worst_views,
+)
+from gsseg_core.view_errors import corrupt_views
+
+SCENE, _ = balls_on_a_table()
+CLEAN = clean_views(12)
+BAD = {"view3", "view7"}
+
+
+@cache
+def learner_with_bad_frames() -> EMLearner:
+    spoilt = corrupt_views(CLEAN, 0, MaskErrors(missed=0, swapped=0, edge_px=0, bad_frame=1.0))
+    views = [bad if bad.name in BAD else clean for bad, clean in zip(spoilt, CLEAN, strict=True)]
+    learner = EMLearner(SCENE, NUM_CLASSES)
+    taught(learner, views).fit()
+    return learner
+
+
+@cache
+def checks() -> dict[str, ViewCheck]:
+    return {check.name: check for check in check_views(learner_with_bad_frames())}
+
+
+def test_bad_frames_come_first() -> None:
+    assert {check.name for check in worst_views(checks().values(), len(BAD))} == BAD
+    assert (
+        max(checks()[name].reliability for name in BAD)
+        < 0.9
+        < min(check.reliability for name, check in checks().items() if name not in BAD)
+    )
+
+
+def test_reliability_is_about_the_share_of_right_pixels() -> None:
+    for clean in CLEAN:
+        mask = learner_with_bad_frames().views[clean.name].read_labels()
+        assert checks()[clean.name].reliability == pytest.approx((mask == clean.read_labels()).mean(), abs=0.05)
+
+
+def test_agreement_of_a_class_that_was_taken_for_another_is_low_and_of_the_background_high() -> None:
+    for name in BAD:
+        agreement = checks()[name].agreement
+        assert agreement.shape == (NUM_CLASSES,)
+        assert agreement[0] > 0.95 and (agreement[1:] < 0.2).all()
+
+
+def test_confusions_name_what_was_taken_for_what_largest_first() -> None:
+    check = ViewCheck("a", 110, np.array([0, 2]), np.array([[50, 3], [10, 0], [7, 30]]))
+    assert check.checked == 100 and check.reliability == pytest.approx(0.8)
+    assert check.confusions(2) == [(1, 0, 0.1), (2, 0, 0.07)]
+    np.testing.assert_allclose(check.agreement, [50 / 53, 0, 30 / 37])
+
+
+def test_report_is_sorted_worst_first_and_plain_json() -> None:
+    report = reliability_report(checks().values(), NAMES)
+    assert json.loads(json.dumps(report)) == report
+    assert {entry["name"] for entry in report[: len(BAD)]} == BAD
+    assert [entry["reliability"] for entry in report] == sorted(entry["reliability"] for entry in report)
+    for entry in report[: len(BAD)]:
+        assert entry["num_pixels"] == 64 * 48
+        shares = [confusion["share"] for confusion in entry["confusions"]]
+        assert shares == sorted(shares, reverse=True) and 0 < sum(shares) <= 1 - entry["reliability"] + 1e-3
+        assert all({confusion["true"], confusion["seen"]} <= set(NAMES.values()) for confusion in entry["confusions"])
+
+
+def test_a_view_is_held_against_the_others_only() -> None:
+    learner = EMLearner(SCENE, NUM_CLASSES)
+    taught(learner, CLEAN[:1]).fit()
+    alone = check_views(learner)[0]
+    truth = CLEAN[0].read_labels()
+    # Nobody else has seen what it shows, so only the empty rays, which belong to the background, say anything.
+    assert alone.checked < truth.size and not alone.counts[1:].any()
+    assert (OtherViews(learner).predict(CLEAN[0])[truth > 0] == UNKNOWN).mean() > 0.9
+
+
+def test_unknown_pixels_do_not_count() -> None:
+    labels = CLEAN[0].read_labels().copy()
+    labels[:20] = UNKNOWN
+    learner = EMLearner(SCENE, NUM_CLASSES)
+    taught(learner, [View.from_arrays(CLEAN[0].camera, labels), *CLEAN[1:]]).fit()
+    check = check_views(learner)[0]
+    assert check.num_pixels == check.checked == (labels >= 0).sum()
+
+
+def test_views_of_which_nothing_is_known_come_last_and_have_no_figure() -> None:
+    unknown = ViewCheck("unknown", 5, np.array([1]), np.zeros((2, 1), np.int64))
+    good = ViewCheck("good", 5, np.array([1]), np.array([[0], [5]]))
+    assert math.isnan(unknown.reliability) and good.reliability == 1
+    assert [check.name for check in worst_views([unknown, good])] == ["good", "unknown"]
+    assert reliability_report([unknown], {})[0] == {
+        "name": "unknown", "reliability": None, "num_pixels": 5, "confusions": [],
+    }  # fmt: skip
+
+
+def test_every_view_is_told_of_and_nothing_that_was_learnt_changes() -> None:
+    learner = learner_with_bad_frames()
+    codes, told = learner.codes_.copy(), []
+    check_views(learner, lambda stage, done, total: told.append((stage, done, total)))
+    np.testing.assert_array_equal(learner.codes_, codes)
+    assert told[0] == ("sum up views", 0, 12) and told[-1] == ("check views", 12, 12) and len(told) == 26
+
+
+def test_the_same_views_give_the_same_figures() -> None:
+    again = check_views(learner_with_bad_frames())
+    assert all((check.counts == checks()[check.name].counts).all() for check in again)
+
+
+def test_picture_has_a_row_of_three_for_each_of_the_worst_views() -> None:
+    learner = learner_with_bad_frames()
+    one, two = (draw_worst_views(OtherViews(learner), list(checks().values()), count) for count in (1, 2))
+    assert one.dtype == np.uint8 and one.shape[1] == two.shape[1] > 3 * 64
+    assert two.shape[0] - one.shape[0] > 48
