@@ -10,6 +10,8 @@ So there are no atomic operations, and the result does not depend on the number 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba as nb
 import numpy as np
 
@@ -29,7 +31,7 @@ def open_rays(
     width: int,  # px
     height: int,  # px
     transmittance: np.ndarray,  # (16, 16) float32 out
-) -> tuple[np.float32, np.float32, int]:
+) -> tuple[Any, Any, int]:
     """Begin with a tile: the pixel centre of its corner, and a bit for each of its rows that is in the image."""
     left, top = (tile % columns) * TILE, (tile // columns) * TILE
     for r in range(TILE):

@@ -195,7 +195,9 @@ class EMLearner(Learner):
         counted, prior = votes.united(self._smooth(votes))
         # Votes are the first step; with the prior counted in, the objective is finite from the start. What is zero now
         # is zero after every step, so the codes keep these places.
-        codes = counted.with_values(counted.values.astype(np.float32) * np.float32(VOTE_UNIT) + prior.values).normalised()
+        codes = counted.with_values(
+            counted.values.astype(np.float32) * np.float32(VOTE_UNIT) + prior.values
+        ).normalised()
         history: list[float] = []
         self.history_ = history
         tell = partial(progress, "em", 0, settings.max_steps)

@@ -57,13 +57,13 @@ class _RowType(types.Type):
         super().__init__(name="Row")
 
 
-_row_type = _RowType()
+_row_type: Any = _RowType()
 
 
 @register_model(_RowType)
 class _RowModel(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, _ROW)
+        super().__init__(manager, kind, _ROW)  # type: ignore[no-untyped-call]
 
 
 class _Builder:
@@ -84,7 +84,9 @@ class _Builder:
 
     def element(self, position: int, number: Any) -> Any:
         """Address of one entry of the array that is argument `position`."""
-        array = self.context.make_array(self.signature.args[position])(self.context, self.llvm, self.arguments[position])
+        array = self.context.make_array(self.signature.args[position])(
+            self.context, self.llvm, self.arguments[position]
+        )
         return self.llvm.gep(array.data, [number], source_etype=_F32)
 
     def columns(self, position: int) -> Callable[[int], Any]:
@@ -227,7 +229,8 @@ def blend_row(typing: Any, rays: Any, r: Any, lines: Any, wide: Any) -> tuple[An
     """Blend one Gaussian into row r of the rays.
 
     In column c its log2 of alpha is peak - wide * (c - x)^2, with x and peak from `aim`; below that of 1/255 alpha
-    counts as 0. Returns its weights, and bits: the low sixteen say which rays are still open, the next which ones were hit.
+    counts as 0. Returns its weights, and bits: the low sixteen say which rays are still open, the next ones which were
+    hit.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -249,7 +252,8 @@ def blend_row(typing: Any, rays: Any, r: Any, lines: Any, wide: Any) -> tuple[An
         bits = builder.or_(builder.shl(row.bits(hit), ir.Constant(_I64, LANES)), still_open)
         return context.make_tuple(builder, signature.return_type, [weight, bits])
 
-    return types.Tuple((_row_type, types.int64))(rays, r, lines, types.float32), generate
+    both: Any = types.Tuple((_row_type, types.int64))  # type: ignore[no-untyped-call]
+    return both(rays, r, lines, types.float32), generate
 
 
 @intrinsic
@@ -297,6 +301,28 @@ def add_where(typing: Any, total: Any, a: Any, lanes: Any) -> tuple[Any, Callabl
 
 
 @intrinsic
+def add_product(typing: Any, total: Any, a: Any, b: Any) -> tuple[Any, Callable[..., Any]]:
+    """Add a product of two rows."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        row = _Builder(context, builder, signature, arguments)
+        return row.fma(arguments[1], arguments[2], arguments[0])
+
+    return _row_type(total, a, b), generate
+
+
+@intrinsic
+def add_scaled(typing: Any, total: Any, a: Any, factor: Any) -> tuple[Any, Callable[..., Any]]:
+    """Add a multiple of a row."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        row = _Builder(context, builder, signature, arguments)
+        return row.fma(row.scalar(2), arguments[1], arguments[0])
+
+    return _row_type(total, a, types.float32), generate
+
+
+@intrinsic
 def add_product_where(typing: Any, total: Any, a: Any, b: Any, lanes: Any) -> tuple[Any, Callable[..., Any]]:
     """Add a product of two rows in the lanes of the bits that are set."""
 
@@ -337,19 +363,6 @@ def dot(typing: Any, a: Any, i: Any, b: Any, j: Any) -> tuple[Any, Callable[...,
         return row.sum(builder.fmul(row.load(row.row(0)), row.load(row.row(2))))
 
     return types.float32(a, i, b, j), generate
-
-
-@intrinsic
-def add_scaled(typing: Any, target: Any, i: Any, a: Any, j: Any, factor: Any) -> tuple[Any, Callable[..., Any]]:
-    """Add factor * a[j] to target[i]."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        row = _Builder(context, builder, signature, arguments)
-        address = row.row(0)
-        row.store(row.fma(row.scalar(4), row.load(row.row(2)), row.load(address)), address)
-        return context.get_dummy_value()
-
-    return types.void(target, i, a, j, types.float32), generate
 
 
 @intrinsic

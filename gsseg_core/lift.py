@@ -137,8 +137,11 @@ def _lift_tile(
 ) -> None:
     rays, lines = np.empty((TILE, TILE), np.float32), np.empty((2, TILE), np.float32)
     left, top, live = open_rays(tile, columns, width, height, rays)
+    labelled = np.zeros(TILE, np.int64)  # one bit per pixel of each row
     for r in range(TILE):
-        if span_start[tile * TILE + r] == span_start[tile * TILE + r + 1]:
+        for span in range(span_start[tile * TILE + r], span_start[tile * TILE + r + 1]):
+            labelled[r] |= lanes[span]
+        if not labelled[r]:
             live &= ~(1 << r)
     for e in range(first, last):
         prefetch(table, entries[min(e + AHEAD, last - 1)])
@@ -153,14 +156,16 @@ def _lift_tile(
             weight, bits = blend_row(rays, r, lines, table[g, WIDTH])
             if not bits & _OPEN:
                 live &= ~(1 << r)
-            touched = bits >> LANES
+            hit |= np.int64(bits >> LANES & labelled[r] > 0) << r
+            if many == 1:
+                current, apart = np.int64(0), add_where(apart, weight, labelled[r])
+                continue
             for span in range(span_start[tile * TILE + r], span_start[tile * TILE + r + 1]):
                 if slots[span] != current:
                     if current >= 0:
                         sums[(e - first) * many + current] += sum_row(apart)
                     current, apart = np.int64(slots[span]), nothing()
                 apart = add_where(apart, weight, np.int64(lanes[span]))
-                hit |= np.int64(touched & lanes[span] > 0) << r
         if current >= 0:
             sums[(e - first) * many + current] += sum_row(apart)
         reached[e] = hit

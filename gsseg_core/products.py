@@ -9,7 +9,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.blend import blend_tile
-from gsseg_core.lanes import add_scaled, dot
+from gsseg_core.lanes import add_scaled, dot, load_row, store_row
 from gsseg_core.tiles import TILE
 
 _FAST = {"contract", "nnan", "nsz", "reassoc"}
@@ -52,8 +52,9 @@ def render(
         for e in range(used):
             g = entries[first + e]
             for i in range(n, ends[e]):
+                weight, row = load_row(weights, i), np.int64(rows[i]) * channels
                 for k in range(channels):
-                    add_scaled(block, rows[i] * channels + k, weights, i, codes[g, k])
+                    store_row(block, row + k, add_scaled(load_row(block, row + k), weight, codes[g, k]))
             n = ends[e]
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
         for r in range(min(TILE, height - top)):

@@ -173,7 +173,9 @@ def _project(
         n = first
         for begin in range(first, last, BLOCK):
             end = min(begin + BLOCK, last)
-            _find_near(means[begin:end], scales[begin:end], opacities[begin:end], viewmat, K, width, height, limits, near)
+            _find_near(
+                means[begin:end], scales[begin:end], opacities[begin:end], viewmat, K, width, height, limits, near
+            )
             for i in range(begin, end):
                 if near[i - begin]:
                     z = _project_one(i, means, quats, scales, opacities, viewmat, K, width, height, limits, table[n])

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-
 _NONE = np.uint32(2**32 - 1)
 
 

@@ -14,7 +14,9 @@ import numpy as np
 from gsseg_core.blend import AHEAD, open_rays
 from gsseg_core.lanes import (
     WIDTH,
+    add_product,
     add_product_where,
+    add_scaled,
     add_scaled_where,
     aim,
     blend_row,
@@ -32,7 +34,7 @@ _FAST = {"contract", "nnan", "nsz", "reassoc"}
 _TINY = np.float32(1e-30)
 
 CHUNKS = 16
-"""Parts of the Gaussians that are gone through beside each other. Each counts from 0; `settle` makes one count of it."""
+"""Parts of the Gaussians that are gone through beside each other. Each counts from 0; `settle` makes that one count."""
 
 _CHUNK = 27  # the bits above these say which chunk a number belongs to
 _NUMBER = (1 << _CHUNK) - 1
@@ -49,7 +51,7 @@ def keep_entries(
     kept: np.ndarray,  # (E, 2) int32 out: where each entry goes, -1 if nowhere; its tile
     rows: np.ndarray,  # (E',) uint16 out: rows of those that are kept
 ) -> None:
-    """Number the entries that reach a labelled pixel."""
+    """Give a number to every entry that reaches a labelled pixel."""
     for tile in nb.prange(start.shape[0] - 1):
         n = kept_start[tile]
         for e in range(start[tile], start[tile + 1]):
@@ -198,6 +200,7 @@ def _blend_said(
         prefetch(table, entries[min(e + AHEAD, entries.shape[0] - 1)])
         g = entries[e]
         aim(table, g, left, top, lines)
+        only = said[sighting[e * many]] if many == 1 else np.float32(0.0)
         todo = np.int64(rows[e])
         while todo:
             r = first_bit(todo)
@@ -206,10 +209,13 @@ def _blend_said(
             store_row(weights, n, weight)
             n += 1
             total = load_row(value, r)
-            for span in range(spans[r], spans[r + 1]):
-                # Where there is no sighting, the weights are zero.
-                s = max(sighting[e * many + slots[span]], 0)
-                total = add_scaled_where(total, weight, said[s], np.int64(lanes[span]))
+            if many == 1:
+                total = add_scaled(total, weight, only)
+            else:
+                for span in range(spans[r], spans[r + 1]):
+                    # Where there is no sighting, the weights are zero.
+                    s = max(sighting[e * many + slots[span]], 0)
+                    total = add_scaled_where(total, weight, said[s], np.int64(lanes[span]))
             store_row(value, r, total)
 
 
@@ -270,6 +276,9 @@ def _sum_shares(
             todo &= todo - 1
             weight = load_row(weights, n)
             n += 1
+            if many == 1:
+                current, apart = np.int64(0), add_product(apart, weight, load_row(inverse, r))
+                continue
             for span in range(spans[r], spans[r + 1]):
                 if slots[span] != current:
                     if current >= 0:

@@ -112,7 +112,7 @@ def _cut(
     classes: np.ndarray,  # (L,)
     tiles: Tiles,
 ) -> Labels:
-    """Number the labels that occur, and cut the mask into tiles."""
+    """Cut a mask into tiles, its labels numbered as in `classes`."""
     position = np.full(max(classes.max(initial=0) + 1, 1), -1, np.int32)
     position[classes] = np.arange(len(classes))
     local = np.where(labels >= 0, position[np.maximum(labels, 0)], -1).astype(np.int32)

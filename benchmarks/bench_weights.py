@@ -1,0 +1,216 @@
+"""Tell whether it is faster to keep the weights of a view than to make them again, and whether 16 bits are enough.
+
+    python benchmarks/bench_weights.py        # on $GSSEG_DATA, default ../shared/data, and on a made-up room
+
+Of a prepared view, gsseg keeps which Gaussians are seen in which rows of which tiles, and makes their weights again in
+every step. Here the same step reads the weights instead, stored as multiples of 1 / 65535. What is told: seconds of a
+step over one view and bytes of the view in either way, and how many labels are other ones after EM.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+from pathlib import Path
+from typing import Any
+
+import numba as nb
+import numpy as np
+from llvmlite import ir
+from machine import DATA, describe, timed
+from numba.core import types
+from workloads import REAL, RoomSize, make_room, true_labels
+
+from gsseg_core import sightings
+from gsseg_core.blend import open_rays
+from gsseg_core.dataset import Dataset, View, spread
+from gsseg_core.em import EMLearner
+from gsseg_core.lanes import (
+    LANES,
+    WIDTH,
+    add_scaled,
+    add_scaled_where,
+    aim,
+    blend_row,
+    first_bit,
+    intrinsic,
+    load_row,
+    store_row,
+)
+from gsseg_core.operator import Shares, ViewOperator, make_operator
+from gsseg_core.scene import GaussianScene
+from gsseg_core.tile_observation import TileObservation
+from gsseg_core.tiles import TILE
+from gsseg_core.warm_up import warm_up
+
+STEPS = 65535.0
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the real scenes")
+    parser.add_argument("--gaussians", type=int, default=1_000_000, help="of the room")
+    parser.add_argument("--views", type=int, default=20, help="views to learn from")
+    parser.add_argument("--runs", type=int, default=5)
+    options = parser.parse_args()
+    print(describe())
+    warm_up()
+    built = make_room(RoomSize(options.gaussians, options.views, 10, 640, 480))
+    views = [View.from_arrays(camera, true_labels(built, camera, 10)) for camera in built.cameras]
+    compare("room", built.scene, views, 10, options.runs)
+    if (options.data / REAL[0]).is_dir():
+        data = Dataset(options.data / REAL[0], "labels_noisy")
+        scene = GaussianScene.load(options.data / REAL[0] / "scene.ply")
+        compare(REAL[0], scene, spread(data.views("train"), options.views), data.num_classes, options.runs)
+    else:
+        print(f"skipped: no {options.data / REAL[0]}")
+
+
+def compare(name: str, scene: GaussianScene, views: list[View], num_classes: int, runs: int) -> None:
+    """Print what both ways cost on a scene, and how far their labels agree."""
+    made, read, sizes = [], [], []
+    for view in spread(views, 5):
+        operator, mask = make_operator(scene, view.camera), view.read_labels()
+        ours, stored = operator.observe(mask), StoredWeights(operator, mask)
+        said, rest = np.full(len(ours.labels), 0.1, np.float32), np.ones(len(ours.classes), np.float32)
+        made.append(statistics.median(timed(lambda: ours.shares(said, rest), runs)))  # noqa: B023 - called at once
+        read.append(statistics.median(timed(lambda: stored.shares(said, rest), runs)))  # noqa: B023
+        sizes.append((ours.nbytes, stored.nbytes))
+    print(
+        f"{name}: a step over one view, mean of {len(made)}: weights made {1e3 * statistics.mean(made):.1f} ms, ",
+        end="",
+    )
+    print(f"read {1e3 * statistics.mean(read):.1f} ms; bytes of a view: ", end="")
+    print(", ".join(f"{statistics.mean(size) / 1e6:.1f} MB" for size in zip(*sizes, strict=True)))
+    plain = EMLearner(scene, num_classes)
+    plain.observe_all(views)
+    with_stored = EMLearner(scene, num_classes)
+    with_stored.observe_all(views)
+    with_stored._prepared = {
+        view.name: StoredWeights(make_operator(scene, view.camera), view.read_labels()) for view in views
+    }
+    one, other = plain.fit(), with_stored.fit()
+    differ = int((one.codes_.argmax(axis=1) != other.codes_.argmax(axis=1))[one.observed_].sum())
+    print(f"{name}: {differ} of {int(one.observed_.sum()):,} labels differ, ", end="")
+    print(f"codes by at most {np.abs(one.codes_ - other.codes_).max():.1g}; {len(one.history_)} steps")
+
+
+class StoredWeights(TileObservation):
+    """An observation that keeps the weights of all its records."""
+
+    def __init__(self, operator: ViewOperator, labels: np.ndarray) -> None:
+        super().__init__(operator.camera, operator.ids, operator._table, operator._tiles, labels)
+        self._first = np.concatenate([[0], np.cumsum(self._records)])
+        self._kept = np.empty((self._first[-1], LANES), np.uint16)
+        self._left_over = np.empty((len(self._records), TILE, TILE), np.float32)
+        store(
+            self._columns, self._camera.width, self._camera.height, self._table, self._start, self._entries, self._rows,
+            self._first, self._kept, self._left_over,
+        )  # fmt: skip
+
+    @property
+    def nbytes(self) -> int:
+        """What a step needs: not the Gaussians, but the weights."""
+        return super().nbytes - self._table.nbytes + self._kept.nbytes + self._left_over.nbytes
+
+    def shares(self, said: np.ndarray, rest: np.ndarray) -> Shares:
+        """Share out as ever, with stored weights."""
+        said, rest = np.ascontiguousarray(said, np.float32), np.ascontiguousarray(rest, np.float32)
+        mask = self._labels
+        logs, left_over = np.zeros(len(self._records)), np.zeros(len(mask.present))
+        sums, parts = np.empty(self._slot_start[-1], np.float32), np.empty((sightings.PARTS, len(said)), np.float32)
+        share_stored(
+            self._start, self._rows, self._first, self._kept, self._left_over, mask.start, mask.present,
+            mask.span_start, mask.slots, mask.lanes, self._slot_start, self._sighting, said, rest, logs, left_over,
+            sums,
+        )  # fmt: skip
+        sightings.add_up(self._slot_start, self._sighting, sums, parts)
+        total = np.bincount(mask.present, weights=left_over, minlength=len(rest))
+        return Shares(parts.sum(axis=0), total, float(logs.sum()))
+
+
+@intrinsic
+def load_steps(typing: Any, source: Any, i: Any, target: Any) -> Any:
+    """Copy a row of sixteen uint16 to target[0], as float32."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        arrays = [
+            context.make_array(kind)(context, builder, array)
+            for kind, array in zip((signature.args[0], signature.args[2]), (arguments[0], arguments[2]), strict=True)
+        ]
+        short, row = ir.VectorType(ir.IntType(16), LANES), ir.VectorType(ir.FloatType(), LANES)
+        first = builder.mul(arguments[1], ir.Constant(ir.IntType(64), LANES))
+        place = builder.gep(arrays[0].data, [first], source_etype=ir.IntType(16))
+        steps = builder.load(builder.bitcast(place, ir.PointerType(short)), align=2, typ=short)
+        wide = builder.sitofp(builder.zext(steps, ir.VectorType(ir.IntType(32), LANES)), row)
+        builder.store(wide, builder.bitcast(arrays[1].data, ir.PointerType(row)), align=4)
+        return context.get_dummy_value()
+
+    return types.void(source, types.int64, target), generate
+
+
+@nb.njit(parallel=True, error_model="numpy")
+def store(columns, width, height, table, start, entries, rows, first, kept, left_over) -> None:  # type: ignore[no-untyped-def]
+    """Make all weights of a view once, and keep them."""
+    for tile in nb.prange(start.shape[0] - 1):
+        rays, lines, record = left_over[tile], np.empty((2, TILE), np.float32), np.empty((1, TILE), np.float32)
+        left, top, _ = open_rays(tile, columns, width, height, rays)
+        n = first[tile]
+        for e in range(start[tile], start[tile + 1]):
+            g = entries[e]
+            aim(table, g, left, top, lines)
+            todo = np.int64(rows[e])
+            while todo:
+                r = first_bit(todo)
+                todo &= todo - 1
+                weight, _ = blend_row(rays, r, lines, table[g, WIDTH])
+                store_row(record, 0, weight)
+                for c in range(TILE):
+                    kept[n, c] = np.uint16(record[0, c] * np.float32(STEPS) + np.float32(0.5))
+                n += 1
+
+
+@nb.njit(parallel=True, fastmath={"contract", "nnan", "nsz", "reassoc"}, error_model="numpy")
+def share_stored(  # type: ignore[no-untyped-def]
+    start, rows, first, kept, final, label_start, present, span_start, slots, lanes, slot_start, sighting, said, rest,
+    logs, left_over, sums,
+) -> None:  # fmt: skip
+    """Do what `sightings.share` does."""
+    for tile in nb.prange(start.shape[0] - 1):
+        labels = present[label_start[tile] : label_start[tile + 1]]
+        many = labels.shape[0]
+        logs[tile] = 0.0
+        if many == 0:
+            continue
+        spans = span_start[tile * TILE : tile * TILE + TILE + 1]
+        here = sighting[slot_start[tile] : slot_start[tile + 1]]
+        value, weights = np.zeros((TILE, TILE), np.float32), np.empty((first[tile + 1] - first[tile], TILE), np.float32)
+        n = 0
+        for e in range(start[tile], start[tile + 1]):
+            only = said[here[e - start[tile]]] * np.float32(1 / STEPS) if many == 1 else np.float32(0.0)
+            todo = np.int64(rows[e])
+            while todo:
+                r = first_bit(todo)
+                todo &= todo - 1
+                load_steps(kept, first[tile] + n, weights[n:])
+                weight = load_row(weights, n)
+                n += 1
+                total = load_row(value, r)
+                if many == 1:
+                    total = add_scaled(total, weight, only)
+                else:
+                    for span in range(spans[r], spans[r + 1]):
+                        s = max(here[(e - start[tile]) * many + slots[span]], 0)
+                        total = add_scaled_where(total, weight, said[s] * np.float32(1 / STEPS), np.int64(lanes[span]))
+                store_row(value, r, total)
+        spare = left_over[label_start[tile] : label_start[tile + 1]]
+        logs[tile] = sightings._invert(spans, slots, lanes, rest[labels], final[tile], value, spare)
+        mine = sums[slot_start[tile] : slot_start[tile + 1]]
+        sightings._sum_shares(rows[start[tile] : start[tile + 1]], many, spans, slots, lanes, value, weights, mine)
+        mine *= np.float32(1 / STEPS)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
