@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
-from gsseg_core.errors import GssegError, SettingsError
+from gsseg_core.errors import GssegError
 from gsseg_core.export import write_json
 from gsseg_core.progress import progress_bars
 from gsseg_core.refine_settings import RefineSettings
@@ -67,7 +67,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     command.add_argument("--seed", type=int, default=0, help="for learners that draw at random (default: %(default)s)")
     command.add_argument(
-        "--ids", choices=("global", "per-view"), default="global", help="whether an id means the same in every view"
+        "--ids",
+        choices=("global", "per-view"),
+        default="global",
+        help="whether an id means the same in every view, or holds in its own view only (default: %(default)s)",
     )
     command.add_argument(
         "--scheduler", metavar="ADDRESS", help="learn on the workers of this Dask scheduler (em and votes)"
@@ -113,10 +116,6 @@ def _segment(options: argparse.Namespace) -> int:
     # The rasteriser's kernels load with the pipeline; `gsseg --help` need not wait for them.
     from gsseg_core import pipeline
 
-    if options.ids != "global":
-        raise SettingsError(
-            "--ids per-view is not in this version; expected global: ids that mean the same in every view"
-        )
     refine = RefineSettings(k=options.k, beta=options.beta, cluster=not options.no_knn, filter=not options.no_filter)
     _load_kernels(options.quiet, options.device)
     with progress_bars(options.quiet) as progress:
@@ -131,6 +130,7 @@ def _segment(options: argparse.Namespace) -> int:
             device=options.device,
             seed=options.seed,
             scheduler=options.scheduler,
+            ids=options.ids,
             progress=progress,
         )
     from gsseg_core.tables import segment_summary

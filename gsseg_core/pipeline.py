@@ -15,6 +15,7 @@ from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.export import draw_views, export_classes, write_json, write_overview, write_pictures
 from gsseg_core.learner import Learner, Progress, silent
 from gsseg_core.masks import write_mask
+from gsseg_core.object_table import find_objects
 from gsseg_core.pictures import save_png
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.report import Stopwatch, build_report
@@ -29,6 +30,9 @@ LEARNERS = ("em", "votes", "gradient")
 
 DISTRIBUTED = ("em", "votes")
 """Learners that sum over views, and so can do it on many machines."""
+
+PER_VIEW = "per-view"
+IDS = ("global", PER_VIEW)
 
 PICTURED_VIEWS = 12
 """Views that `segment` draws, spread evenly over the dataset."""
@@ -100,6 +104,7 @@ def segment(
     device: str = "cpu",
     seed: int = 0,
     scheduler: str | None = None,
+    ids: str = "global",
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Learn from the train views of a dataset, refine, and write everything into `out`.
@@ -122,6 +127,8 @@ def segment(
         The paper's by default.
     scheduler : str, optional
         Address of a Dask scheduler whose workers learn; everything else is done here.
+    ids : str
+        One of `IDS`: whether an id means the same in every view, or the objects are to be found.
 
     Returns
     -------
@@ -138,8 +145,11 @@ def segment(
             f"scheduler {scheduler}: the learner {learner} takes one view after the other, each at the codes that the "
             f"one before it left, so there is nothing to share out; expected one of {', '.join(DISTRIBUTED)}"
         )
+    if ids not in IDS:
+        raise SettingsError(f"ids is {ids!r}; expected one of {', '.join(IDS)}")
     refine = refine or RefineSettings()
     watch = Stopwatch()
+    table = None
     with ExitStack() as stack:
         with watch.stage("load"):
             client = None
@@ -150,8 +160,13 @@ def segment(
             scene = GaussianScene.load(scene_path)
             dataset = Dataset(data, labels)
             train = spread(dataset.views("train"), views)
-            teacher = make_learner(learner, scene, dataset.num_classes, seed=seed, device=device, client=client)
+            class_names = {} if ids == PER_VIEW else dataset.class_names
+        if ids == PER_VIEW:
+            with watch.stage("associate"):
+                table = find_objects(scene, train, device=device, progress=progress)
+                train, class_names = [table.relabelled(view) for view in train], table.class_names
         with watch.stage("observe"):
+            teacher = make_learner(learner, scene, max(class_names) + 1, seed=seed, device=device, client=client)
             teacher.observe_all(train, progress)
         with watch.stage("learn"):
             try:
@@ -159,7 +174,7 @@ def segment(
             except NoUsableViewsError as error:
                 raise NoUsableViewsError(f"{data}: {error}") from error
     with watch.stage("refine"):
-        result = Segmentation.from_codes(scene, teacher.codes_, dataset.class_names, refine)
+        result = Segmentation.from_codes(scene, teacher.codes_, class_names, refine)
     out = Path(out)
     with watch.stage("export"):
         result.save(out / "segmentation.npz")
@@ -173,13 +188,15 @@ def segment(
         views={"used": len(teacher.views), "rejected": teacher.reject_summary(), "names": teacher.rejected},
         settings={
             "learner": learner, "labels": labels, "views": views, "device": device, "seed": seed,
-            "scheduler": scheduler, "refine": asdict(refine), **_settings_of(teacher),
+            "scheduler": scheduler, "ids": ids, "refine": asdict(refine), **_settings_of(teacher),
         },
         objective=teacher.history_,
         plys={k: str(path.relative_to(out)) for k, path in plys.items()},
         pictures=[str(path.relative_to(out)) for path in pictures],
         seconds=watch.seconds,
     )  # fmt: skip
+    if table is not None:
+        report["ids"] = table.summary()
     write_json(out / "report.json", report)
     return report
 

@@ -37,7 +37,9 @@ def render(
     table: np.ndarray,  # (M, 8)
     start: np.ndarray,  # (T + 1,)
     entries: np.ndarray,  # (E,)
-    codes: np.ndarray,  # (M, K) float32
+    rows_of: np.ndarray,  # (M + 1,) codes, as `Rows`
+    classes: np.ndarray,  # (Z,) uint32
+    codes: np.ndarray,  # (Z,) float32
     out: np.ndarray,  # (H, W, K) float32 out
     left_over: np.ndarray,  # (H, W) float32 out: final transmittance
 ) -> None:
@@ -53,8 +55,9 @@ def render(
             g = entries[first + e]
             for i in range(n, ends[e]):
                 weight, row = load_row(weights, i), np.int64(rows[i]) * channels
-                for k in range(channels):
-                    store_row(block, row + k, add_scaled(load_row(block, row + k), weight, codes[g, k]))
+                for z in range(rows_of[g], rows_of[g + 1]):
+                    k = row + np.int64(classes[z])
+                    store_row(block, k, add_scaled(load_row(block, k), weight, codes[z]))
             n = ends[e]
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
         for r in range(min(TILE, height - top)):

@@ -33,7 +33,7 @@ class Rows(NamedTuple):
         cls,
         array: np.ndarray,  # (N, K)
     ) -> Rows:
-        """Keep the entries above zero."""
+        """Keep the entries that are not zero."""
         array = np.ascontiguousarray(array)
         start = np.zeros(len(array) + 1, np.int64)
         _count(array, start[1:])
@@ -118,7 +118,7 @@ def _count(array: np.ndarray, counts: np.ndarray) -> None:
     for i in nb.prange(array.shape[0]):
         n = 0
         for k in range(array.shape[1]):
-            n += array[i, k] > 0
+            n += array[i, k] != 0
         counts[i] = n
 
 
@@ -128,7 +128,7 @@ def _fill(array: np.ndarray, start: np.ndarray, classes: np.ndarray, values: np.
         z = start[i]
         if z < start[i + 1]:
             for k in range(array.shape[1]):
-                if array[i, k] > 0:
+                if array[i, k] != 0:
                     classes[z], values[z] = k, array[i, k]
                     z += 1
 

@@ -8,6 +8,7 @@ from gsseg_core import products
 from gsseg_core.cameras import Camera
 from gsseg_core.operator import Blended, Observation, ViewOperator, Weights
 from gsseg_core.projection import project
+from gsseg_core.rows import Rows
 from gsseg_core.scene import GaussianScene
 from gsseg_core.tile_observation import TileObservation
 from gsseg_core.tiles import TILE, assign
@@ -30,11 +31,12 @@ class TileOperator(ViewOperator):
         self._tiles = assign(projected, camera.width, camera.height)
 
     def _blend(self, codes: np.ndarray) -> Blended:
-        codes = codes[self.ids].astype(np.float32, order="C")
+        # A Gaussian speaks for few classes; the others cost nothing.
+        rows = Rows.of(codes[self.ids].astype(np.float32, order="C"))
         image = np.empty((self.camera.height, self.camera.width, codes.shape[1]), np.float32)
         left_over = np.empty(image.shape[:2], np.float32)
         tiles = self._tiles
-        products.render(tiles.columns, self._table, tiles.start, tiles.entries, codes, image, left_over)
+        products.render(tiles.columns, self._table, tiles.start, tiles.entries, *rows, image, left_over)
         return Blended(image, left_over)
 
     def _adjoint(self, residual: np.ndarray) -> np.ndarray:

@@ -27,8 +27,8 @@ from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import SettingsError
 from gsseg_core.gaussian_kernels import GAIN_UNIT, collect, improve
 from gsseg_core.operator import make_operator
-from gsseg_core.scene import GaussianScene
 from gsseg_core.rows import Rows
+from gsseg_core.scene import GaussianScene
 from gsseg_core.votes import VoteLearner
 
 SCENE, TRUTH = balls_on_a_table()

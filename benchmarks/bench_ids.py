@@ -1,0 +1,249 @@
+"""Masks whose ids hold only inside their own view: how well objects are found, on the real scene and the demo's.
+
+Usage: python benchmarks/bench_ids.py [--data FOLDER] [--out results_out/ids.md] [--scene replica|demo]
+
+Every row finds the objects of the train views, learns them with `em`, and scores label maps of the test views against
+true ids that it never saw: ARI, mIoU under the best one-to-one matching, and mIoU where each found object takes the
+true id that it shares most pixels with. "True ids" are the same masks without the association.
+
+The real scene's ids are numbers modulo 40: objects far apart share one. The rows "instances" have them told apart, by
+the truth alone: pixels of an id, placed in space by the rendered depth, are one instance where they hang together.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from results import markdown, points
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from gsseg_core.dataset import Dataset, View
+from gsseg_core.demo_scene import build_demo
+from gsseg_core.em import EMLearner
+from gsseg_core.matching import Contingency, renamed
+from gsseg_core.metrics import Evaluation
+from gsseg_core.object_table import find_objects
+from gsseg_core.operator import make_operator
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segmentation import Segmentation
+from gsseg_core.warm_up import warm_up
+
+Masks = dict[str, np.ndarray]
+
+WRONG = 0.2
+"""Share of the objects of a view that are split in two, and of those that are merged with a neighbour."""
+
+CELL, REACH, LEAST = 0.1, 0.31, 300
+"""Instances: size of a cell and the gap between cells that hang together, in scene units, and fewest pixels of one."""
+
+COLUMNS = ["masks", "ids", "objects", "true", "ARI", "mIoU one-to-one", "mIoU many-to-one", "find, s", "learn, s"]
+
+
+class Case(NamedTuple):
+    """One row: masks to learn from, and the truth of the test views."""
+
+    masks: str
+    ids: str
+    labels: Masks
+    truth: Masks
+    find: bool
+
+
+def main() -> int:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    repository = Path(__file__).resolve().parents[1]
+    parser.add_argument("--data", default=os.environ.get("GSSEG_DATA") or repository.parent / "shared/data", type=Path)
+    parser.add_argument("--out", default=repository / "results_out/ids.md", type=Path)
+    parser.add_argument("--scene", choices=("replica", "demo"))
+    options = parser.parse_args()
+    warm_up()
+    sections = []
+    if options.scene != "replica":
+        with tempfile.TemporaryDirectory() as folder:
+            sections.append("## Demo scene\n\n" + demo(Path(folder)))
+    if options.scene != "demo":
+        folder = options.data / "replica_apartment"
+        if folder.is_dir():
+            sections.append("## Replica apartment\n\n" + replica(folder))
+        else:
+            print(f"{folder}: not there; set GSSEG_DATA or --data to the folder that holds replica_apartment/")
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.write_text("\n\n".join(sections) + "\n", encoding="utf-8")
+    print(options.out)
+    return 0
+
+
+def demo(folder: Path) -> str:
+    """Measure on the demo scene."""
+    scene = build_demo(folder).scene
+    true, wrong = Dataset(folder, "labels_true"), Dataset(folder)
+    train = true.views("train")
+    truth = labels_of(true.views("test"))
+    return measure(scene, true, cases(labels_of(train), labels_of(wrong.views("train")), truth))
+
+
+def replica(folder: Path) -> str:
+    """Measure on the real scene, its ids as they are and with instances told apart."""
+    scene, data = GaussianScene.load(folder / "scene.ply"), Dataset(folder)
+    train, test = data.views("train"), data.views("test")
+    wrong = labels_of(Dataset(folder, "labels_noisy").views("train"))
+    rows = cases(labels_of(train), wrong, labels_of(test))
+    every = instances(scene, data.views())
+    apart = cases({v.name: every[v.name] for v in train}, None, {v.name: every[v.name] for v in test}, "instances")
+    return measure(scene, data, apart + rows)
+
+
+def cases(true: Masks, wrong: Masks | None, truth: Masks, name: str = "true") -> list[Case]:
+    """List the rows of one scene; `wrong` are its masks with errors."""
+    split = scrambled({view: cut(merged(labels, rng(view)), rng(view)) for view, labels in true.items()})
+    rows = [
+        Case(name, "true", true, truth, False),
+        Case(name, "shuffled", scrambled(true), truth, True),
+        Case(f"{name}, {WRONG:.0%} split, {WRONG:.0%} merged", "shuffled", split, truth, True),
+    ]
+    if wrong is not None:
+        rows.append(Case("wrong", "true", wrong, truth, False))
+        rows.append(Case("wrong", "shuffled", scrambled(wrong), truth, True))
+    return rows
+
+
+def measure(scene: GaussianScene, data: Dataset, rows: list[Case]) -> str:
+    """Find, learn and score every case."""
+    lines = []
+    for case in rows:
+        views = [view for view in data.views("train") if view.name in case.labels]
+        views = [View.from_arrays(view.camera, case.labels[view.name]) for view in views]
+        start = time.perf_counter()
+        if case.find:
+            table = find_objects(scene, views)
+            views = [table.relabelled(view) for view in views]
+        middle = time.perf_counter()
+        learner = EMLearner(scene, max(int(view.read_labels().max()) for view in views) + 1)
+        learner.observe_all(views)
+        learner.fit()
+        end = time.perf_counter()
+        result = Segmentation.from_codes(scene, learner.codes_, {})
+        found = {view.name: result.render(make_operator(scene, view.camera)).labels for view in data.views("test")}
+        score = Contingency()
+        for name, labels in case.truth.items():
+            score.add(labels, found[name])
+        shown = len(np.unique(np.concatenate([labels.ravel() for labels in found.values()])))
+        true = len(np.unique(np.concatenate([labels.ravel() for labels in case.truth.values()])))
+        lines.append([
+            case.masks, case.ids, str(shown), str(true), f"{score.ari:.4f}",
+            points(mean_iou(case.truth, found, score.one_to_one())),
+            points(mean_iou(case.truth, found, score.many_to_one())),
+            f"{middle - start:.1f}" if case.find else "", f"{end - middle:.1f}",
+        ])  # fmt: skip
+        print(*lines[-1], sep=", ", flush=True)
+    return markdown(COLUMNS, lines)
+
+
+def mean_iou(truth: Masks, found: Masks, names: dict[int, int]) -> float:
+    """Mean IoU over the true ids of the test views, with found ids given true ones."""
+    evaluation = Evaluation()
+    for name, labels in truth.items():
+        evaluation.add(labels, renamed(found[name], names), name)
+    return float(evaluation.mean_iou)
+
+
+def labels_of(views: list[View]) -> Masks:
+    return {view.name: view.read_labels() for view in views}
+
+
+def rng(name: str) -> np.random.Generator:
+    """Make a generator of a view's own."""
+    return np.random.default_rng(list(name.encode()))
+
+
+def scrambled(masks: Masks) -> Masks:
+    """Shuffle the ids of each view, 0 apart."""
+    return {name: _relabelled(labels, rng(name).permutation) for name, labels in masks.items()}
+
+
+def _relabelled(labels: np.ndarray, shuffle: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    table = np.arange(int(labels.max()) + 2)
+    table[-1] = -1
+    present = np.unique(labels[labels > 0])
+    table[present] = shuffle(present)
+    return table[labels].astype(np.int32)
+
+
+def cut(labels: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Split some objects in two of equal size, along a line of random direction."""
+    out, new = labels.copy(), int(labels.max()) + 1
+    for k in np.unique(labels[labels > 0]):
+        angle = random.uniform(0, np.pi)
+        if random.random() < WRONG:
+            rows, columns = np.nonzero(labels == k)
+            along = rows * np.sin(angle) + columns * np.cos(angle)
+            half = along > np.median(along)
+            out[rows[half], columns[half]] = new
+            new += 1
+    return out
+
+
+def merged(labels: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Merge some objects with one that they touch, each with one at most."""
+    sides = [(labels[1:], labels[:-1]), (labels[:, 1:], labels[:, :-1])]
+    touching = np.concatenate([np.stack([one.ravel(), two.ravel()], axis=1) for one, two in sides])
+    touching = np.unique(touching[(touching > 0).all(axis=1) & (touching[:, 0] != touching[:, 1])], axis=0)
+    touching = np.concatenate([touching, touching[:, ::-1]])
+    out, free = labels.copy(), np.ones(int(labels.max()) + 1, bool)
+    for k in np.unique(labels[labels > 0]):
+        # Each pair takes two objects.
+        others = np.unique(touching[touching[:, 0] == k, 1])
+        others = others[free[others]]
+        if random.random() < WRONG / 2 and free[k] and len(others):
+            other = random.choice(others)
+            out[out == k] = other
+            free[[k, other]] = False
+    return out
+
+
+def instances(scene: GaussianScene, views: list[View]) -> Masks:
+    """Tell objects that share an id apart, by where their pixels lie in space."""
+    labels = np.stack([view.read_labels() for view in views])
+    places = np.stack([_places(scene, view) for view in views])
+    out, many = np.zeros(labels.shape, np.int32), 0
+    for k in np.unique(labels[labels > 0]):
+        cells, cell, size = np.unique(
+            np.floor(places[labels == k] / CELL).astype(int), axis=0, return_inverse=True, return_counts=True
+        )
+        pairs = cKDTree(cells * CELL).query_pairs(REACH, output_type="ndarray")
+        links = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), shape=(len(cells), len(cells)))
+        part = connected_components(links, directed=False)[1]
+        pixels = np.bincount(part, size)
+        large = np.flatnonzero(pixels >= min(LEAST, pixels.max()))
+        kept = np.flatnonzero(np.isin(part, large))
+        # What is too small is noise of the depth, and goes to the nearest instance.
+        nearest = kept[cKDTree(cells[kept]).query(cells)[1]]
+        out[labels == k] = (many + 1 + np.searchsorted(large, part[nearest]))[cell.ravel()]
+        many += len(large)
+    return dict(zip([view.name for view in views], out, strict=True))
+
+
+def _places(scene: GaussianScene, view: View) -> np.ndarray:
+    """Point that each pixel shows, (H, W, 3), by the mean depth of the Gaussians that made it."""
+    camera = view.camera
+    rotation, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
+    depth, left_over = make_operator(scene, camera).blend((scene.means @ rotation[2] + shift[2])[:, None])
+    z = depth[..., 0] / np.maximum(1 - left_over, 1e-6)
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    local = np.stack([(x - camera.cx) / camera.fx * z, (y - camera.cy) / camera.fy * z, z], axis=-1)
+    places: np.ndarray = (local - shift) @ rotation
+    return places
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,262 @@
+"""Which segments of different views show the same object, where ids hold only inside their own view.
+
+A segment is one id of one view. Lifted to the Gaussians it is a sparse row w_a, in px, and s_v is the sum of the rows
+of view v: all that v saw of each Gaussian. With sqrt(s_u s_v) as the weight of a Gaussian that u and v both see,
+
+    O_ab = sum_i (w_a / sqrt s_u)[i] (w_b / sqrt s_v)[i]       what segment a of u and segment b of v have in common
+    V_av = sum_i (w_a / sqrt s_u)[i] sqrt(s_v)[i]              what v sees of a, whatever it calls it
+
+and O_ab / V_av is the share of what v sees of a that it calls b. Hidden parts do not count, so a segment that is half
+behind a chair still matches the whole. All three are products of sparse matrices, and sums over the segments of a
+cluster are those of the cluster.
+
+1. **Views vote on pairs.** View v says that clusters C and D are one object with the probability that a point of each
+   gets the same id there, A_v = sum_b O_Cb O_Db / (V_Cv V_Dv). What counts is the mean over the views that see both,
+   so an object that some views split, or two that some views merge, are outvoted by the other views.
+2. **Clusters merge**, the most agreed pairs first, while the agreement is above one half; what has merged is compared
+   anew, with the evidence of all its segments together.
+3. **Segments move** to the object that explains them best by what the other views say, until none does. That gives
+   leftovers, one half of something, say, to the whole, and clutter to the background; objects left without a segment
+   are gone.
+
+Nothing depends on the order of views or ids, nor on how many there are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from gsseg_core.errors import SettingsError
+from gsseg_core.segments import Lifted, Profiles, sums
+
+
+@dataclass(frozen=True)
+class AssociationSettings:
+    """Settings of `associate`.
+
+    Attributes
+    ----------
+    kept : float
+        Share of a segment's weight that is kept, in its heaviest Gaussians, in (0, 1].
+    agreement : float
+        Clusters merge above this mean agreement of the views that see both, in (0, 1).
+    doubt : float
+        Views that disagree, added to every pair: pairs that many views confirm merge first.
+    evidence : float
+        Views, in full sight of both clusters, that it takes at least to merge two.
+    full_sight : float
+        Share of a cluster, as far as any view sees it, that a view must see to count in full.
+    full_sight_px : float
+        What a view sees of a cluster counts by x / (x + this), x in px.
+    least_share : float
+        Smaller shares O_ab / V_av are soft edges, not overlap.
+    unseen : float
+        A segment of which the other views have seen less than this share stays what it is.
+    rounds : int
+        Rounds of moves at most.
+    """
+
+    kept: float = 0.8
+    agreement: float = 0.5
+    doubt: float = 0.3
+    evidence: float = 0.3
+    full_sight: float = 0.5
+    full_sight_px: float = 10.0
+    least_share: float = 0.05
+    unseen: float = 0.3
+    rounds: int = 10
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        if not 0 < self.kept <= 1 or not 0 < self.agreement < 1:
+            raise SettingsError(
+                f"association: kept is {self.kept}, agreement {self.agreement}; expected a share in (0, 1]"
+            )
+        if min(self.doubt, self.evidence, self.full_sight_px, self.least_share, self.unseen, self.rounds) < 0:
+            raise SettingsError("association: a setting is negative; expected 0 or more")
+        if self.full_sight <= 0:
+            raise SettingsError(f"association: full_sight is {self.full_sight}; expected a share above 0")
+
+
+def associate(views: Mapping[str, Lifted], settings: AssociationSettings | None = None) -> dict[str, np.ndarray]:
+    """Find the objects that the segments of all views show.
+
+    Time and memory grow with the number of pairs of segments that share a Gaussian or are neighbours of the same
+    segment, not with the square of all: n segments, each seen by o others, take O(n o^2) products.
+
+    Parameters
+    ----------
+    views : mapping from name to Lifted
+        In any order; the names only break ties.
+    settings : AssociationSettings, optional
+
+    Returns
+    -------
+    dict of str to ndarray (L,) int32
+        Object of each segment, like `Lifted.ids`: 0 for the background, others from 1, the largest first.
+    """
+    settings = settings or AssociationSettings()
+    names = sorted(views)
+    if not names:
+        return {}
+    stack = _Stack([views[name] for name in names])
+    objects = _move(stack, _merge(stack, settings), settings)
+    objects = _by_size(objects, stack)
+    return dict(zip(names, np.split(objects, stack.starts[1:-1]), strict=True))
+
+
+class _Stack:
+    """Segments of all views, one below the other."""
+
+    def __init__(self, views: list[Lifted]) -> None:
+        self.views = views
+        self.starts = np.concatenate([[0], np.cumsum([len(view) for view in views])])
+        self.view = np.repeat(np.arange(len(views)), np.diff(self.starts))
+        self.background = np.concatenate([view.ids for view in views]) == 0
+        self.size = np.concatenate([sums(view.weights, 1) for view in views])
+        # Gaussians that nobody sees take no part.
+        self.present, where = np.unique(np.concatenate([view.gaussians for view in views]), return_inverse=True)
+        self.where = np.split(where, np.cumsum([len(view.gaussians) for view in views])[:-1])
+
+    def rows(self, view: int) -> slice:
+        return slice(int(self.starts[view]), int(self.starts[view + 1]))
+
+    def overlaps(self) -> tuple[sparse.csr_matrix, np.ndarray]:
+        """O (n, n), and V (n, views)."""
+        scaled, seen = [], []
+        for view, where in zip(self.views, self.where, strict=True):
+            root = np.sqrt(sums(view.weights, 0)).astype(np.float32)
+            weights = view.weights
+            scaled.append(_rows(weights.data / root[weights.indices], where[weights.indices], weights.indptr, self))
+            seen.append(_rows(root, where, np.array([0, len(root)]), self))
+        stacked = sparse.vstack(scaled, format="csr")
+        return (stacked @ stacked.T).tocsr(), (stacked @ sparse.vstack(seen, format="csr").T).toarray()
+
+
+def _rows(data: np.ndarray, columns: np.ndarray, starts: np.ndarray, stack: _Stack) -> sparse.csr_matrix:
+    return sparse.csr_matrix((data, columns, starts), shape=(len(starts) - 1, len(stack.present)))
+
+
+def _merge(stack: _Stack, settings: AssociationSettings) -> np.ndarray:
+    """Cluster the segments; all of the background are cluster 0, the others are numbered from 1."""
+    overlap, seen = stack.overlaps()
+    nodes = np.flatnonzero(~stack.background)
+    cluster = np.arange(len(nodes))
+    hidden = np.zeros_like(seen)
+    if stack.background.any():
+        columns = np.flatnonzero(stack.background)
+        hidden[:, stack.view[columns]] = overlap[:, columns].toarray()
+        overlap = overlap.tocsc(copy=True)
+        overlap.data[np.repeat(stack.background, np.diff(overlap.indptr))] = 0
+        overlap = overlap.tocsr()
+        overlap.eliminate_zeros()
+    overlap, seen, hidden = overlap[nodes], seen[nodes], hidden[nodes]
+    while len(seen) > 1:
+        pairs = _agreements(*_votes(overlap, seen, hidden, stack.view, settings), settings)
+        target = _match(*pairs, len(seen), settings.agreement)
+        if target is None:
+            break
+        merged = np.unique(target, return_inverse=True)[1]
+        groups = sparse.csr_matrix((np.ones(len(merged), np.float32), (merged, np.arange(len(merged)))))
+        overlap, seen, hidden = (groups @ overlap).tocsr(), groups @ seen, groups @ hidden
+        cluster = merged[cluster]
+    clusters = np.zeros(len(stack.view), np.int64)
+    clusters[nodes] = cluster + 1
+    return clusters
+
+
+def _votes(
+    overlap: sparse.csr_matrix,  # (C, n)
+    seen: np.ndarray,  # (C, views)
+    hidden: np.ndarray,  # (C, views) of that, what is background there
+    view: np.ndarray,  # (n,)
+    settings: AssociationSettings,
+) -> tuple[sparse.csr_matrix, np.ndarray]:
+    """Share of each cluster that each segment has, (C, n), and what each view counts for it, (C, views), in the former.
+
+    Who calls a cluster background says nothing of which object it is.
+    """
+    told = np.maximum(seen - hidden, 0)
+    counts: np.ndarray = np.minimum(told / np.maximum(settings.full_sight * seen.max(axis=1, keepdims=True), 1e-9), 1)
+    counts *= told / (told + settings.full_sight_px)
+    entries = overlap.tocoo()
+    share = entries.data / np.maximum(told[entries.row, view[entries.col]], 1e-9)
+    strong = share > settings.least_share
+    row, col, share = entries.row[strong], entries.col[strong], share[strong]
+    return sparse.csr_matrix((share * counts[row, view[col]], (row, col)), shape=overlap.shape), counts
+
+
+def _agreements(
+    votes: sparse.csr_matrix,  # (C, n)
+    counts: np.ndarray,  # (C, views)
+    settings: AssociationSettings,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pairs of clusters, first < second, and the views' mean agreement on them."""
+    both = sparse.triu(votes @ votes.T, 1).tocoo()
+    evidence = np.empty(both.nnz)
+    for k in range(0, both.nnz, _PAIRS):
+        part = slice(k, k + _PAIRS)
+        evidence[part] = np.einsum("pv,pv->p", counts[both.row[part]], counts[both.col[part]])
+    score = np.where(evidence >= settings.evidence, both.data / (evidence + settings.doubt), 0)
+    return both.row, both.col, score
+
+
+_PAIRS = 1 << 15
+"""So many pairs at a time, to keep memory small."""
+
+_LEVEL = 0.75
+"""Pairs that agree nearly as well as the best one merge at once, before anything is compared anew."""
+
+
+def _match(
+    first: np.ndarray,
+    second: np.ndarray,
+    score: np.ndarray,
+    num: int,
+    least: float,
+) -> np.ndarray | None:
+    """Pair off clusters, best pairs first, each at most once; return whom each one becomes, None if nobody pairs."""
+    good = score > least
+    if not good.any():
+        return None
+    good &= score >= _LEVEL * score.max()
+    first, second, score = first[good], second[good], score[good]
+    target, free = np.arange(num), np.ones(num, bool)
+    for k in np.lexsort([second, first, -score]):
+        a, b = first[k], second[k]
+        if free[a] and free[b]:
+            free[a] = free[b] = False
+            target[b] = a
+    return target
+
+
+def _move(stack: _Stack, objects: np.ndarray, settings: AssociationSettings) -> np.ndarray:
+    """Give every segment to the object that explains it best by what the other views say."""
+    for _ in range(settings.rounds):
+        before = objects
+        profiles = Profiles.empty(len(stack.present))
+        for v, (view, where) in enumerate(zip(stack.views, stack.where, strict=True)):
+            profiles.add(where, view.weights, before[stack.rows(v)])
+        objects = before.copy()
+        for v, (view, where) in enumerate(zip(stack.views, stack.where, strict=True)):
+            rows = stack.rows(v)
+            best, seen = profiles.explain(where, view.weights, before[rows])
+            moves = ~stack.background[rows] & (seen >= settings.unseen)
+            objects[rows] = np.where(moves, best, before[rows])
+        if (objects == before).all():
+            break
+    return objects
+
+
+def _by_size(objects: np.ndarray, stack: _Stack) -> np.ndarray:
+    """Give objects numbers from 1 on, the largest first."""
+    size = np.bincount(objects, stack.size)
+    present = np.unique(objects[objects > 0])
+    number = np.zeros(len(size), np.int32)
+    number[present[np.argsort(-size[present], kind="stable")]] = np.arange(1, len(present) + 1)
+    numbered: np.ndarray = number[objects]
+    return numbered

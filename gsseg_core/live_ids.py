@@ -1,0 +1,130 @@
+"""A live session for masks whose ids hold only inside their own view."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+
+from gsseg_core.dataset import Dataset, View
+from gsseg_core.errors import GssegError, SettingsError
+from gsseg_core.live import LiveSession, Outcome, Rejection
+from gsseg_core.object_table import ObjectTable, Repair, object_name
+from gsseg_core.scene import GaussianScene
+from gsseg_core.state_file import Learnt, State
+
+
+class PerViewSession(LiveSession):
+    """A `LiveSession` whose classes are objects that it finds itself.
+
+    The ids of a new view are matched to the objects so far as it arrives. `learn` first looks at all views that are
+    kept together, and repairs what turns out to be wrong, as `repair` does; objects keep their numbers, and a number
+    that has become part of another one is not given again. While it looks, for a few seconds, other calls wait.
+
+    Parameters
+    ----------
+    scene : GaussianScene
+        N Gaussians.
+    max_views : int
+        The last so many views are kept for `repair` and `learn`; votes are never dropped.
+    device : str
+        Where views are rendered.
+    """
+
+    _table: ObjectTable
+
+    def __init__(self, scene: GaussianScene, *, max_views: int = 200, device: str = "cpu") -> None:
+        super().__init__(scene, max_views=max_views, device=device)
+
+    @property
+    def class_names(self) -> dict[int, str]:
+        """Names by number, "object_001" and so on."""
+        with self._lock:
+            return {k: object_name(k) for k in range(self._live.num_classes)}
+
+    def fuse(self, view: View) -> Rejection | None:
+        """Match a view's ids to the objects so far, add it to the votes, and keep it for `repair` and `learn`."""
+        with self._lock:
+            try:
+                matched = self._table.match(view)
+            except GssegError as error:
+                return self.reject(Rejection.of(error))
+            rejection = super().fuse(matched)
+            if rejection is not None and view.name in self._table.views:
+                self._table.remove(view.name)
+            return rejection
+
+    def repair(self) -> Repair:
+        """Find the objects anew from all views that are kept, and count their votes for the right ones.
+
+        Votes of views that are no longer kept go along with most of their object.
+        """
+        with self._lock:
+            repair, order = self._table.solve(), list(self._live.views)
+            moved = (repair.heirs != np.arange(len(repair.heirs))).any()
+            forgotten = self.num_fused > len(order)
+            names = order if moved and forgotten else [name for name in order if name in set(repair.changed)]
+            views = {name: self._table.relabelled(self._table.views[name]) for name in names}
+            for name in names:
+                self._live.retract(name)
+            if moved and forgotten:
+                self._live.adopt(self._renumbered(self._live.state(), repair.heirs))
+            for view in views.values():
+                self._make_room(view)
+                self._live.observe(view)
+            # The oldest view still is the first one to go.
+            self._live.views = {name: self._live.views[name] for name in order if name in self._live.views}
+            if self._learnt is not None and moved:
+                codes = _renumber(self._learnt.codes, repair.heirs)
+                self._learnt = Learnt(self._learnt.learner, codes, self._learnt.num_views)
+            self._version += 1
+        return repair
+
+    def learn(self, learner: str = "em", dataset: Dataset | None = None, **settings: Any) -> Outcome:
+        """Repair, then learn the best codes from the views kept. The repair stays, even if learning is ended.
+
+        Raises
+        ------
+        SettingsError
+            A dataset is given: its objects would have numbers of their own.
+        NoUsableViewsError
+            There is no view to learn from.
+        """
+        if dataset is not None:
+            raise SettingsError(f"{dataset.root}: ids are per view; expected to learn from the views received only")
+        self.repair()
+        return super().learn(learner, None, **settings)
+
+    def load(self, path: str | os.PathLike[str]) -> int:
+        """Replace all that is known by a saved state, as `LiveSession.load` does; its labels are numbers of objects."""
+        with self._lock:
+            loaded = super().load(path)
+            for view in self._live.views.values():
+                self._table.adopt(view)
+            self._table.reserve(self._live.num_classes - 1)
+        return loaded
+
+    def _forget(self) -> None:
+        super()._forget()
+        self._table = ObjectTable(self.scene, device=self.device)
+
+    def _drop_old_views(self) -> None:
+        super()._drop_old_views()
+        for name in [name for name in self._table.views if name not in self._live.views]:
+            self._table.forget(name)
+
+    @staticmethod
+    def _renumbered(state: State, heirs: np.ndarray) -> State:
+        return State(_renumber(state.votes, heirs), state.views, state.num_fused)
+
+
+def _renumber(
+    columns: np.ndarray,  # (N, K)
+    heirs: np.ndarray,  # (K',) at least as many
+) -> np.ndarray:
+    """Add columns up by their new numbers."""
+    out = np.zeros((len(columns), max(columns.shape[1], int(heirs.max()) + 1)), columns.dtype)
+    for k in range(columns.shape[1]):
+        out[:, heirs[k] if k < len(heirs) else k] += columns[:, k]
+    return out

@@ -1,0 +1,282 @@
+"""Views whose ids hold only inside their own frame, and the objects that they show: ids for all views come out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from gsseg_core.association import AssociationSettings, associate
+from gsseg_core.dataset import View
+from gsseg_core.errors import UnknownLabelError
+from gsseg_core.learner import Progress, silent
+from gsseg_core.masks import BACKGROUND_NAME, MAX_LABEL, UNKNOWN
+from gsseg_core.operator import make_operator
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segments import Lifted, Profiles, sums
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """What the ids of one view mean.
+
+    Attributes
+    ----------
+    objects : dict of int to int
+        Object by id; 0 is the background in both.
+    merged : int
+        Ids that cover two objects or more, so that they can be right for one only.
+    split : int
+        Ids beyond the first of an object that this view has cut up.
+    """
+
+    objects: dict[int, int]
+    merged: int
+    split: int
+
+
+@dataclass(frozen=True, eq=False)
+class Repair:
+    """What `ObjectTable.solve` has changed.
+
+    Attributes
+    ----------
+    changed : list of str
+        Views whose ids now mean something else than before.
+    heirs : (K,) int64
+        What has become of each earlier object: the number that most of it has now.
+    """
+
+    changed: list[str]
+    heirs: np.ndarray
+
+
+class ObjectTable:
+    """Objects, found from views whose ids are their own.
+
+    Views come one at a time: `match` gives the ids of a new one the numbers of the objects that are known so far, at
+    once. `solve` looks at all views together and repairs what one view could not know: it merges objects that were one,
+    and parts others. What it finds does not depend on the order in which the views came.
+
+    Parameters
+    ----------
+    scene : GaussianScene
+        N Gaussians.
+    settings : AssociationSettings, optional
+    device : str
+        Where views are rendered.
+
+    Attributes
+    ----------
+    views : dict of str to View
+        The views as they came, by name.
+    """
+
+    def __init__(
+        self, scene: GaussianScene, settings: AssociationSettings | None = None, *, device: str = "cpu"
+    ) -> None:
+        self.scene, self.settings, self.device = scene, settings or AssociationSettings(), device
+        self.views: dict[str, View] = {}
+        self._lifted: dict[str, Lifted] = {}
+        self._objects: dict[str, np.ndarray] = {}
+        self._largest = 0
+        self._forgotten = Profiles.empty(len(scene))
+        self._profiles = Profiles.empty(len(scene))
+
+    @property
+    def num_objects(self) -> int:
+        """Objects that the views show, the background not counted."""
+        return len({k for objects in self._objects.values() for k in objects.tolist()} - {0})
+
+    @property
+    def class_names(self) -> dict[int, str]:
+        """Names by number, up to the largest that was given: "object_001" and so on."""
+        return {k: object_name(k) for k in range(self._largest + 1)}
+
+    def add(self, view: View) -> bool:
+        """Add a view for `solve`; one of a name that is there already replaces it.
+
+        Returns
+        -------
+        bool
+            Whether it has a mask and sees any Gaussian; if not, nothing has changed.
+
+        Raises
+        ------
+        MaskFormatError, MaskSizeError, UnknownLabelError
+            The mask is broken, of another size than the camera, or has ids beyond `MAX_LABEL`.
+        """
+        lifted = self._lift(view)
+        if lifted is None:
+            return False
+        if view.name in self.views:
+            self.remove(view.name)
+        self.views[view.name], self._lifted[view.name] = replace(view, class_names=None), lifted
+        return True
+
+    def match(self, view: View) -> View:
+        """Add a view, and give its ids the numbers of the objects so far; what nobody has seen yet is a new object.
+
+        Returns
+        -------
+        View
+            As `relabelled` does.
+
+        Raises
+        ------
+        MaskFormatError, MaskSizeError, UnknownLabelError
+            As `add` does, or there are too many objects. Nothing has changed.
+        """
+        if self.add(view):
+            lifted = self._lifted[view.name]
+            best, seen = self._profiles.explain(lifted.gaussians, lifted.weights)
+            new = (lifted.ids > 0) & (seen < self.settings.unseen)
+            best[lifted.ids == 0] = 0
+            best[new] = self._largest + 1 + np.arange(np.count_nonzero(new))
+            if best.max(initial=0) > MAX_LABEL:
+                self.remove(view.name)
+                raise UnknownLabelError(f"view '{view.name}': shows object {best.max()}; expected at most {MAX_LABEL}")
+            self._give(view.name, best)
+        return self.relabelled(view)
+
+    def adopt(self, view: View) -> None:
+        """Add a view whose ids are the numbers of objects already."""
+        if self.add(view):
+            self._give(view.name, self._lifted[view.name].ids)
+
+    def reserve(self, number: int) -> None:
+        """Give no new object a number up to this one."""
+        self._largest = max(self._largest, number)
+
+    def remove(self, name: str) -> None:
+        """Take a view back, and all that it said."""
+        del self.views[name], self._lifted[name]
+        if self._objects.pop(name, None) is not None:
+            self._fill()
+
+    def forget(self, name: str) -> None:
+        """Drop a view; what it said still counts for `match`, but `solve` does without."""
+        lifted = self._lifted.pop(name)
+        self._forgotten.add(lifted.gaussians, lifted.weights, self._objects.pop(name))
+        del self.views[name]
+
+    def solve(self, progress: Progress = silent) -> Repair:
+        """Find the objects from all views together.
+
+        Objects that have a number keep it, by the largest overlap; new ones follow, the largest first.
+        """
+        progress("associate", 0, 1)
+        solved = associate(self._lifted, self.settings)
+        before, heirs = self._objects, np.arange(self._largest + 1)
+        if before:
+            solved, heirs = self._renumbered(solved)
+        self._objects = solved
+        self._largest = max([self._largest, *(int(objects.max(initial=0)) for objects in solved.values())])
+        self._forgotten = self._forgotten.renumbered(heirs)
+        self._fill()
+        progress("associate", 1, 1)
+        changed = [name for name in solved if name not in before or (before[name] != solved[name]).any()]
+        return Repair(changed, heirs)
+
+    def relabelled(self, view: View) -> View:
+        """Return a view as it came, with the numbers of objects for labels; ids that lie on no Gaussian are unknown.
+
+        A view that `add` would not take comes back with nothing but background and unknown pixels, or as it is if it
+        has no mask, so that a learner turns it away for the right reason.
+        """
+        if not view.has_mask:
+            return view
+        labels = replace(self.views.get(view.name, view), class_names=None).read_labels()
+        lifted = self._lifted.get(view.name)
+        if lifted is None:
+            labels = np.minimum(labels, 0)
+        else:
+            table = np.full(int(labels.max()) + 2, UNKNOWN, np.int32)  # The last one is for unknown pixels.
+            table[lifted.ids] = self._objects[view.name]
+            labels = table[labels]
+        return replace(View.from_arrays(view.camera, labels), image_path=view.image_path)
+
+    def alignment(self, name: str) -> Alignment:
+        """Tell what the ids of a view mean, and how many of them do not fit."""
+        lifted, objects = self._lifted[name], self._objects[name]
+        shown = objects[objects > 0]
+        parts, _ = self._profiles.common(lifted.gaussians, lifted.weights)
+        parts[:, 0], parts[lifted.ids == 0] = 0, 0
+        size = parts.sum(axis=0)
+        # Most of an object, as far as this view shows it, lies under an id: more than one, and the id has merged them.
+        most = (parts > 0.5 * size) & (size >= self.settings.full_sight_px)
+        return Alignment(
+            dict(sorted(zip(lifted.ids.tolist(), objects.tolist(), strict=True))),
+            merged=int((most.sum(axis=1) > 1).sum()),
+            split=len(shown) - len(np.unique(shown)),
+        )
+
+    def summary(self) -> dict[str, Any]:
+        """Put together what `report.json` says of the ids."""
+        alignments = {name: asdict(self.alignment(name)) for name in sorted(self._objects)}
+        return {
+            "objects": self.num_objects,
+            "segments": sum(len(lifted) for lifted in self._lifted.values()),
+            "merged": sum(alignment["merged"] for alignment in alignments.values()),
+            "split": sum(alignment["split"] for alignment in alignments.values()),
+            "settings": asdict(self.settings),
+            "views": alignments,
+        }
+
+    def _lift(self, view: View) -> Lifted | None:
+        if not view.has_mask:
+            return None
+        # Names of classes say nothing of ids that are a view's own.
+        labels = replace(view, class_names=None).read_labels()
+        if not (labels >= 0).any():
+            return None
+        observation = make_operator(self.scene, view.camera, self.device).observe(labels)
+        return Lifted.of(observation, self.settings.kept) if len(observation.ids) else None
+
+    def _give(self, name: str, objects: np.ndarray) -> None:
+        lifted, self._objects[name] = self._lifted[name], objects.astype(np.int32)
+        self._largest = max(self._largest, int(objects.max(initial=0)))
+        self._profiles.add(lifted.gaussians, lifted.weights, objects)
+
+    def _fill(self) -> None:
+        self._profiles = self._forgotten.copy()
+        for name, objects in self._objects.items():
+            self._profiles.add(self._lifted[name].gaussians, self._lifted[name].weights, objects)
+
+    def _renumbered(self, solved: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Give solved objects the numbers that most of their weight had before; and who took over what."""
+        names = sorted(self._objects)
+        old, new = (np.concatenate([part[name] for name in names]) for part in (self._objects, solved))
+        size = np.concatenate([sums(self._lifted[name].weights, 1) for name in names])
+        shared = np.zeros((max(int(part.max(initial=0)) for part in solved.values()) + 1, self._largest + 1))
+        np.add.at(shared, (new, old), size)
+        table = np.zeros(len(shared), np.int64)
+        rows, columns = linear_sum_assignment(shared[1:, 1:], maximize=True)
+        kept = shared[rows + 1, columns + 1] > 0
+        table[rows[kept] + 1] = columns[kept] + 1
+        fresh = np.flatnonzero(table[1:] == 0) + 1
+        table[fresh] = self._largest + 1 + np.arange(len(fresh))
+        heirs = np.where(shared.any(axis=0), table[shared.argmax(axis=0)], np.arange(self._largest + 1))
+        heirs[0] = 0
+        return {name: table[objects].astype(np.int32) for name, objects in solved.items()}, heirs
+
+
+def object_name(number: int) -> str:
+    """Name an object by its number."""
+    return f"object_{number:03d}" if number else BACKGROUND_NAME
+
+
+def find_objects(
+    scene: GaussianScene, views: Sequence[View], *, device: str = "cpu", progress: Progress = silent
+) -> ObjectTable:
+    """Find the objects of all views whose masks can be used."""
+    table = ObjectTable(scene, device=device)
+    for done, view in enumerate(views):
+        progress("lift", done, len(views))
+        table.add(view)
+    progress("lift", len(views), len(views))
+    table.solve(progress)
+    return table

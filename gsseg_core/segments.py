@@ -1,0 +1,172 @@
+"""The segments of views, ids lifted to the Gaussians as sparse rows, and what they add up to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import sparse
+
+from gsseg_core.operator import Observation
+
+
+@dataclass(frozen=True, eq=False)
+class Lifted:
+    """The segments of one view, lifted to the Gaussians, heaviest segment first.
+
+    Attributes
+    ----------
+    ids : (L,) int32
+        Id of each segment in the mask; 0 is the background. Ids that lie on no Gaussian are left out.
+    gaussians : (M,) int32
+        Gaussians that the segments are on, ascending.
+    weights : (L, M) csr_matrix of float32
+        w_a, in px.
+    """
+
+    ids: np.ndarray
+    gaussians: np.ndarray
+    weights: sparse.csr_matrix
+
+    @classmethod
+    def of(cls, observation: Observation, kept: float = 0.8) -> Lifted:
+        """Lift the ids of a mask; of each, only the heaviest Gaussians that make up a share of its weight."""
+        segments, ids, weights = observation.labels, observation.ids[observation.rows], observation.votes()
+        order = np.lexsort([ids, -weights, segments])
+        segments, ids, weights = segments[order], ids[order], weights[order]
+        many = np.bincount(segments, minlength=len(observation.classes))
+        size = np.bincount(segments, weights, len(many))
+        above = np.cumsum(weights, dtype=np.float64) - weights - np.repeat(np.cumsum(size) - size, many)
+        heavy = (above < kept * size[segments]) & (weights > 0)
+        segments, ids, weights = segments[heavy], ids[heavy], weights[heavy]
+        # An order that the ids have no part in: by weight, then by the first Gaussian.
+        first = np.full(len(many), np.iinfo(np.int64).max)
+        np.minimum.at(first, segments, ids)
+        order = np.lexsort([first, -size])[: np.count_nonzero(size)]
+        row = np.zeros(len(many), np.int64)
+        row[order] = np.arange(len(order))
+        gaussians, column = np.unique(ids, return_inverse=True)
+        lifted = sparse.csr_matrix((weights, (row[segments], column)), shape=(len(order), len(gaussians)))
+        return cls(observation.classes[order], gaussians, lifted)
+
+    def __len__(self) -> int:
+        """Count the segments."""
+        return len(self.ids)
+
+
+class Profiles:
+    """What views say of the objects so far: the segments of each object added up, a sparse (N, K) matrix, in px."""
+
+    def __init__(self, weights: sparse.csr_matrix) -> None:
+        self._sum, self._more = weights, list[sparse.coo_matrix]()
+
+    @classmethod
+    def empty(cls, num_gaussians: int) -> Profiles:
+        """Know nothing yet."""
+        return cls(sparse.csr_matrix((num_gaussians, 1)))
+
+    def add(
+        self,
+        gaussians: np.ndarray,  # (M,)
+        weights: sparse.csr_matrix,  # (L, M)
+        objects: np.ndarray,  # (L,)
+    ) -> None:
+        """Add the segments of a view."""
+        part = _by_object(weights, objects, int(objects.max(initial=0)) + 1).tocoo()
+        self._more.append(
+            sparse.coo_matrix((part.data, (gaussians[part.row], part.col)), shape=(len(self), part.shape[1]))
+        )
+
+    def renumbered(
+        self,
+        objects: np.ndarray,  # (K,)
+    ) -> Profiles:
+        """Give the objects other numbers; those that get the same one become one."""
+        old = self.weights.tocoo()
+        shape = (len(self), int(objects.max(initial=0)) + 1)
+        return Profiles(sparse.coo_matrix((old.data, (old.row, objects[old.col])), shape=shape).tocsr())
+
+    def copy(self) -> Profiles:
+        """Return the same in memory of its own."""
+        return Profiles(self.weights.copy())
+
+    def __len__(self) -> int:
+        """Count the Gaussians, N."""
+        return int(self._sum.shape[0])
+
+    @property
+    def weights(self) -> sparse.csr_matrix:
+        """The sum, (N, K) csr_matrix of float64."""
+        if self._more:
+            parts = [self._sum.tocoo(), *self._more]
+            row, col, data = (
+                np.concatenate([getattr(part, name) for part in parts]) for name in ("row", "col", "data")
+            )
+            shape = (len(self), int(max(part.shape[1] for part in parts)))
+            self._sum, self._more = sparse.coo_matrix((data, (row, col)), shape=shape).tocsr(), []
+        return self._sum
+
+    def common(
+        self,
+        gaussians: np.ndarray,  # (M,)
+        weights: sparse.csr_matrix,  # (L, M)
+        objects: np.ndarray | None = None,  # (L,)
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Tell how much of each segment of a view lies on each object.
+
+        Parameters
+        ----------
+        gaussians, weights
+            As in `Lifted`.
+        objects : (L,), optional
+            What these segments have been added as; then only what the other views say counts.
+
+        Returns
+        -------
+        common : (L, K) float64
+            In px.
+        known : (L,) float64
+            What lies on Gaussians of which anything is known, in px.
+        """
+        profile = self.weights[gaussians]
+        if objects is not None:
+            profile = (profile - _by_object(weights, objects, profile.shape[1])).tocsr()
+            # Where this view was the only one, rounding is left.
+            profile.data[profile.data < 1e-6] = 0
+        total = sums(profile, 1)
+        profile.data /= np.repeat(np.where(total > 0, total, 1), np.diff(profile.indptr))
+        return (weights @ profile).toarray(), weights @ (total > 0).astype(np.float64)
+
+    def explain(
+        self,
+        gaussians: np.ndarray,  # (M,)
+        weights: sparse.csr_matrix,  # (L, M)
+        objects: np.ndarray | None = None,  # (L,)
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Find the object of the largest IoU with each segment of a view.
+
+        Parameters are those of `common`.
+
+        Returns
+        -------
+        best : (L,) int64
+            Objects; 0 where there is none.
+        seen : (L,) float64
+            Share of each segment that lies on Gaussians of which anything is known.
+        """
+        common, known = self.common(gaussians, weights, objects)
+        union = known[:, None] + common.sum(axis=0) - common
+        iou = np.divide(common, union, out=np.zeros_like(common), where=union > 0)
+        whole = sums(weights, 1)
+        return iou.argmax(axis=1), np.divide(known, whole, out=np.zeros_like(known), where=whole > 0)
+
+
+def _by_object(weights: sparse.csr_matrix, objects: np.ndarray, num: int) -> sparse.csr_matrix:
+    """Sum segments (L, M) by object, (M, num)."""
+    groups = sparse.csr_matrix((np.ones(len(objects)), objects, np.arange(len(objects) + 1)), shape=(len(objects), num))
+    return (weights.T @ groups).tocsr()
+
+
+def sums(matrix: sparse.csr_matrix, axis: int) -> np.ndarray:
+    """Sum over an axis, float64."""
+    return np.asarray(matrix.sum(axis=axis, dtype=np.float64)).ravel()

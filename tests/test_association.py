@@ -1,0 +1,326 @@
+"""Masks whose ids hold only inside their own view: the objects that they show are found, and stay what they are."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_scenes import (
+    NAMES,
+    NUM_CLASSES,
+    balls_on_a_table,
+    clean_views,
+    look_at,
+    many_classes,
+    ring,
+    true_labels,
+    write_dataset,
+)
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+
+import bench_ids
+
+from gsseg_core.association import AssociationSettings, associate
+from gsseg_core.cli import main
+from gsseg_core.dataset import Dataset, View
+from gsseg_core.em import EMLearner
+from gsseg_core.errors import SettingsError
+from gsseg_core.live_ids import PerViewSession
+from gsseg_core.masks import UNKNOWN, read_mask, write_mask
+from gsseg_core.matching import Contingency, renamed
+from gsseg_core.object_table import ObjectTable, find_objects
+from gsseg_core.operator import make_operator
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segments import Lifted
+
+SCENE, TRUTH = balls_on_a_table()
+VIEWS = clean_views(8)
+
+
+def with_labels(view: View, labels: np.ndarray) -> View:
+    return View.from_arrays(view.camera, labels)
+
+
+def shuffled(view: View, seed: int = 0, keep: tuple[int, ...] = (0,)) -> View:
+    """The view under ids of its own; some ids stay."""
+    labels = view.read_labels()
+    rng = np.random.default_rng([seed, *view.name.encode()])
+    table: np.ndarray = np.arange(labels.max() + 1)
+    moved = np.setdiff1d(table, keep)
+    table[moved] = rng.choice(np.arange(1, 200), len(moved), replace=False)
+    return with_labels(view, np.where(labels < 0, labels, table[np.maximum(labels, 0)]))
+
+
+def in_halves(view: View, label: int) -> View:
+    """The object under two ids, cut down the middle."""
+    labels = view.read_labels().copy()
+    rows, columns = np.nonzero(labels == label)
+    right = columns > np.median(columns)
+    labels[rows[right], columns[right]] = 50 + label
+    return with_labels(view, labels)
+
+
+def agreement(table: ObjectTable, views: list[View]) -> float:
+    """ARI of what the ids were found to mean against true labels."""
+    score = Contingency()
+    for view in views:
+        score.add(view.read_labels(), table.relabelled(view).read_labels())
+    return score.ari
+
+
+def test_shuffled_ids_give_the_objects_that_true_ids_give() -> None:
+    table = find_objects(SCENE, [shuffled(view) for view in VIEWS])
+    assert table.num_objects == 3 and agreement(table, VIEWS) == 1.0
+    true = find_objects(SCENE, VIEWS)
+    for view in VIEWS:
+        found = (part.relabelled(part.views[view.name]).read_labels() for part in (table, true))
+        np.testing.assert_array_equal(*found)
+    assert table.class_names == {0: "background", 1: "object_001", 2: "object_002", 3: "object_003"}
+
+
+def test_what_is_found_does_not_depend_on_the_order_of_the_views() -> None:
+    views = [shuffled(in_halves(view, 1 + i % 3)) for i, view in enumerate(VIEWS)]
+    lifted = {v.name: Lifted.of(make_operator(SCENE, v.camera).observe(v.read_labels())) for v in views}
+    expected = associate(lifted)
+    for order in (list(lifted)[::-1], list(np.random.default_rng(0).permutation(list(lifted)))):
+        found = associate({str(name): lifted[str(name)] for name in order})
+        for name, objects in expected.items():
+            np.testing.assert_array_equal(found[name], objects)
+
+
+def test_background_is_an_object_like_others_only_where_masks_do_not_call_it_0() -> None:
+    table = find_objects(SCENE, [shuffled(with_labels(view, view.read_labels() + 1)) for view in VIEWS])
+    assert table.num_objects == 4 and agreement(table, VIEWS) == 1.0
+
+
+def test_an_object_that_some_views_split_is_one() -> None:
+    views = [shuffled(in_halves(view, 1) if i % 3 == 0 else view) for i, view in enumerate(VIEWS)]
+    table = find_objects(SCENE, views)
+    assert table.num_objects == 3 and agreement(table, VIEWS) == 1.0
+    assert [table.alignment(view.name).split for view in VIEWS] == [1, 0, 0, 1, 0, 0, 1, 0]
+    assert table.summary()["split"] == 3 and table.summary()["merged"] == 0
+
+
+def test_objects_that_some_views_merge_stay_two() -> None:
+    merged = [
+        with_labels(view, np.where(view.read_labels() == 2, 1, view.read_labels())) if i % 4 == 0 else view
+        for i, view in enumerate(VIEWS)
+    ]
+    table = find_objects(SCENE, [shuffled(view) for view in merged])
+    assert table.num_objects == 3
+    right = [view for i, view in enumerate(VIEWS) if i % 4]
+    assert agreement(table, right) == 1.0
+    assert [table.alignment(view.name).merged for view in VIEWS] == [1, 0, 0, 0, 1, 0, 0, 0]
+
+
+def test_clutter_that_one_view_shows_goes_to_the_background() -> None:
+    labels = VIEWS[0].read_labels().copy()
+    labels[:6, :10] = np.where(labels[:6, :10] == 0, 9, labels[:6, :10])
+    labels[40:, 20:40] = np.where(labels[40:, 20:40] == 0, 9, labels[40:, 20:40])
+    table = find_objects(SCENE, [with_labels(VIEWS[0], labels), *VIEWS[1:]])
+    assert table.num_objects == 3 and table.alignment(VIEWS[0].name).objects[9] == 0
+
+
+def test_views_that_share_nothing_have_objects_of_their_own() -> None:
+    far = SCENE.means + np.array([500.0, 0, 0], np.float32)
+    two = GaussianScene.from_arrays(
+        np.concatenate([SCENE.means, far]), *(np.tile(a, (2,) + (1,) * (a.ndim - 1)) for a in attributes(SCENE))
+    )
+    there = []
+    for view in VIEWS[:3]:
+        pose = view.camera.world_to_camera.copy()
+        pose[:3, 3] -= pose[:3, :3] @ [500.0, 0, 0]
+        camera = type(view.camera)(f"far {view.name}", view.camera.width, view.camera.height, view.camera.K, pose)
+        there.append(View.from_arrays(camera, view.read_labels()))
+    assert find_objects(two, [*VIEWS[:3], *there]).num_objects == 6
+
+
+def attributes(scene: GaussianScene) -> tuple[np.ndarray, ...]:
+    return scene.quats, scene.scales, scene.opacities, scene.sh
+
+
+def test_there_can_be_more_than_255_objects() -> None:
+    scene, truth = many_classes(300)
+    cameras = [look_at(f"v{i}", np.array([0.2 * i, 0.1, 3.5]), 320, 240, 330.0) for i in range(3)]
+    rng = np.random.default_rng(0)
+    views = []
+    for camera in cameras:
+        labels = true_labels(scene, truth, camera)
+        views.append(View.from_arrays(camera, np.where(labels, 1 + rng.permutation(300)[labels], 0)))
+    table = find_objects(scene, views)
+    assert table.num_objects == 299
+    assert agreement(table, [View.from_arrays(c, true_labels(scene, truth, c)) for c in cameras]) > 0.99
+
+
+def test_no_view_one_view_and_views_without_evidence_are_no_special_case() -> None:
+    assert associate({}) == {} and find_objects(SCENE, []).class_names == {0: "background"}
+    one = find_objects(SCENE, [shuffled(VIEWS[0])])
+    assert one.num_objects == 3 and agreement(one, VIEWS[:1]) == 1.0
+    table = ObjectTable(SCENE)
+    unknown = with_labels(VIEWS[1], np.full((48, 64), UNKNOWN))
+    empty = with_labels(VIEWS[2], np.zeros((48, 64), np.int32))
+    there = VIEWS[0].camera
+    away = type(there)("away", there.width, there.height, there.K, np.diag([1, -1, -1, 1.0]) @ there.world_to_camera)
+    assert not table.add(unknown) and not table.add(View(VIEWS[1].camera))
+    assert not table.add(View.from_arrays(away, np.ones((48, 64), np.int32)))
+    assert table.add(empty) and table.solve().changed == [empty.name] and table.num_objects == 0
+    assert (table.relabelled(unknown).read_labels() == UNKNOWN).all()
+
+
+def test_pixels_that_are_unknown_stay_unknown() -> None:
+    views = []
+    for view in VIEWS:
+        labels = view.read_labels().copy()
+        labels[:, :20] = UNKNOWN
+        views.append(with_labels(view, labels))
+    table = find_objects(SCENE, [shuffled(view) for view in views])
+    assert table.num_objects == 3
+    for view in views:
+        found = table.relabelled(view).read_labels()
+        np.testing.assert_array_equal(found == UNKNOWN, view.read_labels() == UNKNOWN)
+
+
+def test_a_new_view_is_matched_to_the_objects_so_far() -> None:
+    table = ObjectTable(SCENE)
+    first = table.match(shuffled(VIEWS[0])).read_labels()
+    assert len(np.unique(first[first > 0])) == 3
+    for view in VIEWS[1:]:
+        table.match(shuffled(view))
+    assert table.num_objects == 3 and agreement(table, VIEWS) == 1.0
+    assert table.solve().changed == []
+
+
+def test_solving_repairs_what_matching_could_not_know_and_objects_keep_their_numbers() -> None:
+    table = ObjectTable(SCENE)
+    views = [in_halves(VIEWS[0], 1), *VIEWS[1:]]
+    for view in views:
+        table.match(shuffled(view))
+    before = {view.name: table.relabelled(view).read_labels() for view in views}
+    assert table.num_objects == 4
+    repair = table.solve()
+    assert table.num_objects == 3 and agreement(table, VIEWS) == 1.0
+    assert VIEWS[0].name in repair.changed and len(np.unique(repair.heirs)) < len(repair.heirs)
+    for k in (2, 3):
+        place = VIEWS[4].read_labels() == k
+        np.testing.assert_array_equal(table.relabelled(VIEWS[4]).read_labels()[place], before[VIEWS[4].name][place])
+
+
+def test_a_view_can_be_replaced_and_what_was_forgotten_still_matches() -> None:
+    table = ObjectTable(SCENE)
+    for view in VIEWS[:4]:
+        table.match(shuffled(view))
+    table.match(shuffled(VIEWS[0], seed=1))
+    assert len(table.views) == 4 and table.num_objects == 3
+    for view in VIEWS[:4]:
+        table.forget(view.name)
+    assert table.num_objects == 0
+    table.match(shuffled(VIEWS[4]))
+    assert set(table.alignment(VIEWS[4].name).objects.values()) <= {0, 1, 2, 3}
+
+
+def test_a_live_session_finds_the_objects_as_views_arrive_and_repairs_them_when_it_learns() -> None:
+    session = PerViewSession(SCENE, max_views=6)
+    for view in [in_halves(VIEWS[0], 1), *VIEWS[1:]]:
+        assert session.fuse(shuffled(view)) is None
+    assert session.class_names[4] == "object_004"
+    codes = session.learn().learnt.codes
+    assert session.num_views == 6 and session.num_fused == 8
+    true = EMLearner(SCENE, NUM_CLASSES)
+    for view in VIEWS[2:]:
+        true.observe(view)
+    score = Contingency()
+    score.add(true.fit().codes_.argmax(axis=1)[:, None], codes.argmax(axis=1)[:, None])
+    assert score.ari == 1.0
+    assert (session.codes().any(axis=0)).sum() == NUM_CLASSES
+    blank = with_labels(VIEWS[0], np.full((48, 64), UNKNOWN))
+    assert session.fuse(blank).reason == "all_pixels_unknown"  # type: ignore[union-attr]
+
+
+def test_a_live_session_goes_on_with_its_objects_after_saving_and_loading(tmp_path: Path) -> None:
+    session = PerViewSession(SCENE)
+    for view in VIEWS[:5]:
+        session.fuse(shuffled(view))
+    session.save(tmp_path / "state.npz")
+    other = PerViewSession(SCENE)
+    other.load(tmp_path / "state.npz")
+    np.testing.assert_array_equal(other.codes(), session.codes())
+    for each in (session, other):
+        each.fuse(shuffled(VIEWS[5]))
+    np.testing.assert_array_equal(other.codes(), session.codes())
+    with pytest.raises(SettingsError, match="from the views received only"):
+        other.learn(dataset=Dataset(write_dataset(tmp_path / "data")))
+
+
+def test_votes_of_views_that_are_gone_follow_their_object() -> None:
+    session = PerViewSession(SCENE, max_views=5)
+    for view in [*VIEWS[:2], in_halves(VIEWS[2], 1), *VIEWS[3:]]:
+        session.fuse(shuffled(view))
+    before = session.codes().any(axis=1)
+    session.repair()
+    assert session.num_views == 5 and list(session._live.views) == [view.name for view in VIEWS[-5:]]
+    np.testing.assert_array_equal(session.codes().any(axis=1), before)
+
+
+def test_objects_found_are_learnt_as_well_as_with_true_ids() -> None:
+    table = find_objects(SCENE, [shuffled(view) for view in VIEWS])
+    found, true = EMLearner(SCENE, NUM_CLASSES), EMLearner(SCENE, NUM_CLASSES)
+    for view in VIEWS:
+        found.observe(table.relabelled(view))
+        true.observe(view)
+    labels = found.fit().codes_.argmax(axis=1)
+    score = Contingency()
+    score.add(true.fit().codes_.argmax(axis=1)[:, None], labels[:, None])
+    assert score.ari == pytest.approx(1.0)
+
+
+def test_the_command_finds_the_objects_and_reports_what_the_ids_meant(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data", SCENE, TRUTH, ring(9), NAMES)
+    for view in Dataset(data).views("train"):
+        write_mask(data / "labels" / f"{view.name}.png", shuffled(view).read_labels(), 8)
+    inputs = [f"{data}/scene.ply", "--data", str(data), "--quiet"]
+    assert main(["segment", *inputs, "--out", f"{tmp_path}/out", "--ids", "per-view"]) == 0
+    report = json.loads((tmp_path / "out/report.json").read_text())
+    assert report["ids"]["objects"] == 3 and report["ids"]["split"] == report["ids"]["merged"] == 0
+    assert len(report["ids"]["views"]) == 6 and report["settings"]["ids"] == "per-view"
+    names = sorted(path.name for path in (tmp_path / "out/classes").iterdir())
+    assert names == ["0_background.ply", "1_object_001.ply", "2_object_002.ply", "3_object_003.ply"]
+    npz = f"{tmp_path}/out/segmentation.npz"
+    assert main(["render", *inputs, "--segmentation", npz, "--out", f"{tmp_path}/maps"]) == 0
+    pairs = [
+        (read_mask(data / "labels" / p.name).labels, read_mask(p).labels) for p in (tmp_path / "maps").glob("*.png")
+    ]
+    score = Contingency()
+    for pair in pairs:
+        score.add(*pair)
+    names_of = score.one_to_one()
+    assert len(pairs) == 3 and sorted(names_of.values()) == [0, 1, 2, 3] and score.ari > 0.9
+    assert np.mean([(truth == renamed(found, names_of)).mean() for truth, found in pairs]) > 0.95
+
+
+def test_ari_and_matchings_are_those_of_the_definition() -> None:
+    score = Contingency()
+    truth, found = np.array([[0, 0, 0, 1, 1, 1, UNKNOWN]]), np.array([[5, 5, 7, 7, 8, 8, 9]])
+    score.add(truth, found)
+    assert score.ari == pytest.approx(0.2424, abs=1e-4)
+    assert score.one_to_one() == {5: 0, 8: 1} and score.many_to_one() == {5: 0, 7: 0, 8: 1}
+    assert renamed(np.array([5, 7, UNKNOWN]), {5: 0}).tolist() == [0, UNKNOWN, UNKNOWN]
+
+
+def test_settings_that_make_no_sense_are_refused() -> None:
+    for wrong in ({"kept": 0.0}, {"agreement": 1.0}, {"doubt": -1.0}, {"full_sight": 0.0}):
+        with pytest.raises(SettingsError, match="association"):
+            AssociationSettings(**wrong)
+
+
+def test_the_benchmark_splits_and_merges_objects_as_often_as_it_says() -> None:
+    labels = np.kron(np.arange(400).reshape(20, 20), np.ones((4, 4), int))
+    random = np.random.default_rng(0)
+    split, merged = bench_ids.cut(labels, random), bench_ids.merged(labels, random)
+    assert 0.15 * 399 < len(np.unique(split)) - 400 < 0.25 * 399
+    assert 0.15 * 399 < 2 * (400 - len(np.unique(merged))) < 0.25 * 399
+    assert (split[labels == 0] == 0).all() and (merged[labels == 0] == 0).all()
+    assert len(np.unique(np.stack([split.ravel(), labels.ravel()]), axis=1).T) == len(np.unique(split))
