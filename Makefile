@@ -15,7 +15,7 @@ MSGS := $(wildcard msg_defs/*.* msg_defs/action/* msg_defs/msg/* msg_defs/srv/*)
 # Both builders of the messages obey it; without it one of them compiles file after file.
 export CMAKE_BUILD_PARALLEL_LEVEL ?= $(shell nproc 2>/dev/null || echo 1)
 
-.PHONY: help demo demo-local test colcon results bench clean
+.PHONY: help demo demo-local test colcon results robustness bench clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{ printf "%-16s %s\n", $$1, $$2 }'
@@ -37,6 +37,9 @@ colcon: $(COLCON_READY)  ## build both packages with colcon, as a robot does, an
 
 results: $(READY)  ## measure again what docs/results.md shows
 	$(BIN)/python benchmarks/results.py
+
+robustness: $(READY)  ## measure again what docs/robustness.md shows: masks wrong in every way, at every strength
+	$(BIN)/python benchmarks/robustness.py
 
 bench: $(READY)  ## measure speed, memory and peers: BENCHMARK.md, compared with the last BENCHMARK.json (25 minutes)
 	$(BIN)/python benchmarks/bench.py

@@ -73,6 +73,13 @@ def _parser() -> argparse.ArgumentParser:
         help="whether an id means the same in every view, or holds in its own view only (default: %(default)s)",
     )
     command.add_argument(
+        "--memory-budget",
+        type=int,
+        default=1024,
+        metavar="MIB",
+        help="for prepared views; those beyond it are prepared anew in each step (default: %(default)s)",
+    )
+    command.add_argument(
         "--scheduler", metavar="ADDRESS", help="learn on the workers of this Dask scheduler (em and votes)"
     )
     command.set_defaults(run=_segment)
@@ -128,6 +135,7 @@ def _segment(options: argparse.Namespace) -> int:
             views=options.views,
             refine=refine,
             device=options.device,
+            memory_budget=options.memory_budget << 20,
             seed=options.seed,
             scheduler=options.scheduler,
             ids=options.ids,

@@ -42,7 +42,7 @@ import numpy as np
 
 from gsseg_core.errors import SettingsError
 from gsseg_core.gaussian_kernels import collect, improve, mix, take_votes, tally
-from gsseg_core.learner import VOTE_UNIT, Learner, Progress, silent
+from gsseg_core.learner import MEMORY_BUDGET, VOTE_UNIT, Learner, Progress, silent
 from gsseg_core.neighbours import neighbours_of
 from gsseg_core.operator import Observation
 from gsseg_core.rows import Rows
@@ -176,7 +176,7 @@ class EMLearner(Learner):
         settings: EMSettings | None = None,
         *,
         device: str = "cpu",
-        memory_budget: int = 1 << 30,
+        memory_budget: int = MEMORY_BUDGET,
     ) -> None:
         super().__init__(scene, num_classes, device=device, memory_budget=memory_budget)
         self.settings = settings or EMSettings()

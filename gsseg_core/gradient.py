@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from gsseg_core.errors import SettingsError
-from gsseg_core.learner import Learner, Progress, silent
+from gsseg_core.learner import MEMORY_BUDGET, Learner, Progress, silent
 from gsseg_core.operator import Observation
 from gsseg_core.scene import GaussianScene
 
@@ -73,7 +73,7 @@ class GradientLearner(Learner):
         settings: GradientSettings | None = None,
         *,
         device: str = "cpu",
-        memory_budget: int = 1 << 30,
+        memory_budget: int = MEMORY_BUDGET,
     ) -> None:
         super().__init__(scene, num_classes, device=device, memory_budget=memory_budget)
         self.settings = settings or GradientSettings()

@@ -20,6 +20,9 @@ from gsseg_core.state_file import State
 VOTE_UNIT = 2.0**-24
 """Votes are counted in whole multiples of this many px, so that adding and taking back are exact."""
 
+MEMORY_BUDGET = 1 << 30
+"""Bytes of prepared views to keep between steps, unless asked otherwise."""
+
 NO_MASK, SEES_NOTHING, ALL_UNKNOWN = "no mask", "sees no Gaussian", "all pixels unknown"
 
 Progress = Callable[[str, int, int], None]
@@ -67,10 +70,12 @@ class Learner(ABC):
     converged_: bool = False
 
     def __init__(
-        self, scene: GaussianScene, num_classes: int, *, device: str = "cpu", memory_budget: int = 1 << 30
+        self, scene: GaussianScene, num_classes: int, *, device: str = "cpu", memory_budget: int = MEMORY_BUDGET
     ) -> None:
         if num_classes < 1:
             raise SettingsError(f"num_classes is {num_classes}; expected at least 1")
+        if memory_budget < 0:
+            raise SettingsError(f"memory_budget is {memory_budget} bytes; expected at least 0")
         self.scene, self.num_classes, self.device = scene, num_classes, device
         self.memory_budget = memory_budget
         self.views: dict[str, View] = {}
@@ -121,7 +126,7 @@ class Learner(ABC):
         """
         if name not in self.views:
             raise SettingsError(f"view {name!r} was not observed; there are {len(self.views)} others")
-        self._count(self._observation(name), -1)
+        self._count(self.observation(name), -1)
         del self.views[name]
         self._prepared.pop(name, None)
 
@@ -223,7 +228,8 @@ class Learner(ABC):
         if used + observation.nbytes <= self.memory_budget:
             self._prepared[name] = observation
 
-    def _observation(self, name: str) -> Observation:
+    def observation(self, name: str) -> Observation:
+        """Return a view with its mask, prepared; it is kept as far as the memory budget goes."""
         if name not in self._prepared:
             view = self.views[name]
             observation = make_operator(self.scene, view.camera, self.device).observe(view.read_labels())
@@ -233,7 +239,7 @@ class Learner(ABC):
 
     def _observations(self, names: Iterable[str] | None = None) -> Iterator[tuple[str, Observation]]:
         for name in self.views if names is None else names:
-            yield name, self._observation(name)
+            yield name, self.observation(name)
 
     def _begin(self) -> None:
         """Set `observed_`; without a view there is nothing to learn from."""

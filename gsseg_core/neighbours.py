@@ -85,7 +85,9 @@ class Neighbours:
         """
         order, tree = self.tree.order, self.tree
         of_points = codes.places(order)
-        units = np.rint(codes.values[of_points.values] * np.float32(1 / CODE_UNIT)).astype(np.int32)
+        values = codes.values[of_points.values]
+        values[np.repeat(~counted[order], np.diff(of_points.start))] = 0.0
+        units = np.rint(values * np.float32(1 / CODE_UNIT)).astype(np.int32)
         asked = np.arange(len(order)) if wanted is None else np.flatnonzero(wanted[order])
         # A block at a time is written out in full, so that of all the codes only what is not zero is ever in memory.
         parts = []

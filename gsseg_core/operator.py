@@ -10,6 +10,7 @@ import numpy as np
 
 from gsseg_core.cameras import Camera
 from gsseg_core.errors import MaskSizeError, SceneValueError, SettingsError
+from gsseg_core.rows import Rows
 from gsseg_core.scene import GaussianScene
 
 
@@ -197,6 +198,10 @@ class ViewOperator(ABC):
         if codes.ndim != 2 or len(codes) != self.num_gaussians:
             raise SceneValueError(f"codes have shape {codes.shape}; expected ({self.num_gaussians}, K)")
         return self._blend(codes)
+
+    def blend_rows(self, codes: Rows, num_classes: int) -> Blended:
+        """Do the same for codes (N, K) of which only the entries that are not zero are at hand."""
+        return self._blend(codes.dense(num_classes))
 
     def adjoint(
         self,

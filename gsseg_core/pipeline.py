@@ -9,15 +9,18 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from gsseg_core.dataset import Dataset, spread
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.export import draw_views, export_classes, write_json, write_overview, write_pictures
-from gsseg_core.learner import Learner, Progress, silent
+from gsseg_core.learner import MEMORY_BUDGET, Learner, Progress, silent
 from gsseg_core.masks import write_mask
 from gsseg_core.object_table import find_objects
 from gsseg_core.pictures import save_png
 from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.reliability import OtherViews, draw_worst_views, reliability_report
 from gsseg_core.report import Stopwatch, build_report
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
@@ -46,6 +49,7 @@ def make_learner(
     max_steps: int | None = None,
     seed: int = 0,
     device: str = "cpu",
+    memory_budget: int = MEMORY_BUDGET,
     client: Client | None = None,
 ) -> Learner:
     """Make a learner by its name, with its default settings.
@@ -64,6 +68,8 @@ def make_learner(
         For the gradient learner, which draws views at random.
     device : str
         Where views are rendered.
+    memory_budget : int
+        Bytes of prepared views to keep; of each worker, if there are any.
     client : distributed.Client, optional
         Have the workers of this Dask cluster do it.
 
@@ -72,23 +78,24 @@ def make_learner(
     SettingsError
         There is no such learner, or it cannot be distributed.
     """
+    where: dict[str, Any] = {"device": device, "memory_budget": memory_budget}
     em = EMSettings(max_steps=max_steps or EMSettings.max_steps)
     if client is not None and name in DISTRIBUTED:
         from gsseg_core.distributed import DistributedEM, DistributedVotes
 
         if name == "em":
-            return DistributedEM(client, scene, num_classes, em, device=device)
-        return DistributedVotes(client, scene, num_classes, device=device)
+            return DistributedEM(client, scene, num_classes, em, **where)
+        return DistributedVotes(client, scene, num_classes, **where)
     if name == "em":
-        return EMLearner(scene, num_classes, em, device=device)
+        return EMLearner(scene, num_classes, em, **where)
     if name == "votes":
-        return VoteLearner(scene, num_classes, device=device)
+        return VoteLearner(scene, num_classes, **where)
     if name == "gradient":
         # PyTorch takes seconds to import, and the other learners do without.
         from gsseg_core.gradient import GradientLearner, GradientSettings
 
         settings = GradientSettings(epochs=max_steps or GradientSettings.epochs, seed=seed)
-        return GradientLearner(scene, num_classes, settings, device=device)
+        return GradientLearner(scene, num_classes, settings, **where)
     raise SettingsError(f"learner is {name!r}; expected one of {', '.join(LEARNERS)}")
 
 
@@ -102,6 +109,7 @@ def segment(
     views: int | None = None,
     refine: RefineSettings | None = None,
     device: str = "cpu",
+    memory_budget: int = MEMORY_BUDGET,
     seed: int = 0,
     scheduler: str | None = None,
     ids: str = "global",
@@ -125,6 +133,8 @@ def segment(
         Learn from this many train views, spread evenly; from all by default.
     refine : RefineSettings, optional
         The paper's by default.
+    memory_budget : int
+        Bytes of prepared views to keep between the steps of learning; see docs/memory.md.
     scheduler : str, optional
         Address of a Dask scheduler whose workers learn; everything else is done here.
     ids : str
@@ -166,31 +176,52 @@ def segment(
                 table = find_objects(scene, train, device=device, progress=progress)
                 train, class_names = [table.relabelled(view) for view in train], table.class_names
         with watch.stage("observe"):
-            teacher = make_learner(learner, scene, max(class_names) + 1, seed=seed, device=device, client=client)
+            teacher = make_learner(
+                learner, scene, max(class_names) + 1,
+                seed=seed, device=device, memory_budget=memory_budget, client=client,
+            )  # fmt: skip
             teacher.observe_all(train, progress)
         with watch.stage("learn"):
             try:
                 teacher.fit(progress)
             except NoUsableViewsError as error:
                 raise NoUsableViewsError(f"{data}: {error}") from error
-    with watch.stage("refine"):
-        result = Segmentation.from_codes(scene, teacher.codes_, class_names, refine)
     out = Path(out)
+    learnt: dict[str, Any] = {
+        "views": {"used": len(teacher.views), "rejected": teacher.reject_summary(), "names": teacher.rejected},
+        "objective": teacher.history_,
+    }
+    more = _settings_of(teacher)
+    worst: np.ndarray | None = None
+    if type(teacher) is EMLearner:
+        with watch.stage("check views"):
+            others = OtherViews(teacher, progress)
+            checks = others.check_all(progress)
+            learnt["views"]["reliability"] = reliability_report(checks, class_names)
+            worst = draw_worst_views(others, checks)
+            del others
+    codes = teacher.codes_
+    del teacher  # Its votes take as much memory as all that follows.
+    with watch.stage("refine"):
+        result = Segmentation.from_codes(scene, codes, class_names, refine)
+        del codes
     with watch.stage("export"):
         result.save(out / "segmentation.npz")
         plys = export_classes(scene, result, out / "classes")
     with watch.stage("pictures"):
         chosen = spread(dataset.views("all"), PICTURED_VIEWS)
         pictures = write_pictures(scene, result, chosen, out / "pictures", device=device)
+        if worst is not None:
+            pictures.append(out / "pictures" / "worst_views.png")
+            save_png(pictures[-1], worst)
     report = build_report(
         scene,
         result,
-        views={"used": len(teacher.views), "rejected": teacher.reject_summary(), "names": teacher.rejected},
+        **learnt,
         settings={
-            "learner": learner, "labels": labels, "views": views, "device": device, "seed": seed,
-            "scheduler": scheduler, "ids": ids, "refine": asdict(refine), **_settings_of(teacher),
+            "learner": learner, "labels": labels, "views": views, "device": device, "memory_budget": memory_budget,
+            "seed": seed, "scheduler": scheduler, "ids": ids, "refine": asdict(refine), **more,
         },
-        objective=teacher.history_,
         plys={k: str(path.relative_to(out)) for k, path in plys.items()},
         pictures=[str(path.relative_to(out)) for path in pictures],
         seconds=watch.seconds,

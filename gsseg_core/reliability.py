@@ -22,7 +22,7 @@ from gsseg_core.export import background_image
 from gsseg_core.gaussian_kernels import collect, improve, mix
 from gsseg_core.learner import Progress, silent
 from gsseg_core.masks import UNKNOWN
-from gsseg_core.operator import Observation, make_operator
+from gsseg_core.operator import make_operator
 from gsseg_core.pictures import contact_sheet, overlay, palette
 from gsseg_core.rows import Rows
 
@@ -104,6 +104,7 @@ class OtherViews:
     def __init__(self, learner: EMLearner, progress: Progress = silent) -> None:
         self.learner = learner
         self._codes = Rows.of(learner.codes_)
+        self._shows_background = bool((self._codes.classes == 0).any())
         total = len(learner.views)
         done = itertools.count()
         self._gains, _ = learner._gains(
@@ -120,12 +121,13 @@ class OtherViews:
             `UNKNOWN` (-1) where they say nothing: most of the ray ends on Gaussians that only this view has seen.
         """
         learner = self.learner
+        places, values = self._without(view)
+        codes = self._codes.values.copy()
+        codes[places] = values
         operator = make_operator(learner.scene, view.camera, learner.device)
-        observation = operator.observe(view.read_labels())
-        codes = learner.codes_.copy()
-        codes[observation.ids] = self._without(view, observation).dense(learner.num_classes)
-        image, left_over = operator.blend(codes)
-        image[..., 0] += left_over
+        image, left_over = operator.blend_rows(self._codes.with_values(codes), learner.num_classes)
+        if self._shows_background:
+            image[..., 0] += left_over
         labels: np.ndarray = np.where(image.sum(axis=2) > 0.5, image.argmax(axis=2), UNKNOWN).astype(np.int32)
         return labels
 
@@ -133,8 +135,18 @@ class OtherViews:
         """Hold a view's mask against what the others predict."""
         return _compare(view.name, view.read_labels(), self.predict(view), self.learner.num_classes)
 
-    def _without(self, view: View, observation: Observation) -> Rows:
-        """Codes of the M Gaussians that a view sees, after a step of EM that leaves its summand out."""
+    def check_all(self, progress: Progress = silent) -> list[ViewCheck]:
+        """Do that for all views, in their order."""
+        checks, views = [], self.learner.views
+        for done, view in enumerate(views.values()):
+            progress("check views", done, len(views))
+            checks.append(self.check(view))
+        progress("check views", len(views), len(views))
+        return checks
+
+    def _without(self, view: View) -> tuple[np.ndarray, np.ndarray]:
+        """Codes that a view sees, after a step of EM that leaves its summand out: where they stand, and which."""
+        observation = self.learner.observation(view.name)
         start, classes, places = self._codes.places(observation.ids)
         likelihood = np.ascontiguousarray(self.learner.error_models_[view.name].likelihood.T)
         here = np.arange(len(observation.ids), dtype=np.int32)
@@ -144,7 +156,7 @@ class OtherViews:
         collect(start, classes, own, *seen, shares.sightings)  # Exactly what the view has given to the gains.
         # No prior: where no other view has seen anything, nothing is to be said.
         improve(start, codes, self._gains[places] - own, np.zeros(len(places), np.float32))
-        return Rows(start, classes, codes)
+        return places, codes
 
 
 def check_views(learner: EMLearner, progress: Progress = silent) -> list[ViewCheck]:
@@ -162,12 +174,7 @@ def check_views(learner: EMLearner, progress: Progress = silent) -> list[ViewChe
     list of ViewCheck
         In the order of the views.
     """
-    others, checks = OtherViews(learner, progress), []
-    for done, view in enumerate(learner.views.values()):
-        progress("check views", done, len(learner.views))
-        checks.append(others.check(view))
-    progress("check views", len(learner.views), len(learner.views))
-    return checks
+    return OtherViews(learner, progress).check_all(progress)
 
 
 def worst_views(checks: Iterable[ViewCheck], count: int | None = None) -> list[ViewCheck]:

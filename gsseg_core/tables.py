@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+LEAST = 3
+"""Views that are named as those that agree least with the others."""
+
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Lay out rows in columns: the first flush left, the others flush right."""
@@ -35,10 +38,15 @@ def segment_summary(report: Mapping[str, Any], out: str) -> str:
     ]
     views, gaussians = report["views"], report["gaussians"]
     rejected = ", ".join(f"{count} {why}" for why, count in views["rejected"].items())
+    checked = [view for view in views.get("reliability", []) if view["reliability"] is not None]
+    worst = ", ".join(f"{view['name']} ({percent(view['reliability'])})" for view in checked[:LEAST])
     return "\n\n".join(
         [
             table(["class", "Gaussians", "confidence"], classes),
-            f"{views['used']} views used" + (f", rejected: {rejected}" if rejected else "") + "\n"
+            f"{views['used']} views used"
+            + (f", rejected: {rejected}" if rejected else "")
+            + (f"\nmasks that agree least with the other views: {worst}" if worst else "")
+            + "\n"
             f"{report['scene']['gaussians']:,} Gaussians: {gaussians['labelled']:,} labelled "
             f"({gaussians['from_neighbours']:,} of them by their neighbours), {gaussians['removed']:,} removed by the "
             f"filter, {gaussians['unobserved']:,} unobserved",

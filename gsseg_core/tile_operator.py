@@ -32,11 +32,18 @@ class TileOperator(ViewOperator):
 
     def _blend(self, codes: np.ndarray) -> Blended:
         # A Gaussian speaks for few classes; the others cost nothing.
-        rows = Rows.of(codes[self.ids].astype(np.float32, order="C"))
-        image = np.empty((self.camera.height, self.camera.width, codes.shape[1]), np.float32)
+        return self._blend_visible(Rows.of(codes[self.ids].astype(np.float32, order="C")), codes.shape[1])
+
+    def blend_rows(self, codes: Rows, num_classes: int) -> Blended:
+        """Blend codes without their zeros."""
+        visible = codes.places(self.ids)
+        return self._blend_visible(visible.with_values(codes.values[visible.values]), num_classes)
+
+    def _blend_visible(self, codes: Rows, num_classes: int) -> Blended:
+        image = np.empty((self.camera.height, self.camera.width, num_classes), np.float32)
         left_over = np.empty(image.shape[:2], np.float32)
         tiles = self._tiles
-        products.render(tiles.columns, self._table, tiles.start, tiles.entries, *rows, image, left_over)
+        products.render(tiles.columns, self._table, tiles.start, tiles.entries, *codes, image, left_over)
         return Blended(image, left_over)
 
     def _adjoint(self, residual: np.ndarray) -> np.ndarray:

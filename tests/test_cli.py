@@ -19,7 +19,7 @@ from small_scenes import balls_on_a_table, look_at, many_classes, write_dataset
 
 from gsseg_core import atomic, ply
 from gsseg_core.cli import main
-from gsseg_core.masks import read_mask
+from gsseg_core.masks import read_mask, write_mask
 from gsseg_core.scene import GaussianScene
 from gsseg_core.votes import VoteLearner
 
@@ -74,6 +74,19 @@ def test_segment_writes_labels_objects_report_and_pictures(pristine: Path) -> No
     assert all((out / picture).is_file() for picture in report["pictures"])
     assert {"pictures/contact_sheet.png", "pictures/legend.png"} <= set(report["pictures"])
     assert not [path for path in pristine.rglob(".gsseg-*")]
+
+
+def test_segment_says_which_masks_the_other_views_contradict(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    mask = place / "data/labels/view1.png"
+    labels = read_mask(mask).labels
+    write_mask(mask, np.where(labels > 0, 4 - labels, 0), 8)  # red ball and box, exchanged
+    assert main(segment(place)) == 0
+    report = json.loads((place / "out/report.json").read_text())
+    views = report["views"]["reliability"]
+    assert views[0]["name"] == "view1" and views[0]["reliability"] < min(0.9, *(v["reliability"] for v in views[1:]))
+    assert {(c["true"], c["seen"]) for c in views[0]["confusions"]} >= {("red ball", "box"), ("box", "red ball")}
+    assert "masks that agree least with the other views: view1" in capsys.readouterr().out
+    assert "pictures/worst_views.png" in report["pictures"]
 
 
 def test_render_and_eval_score_the_views_that_were_not_learnt_from(

@@ -223,6 +223,7 @@ def test_the_command_gives_the_same_files_with_a_scheduler(address: str, data: P
             np.testing.assert_array_equal(one[name], other[name])
     reports = [json.loads((out / "report.json").read_text()) for out in (here, there)]
     assert reports[1]["settings"]["scheduler"] == address
+    reports[0]["views"].pop("reliability", None)  # The asking process has no view prepared that it could check.
     for key in ("objective", "views", "gaussians", "classes"):
         assert reports[0][key] == reports[1][key]
 

@@ -49,6 +49,22 @@ def test_what_no_view_sees_is_unobserved_until_its_neighbours_fill_it_in(kind: t
     assert (filled.labels >= 0).all() and filled.clustered[-OUT_OF_SIGHT:].all()
 
 
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.7, 1.0])
+def test_prepared_views_stay_within_the_memory_budget_and_results_are_the_same(share: float) -> None:
+    whole = taught(EMLearner(SCENE, NUM_CLASSES), VIEWS).fit()
+    needed = sum(observation.nbytes for observation in whole._prepared.values())
+    assert len(whole._prepared) == len(VIEWS)
+    bounded = taught(EMLearner(SCENE, NUM_CLASSES, memory_budget=int(share * needed)), VIEWS).fit()
+    held = sum(observation.nbytes for observation in bounded._prepared.values())
+    assert share * needed - max(o.nbytes for o in whole._prepared.values()) < held <= share * needed
+    np.testing.assert_array_equal(bounded.codes_, whole.codes_)
+
+
+def test_a_negative_memory_budget_is_refused() -> None:
+    with pytest.raises(SettingsError, match="memory_budget is -1 bytes; expected at least 0"):
+        EMLearner(SCENE, NUM_CLASSES, memory_budget=-1)
+
+
 @every_learner
 def test_the_order_of_the_views_and_the_memory_budget_do_not_matter(kind: type[Learner]) -> None:
     if kind is GradientLearner:

@@ -345,7 +345,7 @@ def test_what_was_set_while_unconfigured_holds_after_configuring(robot: Robot) -
     try:
         brought_to(robot, "active")
         robot.fuse(clean_views(5))
-        status = robot.wait_for_status(lambda status: status["views fused"] == "5", "five views")
+        status = robot.wait_for_status(lambda status: status.get("views fused") == "5", "five views")
         assert status["views kept"] == "3"
         assert robot.learn()[1].report.num_views == 3
     finally:
