@@ -1,20 +1,26 @@
 """Useful pairs per second of the lift, beside what the processor could do at most.
 
 A *pair* is a non-zero weight of W: one Gaussian in one pixel. The lift blends a view and sums its weights by label. Its
-work is counted here in *evaluations*: one Gaussian over the sixteen pixels of one row of a tile, whether or not any of
-them is reached. Operations per evaluation, from `lanes.blend_row`, each on sixteen numbers:
+work is counted here in *aims*, one Gaussian in one tile (`lanes.aim`: which rows does it reach?), and *evaluations*,
+one Gaussian over the sixteen pixels of one row that it reaches and in which a ray is open (`lanes.blend_row`).
+Operations, each on sixteen numbers:
 
-| step                                  | fma | add, sub, mul | other                    |
-| ------------------------------------- | --- | ------------- | ------------------------ |
-| log2 of alpha: peak - wide * (c-x)^2  | 1   | 2             |                          |
-| alpha = 2^that                        | 5   | 1             | round, convert, shift, + |
-| alpha <= 0.99                         |     |               | min                      |
-| counts it? is the ray open, still?    |     |               | 3 compares               |
-| weight = alpha T, T = T - weight      |     | 2             |                          |
+| step of an aim                              | fma | add, sub, mul | other                    |
+| ------------------------------------------- | --- | ------------- | ------------------------ |
+| where is the row's peak, and how high?      | 2   | 2             |                          |
+| the pixel next to it: is alpha 1/255 there? | 1   | 2             | min, max, round, compare |
 
-That is 6 + 5 + 8 = 19 vector instructions and 6 * 2 + 5 = 17 floating-point operations a pixel. Summing by label adds
-one fma for each label in the row where a Gaussian was hit (`lanes.add_product`), and per entry and label a sum of
-sixteen numbers, 15 additions in 4 steps (`lanes.take_sum`).
+| step of an evaluation                       | fma | add, sub, mul | other                    |
+| ------------------------------------------- | --- | ------------- | ------------------------ |
+| log2 of alpha: peak - wide * (c-x)^2        | 1   | 2             |                          |
+| alpha = 2^that                              | 5   | 1             | round, convert, shift, + |
+| alpha <= 0.99                               |     |               | min                      |
+| counts it? is the ray open, still?          |     |               | 3 compares               |
+| weight = alpha T, T = T - weight            |     | 2             |                          |
+
+That is 3 + 4 + 4 = 11 vector instructions and 3 * 2 + 4 = 10 floating-point operations a row of an aim, 6 + 5 + 8 = 19
+and 6 * 2 + 5 = 17 a pixel of an evaluation. Summing by label adds one addition for each label in the row, and per entry
+and label a sum of sixteen numbers, 15 additions in 4 steps.
 """
 
 from __future__ import annotations
@@ -45,6 +51,7 @@ from gsseg_core.lanes import (
 from gsseg_core.projection import Projected
 from gsseg_core.tiles import TILE, Tiles
 
+AIM_FLOPS, AIM_INSTRUCTIONS = 10, 11  # of one aim, per row and per sixteen
 FLOPS, INSTRUCTIONS = 17, 19  # of one evaluation, per pixel and per sixteen
 SUM_FLOPS, SUM_INSTRUCTIONS = 15, 4  # of one sum of sixteen
 CHAINS = (8, 10, 12)
@@ -57,6 +64,8 @@ class Work(NamedTuple):
     ----------
     pairs : int
         Non-zero weights.
+    aims : int
+        Gaussians in tiles, up to where all rays of the tile have ended.
     evaluations : int
         Rows of sixteen pixels that were blended.
     records : int
@@ -68,6 +77,7 @@ class Work(NamedTuple):
     """
 
     pairs: int
+    aims: int
     evaluations: int
     records: int
     products: int
@@ -76,12 +86,14 @@ class Work(NamedTuple):
     @property
     def flops(self) -> int:
         """Floating-point operations, a fused multiply-add being two."""
-        return LANES * (FLOPS * self.evaluations + 2 * self.products) + SUM_FLOPS * self.sums
+        blended = AIM_FLOPS * self.aims + FLOPS * self.evaluations
+        return LANES * (blended + self.products) + SUM_FLOPS * self.sums
 
     @property
     def instructions(self) -> int:
         """Vector instructions on sixteen numbers."""
-        return INSTRUCTIONS * self.evaluations + self.products + SUM_INSTRUCTIONS * self.sums
+        blended = AIM_INSTRUCTIONS * self.aims + INSTRUCTIONS * self.evaluations
+        return blended + self.products + SUM_INSTRUCTIONS * self.sums
 
 
 def count_work(
@@ -109,7 +121,7 @@ def _count(
     start: np.ndarray,  # (T + 1,)
     entries: np.ndarray,  # (E,)
     labels: np.ndarray,  # (H, W)
-    counts: np.ndarray,  # (T, 5) out, as in Work
+    counts: np.ndarray,  # (T, 6) out, as in Work
 ) -> None:
     height, width = labels.shape
     for tile in nb.prange(start.shape[0] - 1):
@@ -128,6 +140,9 @@ def _count(
                     new = new and labels[top + r, left + before] != seen
                 many[r] += new
         for e in range(start[tile], start[tile + 1]):
+            if not live.any():
+                break
+            counts[tile, 1] += 1
             g = entries[e]
             u, v = table[g, U] - np.float32(left + 0.5), table[g, V] - np.float32(top + 0.5)
             reach, any_hit = table[g, Y_REACH], False
@@ -137,9 +152,10 @@ def _count(
                 dy = np.float32(r) - v
                 peak = table[g, LOG_OPACITY] - table[g, HEIGHT] * dy * dy
                 x = u + table[g, SHEAR] * dy
-                hits, still = 0, False
+                hits, reached, still = 0, False, False
                 for c in range(TILE):
                     power = peak - table[g, WIDTH] * (np.float32(c) - x) ** 2
+                    reached = reached or power >= np.float32(LOG_ALPHA_MIN)
                     if power >= np.float32(LOG_ALPHA_MIN) and rays[r, c] >= np.float32(T_MIN):
                         hits += 1
                         rays[r, c] *= 1 - min(np.float32(2.0) ** power, np.float32(ALPHA_MAX))
@@ -147,10 +163,10 @@ def _count(
                 live[r] = still
                 any_hit = any_hit or hits > 0
                 counts[tile, 0] += hits
-                counts[tile, 1] += 1
-                counts[tile, 2] += hits > 0
-                counts[tile, 3] += many[r] * (hits > 0)
-            counts[tile, 4] += any_hit
+                counts[tile, 2] += reached
+                counts[tile, 3] += hits > 0
+                counts[tile, 4] += many[r] * (hits > 0)
+            counts[tile, 5] += any_hit
 
 
 def _fma_kernel(chains: int) -> Callable[[int], float]:

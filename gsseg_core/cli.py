@@ -75,7 +75,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--memory-budget",
         type=int,
-        default=1024,
+        default=2048,
         metavar="MIB",
         help="for prepared views; those beyond it are prepared anew in each step (default: %(default)s)",
     )

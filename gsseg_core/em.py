@@ -244,11 +244,13 @@ class EMLearner(Learner):
 
     def _counted(self, votes: Rows, observation: Observation) -> np.ndarray:
         """Count the pixels (K, L) of each class under each label of a view, by the votes of all the others."""
-        places, own = votes.places(observation.ids), observation.votes()
+        order, own = observation.order, observation.votes()
+        places = votes.places(observation.ids[order])
         others = places.with_values(votes.values[places.values])
-        take_votes(*others, observation.start, observation.classes[observation.labels], own, 1 / VOTE_UNIT)
+        take_votes(*others, order, observation.start, observation.classes[observation.labels], own, 1 / VOTE_UNIT)
         codes = others.with_values(others.values.astype(np.float32)).normalised()
-        return tally(*codes, observation.start, observation.labels, own, self.num_classes, len(observation.classes))
+        seen = order, observation.start, observation.labels
+        return tally(*codes, *seen, own, self.num_classes, len(observation.classes))
 
     def _gains(
         self,
@@ -269,7 +271,7 @@ class EMLearner(Learner):
         for name, observation in self._observations(models):
             tell()  # after each view, so that whoever listens can stop the work at once
             likelihood = np.ascontiguousarray(models[name].likelihood.T)
-            seen = observation.ids, observation.start, observation.labels, likelihood
+            seen = observation.order, observation.ids, observation.start, observation.labels, likelihood
             shares = observation.shares(mix(*codes, *seen), likelihood[:, 0])
             told[name] = shares.log_likelihood
             collect(codes.start, codes.classes, gains, *seen, shares.sightings)
@@ -286,17 +288,17 @@ class EMLearner(Learner):
         """Learn each view's error model anew, from the codes that the step would give without this view."""
         for name, observation in self._observations(models):
             tell()
-            model, (start, classes, places) = models[name], codes.places(observation.ids)
+            model, order = models[name], observation.order
+            start, classes, places = codes.places(observation.ids[order])
             likelihood = np.ascontiguousarray(model.likelihood.T)
-            here = np.arange(len(observation.ids), dtype=np.int32)
-            seen = here, observation.start, observation.labels, likelihood
+            seen = order, inverse(order), observation.start, observation.labels, likelihood
             without, own = codes.values[places], np.zeros(len(places), np.int64)
             shares = observation.shares(mix(start, classes, without, *seen), likelihood[:, 0])
             collect(start, classes, own, *seen, shares.sightings)  # Exactly what the view has given to the gains.
             improve(start, without, gains[places] - own, prior[places])
             shares = observation.shares(mix(start, classes, without, *seen), likelihood[:, 0])
             counts = tally(
-                start, classes, without, observation.start, observation.labels, shares.sightings,
+                start, classes, without, order, observation.start, observation.labels, shares.sightings,
                 self.num_classes, len(model.classes),
             )  # fmt: skip
             counts[0] += shares.rest
@@ -311,6 +313,15 @@ class EMLearner(Learner):
         codes = votes.with_values(votes.values.astype(np.float32) * np.float32(VOTE_UNIT)).normalised()
         smooth = neighbours.mean_codes(codes, self.observed_, self.num_classes).normalised()
         return smooth.with_values(np.float32(self.settings.prior_weight) * smooth.values)
+
+
+def inverse(
+    order: np.ndarray,  # (M,) a permutation
+) -> np.ndarray:
+    """Tell where in the order each one comes, (M,) int32."""
+    place = np.empty(len(order), np.int32)
+    place[order] = np.arange(len(order), dtype=np.int32)
+    return place
 
 
 def _log_prior(

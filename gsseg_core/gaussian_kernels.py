@@ -47,6 +47,7 @@ def mix(
     rows: np.ndarray,  # (N + 1,) codes, as `Rows`
     classes: np.ndarray,  # (Z,) uint32
     codes: np.ndarray,  # (Z,) float32
+    order: np.ndarray,  # (M,) int32: in which to go through the Gaussians
     ids: np.ndarray,  # (M,) int32
     start: np.ndarray,  # (M + 1,)
     labels: np.ndarray,  # (P,) int32
@@ -54,7 +55,8 @@ def mix(
 ) -> np.ndarray:
     """Return what each Gaussian says of the labels under which it is seen, codes[i] . likelihood[y]: (P,) float32."""
     out = np.empty(labels.shape[0], np.float32)
-    for m in nb.prange(ids.shape[0]):
+    for i in nb.prange(order.shape[0]):
+        m = order[i]
         mine = slice(rows[ids[m]], rows[ids[m] + 1])
         code, which = codes[mine], classes[mine]
         for s in range(start[m], start[m + 1]):
@@ -70,6 +72,7 @@ def collect(
     rows: np.ndarray,  # (N + 1,) gains, as `Rows`
     classes: np.ndarray,  # (Z,)
     gains: np.ndarray,  # (Z,) int64, in units of GAIN_UNIT, added to
+    order: np.ndarray,  # (M,) int32: in which to go through the Gaussians
     ids: np.ndarray,  # (M,) int32, distinct
     start: np.ndarray,  # (M + 1,)
     labels: np.ndarray,  # (P,) int32
@@ -77,7 +80,8 @@ def collect(
     shares: np.ndarray,  # (P,) float32
 ) -> None:
     """Add to the gains of each Gaussian its shares times the likelihoods of their labels."""
-    for m in nb.prange(ids.shape[0]):
+    for i in nb.prange(order.shape[0]):
+        m = order[i]
         mine = slice(rows[ids[m]], rows[ids[m] + 1])
         gain, which = gains[mine], classes[mine]
         for s in range(start[m], start[m + 1]):
@@ -109,6 +113,7 @@ def tally(
     rows: np.ndarray,  # (M + 1,) codes, as `Rows`
     classes: np.ndarray,  # (Z,)
     codes: np.ndarray,  # (Z,) float32
+    order: np.ndarray,  # (M,) int32: whose rows these are
     start: np.ndarray,  # (M + 1,)
     labels: np.ndarray,  # (P,) int32
     shares: np.ndarray,  # (P,) float32
@@ -116,13 +121,14 @@ def tally(
     num_labels: int,
 ) -> np.ndarray:
     """Return the sum over the sightings of codes[i] times share, by label, (K, L) float64: what lies under each."""
-    many = start.shape[0] - 1
+    many = order.shape[0]
     parts = np.zeros((BLOCKS, num_classes, num_labels))
     for block in nb.prange(BLOCKS):
         part = parts[block]
-        for m in range(many * block // BLOCKS, many * (block + 1) // BLOCKS):
+        for i in range(many * block // BLOCKS, many * (block + 1) // BLOCKS):
+            m = order[i]
             for s in range(start[m], start[m + 1]):
-                for z in range(rows[m], rows[m + 1]):
+                for z in range(rows[i], rows[i + 1]):
                     part[classes[z], labels[s]] += shares[s] * codes[z]
     counts: np.ndarray = parts.sum(axis=0)
     return counts
@@ -147,15 +153,17 @@ def take_votes(
     rows: np.ndarray,  # (M + 1,) votes, as `Rows`
     classes: np.ndarray,  # (Z,)
     total: np.ndarray,  # (Z,) int64, taken from
+    order: np.ndarray,  # (M,) int32: whose rows these are
     start: np.ndarray,  # (M + 1,)
     sighted: np.ndarray,  # (P,) class of each sighting
     votes: np.ndarray,  # (P,) float32
     units: float,  # per vote; a power of 2
 ) -> None:
     """Take a view's votes away from those of all, row by row."""
-    for m in nb.prange(start.shape[0] - 1):
+    for i in nb.prange(order.shape[0]):
+        m = order[i]
         for s in range(start[m], start[m + 1]):
-            for z in range(rows[m], rows[m + 1]):
+            for z in range(rows[i], rows[i + 1]):
                 if classes[z] == np.uint32(sighted[s]):
                     total[z] -= np.int64(np.rint(np.float64(votes[s]) * units))
 

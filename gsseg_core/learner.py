@@ -20,7 +20,7 @@ from gsseg_core.state_file import State
 VOTE_UNIT = 2.0**-24
 """Votes are counted in whole multiples of this many px, so that adding and taking back are exact."""
 
-MEMORY_BUDGET = 1 << 30
+MEMORY_BUDGET = 2 << 30
 """Bytes of prepared views to keep between steps, unless asked otherwise."""
 
 NO_MASK, SEES_NOTHING, ALL_UNKNOWN = "no mask", "sees no Gaussian", "all pixels unknown"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -97,6 +98,11 @@ class Observation(ABC):
     @abstractmethod
     def nbytes(self) -> int:
         """Memory that it holds, in bytes."""
+
+    @cached_property
+    def order(self) -> np.ndarray:
+        """Places in `ids` in the order of the scene, (M,) int32: whoever goes by it goes through memory once."""
+        return np.argsort(self.ids, kind="stable").astype(np.int32)
 
     @property
     def rows(self) -> np.ndarray:

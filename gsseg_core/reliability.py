@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from gsseg_core.dataset import View
-from gsseg_core.em import EMLearner
+from gsseg_core.em import EMLearner, inverse
 from gsseg_core.export import background_image
 from gsseg_core.gaussian_kernels import collect, improve, mix
 from gsseg_core.learner import Progress, silent
@@ -147,10 +147,10 @@ class OtherViews:
     def _without(self, view: View) -> tuple[np.ndarray, np.ndarray]:
         """Codes that a view sees, after a step of EM that leaves its summand out: where they stand, and which."""
         observation = self.learner.observation(view.name)
-        start, classes, places = self._codes.places(observation.ids)
+        order = observation.order
+        start, classes, places = self._codes.places(observation.ids[order])
         likelihood = np.ascontiguousarray(self.learner.error_models_[view.name].likelihood.T)
-        here = np.arange(len(observation.ids), dtype=np.int32)
-        seen = here, observation.start, observation.labels, likelihood
+        seen = order, inverse(order), observation.start, observation.labels, likelihood
         codes, own = self._codes.values[places], np.zeros(len(places), np.int64)
         shares = observation.shares(mix(start, classes, codes, *seen), likelihood[:, 0])
         collect(start, classes, own, *seen, shares.sightings)  # Exactly what the view has given to the gains.

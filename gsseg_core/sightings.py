@@ -66,12 +66,9 @@ def number_sightings(
     gaussian_start: np.ndarray,  # (M + 1,)
     gaussian_entries: np.ndarray,  # (E,)
     kept: np.ndarray,  # (E, 2)
-    start: np.ndarray,  # (T + 1,)
-    slot_start: np.ndarray,  # (T + 1,)
-    sums: np.ndarray,  # (slot_start[-1],) sum of weights by entry and label
-    kept_start: np.ndarray,  # (T + 1,)
-    kept_slot_start: np.ndarray,  # (T + 1,)
-    label_start: np.ndarray,  # (T + 1,)
+    tiles: np.ndarray,  # (T, 6) int64: first of all entries, of all slots, of the entries kept, of their slots, of the
+    # labels, and how many labels; together, since each look at another tile waits for memory
+    sums: np.ndarray,  # (slots,) sum of weights by entry and label
     present: np.ndarray,
     num_labels: int,
     room: np.ndarray,  # (CHUNKS + 1,) where each chunk's sightings begin; there is more room than needed
@@ -84,7 +81,7 @@ def number_sightings(
     sighting: np.ndarray,  # (kept_slot_start[-1],) int32 out: of each kept entry and label of its tile, -1 where none
 ) -> None:
     """Give a number to every Gaussian that is seen, and to each of its labels, and tell the entries."""
-    many = gaussians.shape[0]
+    many, last = gaussians.shape[0], gaussian_entries.shape[0] - 1
     for chunk in nb.prange(CHUNKS):
         seen, number = np.full(num_labels, -1, np.int64), np.zeros(num_labels, np.int64)
         first, n = chunk * many // CHUNKS, room[chunk]
@@ -92,21 +89,23 @@ def number_sightings(
         for g in range(first, (chunk + 1) * many // CHUNKS):
             begin, is_seen = n, False
             for i in range(gaussian_start[g], gaussian_start[g + 1]):
+                prefetch(kept, gaussian_entries[min(i + AHEAD, last)])
                 e = gaussian_entries[i]
                 target, tile = kept[e, 0], kept[e, 1]
                 if target < 0:
                     continue
                 is_seen = True
                 entries[target] = tag | (place - first)
-                slots = label_start[tile + 1] - label_start[tile]
-                base = slot_start[tile] + (e - start[tile]) * slots
-                position = kept_slot_start[tile] + (target - kept_start[tile]) * slots
+                facts = tiles[tile]
+                slots = facts[5]
+                base = facts[1] + (e - facts[0]) * slots
+                position = facts[3] + (target - facts[2]) * slots
                 for j in range(slots):
                     weight = sums[base + j]
                     if not weight > 0:
                         sighting[position + j] = -1
                         continue
-                    label = present[label_start[tile] + j]
+                    label = present[facts[4] + j]
                     if seen[label] != g:
                         seen[label], number[label] = g, n
                         labels[n], votes[n] = label, 0.0

@@ -56,10 +56,11 @@ class TileObservation(Observation):
         gaussians, label_counts = np.empty(len(ids), np.int32), np.empty(len(ids), np.int32)
         labels, votes = np.empty(room[-1], np.int32), np.empty(room[-1], np.float32)
         self._entries, self._sighting = np.empty(self._start[-1], np.int32), np.empty(self._slot_start[-1], np.int32)
+        begins = (tiles.start, slot_start, self._start, self._slot_start, mask.start)
         sightings.number_sightings(
-            tiles.gaussian_start, tiles.gaussian_entries, kept, tiles.start, slot_start, sums, self._start,
-            self._slot_start, mask.start, mask.present, len(self.classes), room, found, gaussians, label_counts,
-            labels, votes, self._entries, self._sighting,
+            tiles.gaussian_start, tiles.gaussian_entries, kept,
+            np.stack([*(begin[:-1] for begin in begins), many], axis=1), sums, mask.present, len(self.classes),
+            room, found, gaussians, label_counts, labels, votes, self._entries, self._sighting,
         )  # fmt: skip
         before = np.cumsum(found, axis=0) - found
         sightings.settle(self._entries, before[:, 0])
@@ -76,7 +77,7 @@ class TileObservation(Observation):
         held = (self.ids, self.start, self.labels, self._votes, self._table, self._start, self._entries, self._rows,
                 self._records, self._slot_start, self._sighting, mask.start, mask.present, mask.span_start, mask.slots,
                 mask.lanes)  # fmt: skip
-        return sum(array.nbytes for array in held)
+        return sum(array.nbytes for array in held) + self.ids.nbytes  # once more for `order`
 
     def votes(self) -> np.ndarray:
         """Weights summed by sighting, (P,) float32."""

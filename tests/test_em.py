@@ -210,7 +210,7 @@ def test_what_was_all_but_ruled_out_does_not_overflow_the_sums() -> None:
     one, start, label = np.zeros(1, np.int32), np.array([0, 1]), np.zeros(1, np.int32)
     share, likelihood = np.array([1e30], np.float32), np.array([[1.0, 1e-30]], np.float32)
     for _ in range(255):
-        collect(rows, classes, gains, one, start, label, likelihood, share)
+        collect(rows, classes, gains, one, one, start, label, likelihood, share)
     np.testing.assert_allclose(gains * GAIN_UNIT, [255 * 2.0**27, 255.0], rtol=1e-6)
     improve(rows, codes, gains, np.zeros_like(codes))
     np.testing.assert_allclose(codes, [1.0, 0.0], atol=1e-6)
