@@ -27,6 +27,7 @@ from gsseg_core.blend import open_rays
 from gsseg_core.dataset import Dataset, View, spread
 from gsseg_core.em import EMLearner
 from gsseg_core.lanes import (
+    FAST,
     LANES,
     WIDTH,
     add_scaled,
@@ -172,7 +173,7 @@ def store(columns, width, height, table, start, entries, rows, first, kept, left
                 n += 1
 
 
-@nb.njit(parallel=True, fastmath={"contract", "nnan", "nsz", "reassoc"}, error_model="numpy")
+@nb.njit(parallel=True, fastmath=FAST, error_model="numpy")
 def share_stored(  # type: ignore[no-untyped-def]
     start, rows, first, kept, final, label_start, present, span_start, slots, lanes, slot_start, sighting, said, rest,
     logs, left_over, sums,

@@ -22,11 +22,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jobs import hard_votes
 
 from gsseg_core.dataset import Dataset, View
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.export import background_image
-from gsseg_core.learner import Learner, normalise
+from gsseg_core.learner import Learner
 from gsseg_core.metrics import Evaluation, evaluate_folders
 from gsseg_core.operator import make_operator
 from gsseg_core.pictures import contact_sheet, overlay, palette, save_png
@@ -106,9 +107,7 @@ def learn(name: str, scene: GaussianScene, data: Dataset) -> np.ndarray:
         learner.observe(view)
     codes: np.ndarray = learner.fit().codes_
     if name == "votes made hard":
-        hard = np.zeros_like(codes)
-        hard[np.arange(len(codes)), codes.argmax(axis=1)] = 1
-        return normalise(hard * learner.observed_[:, None])
+        return hard_votes(codes, bias=0.0)
     return codes
 
 

@@ -15,13 +15,11 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from gsseg_core.lanes import LANES, WIDTH, aim, blend_row, first_bit, prefetch, store_row
+from gsseg_core.lanes import OPEN, WIDTH, aim, blend_row, first_bit, prefetch, store_row
 from gsseg_core.tiles import TILE
 
 AHEAD = 12
 """Entries between the one that is blended and the one that is fetched from memory."""
-
-_OPEN = (1 << LANES) - 1
 
 
 @nb.njit(inline="always")
@@ -69,8 +67,8 @@ def blend_tile(
             weight, bits = blend_row(transmittance, r, lines, table[g, WIDTH])
             store_row(weights, n, weight)
             rows[n] = r
-            n += bits > _OPEN
-            if not bits & _OPEN:
+            n += bits > OPEN
+            if not bits & OPEN:
                 live &= ~(1 << r)
         ends[e - first] = n
         if not live:

@@ -289,18 +289,12 @@ class EMLearner(Learner):
         for name, observation in self._observations(models):
             tell()
             model, order = models[name], observation.order
-            start, classes, places = codes.places(observation.ids[order])
+            without, _ = codes_without(observation, model, codes, gains, prior)
             likelihood = np.ascontiguousarray(model.likelihood.T)
-            seen = order, inverse(order), observation.start, observation.labels, likelihood
-            without, own = codes.values[places], np.zeros(len(places), np.int64)
-            shares = observation.shares(mix(start, classes, without, *seen), likelihood[:, 0])
-            collect(start, classes, own, *seen, shares.sightings)  # Exactly what the view has given to the gains.
-            improve(start, without, gains[places] - own, prior[places])
-            shares = observation.shares(mix(start, classes, without, *seen), likelihood[:, 0])
-            counts = tally(
-                start, classes, without, order, observation.start, observation.labels, shares.sightings,
-                self.num_classes, len(model.classes),
-            )  # fmt: skip
+            said = mix(*without, order, _inverse(order), observation.start, observation.labels, likelihood)
+            shares = observation.shares(said, likelihood[:, 0])
+            seen = order, observation.start, observation.labels
+            counts = tally(*without, *seen, shares.sightings, self.num_classes, len(model.classes))
             counts[0] += shares.rest
             model.maximise(counts * (1 - model.outliers) * model.confusion)
         return models
@@ -315,7 +309,34 @@ class EMLearner(Learner):
         return smooth.with_values(np.float32(self.settings.prior_weight) * smooth.values)
 
 
-def inverse(
+def codes_without(
+    observation: Observation,
+    model: ErrorModel,
+    codes: Rows,
+    gains: np.ndarray,  # (Z,) int64, of a step at these codes and models
+    prior: np.ndarray | None = None,  # (Z,) px
+) -> tuple[Rows, np.ndarray]:
+    """Take a step of EM that leaves a view's own summand out.
+
+    Returns
+    -------
+    without : Rows
+        Codes of the M Gaussians that the view sees, in the order of the scene.
+    places : (Z',) int64
+        Where in the codes of all they stand.
+    """
+    order = observation.order
+    start, classes, places = codes.places(observation.ids[order])
+    likelihood = np.ascontiguousarray(model.likelihood.T)
+    seen = order, _inverse(order), observation.start, observation.labels, likelihood
+    without, own = codes.values[places], np.zeros(len(places), np.int64)
+    shares = observation.shares(mix(start, classes, without, *seen), likelihood[:, 0])
+    collect(start, classes, own, *seen, shares.sightings)  # Exactly what the view has given to the gains.
+    improve(start, without, gains[places] - own, np.zeros_like(without) if prior is None else prior[places])
+    return Rows(start, classes, without), places
+
+
+def _inverse(
     order: np.ndarray,  # (M,) a permutation
 ) -> np.ndarray:
     """Tell where in the order each one comes, (M,) int32."""

@@ -24,6 +24,7 @@ from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.lanes import ALPHA_MAX, T_MIN
 from gsseg_core.operator import Blended, Observation, Shares, ViewOperator, Weights
 from gsseg_core.projection import ALPHA_MIN, DILATION, NEAR
+from gsseg_core.rows import starts
 from gsseg_core.scene import GaussianScene
 
 TILE = 16
@@ -281,7 +282,7 @@ class GsplatObservation(Observation):
         seen = votes > 0
         self._visible = np.flatnonzero(seen.any(axis=1))
         self.ids, seen = operator.ids[self._visible], seen[self._visible]
-        self.start = np.concatenate([[0], np.cumsum(seen.sum(axis=1))])
+        self.start = starts(seen.sum(axis=1))
         self.labels = seen.nonzero()[1].astype(np.int32)
         self._votes = votes[self._visible][seen]
 

@@ -25,6 +25,12 @@ intrinsic: Any = typed_intrinsic
 
 LANES = 16
 
+OPEN = (1 << LANES) - 1
+"""Of the bits of `blend_row`, those of the rays that are still open."""
+
+FAST = {"contract", "nnan", "nsz", "reassoc"}
+"""What the compiler may do to sums of weights, none of which is NaN."""
+
 ALPHA_MAX = 0.99
 LOG_ALPHA_MIN = -math.log2(255.0)
 """log2 of the least alpha that counts."""

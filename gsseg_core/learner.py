@@ -257,12 +257,3 @@ def count_votes(
     """Add a view's votes, or take them away, in units of `VOTE_UNIT`."""
     classes = observation.classes[observation.labels]
     add_votes(total, observation.ids, observation.start, classes, observation.votes(), 1 / VOTE_UNIT, sign)
-
-
-def normalise(
-    codes: np.ndarray,  # (N, K) float32, changed in place
-) -> np.ndarray:
-    """Scale rows to sum 1; rows of zeros stay zero."""
-    total = codes.sum(axis=1, keepdims=True)
-    np.divide(codes, total, out=codes, where=total > 0)
-    return codes

@@ -13,12 +13,21 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.blend import AHEAD, open_rays
-from gsseg_core.lanes import LANES, WIDTH, add_where, aim, blend_row, count_bits, first_bit, nothing, prefetch, sum_row
+from gsseg_core.lanes import (
+    FAST,
+    LANES,
+    OPEN,
+    WIDTH,
+    add_where,
+    aim,
+    blend_row,
+    count_bits,
+    first_bit,
+    nothing,
+    prefetch,
+    sum_row,
+)
 from gsseg_core.tiles import TILE
-
-_FAST = {"contract", "nnan", "nsz", "reassoc"}
-
-_OPEN = (1 << LANES) - 1
 
 
 @dataclass(frozen=True)
@@ -83,7 +92,7 @@ def cut_labels(
     return start, present[:n].copy(), span_start, slots[:spans].copy(), lanes[:spans].copy()
 
 
-@nb.njit(parallel=True, nogil=True, cache=True, fastmath=_FAST, error_model="numpy")
+@nb.njit(parallel=True, nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def lift(
     columns: int,
     width: int,
@@ -118,7 +127,7 @@ def lift(
             counts[tile, 2] = (mine > 0).sum()
 
 
-@nb.njit(fastmath=_FAST, error_model="numpy")
+@nb.njit(fastmath=FAST, error_model="numpy")
 def _lift_tile(
     tile: int,
     columns: int,
@@ -154,7 +163,7 @@ def _lift_tile(
             r = first_bit(rows)
             rows &= rows - 1
             weight, bits = blend_row(rays, r, lines, table[g, WIDTH])
-            if not bits & _OPEN:
+            if not bits & OPEN:
                 live &= ~(1 << r)
             hit |= np.int64(bits >> LANES & labelled[r] > 0) << r
             if many == 1:

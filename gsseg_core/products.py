@@ -9,10 +9,8 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.blend import blend_tile
-from gsseg_core.lanes import add_scaled, dot, load_row, store_row
+from gsseg_core.lanes import FAST, add_scaled, dot, load_row, store_row
 from gsseg_core.tiles import TILE
-
-_FAST = {"contract", "nnan", "nsz", "reassoc"}
 
 _TINY = np.float32(1e-30)
 
@@ -67,7 +65,7 @@ def render(
                     out[top + r, left + c, k] = block[r, k, c]
 
 
-@nb.njit(parallel=True, nogil=True, cache=True, fastmath=_FAST)
+@nb.njit(parallel=True, nogil=True, cache=True, fastmath=FAST)
 def adjoint_entries(
     columns: int,
     table: np.ndarray,  # (M, 8)

@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 
 from gsseg_core.dataset import View
-from gsseg_core.em import EMLearner, inverse
+from gsseg_core.em import EMLearner, codes_without
 from gsseg_core.export import background_image
-from gsseg_core.gaussian_kernels import collect, improve, mix
 from gsseg_core.learner import Progress, silent
 from gsseg_core.masks import UNKNOWN
 from gsseg_core.operator import make_operator
@@ -121,9 +120,11 @@ class OtherViews:
             `UNKNOWN` (-1) where they say nothing: most of the ray ends on Gaussians that only this view has seen.
         """
         learner = self.learner
-        places, values = self._without(view)
+        # No prior: where no other view has seen anything, nothing is to be said.
+        model = learner.error_models_[view.name]
+        without, places = codes_without(learner.observation(view.name), model, self._codes, self._gains)
         codes = self._codes.values.copy()
-        codes[places] = values
+        codes[places] = without.values
         operator = make_operator(learner.scene, view.camera, learner.device)
         image, left_over = operator.blend_rows(self._codes.with_values(codes), learner.num_classes)
         if self._shows_background:
@@ -143,20 +144,6 @@ class OtherViews:
             checks.append(self.check(view))
         progress("check views", len(views), len(views))
         return checks
-
-    def _without(self, view: View) -> tuple[np.ndarray, np.ndarray]:
-        """Codes that a view sees, after a step of EM that leaves its summand out: where they stand, and which."""
-        observation = self.learner.observation(view.name)
-        order = observation.order
-        start, classes, places = self._codes.places(observation.ids[order])
-        likelihood = np.ascontiguousarray(self.learner.error_models_[view.name].likelihood.T)
-        seen = order, inverse(order), observation.start, observation.labels, likelihood
-        codes, own = self._codes.values[places], np.zeros(len(places), np.int64)
-        shares = observation.shares(mix(start, classes, codes, *seen), likelihood[:, 0])
-        collect(start, classes, own, *seen, shares.sightings)  # Exactly what the view has given to the gains.
-        # No prior: where no other view has seen anything, nothing is to be said.
-        improve(start, codes, self._gains[places] - own, np.zeros(len(places), np.float32))
-        return places, codes
 
 
 def check_views(learner: EMLearner, progress: Progress = silent) -> list[ViewCheck]:

@@ -50,7 +50,7 @@ class Rows(NamedTuple):
         """Put rows below each other."""
         lengths = np.concatenate([np.diff(part.start) for part in parts])
         return cls(
-            np.concatenate([[0], np.cumsum(lengths)]),
+            starts(lengths),
             np.concatenate([part.classes for part in parts]),
             np.concatenate([part.values for part in parts]),
         )
@@ -107,10 +107,17 @@ class Rows(NamedTuple):
     ) -> Rows:
         """Of some rows, where in `values` their entries stand, as values: (Z',) int64."""
         lengths = (self.start[1:] - self.start[:-1])[ids]
-        start = np.concatenate([[0], np.cumsum(lengths)])
+        start = starts(lengths)
         places = np.empty(start[-1], np.int64)
         _place(self.start, ids, start, places)
         return Rows(start, self.classes[places], places)
+
+
+def starts(
+    counts: np.ndarray,  # (n,)
+) -> np.ndarray:
+    """Tell where each of several parts begins, and the last one ends: (n + 1,) int64."""
+    return np.concatenate([[0], np.cumsum(counts)])
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)

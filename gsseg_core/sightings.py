@@ -13,6 +13,7 @@ import numpy as np
 
 from gsseg_core.blend import AHEAD, open_rays
 from gsseg_core.lanes import (
+    FAST,
     WIDTH,
     add_product,
     add_product_where,
@@ -28,8 +29,6 @@ from gsseg_core.lanes import (
     sum_row,
 )
 from gsseg_core.tiles import TILE
-
-_FAST = {"contract", "nnan", "nsz", "reassoc"}
 
 _TINY = np.float32(1e-30)
 
@@ -129,7 +128,7 @@ def settle(
             numbers[i] = (numbers[i] & _NUMBER) + before[numbers[i] >> _CHUNK]
 
 
-@nb.njit(parallel=True, nogil=True, cache=True, fastmath=_FAST, error_model="numpy")
+@nb.njit(parallel=True, nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def share(
     columns: int,
     width: int,
@@ -176,7 +175,7 @@ def share(
         )  # fmt: skip
 
 
-@nb.njit(fastmath=_FAST, error_model="numpy")
+@nb.njit(fastmath=FAST, error_model="numpy")
 def _blend_said(
     left: float,
     top: float,
@@ -253,7 +252,7 @@ def _invert(
     return total
 
 
-@nb.njit(fastmath=_FAST)
+@nb.njit(fastmath=FAST)
 def _sum_shares(
     rows: np.ndarray,  # (E_t,)
     many: int,

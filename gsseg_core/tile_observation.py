@@ -9,6 +9,7 @@ from gsseg_core.cameras import Camera
 from gsseg_core.errors import SceneValueError
 from gsseg_core.lift import Labels, cut_labels, lift
 from gsseg_core.operator import Observation, Shares
+from gsseg_core.rows import starts
 from gsseg_core.tiles import Tiles
 
 
@@ -36,14 +37,14 @@ class TileObservation(Observation):
     def _lift(self, ids: np.ndarray, table: np.ndarray, tiles: Tiles) -> None:
         mask, camera = self._labels, self._camera
         many = np.diff(mask.start)
-        slot_start = _starts(np.diff(tiles.start) * many)
+        slot_start = starts(np.diff(tiles.start) * many)
         reached, sums = np.empty(len(tiles.entries), np.uint16), np.empty(slot_start[-1], np.float32)
         counts = np.empty((len(many), 3), np.int64)
         lift(
             tiles.columns, camera.width, camera.height, table, tiles.start, tiles.entries,
             mask.start, mask.span_start, mask.slots, mask.lanes, slot_start, reached, sums, counts,
         )  # fmt: skip
-        self._start, self._slot_start = _starts(counts[:, 0]), _starts(counts[:, 0] * many)
+        self._start, self._slot_start = starts(counts[:, 0]), starts(counts[:, 0] * many)
         self._records = counts[:, 1].copy()
         kept, self._rows = np.empty((len(reached), 2), np.int32), np.empty(self._start[-1], np.uint16)
         sightings.keep_entries(tiles.start, reached, self._start, kept, self._rows)
@@ -67,7 +68,7 @@ class TileObservation(Observation):
         sightings.settle(self._sighting, before[:, 1])
         seen = _joined(gaussians, chunks, found[:, 0])
         self.ids, self._table = ids[seen], table[seen]
-        self.start = _starts(_joined(label_counts, chunks, found[:, 0]))
+        self.start = starts(_joined(label_counts, chunks, found[:, 0]))
         self.labels, self._votes = _joined(labels, room, found[:, 1]), _joined(votes, room, found[:, 1])
 
     @property
@@ -118,11 +119,6 @@ def _cut(
     position[classes] = np.arange(len(classes))
     local = np.where(labels >= 0, position[np.maximum(labels, 0)], -1).astype(np.int32)
     return Labels(*cut_labels(local, tiles.columns, tiles.rows, len(classes)))
-
-
-def _starts(counts: np.ndarray) -> np.ndarray:
-    """Where each of several parts begins, and the last one ends."""
-    return np.concatenate([[0], np.cumsum(counts)])
 
 
 def _joined(
