@@ -101,8 +101,10 @@ class SegmentationClient:
         self._spinner = Spinner("gsseg_client", context, domain_id)
         self._calls = Calls(self._spinner, self._name, find_timeout)
         node = self._spinner.node
-        self._clients = {kind: node.create_client(kind, f"{self._name}/{name}") for kind, name in _SERVICES.items()}
+        # The question for the state comes last: the node hears of them in this order, and an answer to someone it has
+        # not heard of yet is lost; so once it has told its state, none is.
         self._learn: Any = ActionClient(node, Learn, f"{self._name}/learn")
+        self._clients = {kind: node.create_client(kind, f"{self._name}/{name}") for kind, name in _SERVICES.items()}
         self._clouds: dict[int, PointCloud2] = {}
         self._awaiting_clouds = 0
         self._lock = threading.Lock()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -41,10 +42,12 @@ from gsseg_ros.frames import Similarity
 KINDS = {"mask": Image, "camera_info": CameraInfo, "pose": PoseStamped, "odometry": Odometry}
 SERVICES = {
     "segment": Segment, "render_view": RenderView, "load_scene": LoadScene, "save_state": SaveState,
-    "load_state": LoadState, "export": Export, "reset": Reset, "change_state": ChangeState, "get_state": GetState,
+    "load_state": LoadState, "export": Export, "reset": Reset, "change_state": ChangeState,
     "describe_parameters": DescribeParameters, "get_parameters": GetParameters, "list_parameters": ListParameters,
-    "set_parameters": SetParameters,
+    "set_parameters": SetParameters, "get_state": GetState,
 }  # fmt: skip
+GREETING_SECONDS = 2.0
+"""Until a node that has not answered its first question is asked again."""
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 CLASSES = list(NAMES.values())
@@ -84,8 +87,12 @@ class Robot:
         self.publishers = {
             topic: ros.node.create_publisher(kind, f"{namespace}/{topic}", RELIABLE) for topic, kind in KINDS.items()
         }
-        self._clients: dict[str, Any] = {}
-        self._learner: ActionClient | None = None
+        # The question for the state comes last: a node that answers it has heard of all the others (see `_greet`).
+        self._learner = ActionClient(ros.node, Learn, f"{self.name}/learn")
+        self._clients = {
+            service: ros.node.create_client(kind, f"{self.name}/{service}") for service, kind in SERVICES.items()
+        }
+        self._greeted = False
         self.received_status = ros.collect(DiagnosticArray, "/diagnostics", RELIABLE)
         self.stamp = 1000 * SECOND
         self.process: Process | None = None
@@ -103,6 +110,7 @@ class Robot:
         if self.namespace:
             arguments = ("-r", f"__ns:={self.namespace}", *arguments)
         self.process = self.ros.start("segment_node", {**(parameters or {}), **qos}, *arguments)
+        self._greeted = False
         return self.process
 
     def started(self, parameters: dict[str, Any] | None = None, *arguments: str, lossless: bool = True) -> Robot:
@@ -142,11 +150,31 @@ class Robot:
 
     def send(self, service: str, **fields: Any) -> Any:
         """Call a service of the node and return the future."""
-        if service not in self._clients:
-            self._clients[service] = self.ros.node.create_client(SERVICES[service], f"{self.name}/{service}")
         client = self._clients[service]
         self.ros.wait_until(client.service_is_ready, f"service {service}")
+        self._greet()
         return client.call_async(SERVICES[service].Request(**fields))
+
+    def _greet(self) -> None:
+        """Ask a new node for its state until it answers.
+
+        An answer is lost where the node has not yet heard of the one who asks, though its service is seen; and what
+        the asker has made is heard of in the order in which it was made.
+        """
+        if self._greeted:
+            return
+        client, asked = self._clients["get_state"], []
+        asked_at = -GREETING_SECONDS
+
+        def answered() -> bool:
+            nonlocal asked_at
+            if client.service_is_ready() and time.monotonic() - asked_at >= GREETING_SECONDS:
+                asked.append(client.call_async(GetState.Request()))
+                asked_at = time.monotonic()
+            return any(question.done() for question in asked)
+
+        self.ros.wait_until(answered, "a first answer of the node", timeout=2 * PATIENCE)
+        self._greeted = True
 
     def done(self, service: str, **fields: Any) -> Any:
         """Call a service, which must work."""
@@ -156,9 +184,8 @@ class Robot:
 
     def goal(self, **fields: Any) -> Goal:
         """Send a goal of `~/learn`, which is accepted."""
-        if self._learner is None:
-            self._learner = ActionClient(self.ros.node, Learn, f"{self.name}/learn")
         self.ros.wait_until(self._learner.server_is_ready, "the action")
+        self._greet()
         feedback: list[Any] = []
         learner, goal = self._learner, Learn.Goal(**fields)
         sent = self.ros.run(lambda: learner.send_goal_async(goal, lambda message: feedback.append(message.feedback)))

@@ -462,19 +462,29 @@ def test_of_too_many_masks_at_once_the_oldest_are_dropped_and_counted(
     scene, truth = balls_on_a_table()
     camera = look_at("large", np.array([3.0, 0, 3.0]), 640, 480, 550.0)
     view = View.from_arrays(camera, true_labels(scene, truth, camera))
-    robot.publish({"camera_info": messages(view, robot.next_stamp())["camera_info"]})
-    for _ in range(10):
-        sent = messages(view, robot.next_stamp())
-        robot.publish({"mask": sent["mask"], "pose": sent["pose"]})
-    # Until a later one comes they wait for a camera_info of their own; then all are ready in the same moment.
-    robot.publish({"camera_info": messages(view, robot.next_stamp())["camera_info"]})
+    sent = 0
+
+    def burst() -> None:
+        nonlocal sent
+        robot.publish({"camera_info": messages(view, robot.next_stamp())["camera_info"]})
+        for _ in range(10):
+            made = messages(view, robot.next_stamp())
+            robot.publish({"mask": made["mask"], "pose": made["pose"]})
+        # Until a later one comes they wait for a camera_info of their own; then all are ready in the same moment.
+        robot.publish({"camera_info": messages(view, robot.next_stamp())["camera_info"]})
+        sent += 10
 
     def all_counted(status: dict[str, str]) -> bool:
         # On a busy machine a pose may come too late for its mask.
         rejected = sum(int(count) for key, count in status.items() if key.startswith("rejected "))
-        return int(status["views accepted"]) + rejected == 10
+        return int(status.get("views accepted", 0)) + rejected == sent
 
-    status = robot.wait_for_status(all_counted, "all masks to be fused or dropped")
+    # Whether a burst comes at once is up to the machine, which may be busy.
+    for _ in range(20):
+        burst()
+        status = robot.wait_for_status(all_counted, "all masks to be fused or dropped")
+        if int(status["queue drops"]):
+            break
     assert int(status["queue drops"]) >= 1
     assert status["rejected queue_full"] == status["queue drops"]
     report = robot.done("segment").report
