@@ -192,15 +192,6 @@ class Ros:
         task = self.executor.create_task(work)
         return self.result(task, "the spinning thread")
 
-    def call(self, kind: Any, name: str, request: Any, timeout: float = PATIENCE) -> Any:
-        """Call a service once it is there and return the response."""
-        client = self.node.create_client(kind, name)
-        try:
-            self.wait_until(client.service_is_ready, f"service {name}", timeout)
-            return self.result(client.call_async(request), f"the answer of {name}", timeout)
-        finally:
-            self.node.destroy_client(client)
-
     def close(self) -> None:
         """Kill what still runs and take everything down."""
         for process in self._processes:
