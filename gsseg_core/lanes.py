@@ -296,6 +296,35 @@ def load_row(typing: Any, source: Any, i: Any) -> tuple[Any, Callable[..., Any]]
 
 
 @intrinsic
+def squared_distances(typing: Any, points: Any, i: Any, x: Any, y: Any, z: Any) -> tuple[Any, Callable[..., Any]]:
+    """From (x, y, z) to sixteen points, whose coordinates are points[i] to points[i + 2]; unfused, as scalars are."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        row = _Builder(context, builder, signature, arguments)
+        total = None
+        for axis in range(3):
+            number = builder.add(arguments[1], ir.Constant(arguments[1].type, axis))
+            offset = builder.fsub(row.load(row.address(0, number)), row.scalar(2 + axis))
+            square = builder.fmul(offset, offset)
+            total = square if total is None else builder.fadd(total, square)
+        return total
+
+    number = types.float32
+    return _row_type(points, i, number, number, number), generate
+
+
+@intrinsic
+def at_most(typing: Any, a: Any, limit: Any) -> tuple[Any, Callable[..., Any]]:
+    """Bits of the lanes that are not above a limit."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        row = _Builder(context, builder, signature, arguments)
+        return row.bits(builder.fcmp_ordered("<=", arguments[0], row.scalar(1)))
+
+    return types.int64(a, types.float32), generate
+
+
+@intrinsic
 def add_where(typing: Any, total: Any, a: Any, lanes: Any) -> tuple[Any, Callable[..., Any]]:
     """Add two rows in the lanes of the bits that are set; elsewhere the first stays."""
 

@@ -1,9 +1,7 @@
 """Distances from every point to its k nearest others, found once per scene, and means over those.
 
-A k-d tree whose queries follow each other in space. Two neighbouring queries have almost the same answer, and by the
-triangle inequality the radius of one bounds the radius of the next, so that few points are looked at. What is kept is
-not who the neighbours are but how far the k-th one is: with it, all of them are found again by one descent of the tree,
-and a million points take 16 MB instead of 200.
+What is kept is not who the neighbours are but how far the k-th one is: with it, all of them are found again by one look
+around, and a million points take 16 MB instead of 200.
 
 Results are bit-identical whatever the order of the points and the number of threads: points tied for the last place
 among the k nearest share it equally, and sums are taken over whole numbers, where order is no matter.
@@ -13,28 +11,25 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass
+from itertools import pairwise
 from weakref import WeakKeyDictionary
 
 import numba as nb
 import numpy as np
 
+from gsseg_core.kd_tree import LEAF, Tree, enclose, leaf_range, scaled
+from gsseg_core.lanes import at_most, first_bit, load_row
+from gsseg_core.nearest import CHUNK, NO_SKIP, middle_of, nearest
 from gsseg_core.rows import Rows
 from gsseg_core.scene import GaussianScene
-
-LEAF = 16
-"""Most points in a leaf of the tree."""
-
-FIXED = float(1 << 40)
-"""Distances are summed in steps of 1 / FIXED. None exceeds 4, so that 2^20 of them fit into int64."""
+from gsseg_core.surroundings import Surroundings, end_of_group, look_around, measure, room_for
 
 CODE_UNIT = 2.0**-24
 """Codes are summed in steps of this, which is the precision of a float32 near 1."""
 
-SUBTREE = 8  # levels of a subtree that one thread builds alone: about 4000 points
 BLOCK = 1 << 16  # points whose mean codes are written out at once
-CHUNK = 256  # consecutive queries of one thread, each bounded by the one before
-SLACK = np.float32(1.00001)  # covers float32 rounding in a bound
-TINY = np.float32(1e-30)
+MIXED = np.int32(-(2**31))  # stands for the label of a node whose points have several
+NOBODY = MIXED + 1  # the label of no point
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +61,7 @@ class Neighbours:
     ) -> Neighbours:
         """Find them, for N > 1."""
         tree, k = Tree.build(scaled(means)), min(k, len(means) - 1)
-        radii, distances = nearest(tree.points, tree.boxes, np.arange(len(means), dtype=np.int32), k)
+        radii, distances = nearest(tree.points, tree.boxes, tree.blocks, np.arange(len(means), dtype=np.int32), k)
         return cls(k, tree, radii, distances)
 
     def mean_codes(
@@ -84,10 +79,9 @@ class Neighbours:
             N rows; one without entries where there is no such neighbour, or the point is not wanted.
         """
         order, tree = self.tree.order, self.tree
-        of_points = codes.places(order)
-        values = codes.values[of_points.values]
-        values[np.repeat(~counted[order], np.diff(of_points.start))] = 0.0
-        units = np.rint(values * np.float32(1 / CODE_UNIT)).astype(np.int32)
+        read = np.repeat(counted, np.diff(codes.start))
+        units = np.rint(codes.values * np.float32(1 / CODE_UNIT), where=read, out=np.zeros_like(codes.values))
+        units = units.astype(np.int32)
         asked = np.arange(len(order)) if wanted is None else np.flatnonzero(wanted[order])
         # A block at a time is written out in full, so that of all the codes only what is not zero is ever in memory.
         parts = []
@@ -95,20 +89,42 @@ class Neighbours:
             places = asked[first : first + BLOCK].astype(np.int32)
             out = np.zeros((len(places), num_classes), np.float32)
             average(
-                tree.points, tree.boxes, of_points.start, of_points.classes, units, counted[order], places,
+                tree.points, tree.boxes, tree.blocks, order, codes.start, codes.classes, units, counted, places,
                 self.radii, self.k, out,
             )  # fmt: skip
             parts.append(Rows.of(out))
         return Rows.joined(parts).moved(order[asked], len(order))
 
-    def mean_distances(
+    def class_distances(
         self,
         labels: np.ndarray,  # (N,) int
+        num_classes: int,
     ) -> np.ndarray:
-        """Mean distance to the k nearest others if all of these have the point's own positive label, else NaN: (N,)."""
-        order, tree = self.tree.order, self.tree
-        out = np.full(len(order), np.nan)
-        out[order] = pure_distances(tree.points, tree.boxes, labels[order].astype(np.int32), self.radii, self.distances)
+        """Mean distance to the k nearest others of the same class, or to all of them if there are not as many: (N,).
+
+        Returns
+        -------
+        ndarray (N,) float64
+            In units of the scaled points. NaN where the label is not in 1 to `num_classes` - 1, and where a class has
+            a single member.
+        """
+        tree = self.tree
+        of_point = labels[tree.order].astype(np.int32)
+        of_point[of_point >= num_classes] = 0
+        found = pure_distances(tree.points, tree.boxes, tree.blocks, of_point, self.radii, self.distances)
+        by_class = np.argsort(of_point.astype(np.int16) if num_classes < 2**15 else of_point, kind="stable")
+        bounds = np.searchsorted(of_point, np.arange(1, num_classes + 1), sorter=by_class).tolist()
+        for first, last in pairwise(bounds):
+            members = by_class[first:last]
+            mixed = np.isnan(found[members])
+            # Where other classes are among the neighbours, more of its own are looked for, farther away.
+            if len(members) > 1 and mixed.any():
+                own, places = tree.part(members), np.flatnonzero(mixed).astype(np.int32)
+                found[members[places]] = nearest(
+                    own.points, own.boxes, own.blocks, places, min(self.k, len(members) - 1)
+                )[1]
+        out = np.empty(len(labels))
+        out[tree.order] = found
         return out
 
 
@@ -128,234 +144,17 @@ def neighbours_of(scene: GaussianScene, k: int) -> Neighbours | None:
         return known
 
 
-def scaled(means: np.ndarray) -> np.ndarray:
-    """Scale (N, 3) float32 into [-1, 1] by a power of two: nothing is rounded, and no distance can overflow."""
-    points = np.asarray(means, np.float32)
-    largest = max(points.max(initial=0), -points.min(initial=0))
-    scaled: np.ndarray = np.ldexp(points, -np.frexp(largest)[1])
-    return scaled
-
-
-@dataclass(frozen=True)
-class Tree:
-    """A balanced k-d tree without pointers: node i has the children 2i and 2i + 1, and the root is 1.
-
-    With L leaves, a power of two, leaf i is node L + i and holds points i * n // L to (i + 1) * n // L.
-
-    Attributes
-    ----------
-    points : (3, n) float32
-        In tree order: what is near in the array is near in space.
-    order : (n,) int32
-        Which of the points that went in each one is.
-    boxes : (2 L, 6) float32
-        Lowest and highest corner of each node's points.
-    """
-
-    points: np.ndarray
-    order: np.ndarray
-    boxes: np.ndarray
-
-    @classmethod
-    def build(cls, points: np.ndarray) -> Tree:
-        """Build from (n, 3) float32, n > 0."""
-        depth = ((len(points) - 1) // LEAF).bit_length()
-        points, order = points.copy(), np.arange(len(points), dtype=np.int32)
-        boxes = np.empty((2 << depth, 6), np.float32)
-        if depth > SUBTREE:
-            _grow(points, order, boxes, depth)
-        else:  # waking other threads would take longer than the work
-            _grow_subtree(points, order, boxes, depth, 0, 0)
-        return cls(np.ascontiguousarray(points.T), order, boxes)
-
-
-@nb.njit(parallel=True, nogil=True, cache=True)
-def _grow(points: np.ndarray, order: np.ndarray, boxes: np.ndarray, depth: int) -> None:
-    top = max(depth - SUBTREE, 0)
-    for level in range(top):
-        for j in nb.prange(1 << level):
-            _split(points, order, boxes, depth, level, j)
-    for j in nb.prange(1 << top):
-        _grow_subtree(points, order, boxes, depth, top, j)
-
-
-@nb.njit(nogil=True, cache=True)
-def _grow_subtree(points: np.ndarray, order: np.ndarray, boxes: np.ndarray, depth: int, top: int, root: int) -> None:
-    for level in range(top, depth + 1):
-        for j in range(root << (level - top), (root + 1) << (level - top)):
-            _split(points, order, boxes, depth, level, j)
-
-
-@nb.njit
-def _split(points: np.ndarray, order: np.ndarray, boxes: np.ndarray, depth: int, level: int, j: int) -> None:
-    """Box node j of a level in, and unless it is a leaf bring the lower half along its widest axis to the front."""
-    n = points.shape[0]
-    node, first, last = (1 << level) + j, (j * n) >> level, ((j + 1) * n) >> level
-    widest, axis = np.float32(-1), 0
-    for d in range(3):
-        low = high = points[first, d]
-        for i in range(first + 1, last):
-            low, high = min(low, points[i, d]), max(high, points[i, d])
-        boxes[node, d], boxes[node, 3 + d] = low, high
-        if high - low > widest:
-            widest, axis = high - low, d
-    if level < depth:
-        _partition(points, order, first, last - 1, ((2 * j + 1) * n) >> (level + 1), axis)
-
-
-@nb.njit
-def _partition(points: np.ndarray, order: np.ndarray, low: int, high: int, middle: int, axis: int) -> None:
-    """Quickselect of rows low to high (inclusive): those before `middle` get the smallest coordinates."""
-    while low < high:
-        a, b, c = points[low, axis], points[(low + high) // 2, axis], points[high, axis]
-        pivot = max(min(a, b), min(max(a, b), c))
-        i, j = low, high
-        while i <= j:
-            while points[i, axis] < pivot:
-                i += 1
-            while points[j, axis] > pivot:
-                j -= 1
-            if i <= j:
-                for d in range(3):
-                    points[i, d], points[j, d] = points[j, d], points[i, d]
-                order[i], order[j] = order[j], order[i]
-                i, j = i + 1, j - 1
-        if middle <= j:
-            high = j
-        elif middle >= i:
-            low = i
-        else:
-            return
-
-
-@nb.njit(parallel=True, nogil=True, cache=True)
-def nearest(
-    points: np.ndarray,  # (3, n)
-    boxes: np.ndarray,  # (2 L, 6)
-    places: np.ndarray,  # (M,) int32, which points to look from
-    k: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Find the squared distance to the k-th nearest other point, (M,) float32, and the mean of the k, (M,) float64."""
-    m = places.shape[0]
-    radii, distances = np.empty(m, np.float32), np.empty(m, np.float64)
-    for chunk in nb.prange((m + CHUNK - 1) // CHUNK):
-        near = np.empty(3 * k + LEAF, np.float32)
-        nodes, gaps = np.empty(64, np.int64), np.empty(64, np.float32)
-        bound = np.float32(np.inf)
-        for q in range(chunk * CHUNK, min((chunk + 1) * CHUNK, m)):
-            own = places[q]
-            x, y, z = points[0, own], points[1, own], points[2, own]
-            if q > chunk * CHUNK:
-                last = places[q - 1]
-                dx, dy, dz = points[0, last] - x, points[1, last] - y, points[2, last] - z
-                reach = np.sqrt(dx * dx + dy * dy + dz * dz) + np.sqrt(radii[q - 1])
-                bound = max(reach * reach * SLACK, TINY)
-            found = _search(points, boxes, own, k, bound, near, nodes, gaps)
-            radius = _smallest(near, found, k)
-            total, inside = np.int64(0), np.int64(0)
-            for i in range(found):
-                if near[i] < radius:
-                    total += np.int64(np.float64(np.sqrt(near[i])) * FIXED)
-                    inside += 1
-            total += (k - inside) * np.int64(np.float64(np.sqrt(radius)) * FIXED)
-            radii[q], distances[q] = radius, total / FIXED / k
-    return radii, distances
-
-
-@nb.njit
-def _search(
-    points: np.ndarray,  # (3, n)
-    boxes: np.ndarray,  # (2 L, 6)
-    own: int,
-    k: int,
-    bound: float,  # above the k-th smallest squared distance
-    near: np.ndarray,  # (3 k + LEAF,), filled
-    nodes: np.ndarray,  # (64,), scratch
-    gaps: np.ndarray,  # (64,), scratch
-) -> int:
-    """Collect squared distances to other points, the k smallest among them, in no order; return their number."""
-    x, y, z = points[0, own], points[1, own], points[2, own]
-    leaves, n = boxes.shape[0] // 2, points.shape[1]
-    found, waiting = 0, 1
-    nodes[0], gaps[0] = 1, 0
-    while waiting:
-        waiting -= 1
-        node, gap = nodes[waiting], gaps[waiting]
-        while node < leaves and gap < bound:  # go down to the nearer child, the other one waits
-            node, other = 2 * node, 2 * node + 1
-            gap, other_gap = _gap(boxes, node, x, y, z), _gap(boxes, other, x, y, z)
-            if other_gap < gap:
-                node, gap, other, other_gap = other, other_gap, node, gap
-            if other_gap < bound:
-                nodes[waiting], gaps[waiting] = other, other_gap
-                waiting += 1
-        if gap >= bound:
-            continue
-        first, last = (node - leaves) * n // leaves, (node - leaves + 1) * n // leaves
-        if found + last - first > near.shape[0]:
-            bound = _smallest(near, found, k)
-            kept = 0
-            for i in range(found):
-                distance = near[i]
-                if distance < bound:
-                    near[kept] = distance
-                    kept += 1
-            near[kept:k] = bound
-            found = k
-        for i in range(first, last):
-            dx, dy, dz = points[0, i] - x, points[1, i] - y, points[2, i] - z
-            distance = dx * dx + dy * dy + dz * dz
-            near[found] = distance  # without a branch: what is not counted is overwritten
-            found += (distance < bound) & (i != own)
-    return found
-
-
-@nb.njit(inline="always")
-def _gap(boxes: np.ndarray, node: int, x: float, y: float, z: float) -> np.float32:
-    """Squared distance to a box, in float32 never above that to a point inside it, since rounding is monotonic."""
-    dx = max(max(boxes[node, 0] - x, x - boxes[node, 3]), np.float32(0))
-    dy = max(max(boxes[node, 1] - y, y - boxes[node, 4]), np.float32(0))
-    dz = max(max(boxes[node, 2] - z, z - boxes[node, 5]), np.float32(0))
-    squared: np.float32 = dx * dx + dy * dy + dz * dz
-    return squared
-
-
-@nb.njit
-def _smallest(values: np.ndarray, n: int, k: int) -> np.float32:
-    """k-th smallest of the first n values, float32 and none negative.
-
-    Such floats sort like their bits, so this bisects the bits: counting what is at most the middle takes a few vector
-    instructions, has no branch to mispredict and moves nothing.
-    """
-    bits = values.view(np.int32)
-    low, high = np.int32(0), np.int32(0)
-    for i in range(n):
-        high = max(high, bits[i])
-    while low < high:
-        middle = low + ((high - low) >> np.int32(1))
-        count = np.int32(0)
-        for i in range(n):
-            count += np.int32(bits[i] <= middle)
-        if count >= k:
-            high = middle
-        else:
-            low = middle + np.int32(1)
-    smallest: np.float32 = np.float32(0)
-    for i in range(n):
-        if bits[i] == low:
-            smallest = values[i]
-    return smallest
-
-
 @nb.njit(parallel=True, nogil=True, cache=True)
 def average(
     points: np.ndarray,  # (3, n)
     boxes: np.ndarray,  # (2 L, 6)
+    blocks: np.ndarray,  # (L, 3, LEAF)
+    order: np.ndarray,  # (n,), which row each point has
     rows: np.ndarray,  # (n + 1,) codes, as `Rows`
     classes: np.ndarray,  # (Z,)
     units: np.ndarray,  # (Z,) int32, in steps of CODE_UNIT
-    counted: np.ndarray,  # (n,) bool
-    places: np.ndarray,  # (M,) int32
+    counted: np.ndarray,  # (n,) bool, by row
+    places: np.ndarray,  # (M,) int32 ascending
     radii: np.ndarray,  # (n,), squared distance to the k-th nearest other
     k: int,
     out: np.ndarray,  # (M, K) in: zeros; out: mean codes, zeros where no neighbour counts
@@ -366,69 +165,102 @@ def average(
     for chunk in nb.prange((m + CHUNK - 1) // CHUNK):
         sums = np.empty((2, num_classes), np.int64)  # inside the radius, and on it
         counts = np.empty((2, 2), np.int64)  # the same, and of these the ones that count
-        nodes = np.empty(64, np.int64)
-        for q in range(chunk * CHUNK, min((chunk + 1) * CHUNK, m)):
-            own = places[q]
-            x, y, z, radius = points[0, own], points[1, own], points[2, own], radii[own]
-            sums[:], counts[:] = 0, 0
-            nodes[0], waiting = 1, 1
-            while waiting:
-                waiting -= 1
-                node = nodes[waiting]
-                if _gap(boxes, node, x, y, z) > radius:
-                    continue
-                if node < leaves:
-                    nodes[waiting], nodes[waiting + 1] = 2 * node, 2 * node + 1
-                    waiting += 2
-                    continue
-                for i in range((node - leaves) * n // leaves, (node - leaves + 1) * n // leaves):
-                    dx, dy, dz = points[0, i] - x, points[1, i] - y, points[2, i] - z
-                    distance = dx * dx + dy * dy + dz * dz
-                    if distance <= radius and i != own:
-                        tied = np.int64(distance == radius)
-                        counts[tied, 0] += 1
-                        if counted[i]:
-                            counts[tied, 1] += 1
-                            for e in range(rows[i], rows[i + 1]):
-                                sums[tied, classes[e]] += units[e]
-            if counts[0, 1] + counts[1, 1] > 0:
-                share = (k - counts[0, 0]) / counts[1, 0]
-                total = (counts[0, 1] + share * counts[1, 1]) / CODE_UNIT
-                for c in range(num_classes):
-                    out[q, c] = (sums[0, c] + share * sums[1, c]) / total
+        box, around = np.empty(6, np.float32), room_for(128)
+        first = chunk * CHUNK
+        while first < min((chunk + 1) * CHUNK, m):
+            last = end_of_group(places, first, min((chunk + 1) * CHUNK, m), leaves, n)
+            middle_of(points, places, first, last, box)
+            around, found = look_around(boxes, box, _widest(radii, places, first, last), NO_SKIP, 0, around)
+            for q in range(first, last):
+                own = places[q]
+                radius = radii[own]
+                reached = measure(blocks, points[0, own], points[1, own], points[2, own], radius, found, around)
+                sums[:], counts[:] = 0, 0
+                for h in range(reached):
+                    start = leaf_range(around.leaves[around.reached[h]], leaves, n)[0]
+                    within = at_most(load_row(around.near, h), radius)
+                    while within:
+                        lane = first_bit(within)
+                        within &= within - 1
+                        if start + lane != own:
+                            row, tied = order[start + lane], np.int64(around.near[h, lane] == radius)
+                            counts[tied, 0] += 1
+                            if counted[row]:
+                                counts[tied, 1] += 1
+                                for e in range(rows[row], rows[row + 1]):
+                                    sums[tied, classes[e]] += units[e]
+                if counts[0, 1] + counts[1, 1] > 0:
+                    share = (k - counts[0, 0]) / counts[1, 0]
+                    total = (counts[0, 1] + share * counts[1, 1]) / CODE_UNIT
+                    for c in range(num_classes):
+                        out[q, c] = (sums[0, c] + share * sums[1, c]) / total
+            first = last
+
+
+@nb.njit
+def _widest(radii: np.ndarray, places: np.ndarray, first: int, last: int) -> np.float32:
+    widest = np.float32(0)
+    for q in range(first, last):
+        widest = max(widest, radii[places[q]])
+    return widest
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def pure_distances(
     points: np.ndarray,  # (3, n)
     boxes: np.ndarray,  # (2 L, 6)
+    blocks: np.ndarray,  # (L, 3, LEAF)
     labels: np.ndarray,  # (n,) int32
     radii: np.ndarray,  # (n,)
     distances: np.ndarray,  # (n,)
 ) -> np.ndarray:
     """Distances of the points whose neighbours within the radius all have their own, positive, label; else NaN."""
     leaves, n = boxes.shape[0] // 2, points.shape[1]
-    out = np.full(n, np.nan)
-    for chunk in nb.prange((n + CHUNK - 1) // CHUNK):
-        nodes = np.empty(64, np.int64)
-        for q in range(chunk * CHUNK, min((chunk + 1) * CHUNK, n)):
-            x, y, z, radius, label = points[0, q], points[1, q], points[2, q], radii[q], labels[q]
-            pure = label > 0
-            nodes[0], waiting = 1, 1
-            while waiting and pure:
-                waiting -= 1
-                node = nodes[waiting]
-                if _gap(boxes, node, x, y, z) > radius:
+    out, of_node = np.full(n, np.nan), _labels_of_nodes(labels, leaves)
+    for chunk in nb.prange((leaves + LEAF - 1) // LEAF):
+        box, around = np.empty(6, np.float32), room_for(128)
+        for leaf in range(chunk * LEAF, min((chunk + 1) * LEAF, leaves)):
+            first, last = leaf_range(leaf, leaves, n)
+            widest, label = np.float32(-1), of_node[leaves + leaf]
+            for q in range(first, last):
+                widest = max(widest, radii[q]) if labels[q] > 0 else widest
+            if widest < 0:
+                continue
+            enclose(points, first, last, box)
+            # A node of the leaf's own label has nothing to say; a leaf of several labels has none.
+            skipped = label if label != MIXED else NOBODY
+            around, found = look_around(boxes, box, widest, of_node, skipped, around)
+            for q in range(first, last):
+                if labels[q] <= 0:
                     continue
-                if node < leaves:
-                    nodes[waiting], nodes[waiting + 1] = 2 * node, 2 * node + 1
-                    waiting += 2
-                    continue
-                for i in range((node - leaves) * n // leaves, (node - leaves + 1) * n // leaves):
-                    dx, dy, dz = points[0, i] - x, points[1, i] - y, points[2, i] - z
-                    if labels[i] != label and dx * dx + dy * dy + dz * dz <= radius:
-                        pure = False
-                        break
-            if pure:
-                out[q] = distances[q]
+                reached = measure(blocks, points[0, q], points[1, q], points[2, q], radii[q], found, around)
+                if _pure(labels, labels[q], radii[q], reached, leaves, around):
+                    out[q] = distances[q]
     return out
+
+
+@nb.njit
+def _pure(labels: np.ndarray, label: int, radius: float, reached: int, leaves: int, around: Surroundings) -> bool:
+    """Whether all points measured and within the radius have a label."""
+    for h in range(reached):
+        first, last = leaf_range(around.leaves[around.reached[h]], leaves, labels.shape[0])
+        within = at_most(load_row(around.near, h), radius)
+        for i in range(last - first):
+            if (within >> i) & 1 and labels[first + i] != label:
+                return False
+    return True
+
+
+@nb.njit
+def _labels_of_nodes(labels: np.ndarray, leaves: int) -> np.ndarray:
+    of_node = np.empty(2 * leaves, np.int32)
+    for leaf in range(leaves):
+        first, last = leaf_range(leaf, leaves, labels.shape[0])
+        label, same = labels[first], True
+        for i in range(first + 1, last):
+            same &= labels[i] == label
+        of_node[leaves + leaf] = label if same else MIXED
+    for i in range(leaves - 1):
+        node = leaves - 1 - i
+        of_node[node] = of_node[2 * node] if of_node[2 * node] == of_node[2 * node + 1] else MIXED
+    return of_node

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsseg_core.neighbours import Neighbours, Tree, nearest, scaled
+from gsseg_core.neighbours import Neighbours
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.rows import Rows
 
@@ -131,19 +131,14 @@ def statistical_filter(
     limit = int(labels.max(initial=0)) + 1 if num_classes is None else num_classes
     if len(means) < 3:
         return removed
-    known = (neighbours or Neighbours.find(means, k)).mean_distances(labels)
-    points, by_class = scaled(means), np.argsort(labels, kind="stable")
+    known = (neighbours or Neighbours.find(means, k)).class_distances(labels, limit)
+    by_class = np.argsort(labels, kind="stable")
     bounds = np.searchsorted(labels, np.arange(1, limit + 1), sorter=by_class)
     for first, last in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
         members = by_class[first:last]
         if members.size < 3:
             continue
         distances = known[members]
-        mixed = np.isnan(distances)
-        if mixed.any():
-            tree = Tree.build(points[members])
-            places = np.flatnonzero(mixed[tree.order]).astype(np.int32)
-            distances[tree.order[places]] = nearest(tree.points, tree.boxes, places, min(k, members.size - 1))[1]
         in_order = np.sort(distances)  # rounding in the mean must not depend on the order of the Gaussians
         cut = in_order.mean() + sigmas * in_order.std()
         removed[members] = distances > cut * (1 + 1e-6)

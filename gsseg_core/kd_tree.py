@@ -1,0 +1,209 @@
+"""A balanced k-d tree without pointers, in whose order what is near in space is near in memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba as nb
+import numpy as np
+
+LEAF = 16
+"""Most points in a leaf of the tree."""
+
+SUBTREE = 8  # levels of a subtree that one thread builds alone: about 4000 points
+
+
+@dataclass(frozen=True)
+class Tree:
+    """A balanced k-d tree without pointers: node i has the children 2i and 2i + 1, and the root is 1.
+
+    With L leaves, a power of two, leaf i is node L + i and holds points i * n // L to (i + 1) * n // L.
+
+    Attributes
+    ----------
+    points : (3, n) float32
+        In tree order: what is near in the array is near in space.
+    order : (n,) int32
+        Which of the points that went in each one is.
+    boxes : (2 L, 6) float32
+        Lowest and highest corner of each node's points.
+    blocks : (L, 3, LEAF) float32
+        The points once more, leaf by leaf; those that a leaf lacks are infinitely far away.
+    """
+
+    points: np.ndarray
+    order: np.ndarray
+    boxes: np.ndarray
+    blocks: np.ndarray
+
+    @classmethod
+    def build(
+        cls,
+        points: np.ndarray,  # (n, 3) float32, n > 0
+    ) -> Tree:
+        """Build it by halving the points along the widest axis, again and again."""
+        depth = _depth(len(points))
+        points, order = points.copy(), np.arange(len(points), dtype=np.int32)
+        boxes = np.empty((2 << depth, 6), np.float32)
+        if depth > SUBTREE:
+            _grow(points, order, boxes, depth)
+        else:  # waking other threads would take longer than the work
+            _grow_subtree(points, order, boxes, depth, 0, 0)
+        points = np.ascontiguousarray(points.T)
+        return cls(points, order, boxes, _blocks(points, 1 << depth))
+
+    def part(
+        self,
+        places: np.ndarray,  # (m,) ascending, m > 0
+    ) -> Tree:
+        """Make a tree of some of its points. Their order is kept, for it is as good: only the boxes are new."""
+        points = np.ascontiguousarray(self.points[:, places])
+        boxes = np.empty((2 << _depth(len(places)), 6), np.float32)
+        _enclose(points, boxes)
+        return Tree(points, self.order[places], boxes, _blocks(points, len(boxes) // 2))
+
+
+def scaled(means: np.ndarray) -> np.ndarray:
+    """Scale (N, 3) float32 into [-1, 1] by a power of two: nothing is rounded, and no distance can overflow."""
+    points = np.asarray(means, np.float32)
+    largest = max(points.max(initial=0), -points.min(initial=0))
+    scaled: np.ndarray = np.ldexp(points, -np.frexp(largest)[1])
+    return scaled
+
+
+def _depth(count: int) -> int:
+    return ((count - 1) // LEAF).bit_length()
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _grow(points: np.ndarray, order: np.ndarray, boxes: np.ndarray, depth: int) -> None:
+    top = max(depth - SUBTREE, 0)
+    for level in range(top):
+        for j in nb.prange(1 << level):
+            _split(points, order, boxes, depth, level, j)
+    for j in nb.prange(1 << top):
+        _grow_subtree(points, order, boxes, depth, top, j)
+
+
+@nb.njit(nogil=True, cache=True)
+def _grow_subtree(points: np.ndarray, order: np.ndarray, boxes: np.ndarray, depth: int, top: int, root: int) -> None:
+    for level in range(top, depth + 1):
+        for j in range(root << (level - top), (root + 1) << (level - top)):
+            _split(points, order, boxes, depth, level, j)
+
+
+@nb.njit
+def _split(points: np.ndarray, order: np.ndarray, boxes: np.ndarray, depth: int, level: int, j: int) -> None:
+    """Box node j of a level in, and unless it is a leaf bring the lower half along its widest axis to the front."""
+    n = points.shape[0]
+    node, first, last = (1 << level) + j, (j * n) >> level, ((j + 1) * n) >> level
+    widest, axis = np.float32(-1), 0
+    for d in range(3):
+        low = high = points[first, d]
+        for i in range(first + 1, last):
+            low, high = min(low, points[i, d]), max(high, points[i, d])
+        boxes[node, d], boxes[node, 3 + d] = low, high
+        if high - low > widest:
+            widest, axis = high - low, d
+    if level < depth:
+        _partition(points, order, first, last - 1, ((2 * j + 1) * n) >> (level + 1), axis)
+
+
+@nb.njit
+def _partition(points: np.ndarray, order: np.ndarray, low: int, high: int, middle: int, axis: int) -> None:
+    """Quickselect of rows low to high (inclusive): those before `middle` get the smallest coordinates."""
+    while low < high:
+        a, b, c = points[low, axis], points[(low + high) // 2, axis], points[high, axis]
+        pivot = max(min(a, b), min(max(a, b), c))
+        i, j = low, high
+        while i <= j:
+            while points[i, axis] < pivot:
+                i += 1
+            while points[j, axis] > pivot:
+                j -= 1
+            if i <= j:
+                for d in range(3):
+                    points[i, d], points[j, d] = points[j, d], points[i, d]
+                order[i], order[j] = order[j], order[i]
+                i, j = i + 1, j - 1
+        if middle <= j:
+            high = j
+        elif middle >= i:
+            low = i
+        else:
+            return
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _enclose(points: np.ndarray, boxes: np.ndarray) -> None:
+    """Box the points of every leaf in, and then those of every node above."""
+    leaves = boxes.shape[0] // 2
+    for leaf in nb.prange(leaves):
+        first, last = leaf_range(leaf, leaves, points.shape[1])
+        enclose(points, first, last, boxes[leaves + leaf])
+    for i in range(leaves - 1):
+        node = leaves - 1 - i
+        for d in range(3):
+            boxes[node, d] = min(boxes[2 * node, d], boxes[2 * node + 1, d])
+            boxes[node, 3 + d] = max(boxes[2 * node, 3 + d], boxes[2 * node + 1, 3 + d])
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _blocks(points: np.ndarray, leaves: int) -> np.ndarray:
+    blocks = np.full((leaves, 3, LEAF), np.float32(np.inf))
+    for leaf in nb.prange(leaves):
+        first, last = leaf_range(leaf, leaves, points.shape[1])
+        for d in range(3):
+            for i in range(first, last):
+                blocks[leaf, d, i - first] = points[d, i]
+    return blocks
+
+
+@nb.njit
+def enclose(
+    points: np.ndarray,  # (3, n)
+    first: int,
+    last: int,
+    box: np.ndarray,  # (6,), filled: lowest and highest corner
+) -> None:
+    """Box points first to last in."""
+    for d in range(3):
+        low = high = points[d, first]
+        for i in range(first + 1, last):
+            low, high = min(low, points[d, i]), max(high, points[d, i])
+        box[d], box[3 + d] = low, high
+
+
+@nb.njit(inline="always")
+def leaf_range(leaf: int, leaves: int, n: int) -> tuple[int, int]:
+    """First and last point of a leaf, the last one excluded."""
+    return leaf * n // leaves, (leaf + 1) * n // leaves
+
+
+@nb.njit(inline="always")
+def leaf_of(place: int, leaves: int, n: int) -> int:
+    """Which leaf holds a point."""
+    leaf = np.int64(place) * leaves // n  # of an int32 the product would not fit
+    while (leaf + 1) * n // leaves <= place:
+        leaf += 1
+    return leaf
+
+
+@nb.njit(inline="always")
+def gap_to_point(boxes: np.ndarray, node: int, x: float, y: float, z: float) -> np.float32:
+    """Squared distance to a box, in float32 never above that to a point inside it, since rounding is monotonic."""
+    dx = max(max(boxes[node, 0] - x, x - boxes[node, 3]), np.float32(0))
+    dy = max(max(boxes[node, 1] - y, y - boxes[node, 4]), np.float32(0))
+    dz = max(max(boxes[node, 2] - z, z - boxes[node, 5]), np.float32(0))
+    squared: np.float32 = dx * dx + dy * dy + dz * dz
+    return squared
+
+
+@nb.njit(inline="always")
+def gap_to_box(boxes: np.ndarray, node: int, box: np.ndarray) -> np.float32:
+    """Squared distance between two boxes, never above that between a point in the one and a point in the other."""
+    dx = max(max(boxes[node, 0] - box[3], box[0] - boxes[node, 3]), np.float32(0))
+    dy = max(max(boxes[node, 1] - box[4], box[1] - boxes[node, 4]), np.float32(0))
+    dz = max(max(boxes[node, 2] - box[5], box[2] - boxes[node, 5]), np.float32(0))
+    squared: np.float32 = dx * dx + dy * dy + dz * dz
+    return squared

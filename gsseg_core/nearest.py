@@ -1,0 +1,221 @@
+"""The k nearest others of points: how far the last of them is, and how far they are on average."""
+
+from __future__ import annotations
+
+import math
+
+import numba as nb
+import numpy as np
+
+from gsseg_core.kd_tree import LEAF, gap_to_point, leaf_of, leaf_range
+from gsseg_core.surroundings import DEPTH, FAR, Surroundings, end_of_group, look_around, measure, room_for
+
+DIGITS = 24
+"""Distances are summed in steps of 2^-DIGITS of the k-th one, or finer: the precision of a float32."""
+
+CHUNK = 256  # consecutive points of one thread
+SLACK = np.float32(1.00001)  # covers float32 rounding in a bound
+TINY = np.float32(1e-30)
+NO_SKIP = np.zeros(0, np.int32)
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def nearest(
+    points: np.ndarray,  # (3, n)
+    boxes: np.ndarray,  # (2 L, 6)
+    blocks: np.ndarray,  # (L, 3, LEAF)
+    places: np.ndarray,  # (M,) int32 ascending, which points to look from
+    k: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the squared distance to the k-th nearest other point, (M,) float32, and the mean of the k, (M,) float64.
+
+    By the triangle inequality the radius of one point bounds those of all others in its leaf.
+    """
+    m, n, leaves = places.shape[0], points.shape[1], boxes.shape[0] // 2
+    radii, distances = np.empty(m, np.float32), np.empty(m, np.float64)
+    bits = radii.view(np.int32)
+    for chunk in nb.prange((m + CHUNK - 1) // CHUNK):
+        gaps, close, around = np.empty(DEPTH, np.float32), np.empty(3 * k + LEAF, np.float32), room_for(128)
+        box, bounds = np.empty(6, np.float32), np.empty((2, LEAF), np.float32)
+        close_bits, bound_bits = close.view(np.int32), bounds.view(np.int32)
+        before, first = -1, chunk * CHUNK
+        while first < min((chunk + 1) * CHUNK, m):
+            last = end_of_group(places, first, min((chunk + 1) * CHUNK, m), leaves, n)
+            middle = middle_of(points, places, first, last, box)
+            own, bound = places[middle], FAR
+            if before >= 0:
+                bound = _farthest(points, places[before], own, radii[before])
+            found = _search(points, boxes, own, k, bound, close, around.nodes, gaps)
+            bits[middle] = _smallest(close_bits, found, k, np.int32(0), _largest(close_bits, found))
+            reach = _bound(points, places, first, last, middle, radii[middle], bounds)
+            around, found = look_around(boxes, box, reach, NO_SKIP, 0, around)
+            near = around.near.reshape(-1)
+            near_bits = near.view(np.int32)
+            for q in range(first, last):
+                own, bound = places[q], bounds[1, q - first]
+                count = LEAF * measure(blocks, points[0, own], points[1, own], points[2, own], bound, found, around)
+                _leave_out(own, leaf_of(own, leaves, n), leaves, n, count, around)
+                bits[q] = _smallest(near_bits, count, k, bound_bits[0, q - first], bound_bits[1, q - first])
+                distances[q] = _mean_root(near, count, k, radii[q])
+            before, first = middle, last
+    return radii, distances
+
+
+@nb.njit
+def _leave_out(own: int, leaf: int, leaves: int, n: int, count: int, around: Surroundings) -> None:
+    """Take a point out of what was measured from it."""
+    for h in range(count // LEAF):
+        if around.leaves[around.reached[h]] == leaf:
+            around.near[h, own - leaf_range(leaf, leaves, n)[0]] = FAR
+
+
+@nb.njit
+def middle_of(points: np.ndarray, places: np.ndarray, first: int, last: int, box: np.ndarray) -> int:
+    """Box some points in, and return which of them is nearest to its middle."""
+    for d in range(3):
+        low = high = points[d, places[first]]
+        for q in range(first + 1, last):
+            low, high = min(low, points[d, places[q]]), max(high, points[d, places[q]])
+        box[d], box[3 + d] = low, high
+    best, least = first, np.float32(np.inf)
+    for q in range(first, last):
+        gap = np.float32(0)
+        for d in range(3):
+            off = points[d, places[q]] - np.float32(0.5) * (box[d] + box[3 + d])
+            gap += off * off
+        if gap < least:
+            best, least = q, gap
+    return best
+
+
+@nb.njit(inline="always")
+def _apart(points: np.ndarray, i: int, j: int) -> np.float32:
+    dx, dy, dz = points[0, i] - points[0, j], points[1, i] - points[1, j], points[2, i] - points[2, j]
+    apart: np.float32 = np.sqrt(dx * dx + dy * dy + dz * dz)
+    return apart
+
+
+@nb.njit(inline="always")
+def _farthest(points: np.ndarray, known: int, own: int, radius: float) -> np.float32:
+    """Bound above the squared radius of one point by that of another."""
+    reach = _apart(points, known, own) + np.sqrt(radius)
+    return max(reach * reach * SLACK, TINY)
+
+
+@nb.njit
+def _bound(
+    points: np.ndarray, places: np.ndarray, first: int, last: int, middle: int, radius: float, bounds: np.ndarray
+) -> np.float32:
+    """Bound the squared radii of a group, below and above, by that of one of its points; returns the largest."""
+    reach, root = np.float32(0), np.sqrt(radius)
+    for q in range(first, last):
+        at_least = max(root - _apart(points, places[middle], places[q]), np.float32(0))
+        bounds[0, q - first] = at_least * at_least / SLACK
+        bounds[1, q - first] = _farthest(points, places[middle], places[q], radius)
+        reach = max(reach, bounds[1, q - first])
+    return reach
+
+
+@nb.njit
+def _mean_root(near: np.ndarray, found: int, k: int, radius: float) -> float:
+    """Mean distance of the k nearest; those at the radius share the places that are left."""
+    root = np.sqrt(radius)
+    exponent = DIGITS - math.frexp(root)[1]
+    scale = np.float32(2.0**exponent)
+    total = np.int64(0)
+    for c in range(found):
+        total += np.int32(np.sqrt(min(near[c], radius)) * scale)
+    return (total - (found - k) * np.int64(root * scale)) / 2.0**exponent / k
+
+
+@nb.njit
+def _search(
+    points: np.ndarray,  # (3, n)
+    boxes: np.ndarray,  # (2 L, 6)
+    own: int,
+    k: int,
+    bound: float,  # above the k-th smallest squared distance
+    near: np.ndarray,  # (at least 3 k + LEAF,), filled
+    nodes: np.ndarray,  # (DEPTH,), scratch
+    gaps: np.ndarray,  # (DEPTH,), scratch
+) -> int:
+    """Collect squared distances to other points, the k smallest among them, in no order; return their number."""
+    x, y, z = points[0, own], points[1, own], points[2, own]
+    leaves, n = boxes.shape[0] // 2, points.shape[1]
+    found, waiting = 0, 1
+    nodes[0], gaps[0] = 1, 0
+    while waiting:
+        waiting -= 1
+        node, gap = nodes[waiting], gaps[waiting]
+        while node < leaves and gap < bound:  # go down to the nearer child, the other one waits
+            node, other = 2 * node, 2 * node + 1
+            gap, other_gap = gap_to_point(boxes, node, x, y, z), gap_to_point(boxes, other, x, y, z)
+            if other_gap < gap:
+                node, gap, other, other_gap = other, other_gap, node, gap
+            if other_gap < bound:
+                nodes[waiting], gaps[waiting] = other, other_gap
+                waiting += 1
+        if gap >= bound:
+            continue
+        first, last = leaf_range(node - leaves, leaves, n)
+        if found + last - first > near.shape[0]:
+            bound, found = _shorten(near, found, k), k
+        for i in range(first, last):
+            dx, dy, dz = points[0, i] - x, points[1, i] - y, points[2, i] - z
+            distance = dx * dx + dy * dy + dz * dz
+            near[found] = distance  # without a branch: what is not counted is overwritten
+            found += (distance < bound) & (i != own)
+    return found
+
+
+@nb.njit
+def _shorten(near: np.ndarray, found: int, k: int) -> np.float32:
+    """Keep the k smallest, of equal ones any; returns the largest of them."""
+    bits = near.view(np.int32)
+    limit = _smallest(bits, found, k, np.int32(0), _largest(bits, found))
+    kept = 0
+    for i in range(found):
+        if bits[i] < limit:
+            bits[kept] = bits[i]
+            kept += 1
+    bits[kept:k] = limit
+    largest: np.float32 = near[k - 1]
+    return largest
+
+
+@nb.njit
+def _largest(bits: np.ndarray, n: int) -> np.int32:
+    largest = np.int32(0)
+    for i in range(n):
+        largest = max(largest, bits[i])
+    return largest
+
+
+@nb.njit
+def _smallest(
+    bits: np.ndarray,  # (n or more,) int32
+    n: int,
+    k: int,
+    low: np.int32,
+    high: np.int32,
+) -> np.int32:
+    """Bits of the k-th smallest of n float32, none negative, which is known to be between two others.
+
+    Such floats sort like their bits, so this bisects the bits: counting what is at most the middle takes a few vector
+    instructions, has no branch to mispredict and moves nothing. It ends as soon as k are on one side.
+    """
+    while low < high:
+        middle = low + ((high - low) >> np.int32(1))
+        count = np.int32(0)
+        for i in range(n):
+            count += np.int32(bits[i] <= middle)
+        if count >= k:
+            high = middle
+            if count == k:
+                break
+        else:
+            low = middle + np.int32(1)
+    largest = np.int32(0)
+    for i in range(n):
+        largest = max(largest, bits[i] if bits[i] <= high else np.int32(0))
+    return largest
