@@ -183,7 +183,7 @@ def leaf_range(leaf: int, leaves: int, n: int) -> tuple[int, int]:
 @nb.njit(inline="always")
 def leaf_of(place: int, leaves: int, n: int) -> int:
     """Which leaf holds a point."""
-    leaf = np.int64(place) * leaves // n  # of an int32 the product would not fit
+    leaf = int(np.int64(place) * leaves // n)  # of an int32 the product would not fit
     while (leaf + 1) * n // leaves <= place:
         leaf += 1
     return leaf
