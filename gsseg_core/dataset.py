@@ -1,10 +1,10 @@
-"""Posed views with their label images, read lazily from a dataset folder or held in memory."""
+"""Posed views with their masks, read lazily from a dataset folder or held in memory."""
 
 from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +17,9 @@ from gsseg_core.camera_files import read_cameras
 from gsseg_core.cameras import Camera
 from gsseg_core.errors import MaskFormatError, MaskSizeError, SettingsError, SplitFileError, UnknownLabelError
 from gsseg_core.json_files import read_json
-from gsseg_core.masks import BACKGROUND_NAME, MAX_LABEL, UNKNOWN, PackedLabels, mask_bits, read_classes, read_mask
+from gsseg_core.masks import BACKGROUND_NAME, MAX_LABEL, UNKNOWN, mask_bits, read_classes, read_mask
+from gsseg_core.soft_files import SUPERVISES, mask_files, read_soft_mask, read_supervises
+from gsseg_core.soft_masks import PackedMask, SeenLabels, combine_detections, quantise, restrict
 
 _IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 
@@ -31,18 +33,22 @@ class View:
     camera : Camera
         Where from.
     mask_path : pathlib.Path or None
-        The label image; None if there is none or the labels are in memory.
+        The mask: a label image (.png), probabilities (.npz) or a folder of detections, see docs/masks.md; None if there
+        is none or it is in memory.
     image_path : pathlib.Path or None
         The photo, if there is one.
     class_names : mapping from id to name, or None
         If given, labels must be among its ids.
+    supervised : tuple of int, or None
+        If given, the label image says something of these classes only: its 0 means "none of these".
     """
 
     camera: Camera
     mask_path: Path | None = None
     image_path: Path | None = None
     class_names: Mapping[int, str] | None = field(default=None, repr=False)
-    _labels: PackedLabels | None = field(default=None, repr=False)
+    supervised: tuple[int, ...] | None = None
+    _mask: PackedMask | None = field(default=None, repr=False)
 
     @classmethod
     def from_arrays(
@@ -50,8 +56,21 @@ class View:
         camera: Camera,
         labels: npt.ArrayLike,  # (H, W)
         class_names: Mapping[int, str] | None = None,
+        *,
+        supervised: Collection[int] | None = None,
     ) -> View:
         """Build a view from labels (H, W) of whole numbers, `UNKNOWN` (-1) where nothing is known.
+
+        Parameters
+        ----------
+        camera : Camera
+            Where from.
+        labels : (H, W) of int
+            The mask.
+        class_names : mapping from id to name, optional
+            Labels must be among its ids.
+        supervised : collection of int, optional
+            The segmenter looked for these classes only, and 0 means "none of these".
 
         Raises
         ------
@@ -63,9 +82,82 @@ class View:
             raise MaskFormatError(
                 f"view '{camera.name}': labels are {array.dtype} of shape {array.shape}; expected integers (H, W)"
             )
+        source = f"view '{camera.name}'"
         view = cls(camera, class_names=class_names)
-        view._check(array, f"view '{camera.name}'")
-        return replace(view, _labels=PackedLabels(array))
+        view._check_size(array.shape, source)
+        view._check_ids(array, source)
+        if supervised is None:
+            return replace(view, _mask=PackedMask(SeenLabels(array)))
+        return cls.from_seen(camera, restrict(array, supervised, source), class_names)
+
+    @classmethod
+    def from_probabilities(
+        cls,
+        camera: Camera,
+        probabilities: npt.ArrayLike,  # (C, H, W)
+        classes: Sequence[int] | None = None,
+        *,
+        unknown: npt.NDArray[np.bool_] | None = None,  # (H, W)
+        class_names: Mapping[int, str] | None = None,
+    ) -> View:
+        """Build a view from the probabilities of one segmenter, rounded as `gsseg_core.soft_masks.quantise` says.
+
+        Parameters
+        ----------
+        camera : Camera
+            Where from.
+        probabilities : (C, H, W) of float
+            In [0, 1], summing to at most 1 in each pixel.
+        classes : sequence of C int, optional
+            What the segmenter looked for; what is left to 1 then means "none of these". Without, [c] is class c, and
+            what is left is unknown.
+        unknown : (H, W) bool, optional
+            Where the segmenter says nothing.
+        class_names : mapping from id to name, optional
+            Classes must be among its ids.
+
+        Raises
+        ------
+        MaskFormatError, MaskSizeError, UnknownLabelError
+            Values, sizes or classes are unusable.
+        """
+        source = f"view '{camera.name}'"
+        seen = quantise(np.asarray(probabilities), classes, unknown=unknown, source=source)
+        return cls.from_seen(camera, seen, class_names)
+
+    @classmethod
+    def from_detections(
+        cls,
+        camera: Camera,
+        detections: Mapping[int, npt.NDArray[Any]],  # class -> (H, W)
+        *,
+        unknown: npt.NDArray[np.bool_] | None = None,  # (H, W)
+        class_names: Mapping[int, str] | None = None,
+    ) -> View:
+        """Build a view from detectors of one class each: bool, or probabilities, by class.
+
+        Of a class that is not among them the view says nothing. A detector that ran and found nothing gives zeros.
+
+        Raises
+        ------
+        MaskFormatError, MaskSizeError, UnknownLabelError
+            Values, sizes or classes are unusable.
+        """
+        source = f"view '{camera.name}'"
+        return cls.from_seen(camera, combine_detections(detections, unknown=unknown, source=source), class_names)
+
+    @classmethod
+    def from_seen(cls, camera: Camera, seen: SeenLabels, class_names: Mapping[int, str] | None = None) -> View:
+        """Build a view from labels and what they mean.
+
+        Raises
+        ------
+        MaskSizeError, UnknownLabelError
+            The labels are not of the camera's size, or mean classes that there are not.
+        """
+        view = cls(camera, class_names=class_names)
+        view._check_seen(seen, f"view '{camera.name}'")
+        return replace(view, _mask=PackedMask(seen))
 
     @property
     def name(self) -> str:
@@ -75,50 +167,78 @@ class View:
     @property
     def has_mask(self) -> bool:
         """Whether there are labels to read."""
-        return self.mask_path is not None or self._labels is not None
+        return self.mask_path is not None or self._mask is not None
 
     @property
     def mask_bits(self) -> int | None:
-        """Bits per label of the mask, 8 or 16 (in memory: as many as its labels need); None without a mask."""
-        if self._labels is not None:
-            return 8 if self._labels.largest < 255 else 16
-        return None if self.mask_path is None else mask_bits(self.mask_path)
+        """Bits per label of a label image, 8 or 16 (of other masks: as many as labels need); None without a mask."""
+        if self.mask_path is not None and self.mask_path.suffix.lower() == ".png":
+            return mask_bits(self.mask_path)
+        return (8 if self.largest_label < 255 else 16) if self.has_mask else None
 
     @property
     def largest_label(self) -> int:
-        """The largest label of the mask, `UNKNOWN` (-1) if it says nothing at all."""
-        return int(self.read_labels().max()) if self._labels is None else self._labels.largest
+        """The largest class that the mask says something of, `UNKNOWN` (-1) if it says nothing at all."""
+        if self._mask is not None:
+            return self._mask.largest
+        seen = self.read_seen()
+        return int(seen.labels.max()) if seen.meaning is None else seen.meaning.largest
+
+    def class_ids(self) -> set[int]:
+        """Classes that the mask says something of."""
+        seen = self.read_seen()
+        ids = np.unique(seen.labels) if seen.meaning is None else seen.meaning.concerned
+        return set(ids.tolist()) - {UNKNOWN}
 
     def read_labels(self) -> npt.NDArray[np.int32]:
-        """Read the labels (H, W) int32, `UNKNOWN` (-1) where the mask says nothing.
+        """Read the class that each pixel names, (H, W) int32; `UNKNOWN` (-1) where the mask names none.
 
         Raises
         ------
         MaskFormatError
-            The mask is missing or no label image.
+            The mask is missing or broken.
         MaskSizeError
             The mask has another size than the camera.
         UnknownLabelError
             A label is not among the classes.
         """
+        return self.read_seen().named()
+
+    def read_seen(self) -> SeenLabels:
+        """Read all that the mask says: labels, which for a soft or partial one are prototypes, and what they mean.
+
+        Raises
+        ------
+        MaskFormatError, MaskSizeError, UnknownLabelError
+            As `read_labels`.
+        """
         source = str(self.mask_path or f"view '{self.name}'")
-        if self._labels is not None:
-            labels = self._labels.unpack()
+        if self._mask is not None:
+            seen = self._mask.unpack()
         elif self.mask_path is not None:
-            labels = read_mask(self.mask_path).labels
+            seen = self._read_file(self.mask_path)
         else:
             raise MaskFormatError(f"{source}: has no mask; expected a label image {self.name}.png")
-        self._check(labels, source)
-        return labels
+        self._check_seen(seen, source)
+        return seen
 
-    def _check(self, labels: npt.NDArray[np.integer[Any]], source: str) -> None:
-        size, expected = labels.shape[::-1], (self.camera.width, self.camera.height)
+    def _read_file(self, path: Path) -> SeenLabels:
+        if path.suffix.lower() != ".png":
+            return read_soft_mask(path, self.class_names)
+        labels = read_mask(path).labels
+        return SeenLabels(labels) if self.supervised is None else restrict(labels, self.supervised, str(path))
+
+    def _check_seen(self, seen: SeenLabels, source: str) -> None:
+        self._check_size(seen.labels.shape, source)
+        self._check_ids(seen.labels if seen.meaning is None else seen.meaning.concerned, source)
+
+    def _check_size(self, shape: tuple[int, ...], source: str) -> None:
+        size, expected = shape[::-1], (self.camera.width, self.camera.height)
         if size != expected:
             raise MaskSizeError(
                 f"{source}: mask is {size[0]} x {size[1]} pixels; expected {expected[0]} x {expected[1]}, the size of "
                 f"camera '{self.name}' (masks are never resized)"
             )
-        self._check_ids(labels, source)
 
     def _check_ids(self, labels: npt.NDArray[np.integer[Any]], source: str) -> None:
         ids = np.unique(labels)
@@ -133,7 +253,7 @@ class View:
 
 
 class Dataset:
-    """A folder with cameras and label images in `labels/<stem>.png`.
+    """A folder with cameras and masks in `labels/`: `<stem>.png`, or `<stem>.npz` and folders, see docs/masks.md.
 
     Photos in `images/<stem>.jpg` (or .jpeg, .png), `classes.json` and `split.json` are optional.
 
@@ -142,7 +262,7 @@ class Dataset:
     root : path
         The folder.
     labels : str
-        Sub-folder of the label images.
+        Sub-folder of the masks.
 
     Attributes
     ----------
@@ -153,8 +273,10 @@ class Dataset:
 
     Raises
     ------
-    CameraFileError, PoseError, IntrinsicsError, ClassesFileError, SplitFileError
+    CameraFileError, PoseError, IntrinsicsError, ClassesFileError, SplitFileError, SupervisesFileError
         A file is missing or broken. A mask that is missing is no error here.
+    MaskFormatError
+        A view has masks of two kinds.
     """
 
     def __init__(self, root: str | os.PathLike[str], labels: str = "labels") -> None:
@@ -162,10 +284,14 @@ class Dataset:
         self.cameras = read_cameras(self.root)
         classes = self.root / "classes.json"
         self._declared = read_classes(classes) if classes.is_file() else None
-        masks = _files_by_stem(self.root / labels, (".png",))
+        stems = [camera.name for camera in self.cameras]
+        masks = mask_files(self.root / labels, stems)
+        supervised = read_supervises(self.root / labels / SUPERVISES, masks, stems, self._declared)
         images = _files_by_stem(self.root / "images", _IMAGE_SUFFIXES)
         self._views = {
-            camera.name: View(camera, masks.get(camera.name), images.get(camera.name), self._declared)
+            camera.name: View(
+                camera, masks.get(camera.name), images.get(camera.name), self._declared, supervised.get(camera.name)
+            )
             for camera in self.cameras
         }
         self._split = self._read_split()
@@ -183,8 +309,8 @@ class Dataset:
         """Names by id, 0 included: from `classes.json`, else "class_07" and the like for the ids in the masks."""
         if self._declared is not None:
             return self._declared
-        ids = {0, UNKNOWN}.union(*(np.unique(view.read_labels()).tolist() for view in self.views() if view.has_mask))
-        return {i: f"class_{i:02d}" if i else BACKGROUND_NAME for i in sorted(ids - {UNKNOWN})}
+        ids = {0}.union(*(view.class_ids() for view in self.views() if view.has_mask))
+        return {i: f"class_{i:02d}" if i else BACKGROUND_NAME for i in sorted(ids)}
 
     @property
     def num_classes(self) -> int:

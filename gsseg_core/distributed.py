@@ -278,8 +278,8 @@ class DistributedEM(_OnWorkers, EMLearner):
 
 def _by_path(view: View) -> tuple[View, str | None]:
     """Make a view of which a worker reads the mask from its own files, if they are the same; its digest tells."""
-    if view.mask_path is None:
-        return view, None
+    if view.mask_path is None or view.mask_path.is_dir():  # A folder has no digest, so what it holds is sent.
+        return _packed(view)
     return replace(view, mask_path=view.mask_path.resolve()), digest_of(view.mask_path)
 
 
@@ -287,4 +287,4 @@ def _packed(view: View) -> tuple[View, None]:
     """Make a view that has its mask with it."""
     if view.mask_path is None:
         return view, None
-    return View.from_arrays(view.camera, view.read_labels(), view.class_names), None
+    return View.from_seen(view.camera, view.read_seen(), view.class_names), None

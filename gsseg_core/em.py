@@ -30,6 +30,11 @@ without the summand of v, and with B_v taken at q^-v
 with the left-over transmittance as one more Gaussian of class 0. a_v[k] counts pseudo-pixels in which the segmenter was
 right, a share of those that class k fills in view v by the votes of the others. At first q^-v are these votes' codes;
 once the codes have converged the models are learnt anew in this way, and then the codes once more.
+
+Soft and partial masks. There the segmenter's words y are classes, and "none of those that I looked for", which is right
+for all others. A pixel's label m is a mixture of words with shares s_m[y] (see `gsseg_core.meaning`): wherever
+C_v[k, y] stands for a pixel, it is sum_y s_m[y] C_v[k, y] there, and the expected counts of R_v are split in proportion
+to the summands.
 """
 
 from __future__ import annotations
@@ -43,6 +48,7 @@ import numpy as np
 from gsseg_core.errors import SettingsError
 from gsseg_core.gaussian_kernels import collect, improve, mix, take_votes, tally
 from gsseg_core.learner import MEMORY_BUDGET, VOTE_UNIT, Learner, Progress, silent
+from gsseg_core.meaning import Meaning, standing
 from gsseg_core.neighbours import neighbours_of
 from gsseg_core.operator import Observation
 from gsseg_core.rows import Rows
@@ -98,59 +104,77 @@ class ErrorModel:
 
     Attributes
     ----------
-    classes : (L,) int32
-        Labels that occur in the view's mask.
-    confusion : (K, L) float32
-        R_v: rows are true classes, columns the labels seen; rows sum to 1.
-    right : (L,) float64
-        a_v of the classes that occur, in px.
+    meaning : Meaning
+        Of the L labels that occur in the view's mask; they are made of W words.
+    confusion : (K, W) float32
+        R_v: rows are true classes, columns the words seen; rows sum to 1.
+    right : (T,) float64
+        a_v of the classes that have a right word, in px.
     outliers : float
         Share of pixels labelled by chance.
     num_pixels : int
         Pixels with a label.
     """
 
-    classes: np.ndarray
+    meaning: Meaning
     confusion: np.ndarray
     right: np.ndarray
     outliers: float
     num_pixels: int
 
     @classmethod
-    def trusting(cls, classes: np.ndarray, num_classes: int, outliers: float, num_pixels: int) -> ErrorModel:
+    def trusting(cls, meaning: Meaning, num_classes: int, outliers: float, num_pixels: int) -> ErrorModel:
         """Believe that every label is right."""
-        confusion = np.zeros((num_classes, len(classes)), np.float32)
-        confusion[classes, np.arange(len(classes))] = 1.0
-        return cls(classes, confusion, np.zeros(len(classes)), outliers, num_pixels)
+        confusion, right = np.zeros((num_classes, len(meaning.words)), np.float32), meaning.right(num_classes)
+        confusion[right] = 1.0
+        return cls(meaning, confusion, np.zeros(len(right[0])), outliers, num_pixels)
 
     @classmethod
     def from_counts(
         cls,
-        classes: np.ndarray,  # (L,)
+        meaning: Meaning,
         counts: np.ndarray,  # (K, L) px of each class under each label
         prior: float,
         outliers: float,
         num_pixels: int,
     ) -> ErrorModel:
         """Start from what the codes so far say of the mask."""
-        right = prior * counts[classes].sum(axis=1)
-        uniform = np.full(counts.shape, 1.0 / len(classes), np.float32)
-        model = cls(classes, uniform, right, outliers, num_pixels)
+        if meaning.shares is not None:
+            counts = counts @ (meaning.shares / meaning.shares.sum(axis=1, keepdims=True))
+        right = prior * counts[meaning.right(len(counts))[0]].sum(axis=1)
+        uniform = np.full(counts.shape, 1.0 / len(meaning.words), np.float32)
+        model = cls(meaning, uniform, right, outliers, num_pixels)
         model.maximise(counts)
         return model
 
     @property
+    def classes(self) -> np.ndarray:
+        """The words seen, (W,) int32: classes, and then `UNKNOWN` (-1) for "none of these", if it occurs."""
+        return self.meaning.words
+
+    @property
     def likelihood(self) -> np.ndarray:
         """C_v: probability of each label given the class, (K, L) float32."""
-        return (1 - self.outliers) * self.confusion + np.float32(self.outliers / len(self.classes))
+        words: np.ndarray = (1 - self.outliers) * self.confusion + np.float32(self.outliers / len(self.classes))
+        return words if self.meaning.shares is None else np.asarray(words @ self.meaning.shares.T)
+
+    def expected(
+        self,
+        counts: np.ndarray,  # (K, L) sum of the shares of each class under each label
+    ) -> np.ndarray:
+        """Count the pixels (K, W) in which each class was there and each word was meant."""
+        if self.meaning.shares is not None:
+            counts = counts @ self.meaning.shares
+        expected: np.ndarray = counts * (1 - self.outliers) * self.confusion
+        return expected
 
     def maximise(
         self,
-        counts: np.ndarray,  # (K, L) expected px
+        counts: np.ndarray,  # (K, W) expected px
     ) -> None:
         """Set R_v to its best for expected counts; classes that the view does not show keep their row."""
         counts = counts.astype(np.float64)
-        counts[self.classes, np.arange(len(self.classes))] += self.right
+        counts[self.meaning.right(len(counts))] += self.right
         total = counts.sum(axis=1, keepdims=True)
         shown = total[:, 0] > 0
         self.confusion[shown] = counts[shown] / total[shown]
@@ -192,7 +216,8 @@ class EMLearner(Learner):
         settings = self.settings
         self._begin()
         votes = Rows.of(self._votes)
-        counted, prior = votes.united(self._smooth(votes))
+        stands = standing(votes, self._possible())
+        counted, prior = stands.united(self._smooth(stands))
         # Votes are the first step; with the prior counted in, the objective is finite from the start. What is zero now
         # is zero after every step, so the codes keep these places.
         codes = counted.with_values(
@@ -219,7 +244,7 @@ class EMLearner(Learner):
             improve(codes.start, codes.values, gains, prior.values)
         progress("em", settings.max_steps, settings.max_steps)
         self.codes_, self.error_models_ = codes.dense(self.num_classes), models
-        self.codes_[~self.observed_] = 0.0
+        self._finish()
         return self
 
     def _first_models(
@@ -236,20 +261,21 @@ class EMLearner(Learner):
         return models
 
     def _first_model(self, votes: Rows, observation: Observation) -> ErrorModel:
-        settings, classes, pixels = self.settings, observation.classes, observation.num_pixels
+        settings, meaning, pixels = self.settings, observation.meaning, observation.num_pixels
         if not settings.errors:
-            return ErrorModel.trusting(classes, self.num_classes, settings.outliers, pixels)
+            return ErrorModel.trusting(meaning, self.num_classes, settings.outliers, pixels)
         counts = self._counted(votes, observation)
-        return ErrorModel.from_counts(classes, counts, settings.error_prior, settings.outliers, pixels)
+        return ErrorModel.from_counts(meaning, counts, settings.error_prior, settings.outliers, pixels)
 
     def _counted(self, votes: Rows, observation: Observation) -> np.ndarray:
         """Count the pixels (K, L) of each class under each label of a view, by the votes of all the others."""
         order, own = observation.order, observation.votes()
+        seen = order, observation.start, observation.labels
         places = votes.places(observation.ids[order])
         others = places.with_values(votes.values[places.values])
-        take_votes(*others, order, observation.start, observation.classes[observation.labels], own, 1 / VOTE_UNIT)
+        take_votes(*others, *seen, *observation.meaning.votes, own, 1 / VOTE_UNIT)
+        others = standing(others, self._possible())
         codes = others.with_values(others.values.astype(np.float32)).normalised()
-        seen = order, observation.start, observation.labels
         return tally(*codes, *seen, own, self.num_classes, len(observation.classes))
 
     def _gains(
@@ -294,9 +320,9 @@ class EMLearner(Learner):
             said = mix(*without, order, _inverse(order), observation.start, observation.labels, likelihood)
             shares = observation.shares(said, likelihood[:, 0])
             seen = order, observation.start, observation.labels
-            counts = tally(*without, *seen, shares.sightings, self.num_classes, len(model.classes))
+            counts = tally(*without, *seen, shares.sightings, self.num_classes, len(observation.classes))
             counts[0] += shares.rest
-            model.maximise(counts * (1 - model.outliers) * model.confusion)
+            model.maximise(model.expected(counts))
         return models
 
     def _smooth(self, votes: Rows) -> Rows:

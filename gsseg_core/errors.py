@@ -39,7 +39,7 @@ class IntrinsicsError(GssegError):
 
 
 class MaskFormatError(GssegError):
-    """A mask is missing, unreadable, or not an image of one 8- or 16-bit integer per pixel."""
+    """A mask is missing, unreadable, or of a kind or with values that no mask has."""
 
 
 class MaskSizeError(GssegError):
@@ -52,6 +52,10 @@ class UnknownLabelError(GssegError):
 
 class ClassesFileError(GssegError):
     """`classes.json` is broken."""
+
+
+class SupervisesFileError(GssegError):
+    """`supervises.json` is broken, or names views or classes that do not exist."""
 
 
 class SplitFileError(GssegError):

@@ -137,15 +137,30 @@ def tally(
 @nb.njit(parallel=True, nogil=True, cache=True)
 def share_votes(
     votes: np.ndarray,  # (N, K) int64
+    possible: np.ndarray,  # (K,) bool: ids that are classes
     codes: np.ndarray,  # (N, K) float32 out
-) -> None:
-    """Divide each row of votes by its sum; rows of zeros stay zero."""
+) -> int:
+    """Divide the votes for classes by their sum; rows of zeros stay zero.
+
+    Votes below 0 are against a class. Where there are such, and none for any, the one class that has none at all is
+    what is left. Where several have none, the row is left zero; returns how many rows these are.
+    """
+    unsure = 0
     for i in nb.prange(votes.shape[0]):
-        total = np.int64(0)
+        total, against, free, left = np.int64(0), False, 0, -1
         for k in range(votes.shape[1]):
-            total += votes[i, k]
+            total += max(votes[i, k], 0)
+            against |= votes[i, k] < 0
+            if votes[i, k] == 0 and possible[k]:
+                free, left = free + 1, k
         for k in range(votes.shape[1]):
-            codes[i, k] = votes[i, k] / total if total > 0 else 0.0
+            codes[i, k] = max(votes[i, k], 0) / total if total > 0 else 0.0
+        if total == 0 and against:
+            if free == 1:
+                codes[i, left] = 1.0
+            else:
+                unsure += 1
+    return unsure
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
@@ -155,7 +170,10 @@ def take_votes(
     total: np.ndarray,  # (Z,) int64, taken from
     order: np.ndarray,  # (M,) int32: whose rows these are
     start: np.ndarray,  # (M + 1,)
-    sighted: np.ndarray,  # (P,) class of each sighting
+    labels: np.ndarray,  # (P,) int32: label of each sighting
+    said_start: np.ndarray,  # (L + 1,) what a pixel of each label votes, as `Rows`
+    said_classes: np.ndarray,
+    said: np.ndarray,  # float64
     votes: np.ndarray,  # (P,) float32
     units: float,  # per vote; a power of 2
 ) -> None:
@@ -163,9 +181,10 @@ def take_votes(
     for i in nb.prange(order.shape[0]):
         m = order[i]
         for s in range(start[m], start[m + 1]):
-            for z in range(rows[i], rows[i + 1]):
-                if classes[z] == np.uint32(sighted[s]):
-                    total[z] -= np.int64(np.rint(np.float64(votes[s]) * units))
+            for j in range(said_start[labels[s]], said_start[labels[s] + 1]):
+                for z in range(rows[i], rows[i + 1]):
+                    if classes[z] == said_classes[j]:
+                        total[z] -= np.int64(np.rint(np.float64(votes[s]) * said[j] * units))
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
@@ -173,7 +192,10 @@ def add_votes(
     total: np.ndarray,  # (N, K) int64, added to
     ids: np.ndarray,  # (M,) int32, distinct
     start: np.ndarray,  # (M + 1,)
-    classes: np.ndarray,  # (P,) int32: class of each sighting
+    labels: np.ndarray,  # (P,) int32: label of each sighting
+    said_start: np.ndarray,  # (L + 1,) what a pixel of each label votes, as `Rows`
+    said_classes: np.ndarray,
+    said: np.ndarray,  # float64
     votes: np.ndarray,  # (P,) float32
     units: float,  # per vote; a power of 2
     sign: int,
@@ -182,4 +204,5 @@ def add_votes(
     for m in nb.prange(ids.shape[0]):
         row = total[ids[m]]
         for s in range(start[m], start[m + 1]):
-            row[classes[s]] += sign * np.int64(np.rint(np.float64(votes[s]) * units))
+            for j in range(said_start[labels[s]], said_start[labels[s] + 1]):
+                row[said_classes[j]] += sign * np.int64(np.rint(np.float64(votes[s]) * said[j] * units))

@@ -59,6 +59,8 @@ class GradientLearner(Learner):
     - All codes start at zero, the "initial state of uniform distribution across all categories" of its section 3.2.
     - Adam with rate 0.05, falling exponentially to a tenth; one view a step, in random order, ten times over all views.
     - Pixels whose label is unknown do not count, neither in the sum nor in N.
+    - Where a mask is soft or partial, a rendered code counts by how plausible the pixel's label makes each class (see
+      `gsseg_core.meaning`): -log sum_k pl(k) M_bar_k. With one class per label that is the same.
 
     Attributes
     ----------
@@ -111,6 +113,7 @@ class GradientLearner(Learner):
         learnt: np.ndarray = torch.softmax(codes, dim=1).detach().numpy()
         learnt[~self.observed_] = 0.0
         self.codes_ = learnt
+        self._finish()
         return self
 
 
@@ -128,15 +131,24 @@ class _CrossEntropy(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, probabilities: torch.Tensor, observation: Observation) -> torch.Tensor:
-        rows, classes = observation.ids[observation.rows], observation.classes[observation.labels]
-        said = probabilities.detach().numpy()[rows, classes]
-        shares = observation.shares(said, (observation.classes == 0).astype(np.float32))
-        scale = 1.0 / (observation.num_pixels * probabilities.shape[1])
-        ctx.shape, ctx.where, ctx.gradient = probabilities.shape, (rows, classes), -scale * shares.sightings
+        codes, scale = probabilities.detach().numpy(), 1.0 / (observation.num_pixels * probabilities.shape[1])
+        ctx.shape, ctx.observation = probabilities.shape, observation
+        if observation.meaning.mass is None:
+            where = observation.ids[observation.rows], observation.classes[observation.labels]
+            said, rest = codes[where], (observation.classes == 0).astype(np.float32)
+        else:
+            plausible = observation.meaning.plausibility(codes.shape[1])
+            said, rest = (codes[observation.ids] @ plausible.T)[observation.rows, observation.labels], plausible[:, 0]
+        shares = observation.shares(said, rest)
+        ctx.gradient = -scale * shares.sightings
         return torch.tensor(-scale * shares.log_likelihood, dtype=probabilities.dtype)
 
     @staticmethod
     def backward(ctx: Any, upstream: torch.Tensor) -> tuple[torch.Tensor, None]:
-        gradient = np.zeros(ctx.shape, np.float32)
-        gradient[ctx.where] = ctx.gradient
+        gradient, observation = np.zeros(ctx.shape, np.float32), ctx.observation
+        if observation.meaning.mass is None:
+            gradient[observation.ids[observation.rows], observation.classes[observation.labels]] = ctx.gradient
+        else:
+            plausible = observation.meaning.plausibility(ctx.shape[1])
+            gradient[observation.ids] = observation.dense(ctx.gradient) @ plausible
         return upstream * torch.from_numpy(gradient), None

@@ -13,8 +13,10 @@ import numpy as np
 from gsseg_core.dataset import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
 from gsseg_core.gaussian_kernels import add_votes, share_votes
+from gsseg_core.meaning import decided, guess
 from gsseg_core.operator import Observation, make_operator
 from gsseg_core.scene import GaussianScene
+from gsseg_core.soft_masks import SeenLabels
 from gsseg_core.state_file import State
 
 VOTE_UNIT = 2.0**-24
@@ -56,9 +58,10 @@ class Learner(ABC):
     rejected : dict of str to str
         Names of views that could not be used, and why.
     codes_ : (N, K) float32
-        After `fit`: class probabilities of each Gaussian; a row of zeros where no labelled pixel saw it.
+        After `fit`: class probabilities of each Gaussian; a row of zeros where no labelled pixel saw it, or all that is
+        known is what it is not, see docs/masks.md.
     observed_ : (N,) bool
-        After `fit`: whether any labelled pixel saw the Gaussian.
+        After `fit`: whether the Gaussian has a code.
     history_ : list of float
         The objective after each step of `fit`, for learners that have one.
     converged_ : bool
@@ -194,9 +197,16 @@ class Learner(ABC):
 
     def vote_codes(self) -> np.ndarray:
         """Votes as probabilities, (N, K) float32; a row of zeros where no labelled pixel saw the Gaussian."""
-        codes = np.empty(self._votes.shape, np.float32)
-        share_votes(self._votes, codes)
+        codes, possible = np.empty(self._votes.shape, np.float32), self._possible()
+        if share_votes(self._votes, possible, codes):
+            guess(codes, self._votes, possible)
         return codes
+
+    def evidence(self) -> np.ndarray:
+        """Weight of the labelled pixels that saw each Gaussian, over all views, in px, (N,) float32."""
+        # What rules a class out counts as much as what speaks for one.
+        evidence: np.ndarray = (np.abs(self._votes).sum(axis=1) * VOTE_UNIT).astype(np.float32)
+        return evidence
 
     def reject_summary(self) -> dict[str, int]:
         """Count the rejected views by reason."""
@@ -205,15 +215,15 @@ class Learner(ABC):
     def _open(self, view: View) -> tuple[Observation | None, str]:
         if not view.has_mask:
             return None, NO_MASK
-        labels = view.read_labels()
-        self._check_labels(view, labels)
-        if not (labels >= 0).any():
+        seen = view.read_seen()
+        self._check_labels(view, seen)
+        if not (seen.labels >= 0).any():
             return None, ALL_UNKNOWN
-        observation = make_operator(self.scene, view.camera, self.device).observe(labels)
+        observation = make_operator(self.scene, view.camera, self.device).observe(*seen)
         return (observation, "") if len(observation.ids) else (None, SEES_NOTHING)
 
-    def _check_labels(self, view: View, labels: np.ndarray) -> None:
-        largest = int(labels.max())
+    def _check_labels(self, view: View, seen: SeenLabels) -> None:
+        largest = int(seen.labels.max()) if seen.meaning is None else seen.meaning.largest
         if largest >= self.num_classes:
             raise UnknownLabelError(
                 f"{view.mask_path or view.name}: mask holds the label {largest}; expected at most "
@@ -232,7 +242,7 @@ class Learner(ABC):
         """Return a view with its mask, prepared; it is kept as far as the memory budget goes."""
         if name not in self._prepared:
             view = self.views[name]
-            observation = make_operator(self.scene, view.camera, self.device).observe(view.read_labels())
+            observation = make_operator(self.scene, view.camera, self.device).observe(*view.read_seen())
             self._keep(name, observation)
             return observation
         return self._prepared[name]
@@ -246,7 +256,24 @@ class Learner(ABC):
         if not self.views:
             reasons = ", ".join(f"{count} {why}" for why, count in self.reject_summary().items()) or "none was given"
             raise NoUsableViewsError(f"no view to learn from ({reasons}); expected posed views with label images")
-        self.observed_ = self._votes.sum(axis=1) > 0
+        self.observed_ = decided(self._votes, self._possible())
+
+    def _finish(self) -> None:
+        """Leave codes only where something was seen that they can be told by."""
+        unsure = np.flatnonzero(~self.observed_)
+        seen = self._votes[unsure].any(axis=1)
+        self.codes_[unsure[~seen]] = 0.0
+        if seen.any():
+            guess(self.codes_, self._votes, self._possible(), unsure[seen])
+            self.observed_[unsure] = self.codes_[unsure].any(axis=1)
+
+    def _possible(self) -> np.ndarray:
+        """Mark the ids that are classes, (K,) bool: those that views name; all, where one of them has no names."""
+        possible = np.zeros(self.num_classes, bool)
+        names = {id(view.class_names): view.class_names for view in self.views.values()}
+        for ids in names.values() or (None,):
+            possible[[k for k in ids if k < self.num_classes] if ids is not None else slice(None)] = True
+        return possible
 
 
 def count_votes(
@@ -255,5 +282,5 @@ def count_votes(
     sign: int = 1,
 ) -> None:
     """Add a view's votes, or take them away, in units of `VOTE_UNIT`."""
-    classes = observation.classes[observation.labels]
-    add_votes(total, observation.ids, observation.start, classes, observation.votes(), 1 / VOTE_UNIT, sign)
+    seen = observation.ids, observation.start, observation.labels
+    add_votes(total, *seen, *observation.meaning.votes, observation.votes(), 1 / VOTE_UNIT, sign)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from abc import ABC, abstractmethod
 from functools import cached_property
 from typing import NamedTuple
@@ -10,7 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from gsseg_core.cameras import Camera
+from gsseg_core.devices import checked_device
 from gsseg_core.errors import MaskSizeError, SceneValueError, SettingsError
+from gsseg_core.meaning import Meaning
 from gsseg_core.rows import Rows
 from gsseg_core.scene import GaussianScene
 
@@ -86,6 +87,8 @@ class Observation(ABC):
         Labels that occur in the mask, ascending.
     num_pixels : int
         Pixels with a label.
+    meaning : Meaning
+        What the labels say of the classes; of a plain mask, that they are classes.
     """
 
     ids: np.ndarray
@@ -98,6 +101,11 @@ class Observation(ABC):
     @abstractmethod
     def nbytes(self) -> int:
         """Memory that it holds, in bytes."""
+
+    @cached_property
+    def meaning(self) -> Meaning:
+        """What the labels say of the classes."""
+        return Meaning(self.classes)
 
     @cached_property
     def order(self) -> np.ndarray:
@@ -236,8 +244,16 @@ class ViewOperator(ABC):
     def observe(
         self,
         labels: np.ndarray,  # (H, W) int32, negative = unknown
+        meaning: Meaning | None = None,
     ) -> Observation:
         """Tie the view to its mask.
+
+        Parameters
+        ----------
+        labels : (H, W) int32
+            Classes, negative where nothing is known; or prototypes 0 to L - 1, each of which occurs.
+        meaning : Meaning, optional
+            What prototypes mean.
 
         Raises
         ------
@@ -245,7 +261,10 @@ class ViewOperator(ABC):
             The labels are not of the camera's size.
         """
         self._check_size(labels, 2)
-        return self._observe(labels)
+        observation = self._observe(labels)
+        if meaning is not None:
+            observation.meaning = meaning
+        return observation
 
     def visibility(self) -> np.ndarray:
         """Sum of each Gaussian's weights over the image: W^T 1, (N,) float32, in px."""
@@ -314,12 +333,10 @@ def make_operator(scene: GaussianScene, camera: Camera, device: str = "cpu") -> 
     SettingsError
         There is no such device, or what it needs is not installed.
     """
-    if device == "cpu":
+    if checked_device(device) == "cpu":
         from gsseg_core.tile_operator import TileOperator
 
         return TileOperator(scene, camera)
-    if not re.fullmatch(r"cuda(:[0-9]+)?", device):
-        raise SettingsError(f"device is {device!r}; expected 'cpu', 'cuda' or 'cuda:' and the number of a GPU")
     try:
         from gsseg_core.gsplat_operator import GsplatOperator, load_gsplat
     except ModuleNotFoundError as missing:

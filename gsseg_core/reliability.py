@@ -3,7 +3,9 @@
 The codes that learnt from a mask agree with its errors, so a mask is held against codes that have not seen it: one
 more step of EM from the codes that were learnt, without the summand of this view (see `gsseg_core.em`). Rendered from
 where the view was taken, they predict its labels. A view's reliability is the share of its pixels whose label is the
-one predicted. It is an estimate of the share whose label is right.
+one predicted. It is an estimate of the share whose label is right. Of a soft mask, a pixel's label is
+its largest share; in a partial one "none of those looked for" is a label too, and right where a class is predicted that
+was not looked for.
 """
 
 from __future__ import annotations
@@ -16,11 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from gsseg_core.dataset import View
+from gsseg_core.calibration import VIEWS, Sample, sample_pixels
+from gsseg_core.dataset import View, spread
 from gsseg_core.em import EMLearner, codes_without
 from gsseg_core.export import background_image
 from gsseg_core.learner import Progress, silent
-from gsseg_core.masks import UNKNOWN
+from gsseg_core.masks import UNKNOWN, PackedLabels
+from gsseg_core.meaning import Meaning
 from gsseg_core.operator import make_operator
 from gsseg_core.pictures import contact_sheet, overlay, palette
 from gsseg_core.rows import Rows
@@ -42,16 +46,22 @@ class ViewCheck:
     num_pixels : int
         Pixels with a label.
     classes : (L,) int32
-        Labels that occur in the mask, ascending.
+        Labels that occur in the mask, ascending; of a partial one, `UNKNOWN` (-1) at last for "none of these".
     counts : (K, L) int64
         Of the pixels with a label of which the other views say something: how many by class predicted (row) and by
         label (column).
+    predicted : PackedLabels, optional
+        What the other views predict, (H, W), for pictures.
+    meaning : Meaning, optional
+        Of a soft or partial mask; `classes` are its words.
     """
 
     name: str
     num_pixels: int
     classes: np.ndarray
     counts: np.ndarray
+    predicted: PackedLabels | None = None
+    meaning: Meaning | None = None
 
     @property
     def checked(self) -> int:
@@ -61,13 +71,13 @@ class ViewCheck:
     @property
     def reliability(self) -> float:
         """Share of the checked pixels whose label is the one predicted, in [0, 1]; NaN where there is none."""
-        return float(self._right.sum() / self.checked) if self.checked else math.nan
+        return float(self.counts[self._right].sum() / self.checked) if self.checked else math.nan
 
     @property
     def agreement(self) -> np.ndarray:
         """Share of the pixels predicted as each class that carry its label, (K,); NaN where none is predicted."""
         right = np.zeros(len(self.counts))
-        right[self.classes] = self._right
+        right[self._right[0]] = self.counts[self._right]
         shown = self.counts.sum(axis=1)
         share: np.ndarray = np.divide(right, shown, out=np.full(len(shown), np.nan), where=shown > 0)
         return share
@@ -75,7 +85,7 @@ class ViewCheck:
     def confusions(self, count: int = CONFUSIONS) -> list[tuple[int, int, float]]:
         """Give what was most often taken for something else: class predicted, label seen, share of checked pixels."""
         wrong = self.counts.copy()
-        wrong[self.classes, np.arange(len(self.classes))] = 0
+        wrong[self._right] = 0
         largest = np.argsort(-wrong, axis=None, kind="stable")[:count]
         return [
             (k, int(self.classes[y]), float(wrong[k, y] / self.checked))
@@ -84,9 +94,9 @@ class ViewCheck:
         ]
 
     @property
-    def _right(self) -> np.ndarray:
-        right: np.ndarray = self.counts[self.classes, np.arange(len(self.classes))]
-        return right
+    def _right(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where in the counts class and label agree."""
+        return (self.meaning or Meaning(self.classes)).right(len(self.counts))
 
 
 class OtherViews:
@@ -102,6 +112,8 @@ class OtherViews:
 
     def __init__(self, learner: EMLearner, progress: Progress = silent) -> None:
         self.learner = learner
+        self._sampled = {view.name for view in spread(list(learner.views.values()), VIEWS)}
+        self._samples: dict[str, Sample] = {}
         self._codes = Rows.of(learner.codes_)
         self._shows_background = bool((self._codes.classes == 0).any())
         total = len(learner.views)
@@ -119,6 +131,10 @@ class OtherViews:
         (H, W) int32
             `UNKNOWN` (-1) where they say nothing: most of the ray ends on Gaussians that only this view has seen.
         """
+        return _strongest(self.blend(view))
+
+    def blend(self, view: View) -> np.ndarray:
+        """Blend what all the others say into a view, (H, W, K) float32; rows sum to less where they are silent."""
         learner = self.learner
         # No prior: where no other view has seen anything, nothing is to be said.
         model = learner.error_models_[view.name]
@@ -129,12 +145,20 @@ class OtherViews:
         image, left_over = operator.blend_rows(self._codes.with_values(codes), learner.num_classes)
         if self._shows_background:
             image[..., 0] += left_over
-        labels: np.ndarray = np.where(image.sum(axis=2) > 0.5, image.argmax(axis=2), UNKNOWN).astype(np.int32)
-        return labels
+        return image
 
     def check(self, view: View) -> ViewCheck:
         """Hold a view's mask against what the others predict."""
-        return _compare(view.name, view.read_labels(), self.predict(view), self.learner.num_classes)
+        image = self.blend(view)
+        if view.name in self._sampled:
+            self._samples[view.name] = sample_pixels(image, view.read_labels())
+        return hold_against(view, _strongest(image), self.learner.num_classes)
+
+    def sample(self, view: View) -> Sample:
+        """Take pixels of a view's mask with what the others predict of them, to fit the temperature to."""
+        if view.name not in self._samples:
+            self._samples[view.name] = sample_pixels(self.blend(view), view.read_labels())
+        return self._samples[view.name]
 
     def check_all(self, progress: Progress = silent) -> list[ViewCheck]:
         """Do that for all views, in their order."""
@@ -222,7 +246,8 @@ def draw_worst_views(others: OtherViews, checks: Sequence[ViewCheck], count: int
     for check in worst_views(checks, count):
         view = learner.views[check.name]
         image = background_image(learner.scene, make_operator(learner.scene, view.camera, learner.device))
-        mask, predicted = view.read_labels(), others.predict(view)
+        mask = view.read_labels()
+        predicted = others.predict(view) if check.predicted is None else check.predicted.unpack()
         different = ((mask != predicted) & (mask != UNKNOWN) & (predicted != UNKNOWN)).astype(np.int32)
         images += [overlay(image, mask, colors), overlay(image, predicted, colors)]
         images.append(overlay(image, different, _DIFFERENT))
@@ -231,14 +256,31 @@ def draw_worst_views(others: OtherViews, checks: Sequence[ViewCheck], count: int
     return contact_sheet(images, captions, 3)
 
 
-def _compare(name: str, labels: np.ndarray, predicted: np.ndarray, num_classes: int) -> ViewCheck:
-    known = labels >= 0
-    classes = np.unique(labels[known]).astype(np.int32)
+def _strongest(
+    image: np.ndarray,  # (H, W, K)
+) -> np.ndarray:
+    labels: np.ndarray = np.where(image.sum(axis=2) > 0.5, image.argmax(axis=2), UNKNOWN).astype(np.int32)
+    return labels
+
+
+def hold_against(
+    view: View,
+    predicted: np.ndarray,  # (H, W) int32
+    num_classes: int,
+) -> ViewCheck:
+    """Hold a view's mask against any prediction of its labels, `UNKNOWN` (-1) where that says nothing."""
+    seen = view.read_seen()
+    labels, meaning = seen.named(), seen.meaning
+    # Where a partial mask names no class, it says "none of these", its last word.
+    unnamed = (seen.labels >= 0) & (labels < 0) if meaning is not None and meaning.says_none else np.False_
+    known = (labels >= 0) | unnamed
+    classes = np.unique(labels[labels >= 0]).astype(np.int32) if meaning is None else meaning.words
     both = known & (predicted >= 0)
-    cells = predicted[both] * np.int64(len(classes)) + np.searchsorted(classes, labels[both])
+    words = np.where(labels >= 0, np.searchsorted(classes[classes >= 0], labels), len(classes) - 1)
+    cells = predicted[both] * np.int64(len(classes)) + words[both]
     counts = np.bincount(cells, minlength=num_classes * len(classes)).reshape(num_classes, len(classes))
-    return ViewCheck(name, int(known.sum()), classes, counts)
+    return ViewCheck(view.name, int(known.sum()), classes, counts, PackedLabels(predicted), meaning)
 
 
 def _name(class_names: Mapping[int, str], label: int) -> str:
-    return class_names.get(label, f"class_{label:02d}")
+    return class_names.get(label, f"class_{label:02d}") if label >= 0 else "none of these"

@@ -14,7 +14,9 @@ from gsseg_core.atomic import write_atomically
 from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
 from gsseg_core.errors import StateFileError
+from gsseg_core.meaning import Meaning
 from gsseg_core.npz_files import open_npz
+from gsseg_core.soft_masks import SeenLabels
 
 FORMAT = "gsseg-state-1"
 
@@ -31,11 +33,14 @@ class Learnt:
         Class probabilities; a row of zeros where no labelled pixel saw the Gaussian.
     num_views : int
         Views that it learnt from.
+    temperature : float
+        At which the codes are probabilities, see `gsseg_core.held_out`.
     """
 
     learner: str
     codes: np.ndarray
     num_views: int
+    temperature: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,10 +86,18 @@ class State:
         }
         arrays = {"seen": seen.astype(np.int64), "votes": self.votes[seen]}
         if self.learnt is not None:
-            header["learnt"] = {"learner": self.learnt.learner, "num_views": self.learnt.num_views}
+            header["learnt"] = {
+                "learner": self.learnt.learner,
+                "num_views": self.learnt.num_views,
+                "temperature": self.learnt.temperature,
+            }
             arrays["codes"] = self.learnt.codes
         for i, view in enumerate(self.views):
-            arrays[f"labels_{i}"] = view.read_labels()
+            arrays[f"labels_{i}"], meaning = view.read_seen()
+            if meaning is not None and meaning.mass is not None:
+                arrays[f"classes_{i}"], arrays[f"mass_{i}"] = meaning.classes, meaning.mass
+                if meaning.supervised is not None:
+                    arrays[f"supervised_{i}"] = meaning.supervised
             arrays[f"pose_{i}"] = np.stack([np.pad(view.camera.K, (0, 1)), view.camera.world_to_camera])
         with write_atomically(path, suffix=".npz") as temporary, open(temporary, "wb") as file:
             np.savez_compressed(file, allow_pickle=False, header=np.array(json.dumps(header)), **arrays)
@@ -110,7 +123,8 @@ class State:
             learnt = None
             if "learnt" in header:
                 entry = header["learnt"]
-                learnt = Learnt(str(entry["learner"]), file["codes"], int(entry["num_views"]))
+                temperature = float(entry.get("temperature", 1.0))  # earlier files have none
+                learnt = Learnt(str(entry["learner"]), file["codes"], int(entry["num_views"]), temperature)
                 if learnt.codes.ndim != 2 or len(learnt.codes) != n:
                     raise StateFileError(f"{path}: codes have shape {learnt.codes.shape}; expected ({n}, K)")
             return cls(
@@ -126,4 +140,11 @@ def _read_view(file: np.lib.npyio.NpzFile, i: int, entry: dict[str, Any]) -> Vie
     width, height = (int(side) for side in entry["size"])
     pose = file[f"pose_{i}"]
     camera = Camera(str(entry["name"]), width, height, pose[0, :3, :3], pose[1])
-    return View.from_arrays(camera, file[f"labels_{i}"])
+    labels = file[f"labels_{i}"]
+    if f"mass_{i}" not in file.files:
+        return View.from_arrays(camera, labels)
+    supervised = file[f"supervised_{i}"] if f"supervised_{i}" in file.files else None
+    meaning = Meaning(file[f"classes_{i}"], file[f"mass_{i}"], supervised)
+    if meaning.mass is None or meaning.mass.shape != (labels.max() + 1, len(meaning.classes)):
+        raise StateFileError(f"view '{camera.name}': mask and what it means do not fit; expected one row per label")
+    return View.from_seen(camera, SeenLabels(labels, meaning))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from gsseg_core.learner import Learner, Progress, silent
 
 
@@ -15,4 +17,5 @@ class VoteLearner(Learner):
         """Normalise the votes."""
         self._begin()
         self.codes_, self.converged_ = self.vote_codes(), True
+        self.observed_ = np.asarray(self.codes_.any(axis=1))
         return self

@@ -68,6 +68,20 @@ def assert_same(one: Learner, other: Learner) -> None:
             np.testing.assert_array_equal(model.confusion, other.error_models_[name].confusion)
 
 
+@pytest.mark.parametrize("kind", ["em", "votes"])
+def test_soft_and_partial_masks_on_workers_give_the_same_bit_for_bit(client: Any, kind: str) -> None:
+    views = []
+    for i, view in enumerate(VIEWS):
+        labels = view.read_labels()
+        chances = np.stack([np.where(labels == k, 0.8, 0.2 / 3) for k in range(NUM_CLASSES)])
+        some = View.from_arrays(view.camera, np.where(labels == 1 + i % 3, labels, 0), supervised=[1 + i % 3])
+        views.append([view, some, View.from_probabilities(view.camera, chances)][i % 3])
+    there = DistributedEM(client, SCENE, NUM_CLASSES) if kind == "em" else DistributedVotes(client, SCENE, NUM_CLASSES)
+    here = EMLearner(SCENE, NUM_CLASSES) if kind == "em" else VoteLearner(SCENE, NUM_CLASSES)
+    there.observe_all(views)
+    assert_same(there, taught(here, views))
+
+
 def with_a_useless_one() -> list[View]:
     return [*VIEWS[:3], View.from_arrays(VIEWS[3].camera, np.full((48, 64), -1, np.int32)), *VIEWS[4:]]
 

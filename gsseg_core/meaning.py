@@ -1,0 +1,273 @@
+"""What the labels of a mask say of the classes: one class, several with a share each, or only which ones it is not.
+
+A label of a plain mask is a class. In general a label is a *prototype*, all pixels of which say the same: a mass m_c on
+each of some classes, and what is left of 1, the rest r, on a set of classes A (a belief function, Shafer 1976). Where
+the segmenter looked for all classes, A is all of them: the rest is ignorance. Where it looked only for the classes S, A
+is all others: the rest says "none of these", and not which other one. How plausible a class is, the sum of the masses
+of all sets that it is in, is the label's likelihood, and all that learning asks:
+
+    pl(c) = m_c + r [c in A].
+
+The segmenter's own vocabulary are *words*: the classes that have a mass, and "none of these" if it says so. Error
+models are learnt of words, so they do not grow with the number of prototypes. Votes go to what a label names, m_c; the
+rest is no vote for anybody, but counts against those that were looked for and not found, m_c - r [c in S].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numba as nb
+import numpy as np
+
+from gsseg_core.masks import UNKNOWN
+from gsseg_core.rows import Rows, starts
+
+_ROUNDS = 50
+
+
+@dataclass(frozen=True, eq=False)
+class Meaning:
+    """What each of the labels of one mask says of the classes.
+
+    Attributes
+    ----------
+    classes : (C,) int32
+        Classes that some label names, ascending.
+    mass : (L, C) float32
+        Mass of each class under each label; rows sum to at most 1. None where label l is class l, for certain.
+    supervised : (S,) int32
+        Classes that were looked for, ascending; all that have a mass are among them. None for all classes.
+    """
+
+    classes: np.ndarray
+    mass: np.ndarray | None = None
+    supervised: np.ndarray | None = None
+
+    @cached_property
+    def rest(self) -> np.ndarray:
+        """Mass of each label on no class in particular, (L,) float32."""
+        if self.mass is None:
+            return np.zeros(len(self.classes), np.float32)
+        rest: np.ndarray = np.maximum(1 - self.mass.sum(axis=1), 0)
+        return rest
+
+    @cached_property
+    def says_none(self) -> bool:
+        """Whether some label says "none of those that were looked for"."""
+        return self.supervised is not None and bool((self.rest > 0).any())
+
+    @property
+    def words(self) -> np.ndarray:
+        """The segmenter's words, (W,) int32: classes, and then `UNKNOWN` (-1) for "none of these" if it is said."""
+        return np.append(self.classes, np.int32(UNKNOWN)) if self.says_none else self.classes
+
+    @cached_property
+    def shares(self) -> np.ndarray | None:
+        """How plausible each word is under each label, (L, W) float32; None where label l is word l."""
+        if self.mass is None:
+            return None
+        shares: np.ndarray = self.mass
+        if self.supervised is None:
+            shares = self.mass + self.rest[:, None]
+        elif self.says_none:
+            shares = np.column_stack([self.mass, self.rest])
+        return shares
+
+    @cached_property
+    def votes(self) -> Rows:
+        """What a pixel of each label votes: the mass of a class, less the rest if it was looked for; float64."""
+        if self.mass is None:
+            return Rows(np.arange(len(self.classes) + 1), self.classes.astype(np.uint32), np.ones(len(self.classes)))
+        votes = np.zeros((len(self.mass), len(self.concerned)))
+        votes[:, np.searchsorted(self.concerned, self.classes)] = self.mass
+        if self.supervised is not None:
+            votes -= self.rest[:, None].astype(np.float64)
+        rows = Rows.of(votes)
+        return Rows(rows.start, self.concerned[rows.classes].astype(np.uint32), rows.values)
+
+    @property
+    def concerned(self) -> np.ndarray:
+        """Classes that the mask says something of, (S,) int32 ascending."""
+        return self.classes if self.supervised is None else self.supervised
+
+    @property
+    def largest(self) -> int:
+        """The largest class that the mask says something of, `UNKNOWN` if there is none."""
+        return int(self.concerned.max(initial=UNKNOWN))
+
+    def right(self, num_classes: int) -> tuple[np.ndarray, np.ndarray]:
+        """Pair classes with their right word: classes (T,), positions in `words` (T,); those without one are left out.
+
+        A class that was not looked for is rightly called "none of these". One that was looked for, and does not occur,
+        has no word.
+        """
+        own = np.arange(len(self.classes))
+        if not self.says_none:
+            return self.classes, own
+        others = np.setdiff1d(np.arange(num_classes, dtype=np.int32), self.concerned)
+        return np.append(self.classes, others), np.append(own, np.full(len(others), len(self.classes)))
+
+    def plausibility(self, num_classes: int) -> np.ndarray:
+        """How plausible each class is under each label, by a segmenter that makes no errors: (L, K) float32."""
+        classes, words = self.right(num_classes)
+        shares = np.eye(len(self.words), dtype=np.float32) if self.shares is None else self.shares
+        out = np.zeros((len(shares), num_classes), np.float32)
+        if self.mass is not None and self.supervised is None:
+            out += self.rest[:, None]
+        out[:, classes] = shares[:, words]
+        return out
+
+    def named(self) -> np.ndarray:
+        """Say which class each label names if it has to name one, (L,) int32; `UNKNOWN` where the rest weighs more."""
+        if self.mass is None:
+            return self.classes
+        if not len(self.classes):
+            return np.full(len(self.mass), UNKNOWN, np.int32)
+        named: np.ndarray = np.where(
+            self.mass.max(axis=1) >= self.rest, self.classes[self.mass.argmax(axis=1)], UNKNOWN
+        )
+        return named.astype(np.int32)
+
+
+def standing(
+    votes: Rows,  # int64
+    possible: np.ndarray,  # (K,) bool: ids that are classes
+) -> Rows:
+    """Keep of votes for and against classes what can be said with them, at least 0; all if none is against.
+
+    A class whose looks went against it is out. If all classes but one were looked for at a Gaussian, that one stands
+    for "none of these", with as many votes as the one that was looked for least.
+    """
+    if votes.values.min(initial=0) >= 0:
+        return votes
+    counts, ids = np.empty(len(votes.start) - 1, np.int64), np.flatnonzero(possible)
+    _count_standing(*votes, ids, counts)
+    start = starts(counts)
+    out = Rows(start, np.empty(start[-1], np.uint32), np.empty(start[-1], np.int64))
+    _keep_standing(*votes, ids, *out)
+    return out
+
+
+def guess(
+    codes: np.ndarray,  # (N, K) float32, changed in place
+    votes: np.ndarray,  # (N, K) int64
+    possible: np.ndarray,  # (K,) bool: ids that are classes
+    rows: np.ndarray | None = None,  # Gaussians that were seen, and never under a class; found if not given
+) -> None:
+    """Where all that is known of a Gaussian is what it is not, share it among the classes that are left.
+
+    In proportion to how frequent they are in the scene, on top of the code that the row has from its neighbours. The
+    background is that to which no class applies, so its frequency is known only if every class was looked for in some
+    view. If one never was, only neighbours count, and without them the row stays zero: unknown.
+    """
+    if rows is None:
+        rows = np.flatnonzero(~codes.any(axis=1) & votes.any(axis=1))
+    candidates = (votes[rows] >= 0) & possible
+    left = codes[rows] * candidates
+    if not (possible & ~votes.any(axis=0))[1:].any():
+        sure = np.ones(len(codes), bool)
+        sure[rows] = False
+        left += _frequency(codes[sure].sum(axis=0, dtype=np.float64), candidates) * candidates
+    codes[rows] = _scaled(left)
+
+
+def _frequency(
+    known: np.ndarray,  # (K,) Gaussians of each class, as far as they are known
+    candidates: np.ndarray,  # (U, K) bool: what each of the others may be
+) -> np.ndarray:
+    """Estimate how frequent each class is, (K,): the likeliest proportions, by expectation maximisation.
+
+    Objects are told by one look, the background by one for every class. So those that are known have too few of it,
+    and what the others may be has to count. (Dempster, Laird & Rubin 1977, on grouped data.)
+    """
+    patterns, many = np.unique(np.packbits(candidates, axis=1), axis=0, return_counts=True)
+    may_be = np.unpackbits(patterns, axis=1, count=candidates.shape[1])
+    frequency = np.full(len(known), 1 / len(known))
+    for _ in range(_ROUNDS):
+        frequency = known + many @ _scaled(may_be * frequency)
+        frequency /= frequency.sum()
+    return frequency
+
+
+def _scaled(
+    rows: np.ndarray,  # (U, K)
+) -> np.ndarray:
+    """Scale rows to sum 1; rows of zeros stay zero."""
+    total = rows.sum(axis=1, keepdims=True)
+    scaled: np.ndarray = np.divide(rows, total, out=np.zeros_like(rows), where=total > 0)
+    return scaled
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def decided(
+    votes: np.ndarray,  # (N, K) int64
+    possible: np.ndarray,  # (K,) bool: ids that are classes
+) -> np.ndarray:
+    """Tell which Gaussians were seen under a class, or have only one class left, (N,) bool."""
+    out = np.empty(votes.shape[0], np.bool_)
+    for i in nb.prange(votes.shape[0]):
+        said, against, free = False, False, 0
+        for k in range(votes.shape[1]):
+            said |= votes[i, k] > 0
+            against |= votes[i, k] < 0
+            free += votes[i, k] == 0 and possible[k]
+        out[i] = said or (against and free == 1)
+    return out
+
+
+@nb.njit(nogil=True, cache=True)
+def _remaining(
+    classes: np.ndarray,  # of one row
+    votes: np.ndarray,  # of it
+    ids: np.ndarray,  # of all classes, ascending
+) -> tuple[int, int]:
+    """Return the one class without votes where all others have some, and any against; -1 if there is no such class."""
+    said, least, against, place = 0, 2**63 - 1, False, 0
+    for z in range(votes.shape[0]):
+        if votes[z] != 0:
+            said += 1
+            least = min(least, abs(votes[z]))
+            against |= votes[z] < 0
+            # Both ascend, so the first id that is not there is the one that is missing.
+            place += place < ids.shape[0] and ids[place] == classes[z]
+    return (ids[place] if against and said == ids.shape[0] - 1 else -1), least
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _count_standing(
+    start: np.ndarray,  # (N + 1,)
+    classes: np.ndarray,  # (Z,)
+    votes: np.ndarray,  # (Z,)
+    ids: np.ndarray,  # of all classes
+    counts: np.ndarray,  # (N,) out
+) -> None:
+    for i in nb.prange(counts.shape[0]):
+        mine = slice(start[i], start[i + 1])
+        counts[i] = (votes[mine] > 0).sum() + (_remaining(classes[mine], votes[mine], ids)[0] >= 0)
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _keep_standing(
+    start: np.ndarray,  # (N + 1,)
+    classes: np.ndarray,  # (Z,)
+    votes: np.ndarray,  # (Z,)
+    ids: np.ndarray,  # of all classes
+    kept_start: np.ndarray,  # (N + 1,)
+    kept_classes: np.ndarray,  # out
+    kept_votes: np.ndarray,  # out
+) -> None:
+    for i in nb.prange(start.shape[0] - 1):
+        mine = slice(start[i], start[i + 1])
+        free, least = _remaining(classes[mine], votes[mine], ids)
+        n = kept_start[i]
+        for z in range(start[i], start[i + 1]):
+            if 0 <= free < classes[z]:
+                kept_classes[n], kept_votes[n] = free, least
+                n, free = n + 1, -1
+            if votes[z] > 0:
+                kept_classes[n], kept_votes[n] = classes[z], votes[z]
+                n += 1
+        if free >= 0:
+            kept_classes[n], kept_votes[n] = free, least

@@ -1,0 +1,299 @@
+"""Soft and partial masks: probabilities become a map of prototypes, which all that works on labels can work on.
+
+A pixel's probabilities are rounded to sixteenths, and pixels that then say the same share one label, a prototype; what
+it says is in its `Meaning`. A mask that is certain everywhere loses nothing, and comes out as the plain mask it is. How
+much each of the others loses is bounded: no probability changes by as much as one step, see `quantise`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
+
+import numba as nb
+import numpy as np
+import numpy.typing as npt
+
+from gsseg_core.errors import MaskFormatError, MaskSizeError, UnknownLabelError
+from gsseg_core.masks import MAX_LABEL, UNKNOWN, PackedLabels
+from gsseg_core.meaning import Meaning
+
+STEPS = (16, 8, 4, 2, 1)
+"""Steps from probability 0 to 1: the first of these that gives no more than `MOST_PROTOTYPES`."""
+
+MOST_PROTOTYPES = 512
+"""Prototypes of a view, unless there are more even without any step between 0 and 1."""
+
+TOLERANCE = 0.01
+"""Probabilities of a pixel may sum to so much more than 1; half precision and images of 8 bits do."""
+
+_SURE = np.float32(1 - 1e-4)
+
+
+class SeenLabels(NamedTuple):
+    """What a mask holds: labels (H, W) int32, `UNKNOWN` where it says nothing, and what they mean (None: classes)."""
+
+    labels: npt.NDArray[np.int32]
+    meaning: Meaning | None = None
+
+    def named(self) -> npt.NDArray[np.int32]:
+        """Give the class that each pixel names, (H, W) int32; `UNKNOWN` where the mask leaves it open."""
+        if self.meaning is None:
+            return self.labels
+        return np.append(self.meaning.named(), np.int32(UNKNOWN))[self.labels]
+
+
+class PackedMask:
+    """A soft or partial mask in memory, its prototypes compressed like a plain one's labels."""
+
+    def __init__(self, seen: SeenLabels) -> None:
+        self._labels, self._meaning = PackedLabels(seen.labels), seen.meaning
+        self.largest = self._labels.largest if seen.meaning is None else seen.meaning.largest
+
+    def unpack(self) -> SeenLabels:
+        """Return what was packed; the labels in memory of their own."""
+        return SeenLabels(self._labels.unpack(), self._meaning)
+
+
+def quantise(
+    probabilities: npt.NDArray[np.floating],  # (C, H, W)
+    classes: Sequence[int] | None = None,
+    *,
+    unknown: npt.NDArray[np.bool_] | None = None,  # (H, W)
+    source: str = "probabilities",
+) -> SeenLabels:
+    """Make prototypes of the probabilities that one segmenter gives.
+
+    Each probability is rounded to the nearest step, or, where a pixel's would then sum to more than 1, down. So none
+    changes by as much as 1/16, or one of the coarser `STEPS` where there would be more than `MOST_PROTOTYPES`. What a
+    pixel's probabilities lack to 1 is the rest.
+
+    Parameters
+    ----------
+    probabilities : (C, H, W) of float16, float32 or float64
+        Of class classes[c] at [c], in [0, 1].
+    classes : sequence of C int, optional
+        The segmenter looked for these classes and no others: the rest means "none of these". Without, [c] is class c,
+        no class is left out, and the rest is unknown.
+    unknown : (H, W) bool, optional
+        Where the segmenter says nothing at all.
+    source : str
+        What messages call the mask.
+
+    Raises
+    ------
+    MaskFormatError
+        The array has another type or dimension, is not finite, has negative values or sums above 1.
+    MaskSizeError
+        `unknown` has another size.
+    UnknownLabelError
+        `classes` are not C different ids from 0 to `MAX_LABEL`.
+    """
+    probabilities = np.asarray(probabilities)
+    supervised = None if classes is None else _checked_classes(classes, len(probabilities), source)
+    _check_probabilities(probabilities, source)
+    if unknown is not None:
+        _check_unknown(unknown, probabilities.shape[1:], source)
+    ids = np.arange(len(probabilities), dtype=np.int32) if classes is None else np.asarray(classes, np.int32)
+    order = np.argsort(ids)
+    occurs = [c for c in order if probabilities[c].max(initial=0) > 0]
+    values = np.ascontiguousarray(np.moveaxis(probabilities[occurs], 0, -1), np.float32)  # (H, W, C')
+    for steps in STEPS:
+        parts = _rounded(values, steps).reshape(values.shape[0] * values.shape[1], -1 if occurs else 0)
+        labels, firsts = _group(parts)
+        if len(firsts) <= MOST_PROTOTYPES:
+            break
+    mass = parts[firsts] / np.float32(steps)
+    return _tidied(labels.reshape(values.shape[:2]).astype(np.int32), ids[occurs], mass, supervised, unknown)
+
+
+def combine_detections(
+    detections: Mapping[int, npt.NDArray[np.generic]],  # class -> (H, W)
+    *,
+    unknown: npt.NDArray[np.bool_] | None = None,  # (H, W)
+    source: str = "detections",
+) -> SeenLabels:
+    """Make prototypes of what several detectors say, each of which looked for one class and knows of no other.
+
+    Where detectors contradict each other, each is taken as evidence of its own: a pixel is of class k, and of no other
+    that was looked for, with a probability in proportion to p_k prod_{c != k} (1 - p_c), and none of these with
+    prod_c (1 - p_c). For one detector that is p and 1 - p.
+
+    Parameters
+    ----------
+    detections : mapping from class to (H, W) of bool or float
+        Probability of this class in each pixel, in [0, 1]. A detector that ran and found nothing gives zeros; of a
+        class that is not here nothing is said.
+    unknown : (H, W) bool, optional
+        Where nothing is said at all.
+    source : str
+        What messages call the mask.
+
+    Raises
+    ------
+    MaskFormatError, MaskSizeError, UnknownLabelError
+        As `quantise`.
+    """
+    if not detections:
+        raise MaskFormatError(f"{source}: holds no detections; expected at least one class, zeros where it is not seen")
+    classes = sorted(detections)
+    arrays = {k: np.asarray(detections[k]) for k in classes}
+    shape = arrays[classes[0]].shape
+    for k, array in arrays.items():
+        if array.ndim != 2 or array.dtype.kind not in "bf":
+            raise MaskFormatError(
+                f"{source}: class {k} is {array.dtype} of shape {array.shape}; expected bool or float (H, W)"
+            )
+        if array.shape != shape:
+            raise MaskSizeError(
+                f"{source}: class {k} is {array.shape[1]} x {array.shape[0]} pixels; expected {shape[1]} x {shape[0]}, "
+                f"as class {classes[0]}"
+            )
+        _check_range(array, f"{source}: class {k}")
+    alone = np.stack([arrays[k].astype(np.float32) for k in classes])
+    if len(classes) > 1:
+        odds = np.minimum(alone, _SURE)
+        odds /= 1 - odds
+        alone = odds / (1 + odds.sum(axis=0))
+    return quantise(alone, classes, unknown=unknown, source=source)
+
+
+def restrict(
+    labels: npt.NDArray[np.integer],  # (H, W)
+    supervised: Collection[int],
+    source: str = "labels",
+) -> SeenLabels:
+    """Read a plain mask as that of a segmenter that looked for some classes only; its 0 means "none of these".
+
+    0 is a class as any other if it is among them.
+
+    Raises
+    ------
+    UnknownLabelError
+        The mask holds a class that was not looked for.
+    """
+    looked_for = np.array(sorted(set(supervised)), np.int32)
+    ids = np.unique(labels)
+    strangers = [i for i in ids.tolist() if i not in looked_for and i not in (0, UNKNOWN)]
+    if strangers:
+        raise UnknownLabelError(
+            f"{source}: mask holds the labels {str(strangers)[1:-1][:60]}; expected those that it supervises, "
+            f"{str(looked_for.tolist())[1:-1][:60]}, and 0 for none of these"
+        )
+    prototypes = ids[ids != UNKNOWN].astype(np.int32)
+    named = prototypes[np.isin(prototypes, looked_for)]
+    mass = (prototypes[:, None] == named).astype(np.float32)
+    table = np.full(int(ids.max(initial=0)) + 2, UNKNOWN, np.int32)
+    table[prototypes] = np.arange(len(prototypes))
+    return SeenLabels(table[labels], Meaning(named, mass, looked_for))
+
+
+def _rounded(
+    values: npt.NDArray[np.float32],  # (H, W, C)
+    steps: int,
+) -> npt.NDArray[np.uint8]:
+    scaled = values * np.float32(steps)
+    parts = np.rint(scaled)
+    over = parts.sum(axis=2) > steps
+    parts[over] = np.floor(scaled[over])
+    rounded: npt.NDArray[np.uint8] = parts.astype(np.uint8)
+    return rounded
+
+
+def _tidied(
+    labels: npt.NDArray[np.int32],  # (H, W)
+    classes: npt.NDArray[np.int32],  # (C,)
+    mass: npt.NDArray[np.float32],  # (L, C)
+    supervised: npt.NDArray[np.int32] | None,
+    unknown: npt.NDArray[np.bool_] | None,  # (H, W)
+) -> SeenLabels:
+    """Leave out what says nothing, and give a plain mask back as one."""
+    if unknown is not None:
+        labels[unknown] = UNKNOWN
+    says = np.bincount(labels[labels >= 0], minlength=len(mass)) > 0
+    if supervised is None:
+        says &= mass.any(axis=1)
+    mass = mass[says]
+    number = np.append(np.where(says, np.cumsum(says) - 1, UNKNOWN), UNKNOWN).astype(np.int32)
+    labels = number[labels]
+    occurs = mass.any(axis=0)
+    classes, mass = classes[occurs], mass[:, occurs]
+    if supervised is None and (mass.max(axis=1, initial=0) == 1).all():
+        plain = np.append(classes[mass.argmax(axis=1)] if len(mass) else classes[:0], np.int32(UNKNOWN))
+        return SeenLabels(plain[labels])
+    return SeenLabels(labels, Meaning(classes, mass, supervised))
+
+
+def _checked_classes(classes: Sequence[int], count: int, source: str) -> npt.NDArray[np.int32]:
+    ids = np.asarray(classes)
+    if ids.ndim != 1 or ids.dtype.kind not in "iu" or len(ids) != count or count == 0:
+        raise UnknownLabelError(
+            f"{source}: classes are {ids.dtype} of shape {ids.shape}; expected {count} ids, one per map"
+        )
+    if ids.min() < 0 or ids.max() > MAX_LABEL or len(np.unique(ids)) < count:
+        raise UnknownLabelError(
+            f"{source}: classes are {str(ids.tolist())[1:-1][:60]}; expected different ids from 0 to {MAX_LABEL}"
+        )
+    return np.sort(ids).astype(np.int32)
+
+
+def _check_probabilities(probabilities: npt.NDArray[np.generic], source: str) -> None:
+    if probabilities.ndim != 3 or probabilities.dtype.kind != "f" or not len(probabilities):
+        raise MaskFormatError(
+            f"{source}: probabilities are {probabilities.dtype} of shape {probabilities.shape}; "
+            "expected float16 or float32 (K, H, W)"
+        )
+    _check_range(probabilities, f"{source}: probabilities")
+    total = float(probabilities.sum(axis=0, dtype=np.float32).max(initial=0))
+    if total > 1 + TOLERANCE:
+        raise MaskFormatError(
+            f"{source}: probabilities of a pixel sum to {total:.3f}; expected at most 1 (what detectors say "
+            "that do not know of each other goes into one image per class)"
+        )
+
+
+def _check_range(values: npt.NDArray[np.generic], what: str) -> None:
+    if values.dtype.kind == "b" or not values.size:
+        return
+    low, high = float(values.min()), float(values.max())  # NaN if any is.
+    if not (low >= 0 and high <= 1 + TOLERANCE):
+        found = "NaN" if np.isnan(low) else f"from {low:.3g} to {high:.3g}"
+        raise MaskFormatError(f"{what}: values are {found}; expected probabilities from 0 to 1")
+
+
+def _check_unknown(unknown: npt.NDArray[np.generic], shape: tuple[int, ...], source: str) -> None:
+    if unknown.dtype.kind != "b":
+        raise MaskFormatError(f"{source}: unknown is {unknown.dtype}; expected bool, true where nothing is known")
+    if unknown.shape != shape:
+        raise MaskSizeError(f"{source}: unknown has shape {unknown.shape}; expected {shape}, as the probabilities")
+
+
+@nb.njit(nogil=True, cache=True)
+def _group(
+    rows: np.ndarray,  # (P, C) uint8
+) -> tuple[np.ndarray, np.ndarray]:
+    """Give different rows numbers, in the order in which they first occur: (P,), and where each occurs first."""
+    count, size = rows.shape[0], 64
+    while size < 2 * count:
+        size *= 2
+    table, numbers, firsts, n = np.full(size, -1, np.int64), np.empty(count, np.int64), np.empty(count, np.int64), 0
+    for p in range(count):
+        code = np.uint64(14695981039346656037)  # Fowler, Noll and Vo's hash
+        for c in range(rows.shape[1]):
+            code = (code ^ np.uint64(rows[p, c])) * np.uint64(1099511628211)
+        place = np.int64((code ^ (code >> np.uint64(32))) & np.uint64(size - 1))
+        while table[place] >= 0 and not _same(rows[firsts[table[place]]], rows[p]):
+            place = (place + 1) & (size - 1)
+        if table[place] < 0:
+            table[place], firsts[n] = n, p
+            n += 1
+        numbers[p] = table[place]
+    return numbers, firsts[:n].copy()
+
+
+@nb.njit(nogil=True)
+def _same(one: np.ndarray, two: np.ndarray) -> bool:
+    for c in range(one.shape[0]):  # noqa: SIM110 - compiled: there is no generator.
+        if one[c] != two[c]:
+            return False
+    return True
