@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from gsseg_core.atomic import write_atomically
 from gsseg_core.dataset import View
 from gsseg_core.errors import WriteError
 from gsseg_core.operator import ViewOperator, make_operator
 from gsseg_core.pictures import contact_sheet, legend, overlay, palette, save_png
+from gsseg_core.ply import write_vertices
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
@@ -28,6 +30,8 @@ def export_classes(
     folder: str | os.PathLike[str],
 ) -> dict[int, Path]:
     """Write `<id>_<name>.ply` for every class that has Gaussians; valid 3DGS PLYs with all properties kept.
+
+    Two properties are added: `label` (int), the class, and `confidence` (float), that of the segmentation.
 
     The folder is replaced as a whole, at the end: it never mixes two segmentations.
 
@@ -44,10 +48,13 @@ def export_classes(
         work = Path(tempfile.mkdtemp(prefix=".gsseg-", dir=folder.parent))
     except OSError as error:
         raise WriteError(f"{folder}: cannot be written ({error.strerror or error})") from error
+    confidence = segmentation.confidence
     try:
         (work / "new").mkdir()
         for k, name in names.items():
-            scene.subset(segmentation.labels == k).save(work / "new" / name)
+            members = segmentation.labels == k
+            vertices = scene.vertices[members]
+            write_vertices(work / "new" / name, with_confidence(vertices, k, confidence[members]))
         if folder.exists():
             folder.rename(work / "old")
         (work / "new").rename(folder)
@@ -58,6 +65,21 @@ def export_classes(
             (work / "old").rename(folder)
         shutil.rmtree(work, ignore_errors=True)
     return {k: folder / name for k, name in names.items()}
+
+
+def with_confidence(
+    vertices: npt.NDArray[np.void],  # (M,)
+    label: int,
+    confidence: np.ndarray,  # (M,)
+) -> npt.NDArray[np.void]:
+    """Add the properties `label` (int32) and `confidence` (float32) to vertices; earlier ones are replaced."""
+    kept = [name for name in vertices.dtype.names or () if name not in ("label", "confidence")]
+    types = [(name, vertices.dtype[name]) for name in kept]
+    out = np.empty(len(vertices), [*types, ("label", np.int32), ("confidence", np.float32)])
+    for name in kept:
+        out[name] = vertices[name]
+    out["label"], out["confidence"] = label, confidence
+    return out
 
 
 def _check_replaceable(folder: Path) -> None:
@@ -102,11 +124,14 @@ class Drawn(NamedTuple):
         Class of each pixel.
     overlay : (H, W, 3) uint8
         The scene, tinted by class.
+    image : (H, W, 3) uint8
+        The scene in its own colours.
     """
 
     view: View
     labels: np.ndarray
     overlay: np.ndarray
+    image: np.ndarray
 
 
 def draw_views(
@@ -117,18 +142,12 @@ def draw_views(
     for view in views:
         operator = make_operator(scene, view.camera, device)
         labels = segmentation.render(operator).labels
-        yield Drawn(view, labels, overlay(background_image(scene, operator), labels, colors))
+        image = background_image(scene, operator)
+        yield Drawn(view, labels, overlay(image, labels, colors), image)
 
 
-def write_pictures(
-    scene: GaussianScene,
-    segmentation: Segmentation,
-    views: Iterable[View],
-    folder: str | os.PathLike[str],
-    *,
-    device: str = "cpu",
-) -> list[Path]:
-    """Write overlays of some views, a contact sheet of them, and the legend.
+def write_pictures(segmentation: Segmentation, drawn: Iterable[Drawn], folder: str | os.PathLike[str]) -> list[Path]:
+    """Write overlays of some views, as `draw_views` gives them, a contact sheet of them, and the legend.
 
     Returns
     -------
@@ -137,11 +156,11 @@ def write_pictures(
     """
     folder = Path(folder)
     images, captions, paths = [], [], []
-    for view, _, image in draw_views(scene, segmentation, views, device=device):
-        images.append(image)
-        captions.append(view.name)
-        paths.append(folder / f"overlay_{view.name}.png")
-        save_png(paths[-1], image)
+    for one in drawn:
+        images.append(one.overlay)
+        captions.append(one.view.name)
+        paths.append(folder / f"overlay_{one.view.name}.png")
+        save_png(paths[-1], one.overlay)
     paths += write_overview(segmentation, images, captions, folder)
     # Overlays of views that an earlier run drew would show another segmentation.
     for stale in set(folder.glob("overlay_*.png")) - set(paths):

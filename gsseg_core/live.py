@@ -22,6 +22,7 @@ from gsseg_core.errors import (
     StateFileError,
     UnknownLabelError,
 )
+from gsseg_core.held_out import calibrate
 from gsseg_core.masks import BACKGROUND_NAME
 from gsseg_core.neighbours import neighbours_of
 from gsseg_core.pipeline import make_learner
@@ -149,6 +150,11 @@ class LiveSession:
             return {k: self._names.get(k, f"class_{k:02d}") for k in range(self._live.num_classes)}
 
     @property
+    def version(self) -> int:
+        """Number of the codes: another one as soon as anything that `segmentation` goes by has changed."""
+        return self._version
+
+    @property
     def num_views(self) -> int:
         """Views that are kept for `learn`."""
         return len(self._live.views)
@@ -243,7 +249,9 @@ class LiveSession:
             teacher.observe_all(views, progress)
         with watch.stage("learn"):
             teacher.fit(progress)
-        learnt = Learnt(learner, teacher.codes_, len(teacher.views))
+        with watch.stage("calibrate"):
+            temperature = calibrate(teacher, progress=progress).temperature
+        learnt = Learnt(learner, teacher.codes_, len(teacher.views), temperature)
         outcome = Outcome(learnt, len(teacher.history_), teacher.converged_, teacher.loss, dict(teacher.rejected))
         with self._lock:
             if dataset is not None and not self._declared:
@@ -274,6 +282,9 @@ class LiveSession:
     def segmentation(self, settings: RefineSettings | None = None, watch: Stopwatch | None = None) -> Segmentation:
         """Refine the codes as they are now and label every Gaussian; kept until codes or settings change.
 
+        After `learn`, probabilities are calibrated (see `gsseg_core.held_out`). Those of mere votes are shares of the
+        pixels that saw a Gaussian, and so less sure than they might be.
+
         Raises
         ------
         NoCodesError
@@ -282,6 +293,7 @@ class LiveSession:
         settings, watch = settings or RefineSettings(), watch or Stopwatch()
         with self._lock:
             key, kept, names = (self._version, settings), self._kept, self.class_names
+            temperature = 1.0 if self._learnt is None else self._learnt.temperature
         if kept is not None and kept[0] == key:
             return kept[1]
         with watch.stage("codes"):
@@ -291,6 +303,7 @@ class LiveSession:
         if settings.filter:
             with watch.stage("filter"):
                 result = result.filtered(self.scene, settings)
+        result = result.calibrated(temperature)
         self._kept = (key, result)
         return result
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsseg_core.atomic import write_atomically
+from gsseg_core.calibration import tempered
 from gsseg_core.errors import StateFileError
 from gsseg_core.neighbours import neighbours_of
 from gsseg_core.npz_files import open_npz
@@ -35,7 +36,7 @@ class LabelMap(NamedTuple):
     labels : (H, W) int32
         Class of each pixel.
     confidence : (H, W) float32
-        Its blended probability, at most 1.
+        Its probability, at most 1; of a calibrated segmentation, the share of pixels so sure in which it is right.
     """
 
     labels: np.ndarray
@@ -51,7 +52,7 @@ class Segmentation:
     labels : (N,) int32
         Class, or `UNOBSERVED` (-1), or `REMOVED` (-2).
     probabilities : (N, K) float32
-        Rows sum to 1; zeros where unobserved. Removed Gaussians keep theirs.
+        Rows sum to 1; zeros where unobserved. Removed Gaussians keep theirs. Once calibrated, they mean what they say.
     class_names : dict of int to str
         Names by class id.
     scene_digest : str
@@ -59,7 +60,9 @@ class Segmentation:
     clustered : (N,) bool
         Gaussians whose probabilities came from their neighbours.
     learnt : (C, K) float32
-        What these had learnt themselves, in the order of the scene; zeros where unobserved.
+        What these had learnt themselves, in the order of the scene; zeros where unobserved. Not calibrated.
+    temperature : float
+        At which the probabilities are; 1 where they are those that blend, as they were learnt.
     """
 
     labels: np.ndarray
@@ -68,6 +71,7 @@ class Segmentation:
     scene_digest: str
     clustered: np.ndarray
     learnt: np.ndarray
+    temperature: float = 1.0
 
     @classmethod
     def from_codes(
@@ -125,6 +129,15 @@ class Segmentation:
         )
         return replace(self, labels=np.where(removed, np.int32(REMOVED), self.labels))
 
+    def calibrated(self, temperature: float) -> Segmentation:
+        """Bring all probabilities to a temperature, as `gsseg_core.held_out` fits it; labels and pictures stay.
+
+        What blends into a view are always the shares that were learnt; a pixel's probability is what they blend to, at
+        this temperature.
+        """
+        change = temperature / self.temperature
+        return replace(self, probabilities=tempered(self.probabilities, change), temperature=temperature)
+
     def selected(self, classes: Collection[int], min_confidence: float = 0.0) -> Segmentation:
         """Keep the labels of some classes, and there only of Gaussians at least so sure; the others are removed."""
         kept = np.isin(self.labels, list(classes)) & (self.confidence >= min_confidence)
@@ -154,14 +167,22 @@ class Segmentation:
         covers what is behind it. What a ray has left over is background, if any mask ever showed the background; else
         nothing.
         """
+        image = self.blend(operator)
+        return LabelMap(image.argmax(axis=2).astype(np.int32), tempered(image, self.temperature).max(axis=2))
+
+    def blend(self, operator: ViewOperator) -> np.ndarray:
+        """Blend what was learnt into a view, (H, W, K) float32, not calibrated; rows sum to what is known of a pixel.
+
+        `gsseg_core.calibration.tempered` at `temperature` makes probabilities of them.
+        """
         image, left_over = operator.blend(self._blended)
         if self._shows_background:
             image[..., 0] += left_over
-        return LabelMap(image.argmax(axis=2).astype(np.int32), image.max(axis=2))
+        return image
 
     @cached_property
     def _blended(self) -> np.ndarray:
-        codes = self.probabilities.copy()
+        codes = tempered(self.probabilities, 1 / self.temperature).copy()
         codes[self.clustered] = np.where(self.learnt.any(axis=1, keepdims=True), self.learnt, codes[self.clustered])
         return codes
 
@@ -177,7 +198,8 @@ class Segmentation:
         WriteError
             The file cannot be written; an earlier one is unchanged.
         """
-        header = {"format": FORMAT, "scene": self.scene_digest, "class_names": self.class_names}
+        header = {"format": FORMAT, "scene": self.scene_digest, "class_names": self.class_names,
+                  "temperature": self.temperature}  # fmt: skip
         with write_atomically(path, suffix=".npz") as temporary, open(temporary, "wb") as file:
             np.savez_compressed(
                 file,
@@ -204,9 +226,10 @@ class Segmentation:
         path = Path(path)
         with open_npz(path, "a segmentation.npz", FORMAT, scene.digest) as (file, header):
             names = {int(k): str(name) for k, name in header["class_names"].items()}
+            temperature = float(header.get("temperature", 1.0))
             arrays = (file[name] for name in ("labels", "probabilities", "clustered", "learnt"))
             labels, probabilities, clustered, learnt = arrays
-        result = cls(labels, probabilities, names, scene.digest, clustered, learnt)
+        result = cls(labels, probabilities, names, scene.digest, clustered, learnt, temperature)
         if result.labels.shape != (len(scene),) or result.probabilities.shape != (len(scene), len(names)):
             raise StateFileError(f"{path}: arrays of shape {result.probabilities.shape}; expected ({len(scene)}, K)")
         return result

@@ -12,7 +12,7 @@ from PIL import Image
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views
 
 from gsseg_core.errors import WriteError
-from gsseg_core.export import class_file_name, export_classes, write_json, write_pictures
+from gsseg_core.export import class_file_name, draw_views, export_classes, write_json, write_pictures
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
@@ -114,7 +114,7 @@ def test_names_of_classes_become_safe_names_of_files(name: str, file_name: str) 
 
 
 def test_pictures_are_an_overlay_per_view_a_contact_sheet_and_a_legend(tmp_path: Path) -> None:
-    paths = write_pictures(SCENE, RESULT, clean_views(2), tmp_path)
+    paths = write_pictures(RESULT, draw_views(SCENE, RESULT, clean_views(2)), tmp_path)
     assert [path.name for path in paths] == [
         "overlay_view0.png", "overlay_view1.png", "contact_sheet.png", "legend.png",
     ]  # fmt: skip

@@ -97,7 +97,7 @@ def test_learning_gives_what_the_learner_gives_on_the_same_views() -> None:
     assert outcome.num_steps == len(teacher.history_) and outcome.converged
     assert outcome.loss == -teacher.history_[-1] and outcome.learnt.num_views == 8
     assert all(0 <= done <= total for _, done, total, _ in told) and math.isnan(told[0][3])
-    assert told[0][0] == "observe" and told[-1][0] == "em" and told[-1][3] == outcome.loss
+    assert told[0][0] == "observe" and told[-1][0] == "calibrate" and told[-1][3] == outcome.loss
 
 
 def test_after_learning_its_codes_hold_and_votes_speak_for_the_gaussians_that_it_did_not_see() -> None:

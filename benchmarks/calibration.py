@@ -1,0 +1,266 @@
+"""Measure what docs/calibration.md shows, and write it: whether confidences mean what they say, and ways to get there.
+
+Usage: python benchmarks/calibration.py [--data FOLDER] [--out docs/calibration.md]
+
+FOLDER holds `replica_apartment/` (default: the environment variable GSSEG_DATA, else ../shared/data); without it, only
+the demo scene is measured. Plots go to `pictures/` beside the document.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from calibration_text import HEADER, ROADS, SCORES
+from jobs import hard_votes
+from machine import DATA, REPOSITORY
+from plots import Axis, draw_panels
+from results import machine, markdown
+from scipy.optimize import minimize_scalar
+
+from gsseg_core.calibration import (
+    HIGHEST,
+    LOWEST,
+    OUTLIERS,
+    VIEWS,
+    ReliabilityDiagram,
+    Sample,
+    fit_temperature,
+    risk_coverage,
+    sample_pixels,
+    tempered,
+)
+from gsseg_core.dataset import Dataset, View, spread
+from gsseg_core.demo_scene import build_demo
+from gsseg_core.em import EMLearner, EMSettings
+from gsseg_core.held_out import calibrate, votes_without
+from gsseg_core.learner import VOTE_UNIT, Learner
+from gsseg_core.metrics import Evaluation
+from gsseg_core.operator import make_operator
+from gsseg_core.pipeline import make_learner
+from gsseg_core.reliability import OtherViews
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segmentation import Segmentation
+from gsseg_core.warm_up import warm_up
+
+EM, VOTES, HARD, GRADIENT = "em", "votes", "FlashSplat's rule", "gradient"
+CLEAN, WRONG = "true masks", "wrong masks"
+HELD_OUT = 7
+"""One train view in so many is held out where ways are compared."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A scene with the same train views under true and under wrong masks; test views have true ones."""
+
+    name: str
+    scene: GaussianScene
+    class_names: dict[int, str]
+    train: dict[str, list[View]]
+    test: list[View]
+    learners: Sequence[str]
+
+
+@dataclass
+class Taught:
+    """Codes of one learner, and what it takes to calibrate them."""
+
+    codes: np.ndarray
+    samples: list[Sample]
+    temperature: float
+
+
+def main() -> int:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", default=DATA, type=Path, help="folder that holds replica_apartment/")
+    parser.add_argument("--out", default=REPOSITORY / "docs/calibration.md", type=Path, help="document to write")
+    options = parser.parse_args()
+    warm_up()
+    with tempfile.TemporaryDirectory() as folder:
+        benches = list(open_benches(Path(folder), options.data / "replica_apartment"))
+        roads = [row for bench in benches for row in compare_roads(bench)]
+        scores = measure_test(benches, options.out.parent / "pictures")
+    header = HEADER.format(machine=machine())
+    ways = ["scene", "learner", "accuracy", "as blended", "at the masks' word", "through confusion", "best possible"]
+    names = [
+        "scene", "learner", "mIoU", "labels changed", "temperature", "ECE as blended", "ECE", "AURC as blended", "AURC",
+        "ECE of Gaussians as learnt", "ECE of Gaussians",
+    ]  # fmt: skip
+    text = [header, SCORES.format(table=markdown(names, scores)), ROADS.format(table=markdown(ways, roads))]
+    options.out.write_text("\n".join(text), encoding="utf-8")
+    print(options.out)
+    return 0
+
+
+def open_benches(folder: Path, real: Path) -> Iterator[Bench]:
+    """Build the demo scene in a folder; open the real one, if it is there."""
+    demo = build_demo(folder)
+    true, wrong = Dataset(folder, "labels_true"), Dataset(folder)
+    train = {CLEAN: true.views("train"), WRONG: wrong.views("train")}
+    yield Bench("demo", demo.scene, true.class_names, train, true.views("test"), (EM, VOTES, HARD, GRADIENT))
+    if not real.is_dir():
+        print(f"{real}: not there; measuring the demo scene only")
+        return
+    true, wrong = Dataset(real), Dataset(real, "labels_noisy")
+    train = {CLEAN: true.views("train"), WRONG: wrong.views("train")}
+    scene = GaussianScene.load(real / "scene.ply")
+    yield Bench("apartment", scene, true.class_names, train, true.views("test"), (EM, VOTES, HARD))
+
+
+def taught(bench: Bench, name: str, views: Sequence[View]) -> Taught:
+    """Learn from views, and predict some of their masks from the others."""
+    learner = make_learner(VOTES if name == HARD else name, bench.scene, max(bench.class_names) + 1)
+    learner.observe_all(views)
+    learner.fit()
+    if name == GRADIENT:
+        return Taught(learner.codes_, [], calibrate(learner).temperature)
+    chosen = spread(list(learner.views.values()), VIEWS)
+    samples = list(_held_out(learner, name, chosen))
+    codes = hard_votes(learner.codes_, 0.0) if name == HARD else learner.codes_
+    return Taught(codes, samples, fit_temperature(samples))
+
+
+def _held_out(learner: Learner, name: str, views: Sequence[View]) -> Iterator[Sample]:
+    others = OtherViews(learner) if isinstance(learner, EMLearner) else None
+    for view in views:
+        if others is not None:
+            yield others.sample(view)
+            continue
+        codes = votes_without(learner, view.name)
+        codes = hard_votes(codes, 0.0) if name == HARD else codes
+        image, left_over = make_operator(learner.scene, view.camera).blend(codes)
+        image[..., 0] += left_over * bool(codes[:, 0].any())
+        yield sample_pixels(image, view.read_labels())
+
+
+def compare_roads(bench: Bench) -> Iterator[list[str]]:
+    """Compare ways to choose the temperature, on train views that were held out, against their true masks."""
+    held = [view for i, view in enumerate(bench.train[CLEAN]) if i % HELD_OUT == HELD_OUT // 2]
+    names = {view.name for view in held}
+    for masks, views in bench.train.items():
+        for name in (EM, VOTES, HARD):
+            learnt = taught(bench, name, [view for view in views if view.name not in names])
+            result = Segmentation.from_codes(bench.scene, learnt.codes, bench.class_names)
+            images = [result.blend(make_operator(bench.scene, view.camera)) for view in held]
+            truth = [view.read_labels() for view in held]
+            known = [sample_pixels(image, labels) for image, labels in zip(images, truth, strict=True)]
+            temperatures = [1.0, at_their_word(learnt.samples), learnt.temperature, at_their_word(known)]
+            scored = [diagram(images, truth, temperature) for temperature in temperatures]
+            right = np.mean([(image.argmax(axis=2) == y).mean() for image, y in zip(images, truth, strict=True)])
+            cells = [f"{d.ece:.4f} (T = {t:.2f})" for d, t in zip(scored, temperatures, strict=True)]
+            yield [f"{bench.name}, {masks}", name, f"{right:.4f}", *cells]
+            print(f"{bench.name}, {masks}, {name}: {cells}", flush=True)
+
+
+def at_their_word(samples: Sequence[Sample]) -> float:
+    """Fit the temperature as if every label were the true class."""
+
+    def loss(log_temperature: float) -> float:
+        total = 0.0
+        for shares, seen in samples:
+            told = tempered(shares, float(np.exp(log_temperature)))[np.arange(len(seen)), seen]
+            total -= float(np.log((1 - OUTLIERS) * told + OUTLIERS / shares.shape[1]).sum())
+        return total
+
+    return float(np.exp(minimize_scalar(loss, bounds=np.log([LOWEST, HIGHEST]), method="bounded").x))
+
+
+def diagram(images: Sequence[np.ndarray], truth: Sequence[np.ndarray], temperature: float) -> ReliabilityDiagram:
+    """Hold confidences at a temperature against the truth, over all pixels of all views."""
+    out = ReliabilityDiagram()
+    for image, labels in zip(images, truth, strict=True):
+        known = labels >= 0
+        confidence = tempered(image, temperature).max(axis=2)
+        out.add(confidence[known], (image.argmax(axis=2) == labels)[known])
+    return out
+
+
+def measure_test(benches: Sequence[Bench], pictures: Path) -> list[list[str]]:
+    """Learn from all train views and score on the test views; draw reliability diagrams and risk-coverage curves."""
+    rows = []
+    reliability: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    risks: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for bench in benches:
+        true_codes, seen = best_truth(bench)
+        for masks, views in bench.train.items():
+            title = f"{bench.name}, {masks}"
+            reliability[title], risks[title] = {"perfect": [(0.0, 0.0), (1.0, 1.0)]}, {}
+            for name in bench.learners:
+                learnt = taught(bench, name, views)
+                raw = Segmentation.from_codes(bench.scene, learnt.codes, bench.class_names)
+                result = raw.calibrated(learnt.temperature)
+                row, (before, after), curve = score_test(bench, raw, result)
+                gaussians = [gaussian_ece(one, true_codes, seen) for one in (raw, result)]
+                rows.append([title, name, *row, *(f"{value:.4f}" for value in gaussians)])
+                print(rows[-1], flush=True)
+                if name in (EM, VOTES):
+                    reliability[title] |= {f"{name} as blended": points(before), name: points(after)}
+                risks[title][name] = curve
+    unit = Axis("confidence", 0, 1, 0.25)
+    draw_panels(pictures / "calibration.svg", reliability, unit, Axis("share right", 0, 1, 0.25), columns=2)
+    coverage = Axis("coverage", 0, 1, 0.25)
+    draw_panels(pictures / "risk_coverage.svg", risks, coverage, Axis("share wrong", 0, 0.08, 0.02), columns=2)
+    return rows
+
+
+def score_test(
+    bench: Bench, raw: Segmentation, result: Segmentation
+) -> tuple[list[str], tuple[ReliabilityDiagram, ReliabilityDiagram], list[tuple[float, float]]]:
+    """Score rendered test views before and after calibration."""
+    evaluation, changed = Evaluation(), 0
+    diagrams = ReliabilityDiagram(), ReliabilityDiagram()
+    sure: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
+    right: list[np.ndarray] = []
+    for view in bench.test:
+        operator, truth = make_operator(bench.scene, view.camera), view.read_labels()
+        maps = raw.render(operator), result.render(operator)
+        evaluation.add(truth, maps[1].labels, view.name)
+        changed += int((maps[0].labels != maps[1].labels).sum())
+        known = truth >= 0
+        right.append((maps[1].labels == truth)[known])
+        for one, total, kept in zip(maps, diagrams, sure, strict=True):
+            total.add(one.confidence[known], right[-1])
+            kept.append(one.confidence[known])
+    curves = [risk_coverage(np.concatenate(one), np.concatenate(right)) for one in sure]
+    row = [
+        f"{evaluation.mean_iou:.4f}", str(changed), f"{result.temperature:.2f}",
+        *(f"{one.ece:.4f}" for one in diagrams), *(f"{curve.area:.5f}" for curve in curves),
+    ]  # fmt: skip
+    places = np.linspace(0, len(curves[1].risk) - 1, 101).astype(int)[1:]
+    return row, diagrams, [(float(curves[1].coverage[i]), float(curves[1].risk[i])) for i in places]
+
+
+def points(diagram: ReliabilityDiagram) -> list[tuple[float, float]]:
+    """List the bins of a diagram that hold one prediction in ten thousand or more."""
+    filled = diagram.shares > 1e-4
+    return list(zip(diagram.confidence[filled].tolist(), diagram.accuracy[filled].tolist(), strict=True))
+
+
+def best_truth(bench: Bench) -> tuple[np.ndarray, np.ndarray]:
+    """Learn codes (N, K) from the true masks of all views, test views too; and how many px see each Gaussian."""
+    learner = EMLearner(bench.scene, max(bench.class_names) + 1, EMSettings(errors=False))
+    learner.observe_all([*bench.train[CLEAN], *bench.test])
+    return learner.fit().codes_, learner._votes.sum(axis=1) * VOTE_UNIT
+
+
+def gaussian_ece(result: Segmentation, true_codes: np.ndarray, seen: np.ndarray) -> float:
+    """ECE of the confidence of Gaussians, each weighted by the pixels that see it.
+
+    A Gaussian is right if its most probable class is the strongest one of the codes from the true masks of all views.
+    Those that no view saw have no truth and are left out, as are those of which the result says nothing.
+    """
+    known = true_codes.any(axis=1) & result.probabilities.any(axis=1)
+    right = result.probabilities.argmax(axis=1) == true_codes.argmax(axis=1)
+    out = ReliabilityDiagram()
+    out.add(result.confidence[known], right[known], seen[known])
+    return out.ece
+
+
+if __name__ == "__main__":
+    sys.exit(main())

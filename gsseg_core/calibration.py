@@ -1,0 +1,251 @@
+"""Probabilities that mean what they say: how far they are from that, and the temperature that brings them there.
+
+What a view blends is a share, not a probability. A pixel at an edge that is made to 0.7 of Gaussians of one object
+belongs to it far more often than in seven cases of ten; and the pixels of one view are no independent witnesses: a
+Gaussian of which 0.7 of all pixels say the same has most views on its side, and each view counts about once. Both are
+mended by one number. With the temperature T, shares O[k] become
+
+    P[k] = O[k]^(1/T) / sum_j O[j]^(1/T)
+
+(temperature scaling of log O; Guo et al., On Calibration of Modern Neural Networks, ICML 2017). Their order stays, and
+so do all labels. The temperature is fitted to masks that the codes have not learnt from (`gsseg_core.held_out`).
+A mask may be wrong, while what is wanted is the probability of the true class, so what is maximised is the likelihood
+
+    sum_v sum_p log sum_k P_v[p, k] C_v[k, y_p]
+
+with a confusion matrix per view, C_v[true, seen], learnt at every temperature that is tried, in `STEPS` steps of
+expectation-maximisation, with a prior of `RIGHT` times the pixels of each class in which the segmenter was right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+BINS = 15
+"""Bins of equal width over the confidence, for `ReliabilityDiagram`."""
+
+LOWEST, HIGHEST = 0.2, 5.0
+"""Temperatures that are tried."""
+
+VIEWS = 16
+"""Views whose masks the temperature is fitted to, at most."""
+
+PIXELS = 2048
+"""Pixels of each view that the temperature is fitted to, on a grid, at most about."""
+
+STEPS = 5
+RIGHT = 0.3
+OUTLIERS = 1e-3
+"""Share of pixels that carry any label of the view by chance."""
+
+_PRECISION = 0.02  # of the logarithm of the temperature
+_TINY = 1e-12
+
+
+def tempered(
+    shares: np.ndarray,  # (..., K)
+    temperature: float,
+) -> np.ndarray:
+    """Raise shares to the power of 1 / temperature, and scale each row back to its sum.
+
+    Below 1 the largest gains, above 1 the others do. The order in a row stays, zeros stay zeros. At 1 the very same
+    array is returned. Going to a temperature and then to its reciprocal leads back, up to rounding and to entries that
+    are too small for the type.
+
+    Parameters
+    ----------
+    shares : array (..., K) of float32
+        Not negative.
+    temperature : float
+        Above 0.
+
+    Returns
+    -------
+    ndarray (..., K) float32
+    """
+    if temperature == 1:
+        return shares
+    peak = shares.max(axis=-1, keepdims=True, initial=0)
+    powers: np.ndarray = np.divide(shares, peak, out=np.zeros(shares.shape, np.float32), where=shares > 0)
+    np.power(powers, np.float32(1 / temperature), out=powers, where=powers > 0)
+    total = powers.sum(axis=-1, keepdims=True)
+    known = shares.sum(axis=-1, keepdims=True)
+    powers *= np.divide(known, total, out=np.zeros_like(total), where=total > 0)
+    np.minimum(powers, known, out=powers)  # rounding may take the only class of a row above the whole
+    return powers
+
+
+class Sample(NamedTuple):
+    """Pixels of one view: what was predicted without it, and what its mask shows.
+
+    Attributes
+    ----------
+    shares : (P, C) float32
+        What is predicted of the C classes that occur in the prediction or in the mask; rows sum to 1.
+    seen : (P,) int64
+        Label of each pixel, as its column in `shares`, ascending.
+    """
+
+    shares: np.ndarray
+    seen: np.ndarray
+
+
+def sample_pixels(
+    image: np.ndarray,  # (H, W, K) blended codes that have not seen the mask
+    labels: np.ndarray,  # (H, W) int32, negative = unknown
+) -> Sample:
+    """Take the pixels of a view that the temperature is fitted to: a grid, where label and prediction are known."""
+    height, width = labels.shape
+    step = max(1, int(np.ceil(np.sqrt(height * width / PIXELS))))
+    while -(-height // step) * -(-width // step) > PIXELS:
+        step += 1
+    start = min(step, height, width) // 2
+    grid = np.s_[start::step, start::step]
+    shares, seen = image[grid].reshape(-1, image.shape[2]), labels[grid].ravel()
+    total = shares.sum(axis=1)
+    known = np.flatnonzero((seen >= 0) & (total > 0.5))
+    known = known[np.argsort(seen[known], kind="stable")]
+    shares, seen = shares[known] / total[known, None], seen[known]
+    occurs = shares.max(axis=0, initial=0) > 1e-6
+    occurs[seen] = True
+    columns = np.flatnonzero(occurs)
+    return Sample(np.ascontiguousarray(shares[:, columns]), np.searchsorted(columns, seen))
+
+
+def fit_temperature(samples: Sequence[Sample]) -> float:
+    """Find the temperature at which held-out masks are likeliest, each seen through a confusion matrix of its own.
+
+    Returns
+    -------
+    float
+        In [`LOWEST`, `HIGHEST`]; 1 where there is no pixel to go by.
+    """
+    samples = [sample for sample in samples if len(sample.seen)]
+    if not samples:
+        return 1.0
+
+    def loss(log_temperature: float) -> float:
+        temperature = float(np.exp(log_temperature))
+        return -sum(log_likelihood(sample, temperature) for sample in samples)
+
+    bounds = float(np.log(LOWEST)), float(np.log(HIGHEST))
+    found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": _PRECISION})
+    return float(np.exp(found.x))
+
+
+def log_likelihood(sample: Sample, temperature: float) -> float:
+    """Natural logarithm of the likelihood of a view's labels at a temperature, through its best confusion matrix."""
+    probabilities = tempered(sample.shares, temperature)
+    # Labels are ascending: pixels of one label are a block.
+    present, first, column = np.unique(sample.seen, return_index=True, return_inverse=True)
+    diagonal = present, np.arange(len(present))
+    right = RIGHT * probabilities.sum(axis=0)[present]
+    confusion = np.full((probabilities.shape[1], len(present)), (1 - RIGHT) / len(present))
+    confusion[diagonal] += RIGHT
+    confusion /= confusion.sum(axis=1, keepdims=True)
+    for step in range(STEPS):
+        by_pixel = ((1 - OUTLIERS) * confusion.T)[column] * probabilities  # (P, C): this class, meant by this label
+        told = np.maximum(by_pixel.sum(axis=1) + OUTLIERS / len(present), _TINY)
+        if step < STEPS - 1:
+            counts = np.add.reduceat(by_pixel / told[:, None], first, axis=0).T
+            counts[diagonal] += right
+            total = counts.sum(axis=1, keepdims=True)
+            np.divide(counts, total, out=confusion, where=total > 0)
+    return float(np.log(told).sum())
+
+
+class ReliabilityDiagram:
+    """How often predictions are right, by how sure they are, accumulated over views.
+
+    Confidences from 0 to 1 fall into `BINS` bins of equal width; 1 falls into the last one.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> diagram = ReliabilityDiagram()
+    >>> diagram.add(np.full(10, 0.9), np.arange(10) < 8)
+    >>> round(diagram.ece, 6)
+    0.1
+    """
+
+    def __init__(self) -> None:
+        self._sums = np.zeros((3, BINS))  # weight, weighted confidence, weighted hits
+
+    def add(
+        self,
+        confidence: np.ndarray,  # any shape, in [0, 1]
+        right: np.ndarray,  # same shape; bool, or the probability of being right
+        weights: np.ndarray | None = None,  # same shape
+    ) -> None:
+        """Add predictions, each with the weight 1 unless said otherwise."""
+        sure, hits = np.ravel(confidence).astype(np.float64), np.ravel(right).astype(np.float64)
+        weight = np.ones_like(sure) if weights is None else np.ravel(weights).astype(np.float64)
+        bins = np.clip((sure * BINS).astype(np.int64), 0, BINS - 1)
+        for total, values in zip(self._sums, (weight, weight * sure, weight * hits), strict=True):
+            total += np.bincount(bins, values, BINS)
+
+    @property
+    def shares(self) -> np.ndarray:
+        """Share of all predictions in each bin, (BINS,) float64."""
+        shares: np.ndarray = self._sums[0] / max(self._sums[0].sum(), _TINY)
+        return shares
+
+    @property
+    def confidence(self) -> np.ndarray:
+        """Mean confidence in each bin, (BINS,) float64; NaN where it is empty."""
+        return self._mean(self._sums[1])
+
+    @property
+    def accuracy(self) -> np.ndarray:
+        """Share of right predictions in each bin, (BINS,) float64; NaN where it is empty."""
+        return self._mean(self._sums[2])
+
+    @property
+    def ece(self) -> float:
+        """Expected calibration error: sum over the bins of their share times |accuracy - confidence|.
+
+        Naeini et al., AAAI 2015; NaN before the first prediction.
+        """
+        total = self._sums[0].sum()
+        return float(np.abs(self._sums[1] - self._sums[2]).sum() / total) if total > 0 else float("nan")
+
+    def _mean(self, sums: np.ndarray) -> np.ndarray:
+        filled = self._sums[0] > 0
+        mean: np.ndarray = np.divide(sums, self._sums[0], out=np.full(BINS, np.nan), where=filled)
+        return mean
+
+
+class RiskCoverage(NamedTuple):
+    """What is lost by answering only where one is sure.
+
+    Attributes
+    ----------
+    coverage : (P,) float64
+        Share of the predictions that are kept, the surest first: 1/P to 1.
+    risk : (P,) float64
+        Share of these that are wrong.
+    """
+
+    coverage: np.ndarray
+    risk: np.ndarray
+
+    @property
+    def area(self) -> float:
+        """Area under the curve (AURC; Geifman and El-Yaniv, 2017): the mean risk over all coverages."""
+        return float(self.risk.mean())
+
+
+def risk_coverage(
+    confidence: np.ndarray,  # (P,)
+    right: np.ndarray,  # (P,) bool
+) -> RiskCoverage:
+    """Leave out predictions, the least sure first. Those that are equally sure count as the mean of them."""
+    order = np.argsort(-confidence, kind="stable")
+    _, group, size = np.unique(-confidence[order], return_inverse=True, return_counts=True)
+    wrong = (np.bincount(group, ~right[order].astype(bool)) / size)[group]
+    kept = np.arange(1, len(order) + 1)
+    return RiskCoverage(kept / len(order), np.cumsum(wrong) / kept)

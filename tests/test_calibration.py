@@ -1,0 +1,275 @@
+"""Confidences: the measure of how far they are off, the temperature that mends them, and that files carry them."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, ring, taught, write_dataset, wrong_views
+
+from gsseg_core.calibration import (
+    PIXELS,
+    ReliabilityDiagram,
+    Sample,
+    fit_temperature,
+    risk_coverage,
+    sample_pixels,
+    tempered,
+)
+from gsseg_core.em import EMLearner
+from gsseg_core.export import export_classes
+from gsseg_core.held_out import calibrate, votes_without
+from gsseg_core.learner import Learner
+from gsseg_core.live import LiveSession
+from gsseg_core.masks import UNKNOWN
+from gsseg_core.operator import make_operator
+from gsseg_core.pipeline import segment
+from gsseg_core.reliability import OtherViews
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segmentation import Segmentation
+from gsseg_core.votes import VoteLearner
+
+SCENE, _ = balls_on_a_table()
+VIEWS = wrong_views(10)
+
+
+def draw(probabilities: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """One class per row, with these probabilities."""
+    below = rng.random((len(probabilities), 1)) > np.cumsum(probabilities, axis=1)
+    return np.minimum(below.sum(axis=1), probabilities.shape[1] - 1)
+
+
+def as_sample(shares: np.ndarray, seen: np.ndarray) -> Sample:
+    order = np.argsort(seen, kind="stable")
+    return Sample(shares[order].astype(np.float32), seen[order])
+
+
+# The measure
+
+
+def test_ece_of_predictions_that_are_right_as_often_as_they_say_tends_to_zero() -> None:
+    rng = np.random.default_rng(0)
+    errors = []
+    for count in (1_000, 100_000):
+        sure, diagram = rng.uniform(size=count), ReliabilityDiagram()
+        diagram.add(sure, rng.random(count) < sure)
+        errors.append(diagram.ece)
+    assert errors[1] < 0.006 < errors[0]
+
+
+def test_ece_of_predictions_that_are_too_sure_is_the_gap() -> None:
+    rng = np.random.default_rng(0)
+    sure, diagram = rng.uniform(0.5, 1.0, 100_000), ReliabilityDiagram()
+    diagram.add(sure, rng.random(100_000) < sure - 0.25)
+    assert diagram.ece == pytest.approx(0.25, abs=0.005)
+
+
+def test_bins_of_a_diagram_hold_shares_means_and_hits_and_views_add_up() -> None:
+    diagram = ReliabilityDiagram()
+    diagram.add(np.array([[0.9, 1.0], [0.02, 0.04]]), np.array([[True, False], [False, True]]))
+    diagram.add(np.array([1.0]), np.array([0.5]), np.array([2.0]))
+    assert diagram.shares[[0, 13, 14]] == pytest.approx([2 / 6, 1 / 6, 3 / 6]) and diagram.shares.sum() == 1
+    assert diagram.confidence[[0, 13, 14]] == pytest.approx([0.03, 0.9, 1.0])
+    assert diagram.accuracy[[0, 13, 14]] == pytest.approx([0.5, 1.0, 1 / 3])
+    assert np.isnan(diagram.accuracy[5]) and np.isnan(ReliabilityDiagram().ece)
+    assert diagram.ece == pytest.approx((2 * 0.47 + 0.1 + 3 * (1 - 1 / 3)) / 6)
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(1, 200), st.integers(0, 2**32 - 1))
+def test_order_of_predictions_does_not_matter(count: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    sure, right, order = rng.integers(0, 9, count) / 8, rng.random(count) < 0.7, rng.permutation(count)
+    one, two = ReliabilityDiagram(), ReliabilityDiagram()
+    one.add(sure, right)
+    two.add(sure[order], right[order])
+    assert one.ece == pytest.approx(two.ece)
+    np.testing.assert_allclose(risk_coverage(sure, right).risk, risk_coverage(sure[order], right[order]).risk)
+
+
+def test_risk_grows_with_coverage_from_the_surest_on_and_ties_count_as_their_mean() -> None:
+    curve = risk_coverage(np.array([0.2, 0.9, 0.5, 0.5]), np.array([False, True, True, False]))
+    assert curve.coverage.tolist() == [0.25, 0.5, 0.75, 1.0]
+    assert curve.risk == pytest.approx([0, 0.25, 1 / 3, 0.5])
+    assert curve.area == pytest.approx(np.mean([0, 0.25, 1 / 3, 0.5]))
+
+
+# The temperature
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.integers(1, 8), st.integers(1, 5), st.floats(0.2, 5), st.integers(0, 2**32 - 1))
+def test_tempering_keeps_order_sums_and_zeros_and_can_be_undone(n: int, k: int, temperature: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    shares = (rng.integers(0, 9, (n, k)) / 8).astype(np.float32)
+    out = tempered(shares, temperature)
+    assert out.dtype == np.float32
+    np.testing.assert_allclose(out.sum(axis=1), shares.sum(axis=1), rtol=1e-5)
+    np.testing.assert_array_equal(out == 0, shares == 0)
+    np.testing.assert_array_equal(out.argmax(axis=1), shares.argmax(axis=1))
+    np.testing.assert_allclose(tempered(out, 1 / temperature), shares, rtol=1e-3, atol=1e-6)
+    order = rng.permutation(k)
+    np.testing.assert_allclose(tempered(shares[:, order], temperature), out[:, order], rtol=1e-5)
+
+
+@pytest.mark.parametrize("true", [0.4, 1.0, 2.5])
+def test_temperature_of_known_predictions_is_found_whether_masks_are_right_or_wrong(true: float) -> None:
+    rng = np.random.default_rng(0)
+    samples, spoilt = [], []
+    for _ in range(8):
+        right = rng.dirichlet(np.full(4, 0.3), 2_000).astype(np.float32)
+        shares, classes = tempered(right, 1 / true), draw(right, rng)
+        samples.append(as_sample(shares, classes))
+        # Half of the pixels of one class are called by another one's label.
+        seen = np.where((classes == 2) & (rng.random(len(classes)) < 0.5), 1, classes)
+        spoilt.append(as_sample(shares, seen))
+    assert fit_temperature(samples) == pytest.approx(true, rel=0.1)
+    assert fit_temperature(spoilt) == pytest.approx(true, rel=0.15)
+
+
+def test_names_of_the_classes_and_order_of_the_views_do_not_matter_to_the_temperature() -> None:
+    rng = np.random.default_rng(1)
+    right = rng.dirichlet(np.full(4, 0.3), (3, 500)).astype(np.float32)
+    seen = [draw(one, rng) for one in right]
+    place = np.array([2, 0, 3, 1])  # class k becomes place[k]
+    samples = [as_sample(one, labels) for one, labels in zip(right, seen, strict=True)]
+    renamed = [as_sample(one[:, np.argsort(place)], place[labels]) for one, labels in zip(right, seen, strict=True)]
+    assert fit_temperature(renamed[::-1]) == pytest.approx(fit_temperature(samples), rel=1e-3)
+
+
+def test_nothing_to_go_by_leaves_probabilities_as_they_are() -> None:
+    image, unknown = np.full((8, 8, 2), 0.5, np.float32), np.full((8, 8), UNKNOWN, np.int32)
+    assert fit_temperature([]) == 1 and fit_temperature([sample_pixels(image, unknown)]) == 1
+
+
+@pytest.mark.parametrize("shape", [(5, 7), (300, 400), (1, 100_000), (3_000, 10)])
+def test_pixels_are_sampled_evenly_and_not_too_many(shape: tuple[int, int]) -> None:
+    labels = np.arange(np.prod(shape), dtype=np.int32).reshape(shape) % 3
+    labels[0, 0] = UNKNOWN
+    image = np.eye(5, dtype=np.float32)[labels]
+    image[labels < 0] = 0
+    sample = sample_pixels(image, labels)
+    assert min(np.prod(shape) - 1, PIXELS / 16) <= len(sample.seen) <= PIXELS
+    assert sample.shares.shape[1] == 3 and (sample.shares.argmax(axis=1) == sample.seen).all()
+    assert (np.diff(sample.seen) >= 0).all()
+
+
+# Learners
+
+
+@cache
+def fitted(kind: type[Learner]) -> Learner:
+    return taught(kind(SCENE, NUM_CLASSES), VIEWS).fit()
+
+
+def test_votes_without_a_view_are_those_of_a_learner_that_never_saw_it() -> None:
+    learner = fitted(VoteLearner)
+    before = learner._votes.copy()
+    others = taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS[1:]).fit()
+    np.testing.assert_array_equal(votes_without(learner, VIEWS[0].name), others.codes_)
+    np.testing.assert_array_equal(learner._votes, before)
+
+
+@pytest.mark.parametrize("kind", [EMLearner, VoteLearner])
+def test_calibration_changes_nothing_of_the_learner_and_is_the_same_every_time(kind: type[Learner]) -> None:
+    learner = fitted(kind)
+    codes = learner.codes_.copy()
+    found = calibrate(learner)
+    assert found == calibrate(learner) and found.held_out
+    assert found.views == len(VIEWS) and found.pixels == sum((v.read_labels()[:, ::2] >= 0).sum() for v in VIEWS) // 2
+    np.testing.assert_array_equal(learner.codes_, codes)
+
+
+def test_wrong_masks_make_votes_less_sure_than_they_are_right() -> None:
+    assert calibrate(fitted(VoteLearner)).temperature < 0.8
+
+
+def test_checked_views_are_not_rendered_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    learner = fitted(EMLearner)
+    assert isinstance(learner, EMLearner)
+    others = OtherViews(learner)
+    others.check_all()
+    monkeypatch.setattr(OtherViews, "blend", None)
+    found = calibrate(learner, others)
+    monkeypatch.undo()
+    assert found == calibrate(learner)
+
+
+# What carries it
+
+
+def segmentation() -> Segmentation:
+    return Segmentation.from_codes(SCENE, fitted(VoteLearner).codes_, NAMES)
+
+
+def test_calibration_keeps_labels_and_pictures_and_changes_confidences() -> None:
+    raw = segmentation()
+    result = raw.calibrated(0.5)
+    np.testing.assert_array_equal(result.labels, raw.labels)
+    np.testing.assert_allclose(result.probabilities, tempered(raw.probabilities, 0.5))
+    assert (result.confidence >= raw.confidence - 1e-6).all() and result.confidence.sum() > raw.confidence.sum() + 1
+    for camera in ring(2):
+        operator = make_operator(SCENE, camera)
+        one, two = raw.render(operator), result.render(operator)
+        np.testing.assert_array_equal(one.labels, two.labels)
+        np.testing.assert_allclose(tempered(raw.blend(operator), 0.5).max(axis=2), two.confidence, atol=1e-5)
+    assert raw.calibrated(1.0).probabilities is raw.probabilities
+    np.testing.assert_allclose(result.calibrated(1.0).probabilities, raw.probabilities, atol=1e-6)
+
+
+def test_a_calibrated_segmentation_comes_back_exactly(tmp_path: Path) -> None:
+    result = segmentation().calibrated(0.4)
+    result.save(tmp_path / "segmentation.npz")
+    again = Segmentation.load(tmp_path / "segmentation.npz", SCENE)
+    assert again.temperature == 0.4
+    operator = make_operator(SCENE, ring(1)[0])
+    np.testing.assert_array_equal(again.probabilities, result.probabilities)
+    np.testing.assert_array_equal(again.render(operator).confidence, result.render(operator).confidence)
+    np.testing.assert_array_equal(np.load(tmp_path / "segmentation.npz")["confidence"], result.confidence)
+
+
+def test_plys_carry_label_and_confidence_of_the_segmentation_and_of_it_alone(tmp_path: Path) -> None:
+    result = segmentation().calibrated(0.5)
+    paths = export_classes(SCENE, result, tmp_path / "classes")
+    assert len(paths) == NUM_CLASSES
+    for k, path in paths.items():
+        scene = GaussianScene.load(path)
+        members = result.labels == k
+        assert (scene.vertices["label"] == k).all() and scene.vertices["label"].dtype == np.int32
+        np.testing.assert_array_equal(scene.vertices["confidence"], result.confidence[members])
+        np.testing.assert_array_equal(scene.means, SCENE.means[members])
+        # What was exported before, segmented once more, has the new figures and not both.
+        codes = np.eye(2, dtype=np.float32)[np.ones(len(scene), int)] * np.float32(0.5) + np.float32(0.25)
+        again = Segmentation.from_codes(scene, codes, {})
+        (new,) = export_classes(scene, again, tmp_path / f"again{k}").values()
+        vertices = GaussianScene.load(new).vertices
+        assert set(vertices["label"]) == {1} and set(vertices["confidence"]) == {np.float32(0.75)}
+        assert len(vertices.dtype) == len(scene.vertices.dtype)
+
+
+def test_the_report_says_how_the_files_of_the_command_were_calibrated(tmp_path: Path) -> None:
+    data, out = write_dataset(tmp_path / "data"), tmp_path / "out"
+    found = segment(data / "scene.ply", data, out, learner="votes")["calibration"]
+    assert found == json.loads((out / "report.json").read_text())["calibration"]
+    assert found["views"] == 4 and found["pixels"] > 0 and found["held_out"]
+    result = Segmentation.load(out / "segmentation.npz", GaussianScene.load(data / "scene.ply"))
+    assert result.temperature == pytest.approx(found["temperature"], abs=1e-4) and result.temperature != 1
+
+
+def test_a_live_session_is_calibrated_by_what_it_learns_and_keeps_that(tmp_path: Path) -> None:
+    session = LiveSession(SCENE, NAMES)
+    for view in VIEWS:
+        assert session.fuse(view) is None
+    assert session.segmentation().temperature == 1
+    learnt = session.learn("votes").learnt
+    result = session.segmentation()
+    assert result.temperature == learnt.temperature == calibrate(fitted(VoteLearner)).temperature
+    session.save(tmp_path / "state.npz")
+    again = LiveSession(SCENE, NAMES)
+    again.load(tmp_path / "state.npz")
+    np.testing.assert_array_equal(again.segmentation().confidence, result.confidence)
