@@ -25,6 +25,10 @@ class RefineSettings:
         above the mean of its class.
     cluster, filter : bool
         Whether to take each of the two steps.
+    carve : bool
+        Whether to cut objects to their silhouettes (`gsseg_core.carve`), in place of the filter; for whoever has views.
+    carve_views : int
+        From how many views, 1 or more, spread evenly over the train views.
 
     Raises
     ------
@@ -37,6 +41,8 @@ class RefineSettings:
     filter_sigmas: float = 1.0
     cluster: bool = True
     filter: bool = True
+    carve: bool = False
+    carve_views: int = 24
 
     def __post_init__(self) -> None:
         """Validate."""
@@ -46,3 +52,9 @@ class RefineSettings:
             raise SettingsError(f"refinement: found beta = {self.beta}; expected a probability from 0 to 1")
         if not 0 <= self.filter_sigmas < float("inf"):
             raise SettingsError(f"refinement: found filter_sigmas = {self.filter_sigmas}; expected 0 or more, finite")
+        if self.carve_views != int(self.carve_views) or self.carve_views < 1:
+            raise SettingsError(
+                f"refinement: found carve_views = {self.carve_views}; expected a whole number from 1 up"
+            )
+        if self.carve and self.filter:
+            raise SettingsError("refinement: found both carve and filter; expected one of them")

@@ -1,0 +1,47 @@
+"""The command `gsseg remove`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+HELP = "write the scene without some of its objects"
+DESCRIPTION = """
+Writes a valid 3DGS PLY of all Gaussians but those of the given classes. What an object hid, no camera has seen: where
+it stood there may be holes, and nothing is made up to fill them.
+"""
+EXAMPLES = """
+  gsseg remove scene.ply --segmentation out/segmentation.npz --class chair \\
+               --out without_chair.ply
+  gsseg remove scene.ply --segmentation out/segmentation.npz --class chair \\
+               --class 7 --out rest.ply
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the command takes."""
+    parser.add_argument("scene", metavar="SCENE.ply", help="trained 3DGS scene")
+    parser.add_argument("--segmentation", required=True, metavar="FILE", help="segmentation.npz of this scene")
+    parser.add_argument(
+        "--class",
+        dest="classes",
+        action="append",
+        required=True,
+        metavar="NAME",
+        help="name or id of a class to leave out; may be given several times",
+    )
+    parser.add_argument("--out", required=True, metavar="PLY", help="file to write")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Remove, and say what is left."""
+    from gsseg_core.removal import class_ids, without_objects
+    from gsseg_core.scene import GaussianScene
+    from gsseg_core.segmentation import Segmentation
+
+    scene = GaussianScene.load(options.scene)
+    segmentation = Segmentation.load(options.segmentation, scene)
+    rest = without_objects(scene, segmentation, class_ids(segmentation, options.classes))
+    rest.save(Path(options.out))
+    print(f"{len(rest)} of {len(scene)} Gaussians in {options.out}")
+    return 0

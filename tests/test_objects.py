@@ -1,0 +1,319 @@
+"""Extracted objects: their silhouettes, what is carved away, halves of straddlers, and the scene without them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numba as nb
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from small_scenes import (
+    HEIGHT,
+    NAMES,
+    NUM_CLASSES,
+    WIDTH,
+    balls_on_a_table,
+    build,
+    clean_views,
+    look_at,
+    ring,
+    true_labels,
+    write_dataset,
+)
+
+from gsseg_core.cameras import Camera
+from gsseg_core.carve import Silhouette, carve, carved, shares
+from gsseg_core.cli import main
+from gsseg_core.errors import EmptySceneError, MaskSizeError, SceneValueError, SettingsError
+from gsseg_core.export import export_classes
+from gsseg_core.operator import make_operator
+from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.removal import class_ids, without_objects
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segmentation import REMOVED, Segmentation
+from gsseg_core.silhouettes import BEHIND, ObjectScores, depths, objects_of, surface
+from gsseg_core.straddlers import DISTANCE, half_opacity, split, straddlers
+
+SCENE, TRUTH = balls_on_a_table()
+LABELS = TRUTH.astype(np.int32)
+UNREFINED = RefineSettings(cluster=False, filter=False)
+
+
+def silhouettes(scene: GaussianScene = SCENE, cameras: list[Camera] | None = None) -> list[Silhouette]:
+    out = []
+    for camera in cameras or ring(3):
+        out.append(Silhouette.of(scene, make_operator(scene, camera), true_labels(SCENE, TRUTH, camera)))
+    return out
+
+
+def scores(labels: np.ndarray, scene: GaussianScene = SCENE, turn: float = 0.3) -> ObjectScores:
+    result, objects = ObjectScores(NUM_CLASSES), objects_of(scene, labels)
+    for camera in ring(3, turn=turn):
+        depth = surface(SCENE, make_operator(SCENE, camera)).depth
+        result.add(objects, camera, true_labels(SCENE, TRUTH, camera), depth)
+    return result
+
+
+def with_fringe() -> tuple[GaussianScene, np.ndarray, np.ndarray]:
+    """The scene with flat discs of the table, around the balls, taken for parts of these; and which they are."""
+    distance = np.linalg.norm(
+        SCENE.means[:, None, :2] - [SCENE.means[k == LABELS, :2].mean(axis=0) for k in (1, 2, 3)], axis=2
+    )
+    labels = LABELS.copy()
+    fringe = (LABELS == 0) & (distance.min(axis=1) > 0.5) & (distance.min(axis=1) < 0.7) & (SCENE.means[:, 2] < 1)
+    labels[fringe] = distance.argmin(axis=1)[fringe] + 1
+    return SCENE, labels, fringe
+
+
+def slow_shares(scene: GaussianScene, labels: np.ndarray, views: list[Silhouette], steps: int) -> np.ndarray:
+    """Readable twin of `shares`: each Gaussian's alpha is the weight that it has when it is alone."""
+    kept = np.ones(len(scene))
+    alphas = [
+        np.stack([1 - make_operator(scene.subset([i]), view.camera).transmittance() for i in range(len(scene))])
+        for view in views
+    ]
+    for _ in range(steps):
+        stay, go = np.zeros(len(scene)), np.zeros(len(scene))
+        for view, alpha in zip(views, alphas, strict=True):
+            for k in range(1, labels.max() + 1):
+                members = np.flatnonzero(labels == k)
+                through = np.prod(1 - kept[members, None, None] * alpha[members], axis=0)
+                need = through / (1 - through + 1e-3) * (view.labels == k)
+                excess = (view.labels != k) & (view.labels >= 0)
+                for i in members:
+                    shows = excess & (depths(scene, view.camera)[i] <= BEHIND * view.depth)
+                    stay[i] += (alpha[i] * need).sum()
+                    go[i] += (alpha[i] * shows).sum()
+        kept = np.where(go > 0, np.clip(kept * stay / np.maximum(go, 1e-30), 0.01, 1), kept)
+    return kept
+
+
+def test_shares_agree_with_their_slow_twin() -> None:
+    chosen = np.concatenate([np.flatnonzero(k == LABELS)[:20] for k in range(NUM_CLASSES)])
+    scene, labels = SCENE.subset(chosen), LABELS[chosen]
+    labels[:4] = 1
+    views = []
+    for camera in ring(2):
+        shown = true_labels(SCENE, TRUTH, camera)
+        shown[:10] = -1
+        views.append(Silhouette.of(scene, make_operator(scene, camera), shown))
+    result = shares(scene, labels, views, steps=3)
+    np.testing.assert_allclose(result.kept, slow_shares(scene, labels, views, 3), atol=2e-3)
+    assert (result.kept < 0.5).any() and (result.kept == 1).any()
+
+
+def test_carving_takes_the_fringe_away_and_leaves_the_objects() -> None:
+    scene, labels, fringe = with_fringe()
+    out = carve(scene, labels, silhouettes())
+    assert fringe.sum() > 20 and out[fringe].mean() > 0.9 and out[~fringe].mean() < 0.03
+    before, after = scores(labels), scores(np.where(out, 0, labels))
+    assert np.nanmean(after.visible.iou) > np.nanmean(before.visible.iou) + 0.1
+    assert np.nanmean(after.visible.boundary_iou) > np.nanmean(before.visible.boundary_iou)
+
+
+def test_background_and_what_no_view_sees_is_never_carved() -> None:
+    _, labels, _ = with_fringe()
+    labels[-3:] = 1  # out of sight
+    labels[:5] = REMOVED
+    out = carve(SCENE, labels, silhouettes())
+    assert not out[labels <= 0].any() and not out[-3:].any()
+    assert not carve(SCENE, labels, []).any()
+
+
+@settings(max_examples=5, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_order_of_gaussians_and_number_of_threads_change_nothing_in_what_is_carved(seed: int) -> None:
+    scene, labels, _ = with_fringe()
+    out = carve(scene, labels, silhouettes())
+    order = np.random.default_rng(seed).permutation(len(scene))
+    threads = nb.get_num_threads()
+    nb.set_num_threads(1)
+    try:
+        again = carve(scene.subset(order), labels[order], silhouettes(scene.subset(order)))
+    finally:
+        nb.set_num_threads(threads)
+    np.testing.assert_array_equal(again, out[order])
+
+
+def test_a_rigid_motion_carves_the_same() -> None:
+    scene, labels, _ = with_fringe()
+    turn = Rotation.from_euler("xyz", [0.4, -1.1, 2.0])
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = turn.as_matrix(), [0.3, -2, 1]
+    quats = (turn * Rotation.from_quat(scene.quats, scalar_first=True)).as_quat(scalar_first=True)
+    moved = GaussianScene.from_arrays(
+        scene.means @ motion[:3, :3].T + motion[:3, 3], quats, scene.scales, scene.opacities, scene.sh
+    )
+    there = []
+    for view in silhouettes():
+        c = view.camera
+        camera = Camera(c.name, c.width, c.height, c.K, c.world_to_camera @ np.linalg.inv(motion))
+        there.append(Silhouette.of(moved, make_operator(moved, camera), view.labels))
+    assert (carve(moved, labels, there) != carve(scene, labels, silhouettes())).sum() <= 2
+
+
+def test_a_segmentation_carves_itself_by_what_it_renders() -> None:
+    result = Segmentation.from_codes(SCENE, np.eye(NUM_CLASSES, dtype=np.float32)[TRUTH], NAMES, UNREFINED)
+    after = carved(SCENE, result, ring(3))
+    changed = after.labels != result.labels
+    assert (after.labels[changed] == REMOVED).all() and changed.mean() < 0.05
+    np.testing.assert_array_equal(after.probabilities, result.probabilities)
+
+
+def test_a_label_map_of_another_size_is_refused() -> None:
+    camera = ring(1)[0]
+    with pytest.raises(MaskSizeError, match=rf"view0.*shape \(3, 4\); expected \({HEIGHT}, {WIDTH}\)"):
+        Silhouette.of(SCENE, make_operator(SCENE, camera), np.zeros((3, 4), np.int32))
+    with pytest.raises(MaskSizeError, match=r"truth has shape \(3, 4\)"):
+        ObjectScores(2).add({}, camera, np.zeros((3, 4), np.int32), np.zeros((HEIGHT, WIDTH)))
+
+
+def test_a_silhouette_counts_what_sticks_out_and_not_what_is_hidden() -> None:
+    """A small disc, wholly behind a larger one or beside it."""
+    camera = look_at("front", np.array([0.0, -4.0, 0.0]))
+    means = np.array([[0, 0, 0], [0, 1.0, 0]])
+    scene = build(np.array([1, 2]), means, np.array([[0.5, 0.02, 0.5], [0.2, 0.02, 0.2]]))
+    truth = true_labels(scene, np.array([1, 2]), camera)
+    depth = surface(scene, make_operator(scene, camera)).depth
+    objects = objects_of(scene, np.array([1, 2]))
+    assert not (truth == 2).any()
+    truth[0, 0] = 2  # so that object 2 is scored; the scene is empty there
+    both = ObjectScores(3)
+    both.add(objects, camera, truth, depth)
+    covered = int((surface(objects[2], make_operator(objects[2], camera)).coverage > 0.5).sum())
+    assert covered > 5
+    assert both.whole.iou[2] == 0 and both.whole._counts[0, 2, 2] == covered
+    assert both.visible._counts[0, 2, 2] == 0
+    assert np.isnan(both.whole.iou[0]) and both.whole.iou[1] == both.visible.iou[1] > 0.9
+    scene.means[1] = [1.5, 0, 0]
+    beside = ObjectScores(3)
+    beside.add(objects_of(scene, np.array([1, 2])), camera, truth, surface(scene, make_operator(scene, camera)).depth)
+    assert beside.visible._counts[0, 2, 2] > 5
+    lost = ObjectScores(3)
+    lost.add({}, camera, truth, depth)
+    assert lost.visible.iou[1] == 0 and np.isnan(lost.visible.iou[0])
+
+
+def test_halves_cover_what_the_whole_did_at_every_opacity() -> None:
+    o = np.linspace(0.001, 0.99, 400)[:, None]
+    x = np.linspace(-8, 8, 1601)
+    whole, variance = o * np.exp(-(x**2) / 2), 1 - DISTANCE**2
+    ahead, back = (half_opacity(o) * np.exp(-((x - sign * DISTANCE) ** 2) / (2 * variance)) for sign in (-1, 1))
+    halves = 1 - (1 - ahead) * (1 - back)
+    np.testing.assert_allclose(halves.sum(axis=1), whole.sum(axis=1), rtol=1e-6)
+    error = np.abs(halves - whole).max(axis=1)
+    assert error[o[:, 0] <= 0.5].max() < 0.04 and error.max() < 0.17
+    assert (half_opacity(o) < 0.7).all() and (half_opacity(o) > 0).all()
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_a_picture_of_split_gaussians_is_that_of_whole_ones(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scene = GaussianScene.from_arrays(
+        np.zeros((1, 3)), rng.normal(size=(1, 4)), rng.uniform(0.1, 0.5, (1, 3)), rng.uniform(0.1, 0.99, 1),
+        np.zeros((1, 1, 3)),
+    )  # fmt: skip
+    camera = look_at("near", np.array([0.0, -3.0, 1.0]))
+    halves, parents = split(scene, np.array([True]))
+    assert parents.tolist() == [0, 0] and len(halves) == 2
+    pictures = [make_operator(each, camera).transmittance() for each in (scene, halves)]
+    np.testing.assert_allclose(*pictures, atol=0.18)
+    # Mass and variance along the axis stay where they were.
+    np.testing.assert_allclose(halves.means.mean(axis=0), scene.means[0], atol=1e-6)
+    longest = scene.scales.max()
+    offset = np.linalg.norm(halves.means[0] - halves.means[1]) / 2
+    np.testing.assert_allclose(
+        halves.scales[0].astype(float)[scene.scales[0].argmax()] ** 2 + offset**2, longest**2, rtol=1e-5
+    )
+
+
+def test_a_split_scene_is_a_valid_ply_and_the_others_are_untouched(tmp_path: Path) -> None:
+    which = LABELS == 2
+    halves, parents = split(SCENE, which)
+    halves.save(tmp_path / "split.ply")
+    read = GaussianScene.load(tmp_path / "split.ply")
+    for name in ("means", "scales", "opacities", "quats"):
+        np.testing.assert_allclose(getattr(read, name), getattr(halves, name), rtol=1e-5, atol=1e-7)
+    np.testing.assert_array_equal(halves.vertices[: len(SCENE)][~which], SCENE.vertices[~which])
+    np.testing.assert_array_equal(parents, np.concatenate([np.arange(len(SCENE)), np.flatnonzero(which)]))
+    assert len(split(SCENE, np.zeros(len(SCENE), bool)).scene) == len(SCENE)
+    with pytest.raises(SceneValueError, match=r"shape \(3,\).*expected \(\d+,\), bool"):
+        split(SCENE, np.ones(3, bool))
+
+
+def test_straddlers_have_reasons_for_both() -> None:
+    scene, labels, fringe = with_fringe()
+    result = shares(scene, labels, silhouettes())
+    found = straddlers(result)
+    assert found.any() and not found[labels <= 0].any()
+    assert (np.minimum(result.stay, result.go)[found] >= 2).all() and found[~fringe].mean() < 0.2
+
+
+def segmentation() -> Segmentation:
+    return Segmentation.from_codes(SCENE, np.eye(NUM_CLASSES, dtype=np.float32)[TRUTH], NAMES, UNREFINED)
+
+
+@pytest.mark.parametrize("classes", [[1], [2, 3], [0]])
+def test_objects_and_the_scene_without_them_make_up_the_scene(tmp_path: Path, classes: list[int]) -> None:
+    result = segmentation()
+    rest = without_objects(SCENE, result, classes)
+    rest.save(tmp_path / "rest.ply")
+    read = GaussianScene.load(tmp_path / "rest.ply")
+    plys = export_classes(SCENE, result, tmp_path / "classes")
+    assert read.vertices.dtype == SCENE.vertices.dtype
+    parts = [read.vertices, *(GaussianScene.load(plys[k]).vertices[list(SCENE.vertices.dtype.names)] for k in classes)]
+    together = np.sort(np.concatenate([part.astype(SCENE.vertices.dtype) for part in parts]))
+    np.testing.assert_array_equal(together, np.sort(SCENE.vertices))
+    np.testing.assert_array_equal(read.vertices, SCENE.vertices[~np.isin(TRUTH, classes)])
+
+
+def test_what_cannot_be_removed_is_refused_by_name() -> None:
+    result = segmentation()
+    with pytest.raises(SettingsError, match=r"remove class 7, which has no Gaussians; expected some of: 0 \(backgr"):
+        without_objects(SCENE, result, [1, 7])
+    with pytest.raises(SettingsError, match="remove no class"):
+        without_objects(SCENE, result, [])
+    with pytest.raises(EmptySceneError, match="nothing is left without 4 classes"):
+        without_objects(SCENE, result, range(NUM_CLASSES))
+    with pytest.raises(SettingsError, match="class 'chair' is not in the segmentation; expected one of background"):
+        class_ids(result, ["box", "chair"])
+    assert class_ids(result, ["box", "1"]) == [3, 1]
+
+
+def test_gsseg_remove_writes_the_rest_and_refuses_what_is_not_there(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = write_dataset(tmp_path / "data")
+    segmentation().save(tmp_path / "segmentation.npz")
+    command = ["remove", f"{data}/scene.ply", "--segmentation", f"{tmp_path}/segmentation.npz"]
+    assert main([*command, "--class", "box", "--class", "1", "--out", f"{tmp_path}/rest.ply"]) == 0
+    kept = int((~np.isin(TRUTH, [1, 3])).sum())
+    assert f"{kept} of {len(SCENE)} Gaussians" in capsys.readouterr().out
+    assert len(GaussianScene.load(tmp_path / "rest.ply")) == kept
+    assert main([*command, "--class", "chair", "--out", f"{tmp_path}/none.ply"]) == 2
+    assert "class 'chair' is not in the segmentation" in capsys.readouterr().err
+    assert not (tmp_path / "none.ply").exists()
+
+
+def test_gsseg_segment_carves_when_asked_to(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data")
+    out = tmp_path / "out"
+    assert main(["segment", f"{data}/scene.ply", "--data", str(data), "--out", str(out), "--carve", "--quiet"]) == 0
+    report = (out / "report.json").read_text()
+    assert '"carve": true' in report and '"filter": false' in report
+
+
+@pytest.mark.parametrize("wrong", [{"carve_views": 0}, {"carve_views": 1.5}, {"carve": True}])
+def test_settings_of_carving_out_of_range_are_refused_by_name(wrong: dict[str, float]) -> None:
+    with pytest.raises(SettingsError, match=r"refinement: found .*carve.*; expected"):
+        RefineSettings(**wrong)
+
+
+def test_clean_views_carve_hardly_anything() -> None:
+    """The truth itself has nothing to carve but what lies across an edge."""
+    views = [Silhouette.of(SCENE, make_operator(SCENE, v.camera), v.read_labels()) for v in clean_views(4)]
+    assert carve(SCENE, LABELS, views).mean() < 0.05
