@@ -1,0 +1,64 @@
+"""The command `gsseg pick`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from gsseg_core.cli_shared import add_scene, load_kernels
+from gsseg_core.errors import SettingsError
+
+HELP = "pick one object by a mask or a click in one view, and write it as a PLY"
+DESCRIPTION = """
+Finds the Gaussians of one object that is shown in one view, by a mask (best) or by a click, and writes it as
+DIR/object.ply, with the indices in DIR/pick.npz and a picture of the view. Needs no other masks.
+"""
+EXAMPLES = """
+  gsseg pick scene.ply --data DATASET --view 0001 --mask chair.png --out chair
+  gsseg pick scene.ply --data DATASET --view 0001 --click 160 120 --out cup
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the command takes."""
+    add_scene(parser)
+    parser.add_argument("--view", required=True, metavar="STEM", help="the view in which it is shown")
+    how = parser.add_mutually_exclusive_group(required=True)
+    how.add_argument("--mask", metavar="FILE", help="label image of the view: all that is not 0 is the object")
+    how.add_argument("--click", nargs=2, type=int, metavar=("COLUMN", "ROW"), help="a pixel of the object")
+    parser.add_argument("--label", type=int, help="with --mask: the object is this label alone")
+    parser.add_argument(
+        "--reach", type=float, help="with --click: how far to grow, in squared colour steps (default: 48)"
+    )
+    parser.add_argument("--out", required=True, metavar="DIR", help="gets object.ply, pick.npz and pick.png")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Pick, and say what was written."""
+    from gsseg_core.dataset import Dataset, View
+    from gsseg_core.export import background_image
+    from gsseg_core.operator import make_operator
+    from gsseg_core.pick import REACH, pick_click, pick_mask, read_object_mask
+    from gsseg_core.pictures import overlay, palette, save_png
+    from gsseg_core.scene import GaussianScene
+
+    cameras = {camera.name: camera for camera in Dataset(options.data).cameras}
+    if options.view not in cameras:
+        raise SettingsError(f"{options.data}: has no view {options.view!r}; expected a stem such as {min(cameras)!r}")
+    camera, out = cameras[options.view], Path(options.out)
+    scene = GaussianScene.load(options.scene)
+    load_kernels(options.quiet, options.device)
+    if options.mask:
+        view = View.from_arrays(camera, read_object_mask(options.mask, options.label))
+        picked = pick_mask(scene, view, device=options.device)
+    else:
+        column, row = options.click
+        reach = REACH if options.reach is None else options.reach
+        picked = pick_click(scene, camera, row, column, reach, device=options.device)
+    scene.subset(picked.ids).save(out / "object.ply")
+    picked.save(out / "pick.npz")
+    shown = picked.silhouette(scene, camera, device=options.device)
+    image = background_image(scene, make_operator(scene, camera, options.device))
+    save_png(out / "pick.png", overlay(image, shown.astype(int), palette(2)))
+    print(f"{len(picked.ids):,} of {len(scene):,} Gaussians: {out}/object.ply, pick.npz, and pick.png to look at")
+    return 0

@@ -1,0 +1,121 @@
+"""One object from one view: a mask or a click in it gives the object in 3D, and what it hides is not the object."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import small_scenes
+
+from gsseg_core.cli import main
+from gsseg_core.dataset import View
+from gsseg_core.errors import MaskFormatError, NoUsableViewsError, SettingsError
+from gsseg_core.masks import write_mask
+from gsseg_core.pick import Pick, pick_click, pick_mask, read_object_mask
+from gsseg_core.scene import GaussianScene
+
+SCENE, TRUTH = small_scenes.balls_on_a_table()
+CAMERA = small_scenes.ring(1)[0]
+LABELS = small_scenes.true_labels(SCENE, TRUTH, CAMERA)
+
+
+def iou_of_gaussians(picked: Pick, label: int) -> float:
+    mine, true = picked.membership >= 0.5, label == TRUTH
+    return float((mine & true).sum() / (mine | true).sum())
+
+
+@pytest.mark.parametrize("label", [1, 2, 3])
+def test_a_mask_in_one_view_gives_the_object_in_the_others(label: int) -> None:
+    picked = pick_mask(SCENE, View.from_arrays(CAMERA, (label == LABELS).astype(int)))
+    assert iou_of_gaussians(picked, label) > 0.85
+    for camera in small_scenes.ring(3, turn=0.4):
+        true = small_scenes.true_labels(SCENE, TRUTH, camera) == label
+        seen = picked.silhouette(SCENE, camera)
+        assert (seen & true).sum() / max((seen | true).sum(), 1) > 0.6
+
+
+def test_what_lies_behind_the_mask_is_not_the_object() -> None:
+    """A wall that a panel hides, but for its rim: the mask of the panel covers it and says nothing of it."""
+    x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-1.2, 1.2, 17), np.linspace(-1.2, 1.2, 17)))
+    wall, panel = np.stack([x, y, 0 * x], axis=1), np.stack([x / 2, y / 2, 0 * x + 1.2], axis=1)
+    truth = np.repeat([0, 1], len(x))
+    scene = small_scenes.build(truth, np.concatenate([wall, panel]), np.full((2 * len(x), 3), [[0.1, 0.1, 0.02]]))
+    camera = small_scenes.look_at("front", np.array([0.0, 0.0, 4.0]))
+    labels = small_scenes.true_labels(scene, truth, camera)
+    picked = pick_mask(scene, View.from_arrays(camera, labels))
+    behind = (truth == 0) & (np.abs(scene.means[:, :2]).max(axis=1) < 0.5)
+    assert behind.sum() > 20
+    assert (picked.membership[behind] < 0.5).all()
+    assert (picked.membership[truth == 1] >= 0.5).mean() > 0.95
+
+
+def test_scribbles_of_both_kinds_are_enough() -> None:
+    labels = np.full_like(LABELS, -1)
+    for k, wanted in ((1, LABELS == 2), (0, LABELS != 2)):
+        rows, columns = np.nonzero(wanted)
+        few = slice(None, None, 7)
+        labels[rows[few], columns[few]] = k
+    assert iou_of_gaussians(pick_mask(SCENE, View.from_arrays(CAMERA, labels)), 2) > 0.7
+
+
+def test_a_click_gives_what_looks_like_it_around() -> None:
+    rows, columns = np.nonzero(LABELS == 1)
+    middle = len(rows) // 2
+    picked = pick_click(SCENE, CAMERA, int(rows[middle]), int(columns[middle]), reach=5.0)
+    assert iou_of_gaussians(picked, 1) > 0.8
+    near = pick_click(SCENE, CAMERA, int(rows[middle]), int(columns[middle]), reach=0)
+    assert len(near.ids) == 1
+    assert set(near.ids) <= set(picked.ids)
+
+
+def test_a_click_reaches_further_with_more_reach() -> None:
+    rows, columns = np.nonzero(LABELS == 3)
+    sizes = [len(pick_click(SCENE, CAMERA, int(rows[0]), int(columns[0]), reach).ids) for reach in (0, 0.1, 1, 10, 1e4)]
+    assert sizes == sorted(sizes)
+
+
+def test_prompts_that_say_nothing_are_refused() -> None:
+    everything, other = (View.from_arrays(CAMERA, np.full_like(LABELS, k)) for k in (1, 2))
+    with pytest.raises(NoUsableViewsError, match="label 0"):
+        pick_mask(SCENE, everything)
+    with pytest.raises(SettingsError, match="expected 1"):
+        pick_mask(SCENE, other)
+    with pytest.raises(SettingsError, match="pixel"):
+        pick_click(SCENE, CAMERA, -1, 0)
+    with pytest.raises(SettingsError, match="reach"):
+        pick_click(SCENE, CAMERA, 0, 0, reach=-1.0)
+    nothing = SCENE.subset(np.arange(len(SCENE)) == len(SCENE) - 1)  # one Gaussian, high above
+    with pytest.raises(NoUsableViewsError, match="expected a click on something"):
+        pick_click(nothing, CAMERA, 0, 0)
+
+
+def test_drawn_masks_are_read_black_and_white_or_by_label(tmp_path: Path) -> None:
+    write_mask(tmp_path / "drawn.png", np.array([[-1, 0]]), 8)  # written as 255, white
+    assert read_object_mask(tmp_path / "drawn.png").tolist() == [[1, 0]]
+    write_mask(tmp_path / "labels.png", np.array([[3, 5, 0, -1]]), 8)
+    assert read_object_mask(tmp_path / "labels.png").tolist() == [[1, 1, 0, -1]]
+    assert read_object_mask(tmp_path / "labels.png", 5).tolist() == [[0, 1, 0, -1]]
+    with pytest.raises(MaskFormatError, match="expected pixels with the label 7"):
+        read_object_mask(tmp_path / "labels.png", 7)
+
+
+def test_the_command_writes_a_ply_and_the_ids(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = small_scenes.write_dataset(tmp_path / "data")
+    start = ["pick", str(data / "scene.ply"), "--data", str(data), "--view", "view0", "--quiet"]
+    by_mask = ["--mask", str(data / "labels/view0.png"), "--label", "1", "--out", str(tmp_path / "mask")]
+    assert main(start + by_mask) == 0
+    with np.load(tmp_path / "mask/pick.npz") as file:
+        ids, header = file["ids"], json.loads(str(file["header"]))
+        assert file["membership"].shape == (len(SCENE),)
+    scene = GaussianScene.load(data / "scene.ply")
+    assert header == {"format": "gsseg-pick-1", "scene": scene.digest}
+    np.testing.assert_array_equal(GaussianScene.load(tmp_path / "mask/object.ply").means, scene.means[ids])
+    assert (tmp_path / "mask/pick.png").is_file()
+    rows, columns = np.nonzero(LABELS == 1)
+    by_click = ["--click", str(columns[len(rows) // 2]), str(rows[len(rows) // 2]), "--out", str(tmp_path / "click")]
+    assert main(start + by_click) == 0
+    assert "Gaussians" in capsys.readouterr().out
+    assert main([*start[:5], "nowhere", "--click", "0", "0", "--out", str(tmp_path)]) == 2
+    assert "has no view 'nowhere'" in capsys.readouterr().err

@@ -1,0 +1,155 @@
+"""NVOS, SPIn-NeRF and LERF-Mask: small copies of their layouts are read, run and scored as docs/evaluation.md says."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import small_scenes
+from PIL import Image
+
+from gsseg_core.camera_files import read_cameras
+from gsseg_core.errors import CameraFileError, MaskFormatError, MaskSizeError
+from gsseg_core.protocols import Task, lerf_mask, nvos, resized, score_task, spin_nerf
+from gsseg_core.segmentation import Segmentation
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+import evaluate_protocol
+
+CAMERAS = small_scenes.ring(6)
+SCENE, TRUTH = small_scenes.balls_on_a_table()
+BALL = 1
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    return small_scenes.write_dataset(tmp_path / "data")
+
+
+def save(path: Path, mask: np.ndarray, mode: str = "L") -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray((255 * mask).astype(np.uint8)).convert(mode).save(path)
+
+
+def ball(index: int, scale: int = 1) -> np.ndarray:
+    camera = CAMERAS[index]
+    camera = resized(camera, scale * camera.width, scale * camera.height)
+    return small_scenes.true_labels(SCENE, TRUTH, camera) == BALL
+
+
+def write_nvos(root: Path) -> Path:
+    """As published: one folder a kind, one in it a scene; masks larger than the images that were trained on."""
+    inside, spots = ball(0), np.arange(ball(0).size).reshape(ball(0).shape) % 5 == 0
+    save(root / "reference_image/fern/view0.png", inside)
+    save(root / "scribbles/fern/pos_0.png", inside & spots, "RGB")
+    save(root / "scribbles/fern/neg_0.png", ~inside & spots, "RGB")
+    save(root / "masks/fern/view2_mask.png", ball(2, 2))
+    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(root / "masks/fern/view2.JPG")
+    return root
+
+
+def write_spin(folder: Path, names: list[str]) -> Path:
+    for index, name in enumerate(names):
+        save(folder / f"{name}.png", ball(index))
+        save(folder / f"{name}_cutout.png", ball(index), "RGB")
+        save(folder / f"{name}_pseudo.png", ball(index))
+    return folder
+
+
+def run(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> list[list[str]]:
+    """Cells of the table that the program prints."""
+    assert evaluate_protocol.main(arguments) == 0
+    lines = capsys.readouterr().out.splitlines()[2:]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def test_nvos_is_scored_in_its_target_view_at_the_size_of_its_mask(
+    tmp_path: Path, data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = write_nvos(tmp_path / "nvos")
+    task = nvos(root, "fern", read_cameras(data))
+    assert task.reference is not None
+    assert set(np.unique(task.reference.read_labels())) == {-1, 0, 1}
+    assert [(view.name, view.camera.width) for view in task.targets] == [("view2", 2 * small_scenes.WIDTH)]
+    table = run(["nvos", str(data / "scene.ply"), "--data", str(data), "--masks", str(root), "--name", "fern"], capsys)
+    assert table[0][:2] == ["fern", "1"]
+    assert float(table[0][2]) > 0.6
+
+
+@pytest.mark.parametrize("names", [[f"view{i}" for i in range(6)], [f"image{i:03d}" for i in range(6)]])
+def test_spin_nerf_is_scored_in_all_views_by_name_or_by_order(
+    tmp_path: Path, data: Path, capsys: pytest.CaptureFixture[str], names: list[str]
+) -> None:
+    folder = write_spin(tmp_path / "fern", names)
+    task = spin_nerf(folder, read_cameras(data))
+    assert [view.name for view in task.targets] == [camera.name for camera in CAMERAS]
+    assert task.reference is task.targets[0]
+    table = run(["spin-nerf", str(data / "scene.ply"), "--data", str(data), "--masks", str(folder)], capsys)
+    assert table[0][:2] == ["fern", "6"]
+    assert float(table[0][2]) > 0.6
+
+
+def test_spin_nerf_masks_of_some_views_are_paired_by_a_file(tmp_path: Path, data: Path) -> None:
+    folder, cameras = write_spin(tmp_path / "orchids", ["a", "b"]), read_cameras(data)
+    with pytest.raises(CameraFileError, match=r"2 of 2 masks have no camera.*pairs\.json"):
+        spin_nerf(folder, cameras)
+    (folder / "pairs.json").write_text(json.dumps({"a": "view0", "b": "view1"}))
+    assert [view.name for view in spin_nerf(folder, cameras).targets] == ["view0", "view1"]
+
+
+@pytest.mark.parametrize("numbered", [True, False])
+def test_lerf_mask_is_scored_by_the_name_of_the_class(
+    tmp_path: Path, data: Path, capsys: pytest.CaptureFixture[str], numbered: bool
+) -> None:
+    for i in (0, 1, 3, 4):
+        save(data / f"images_train/view{i}.jpg", ball(i))
+    for number, index in enumerate((2, 5)):
+        save(data / f"test_mask/{number if numbered else f'view{index}'}/red ball.png", ball(index))
+    tasks = lerf_mask(data, read_cameras(data))
+    assert [(task.name, [view.name for view in task.targets]) for task in tasks] == [("red ball", ["view2", "view5"])]
+    Segmentation.from_codes(SCENE, np.eye(small_scenes.NUM_CLASSES, dtype=np.float32)[TRUTH], small_scenes.NAMES).save(
+        tmp_path / "segmentation.npz"
+    )
+    arguments = ["lerf-mask", str(data / "scene.ply"), "--data", str(data)]
+    table = run([*arguments, "--segmentation", str(tmp_path / "segmentation.npz")], capsys)
+    assert table[0][:2] == ["red ball", "2"]
+    assert float(table[0][2]) > 0.95
+    assert evaluate_protocol.main(arguments) == 2
+    assert "--segmentation" in capsys.readouterr().err
+
+
+def test_scores_are_those_of_the_definitions() -> None:
+    truths = [np.zeros((10, 10), np.int32) for _ in range(2)]
+    truths[0][:5], truths[1][:1] = 1, 1
+    views = [small_scenes.View.from_arrays(small_scenes.look_at(f"{i}", np.array([0, 1.0, 3]), 10, 10), truth)
+             for i, truth in enumerate(truths)]  # fmt: skip
+    prediction = np.zeros((10, 10), bool)
+    prediction[:2] = True
+    scores = score_task(Task("thing", None, views), lambda camera: prediction)
+    assert scores.iou == pytest.approx((20 / 50 + 10 / 20) / 2)
+    assert scores.pooled_iou == pytest.approx(30 / 70)
+    assert scores.accuracy == pytest.approx((70 + 90) / 200)
+    perfect = iter(truths)
+    assert score_task(Task("thing", None, views), lambda camera: next(perfect) > 0)[:4] == (1, 1, 1, 1)
+
+
+def test_a_layout_that_is_not_whole_is_refused(tmp_path: Path, data: Path) -> None:
+    cameras = read_cameras(data)
+    root = write_nvos(tmp_path / "nvos")
+    (root / "scribbles/fern/neg_0.png").unlink()
+    with pytest.raises(MaskFormatError, match=r"found 0 files \*neg\*"):
+        nvos(root, "fern", cameras)
+    with pytest.raises(MaskFormatError, match="found no masks"):
+        spin_nerf(tmp_path, cameras)
+    with pytest.raises(MaskFormatError, match="found no masks"):
+        lerf_mask(data, cameras)
+    save(tmp_path / "wide/view0.png", np.ones((10, 50)))
+    with pytest.raises(MaskSizeError, match="50 x 10"):
+        spin_nerf(tmp_path / "wide", cameras)
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken/view0.png").write_text("no image")
+    with pytest.raises(MaskFormatError, match="cannot be read"):
+        spin_nerf(tmp_path / "broken", cameras)
