@@ -1,12 +1,15 @@
-"""Ask the node for its objects and print their centroids and boxes as JSON, for a planner.
+"""Ask the node for its objects and print their boxes as JSON, and how a gripper would take them.
 
 While `segment_node` runs and masks have come (see examples/README.md):
 
     python examples/objects_to_boxes.py                                   # every object
     python examples/objects_to_boxes.py mug bowl --min-confidence 0.7     # two, without what is in doubt
+    python examples/objects_to_boxes.py --opening 0.08                    # what a hand of 8 cm can close around
 
-One line an object: centroid, centre and size of the axis-aligned box in the map frame, in metres. A single stray
-Gaussian would make a box too large, so the outermost `--trim` percent on each side are left out.
+One line an object, in metres of the map frame: the middle of its box, the directions and lengths of the box's sides,
+the longest first, its mean and covariance, and, where a side is shorter than the hand opens, the direction along which
+to close: the shortest such side. Boxes lie as the objects do, and stray Gaussians do not blow them up. A planner that
+is a ROS node itself gets the same from the topic ~/objects.
 """
 
 from __future__ import annotations
@@ -15,18 +18,16 @@ import argparse
 import json
 import sys
 
-import numpy as np
-
 from gsseg_ros.client import NodeUnavailableError, SegmentationClient, SegmentationError
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("classes", nargs="*", metavar="CLASS", help="names of the classes wanted (default: all)")
 parser.add_argument("--min-confidence", type=float, default=0.5, help="0 to 1 (default: %(default)s)")
-parser.add_argument("--trim", type=float, default=1.0, help="percent, 0 to 49 (default: %(default)s)")
+parser.add_argument("--opening", type=float, default=0.1, help="of the hand, in metres (default: %(default)s)")
 parser.add_argument("--node", default="gsseg", help="name of the node (default: %(default)s)")
 options = parser.parse_args()
-if not 0 <= options.trim < 50:
-    parser.error(f"--trim is {options.trim:g}; expected 0 to 49 percent")
+if not options.opening > 0:
+    parser.error(f"--opening is {options.opening:g}; expected more than 0 m")
 
 try:
     with SegmentationClient(options.node) as client:
@@ -35,14 +36,13 @@ except (SegmentationError, NodeUnavailableError) as error:
     sys.exit(f"objects_to_boxes: {error}")
 
 for name, thing in result.objects.items():
-    low, high = np.percentile(thing.points, [options.trim, 100 - options.trim], axis=0)
-    box = {
+    box = thing.oriented_box
+    line = {
         "object": name,
         "frame": result.report.header.frame_id,
-        "centroid": thing.centroid.round(4).tolist(),
-        "box_center": ((low + high) / 2).round(4).tolist(),
-        "box_size": (high - low).round(4).tolist(),
         "confidence": round(float(thing.confidence.mean()), 3),
         "gaussians": len(thing.points),
+        **box.as_dict(),
+        "close_along": box.axes[:, 2].round(4).tolist() if box.size[2] < options.opening else None,
     }
-    print(json.dumps(box))
+    print(json.dumps(line))

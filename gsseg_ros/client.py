@@ -25,10 +25,9 @@ from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import GetState
 from rclpy.action import ActionClient
 from rclpy.context import Context
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
-from gsseg_ros.client_calls import Calls, LearnGoal
+from gsseg_ros.client_calls import Calls, LearnGoal, class_names
 from gsseg_ros.client_results import (
     Exported,
     LearnResult,
@@ -50,6 +49,8 @@ from gsseg_ros.conversions import (
     viewpoint_messages,
 )
 from gsseg_ros.errors import NodeUnavailableError, SegmentationError
+from gsseg_ros.object_messages import box_from_object
+from gsseg_ros.qos import all_clouds
 from gsseg_ros.spinner import Spinner
 
 __all__ = [
@@ -61,10 +62,6 @@ _SERVICES = {
     Segment: "segment", RenderView: "render_view", LoadScene: "load_scene", SaveState: "save_state",
     LoadState: "load_state", Export: "export", Reset: "reset", GetState: "get_state",
 }  # fmt: skip
-
-# Reliable, for large clouds do not arrive otherwise; latched, so that a cloud is not lost that was sent before the two
-# ends had found each other; deep enough that one of another client does not push it out.
-_CLOUD_QOS = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 ASK_SECONDS, POLL_SECONDS = 2.0, 0.2
 """Until a question for the node's state is asked again, unanswered and answered."""
@@ -108,7 +105,7 @@ class SegmentationClient:
         self._clouds: dict[int, PointCloud2] = {}
         self._awaiting_clouds = 0
         self._lock = threading.Lock()
-        self._cloud_topic = node.create_subscription(PointCloud2, f"{self._name}/cloud", self._on_cloud, _CLOUD_QOS)
+        self._cloud_topic = node.create_subscription(PointCloud2, f"{self._name}/cloud", self._on_cloud, all_clouds())
         self._diagnostics: Any = None
         self._statuses: deque[Any] = deque(maxlen=10)
         self._learning: set[LearnGoal] = set()
@@ -284,7 +281,7 @@ class SegmentationClient:
         """
         deadline = time.monotonic() + timeout
         request = Segment.Request(
-            classes=_names(classes),
+            classes=class_names(classes),
             min_confidence=float(min_confidence),
             skip_refinement=not refine,
             skip_filter=not filter,
@@ -295,7 +292,8 @@ class SegmentationClient:
             answer = self._call(Segment, request, timeout)
             cloud = arrays_from_cloud(self._cloud_of(stamp_ns(answer.report.header.stamp), deadline))
         labels = labels_from_image(answer.label_image, "label_image") if viewpoint is not None else None
-        return SegmentResult(cloud.points, cloud.labels, cloud.confidence, cloud.rgb, answer.report, labels)
+        boxes = {thing.id: box_from_object(thing) for thing in answer.objects}
+        return SegmentResult(cloud.points, cloud.labels, cloud.confidence, cloud.rgb, answer.report, labels, boxes)
 
     def render_view(
         self,
@@ -354,7 +352,7 @@ class SegmentationClient:
         """Write segmentation.npz, one PLY per class, and report.json; by default to gsseg_export in `data_root`."""
         request = Export.Request(
             directory=os.fspath(directory),
-            classes=_names(classes),
+            classes=class_names(classes),
             min_confidence=float(min_confidence),
             skip_refinement=not refine,
             skip_filter=not filter,
@@ -398,7 +396,3 @@ class SegmentationClient:
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         self._statuses.extend(status for status in message.status if status.name == self._name)
-
-
-def _names(classes: Sequence[str | int]) -> list[str]:
-    return [classes] if isinstance(classes, str) else [str(name) for name in classes]

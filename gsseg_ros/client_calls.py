@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from gsseg_msgs.action import Learn
@@ -159,3 +159,8 @@ def checked(answer: Any) -> Any:
     if answer.error_code:
         raise SegmentationError(answer.error_code, error_name(answer.error_code, type(answer)), answer.error_msg)
     return answer
+
+
+def class_names(classes: Sequence[str | int]) -> list[str]:
+    """Write classes, or a single one, as a request names them."""
+    return [classes] if isinstance(classes, str) else [str(name) for name in classes]

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from gsseg_msgs.msg import SegmentationReport
 
+from gsseg_core.boxes import OrientedBox
 from gsseg_core.cameras import Camera
 
 
@@ -73,6 +74,9 @@ class SegmentedObject:
         Probability of the class, 0 to 1.
     color : (3,) uint8
         Of the class in clouds and pictures.
+    oriented_box : OrientedBox
+        The box that it fills, which lies as it does, with its mean and covariance, in the map frame, metres; see
+        `gsseg_core.boxes`. Stray Gaussians do not blow it up.
     """
 
     class_id: int
@@ -80,6 +84,7 @@ class SegmentedObject:
     points: npt.NDArray[np.float32]
     confidence: npt.NDArray[np.float32]
     color: npt.NDArray[np.uint8]
+    oriented_box: OrientedBox
 
     @property
     def centroid(self) -> npt.NDArray[np.float64]:
@@ -89,7 +94,7 @@ class SegmentedObject:
 
     @property
     def box(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-        """Lower and upper corner (3,) of the axis-aligned box around the points, metres."""
+        """Lower and upper corner (3,) of the axis-aligned box around all of the points, metres."""
         return self.points.min(axis=0), self.points.max(axis=0)
 
 
@@ -123,6 +128,8 @@ class SegmentResult(Timed):
         of the points.
     label_image : (H, W) int32 or None
         What the viewpoint sees, -1 where that is unknown; None without a viewpoint.
+    boxes : dict of int to OrientedBox
+        Box of every object by its class, in the map frame, metres.
     """
 
     points: npt.NDArray[np.float32]
@@ -131,6 +138,7 @@ class SegmentResult(Timed):
     rgb: npt.NDArray[np.uint8]
     report: SegmentationReport
     label_image: npt.NDArray[np.int32] | None
+    boxes: dict[int, OrientedBox]
 
     @cached_property
     def objects(self) -> dict[str, SegmentedObject]:
@@ -140,7 +148,12 @@ class SegmentResult(Timed):
             mine = self.labels == summary.class_id
             if mine.any():
                 objects[summary.name] = SegmentedObject(
-                    summary.class_id, summary.name, self.points[mine], self.confidence[mine], self.rgb[mine][0]
+                    summary.class_id,
+                    summary.name,
+                    self.points[mine],
+                    self.confidence[mine],
+                    self.rgb[mine][0],
+                    self.boxes[summary.class_id],
                 )
         return objects
 

@@ -1,4 +1,4 @@
-"""All conversion between ROS messages and the values of `gsseg_core`; nothing else reads or fills in a message.
+"""Conversion between ROS messages and the values of `gsseg_core`; that of objects is in `object_messages`.
 
 Numbers of a message are set as `array.array`, which rclpy takes over as a whole; anything else it checks and copies
 element by element, which takes seconds for a large cloud.
@@ -40,7 +40,10 @@ _MASK_ENCODINGS: dict[str, tuple[npt.DTypeLike, int]] = {
 }
 
 # Type of a channel, and how many.
-_PICTURE_ENCODINGS: dict[str, tuple[npt.DTypeLike, int]] = {"rgb8": (np.uint8, 3), "32FC1": (np.float32, 1)}
+_PICTURE_ENCODINGS: dict[str, tuple[npt.DTypeLike, int]] = {
+    "rgb8": (np.uint8, 3), "bgr8": (np.uint8, 3), "rgba8": (np.uint8, 4), "bgra8": (np.uint8, 4),
+    "mono8": (np.uint8, 1), "32FC1": (np.float32, 1),
+}  # fmt: skip
 
 # Field, its type in the message, its type here. RViz and PCL want 0x00RRGGBB in the bits of a float.
 _CLOUD_FIELDS = (
@@ -98,7 +101,7 @@ def labels_from_image(message: Image, topic: str) -> npt.NDArray[np.int32]:
 
 
 def picture_from_image(message: Image, topic: str) -> npt.NDArray[Any]:
-    """Read what `rgb_image` (H, W, 3) uint8 or `confidence_image` (H, W) float32 wrote.
+    """Read a picture as it is: (H, W) or (H, W, C), uint8, or float32 where the encoding is 32FC1.
 
     Raises
     ------

@@ -12,6 +12,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from gsseg_core.boxes import OrientedBox
 from gsseg_core.errors import SettingsError
 
 Array: TypeAlias = npt.NDArray[np.float64]
@@ -62,6 +63,10 @@ class Similarity:
         """Move points (M, 3) of the scene, in scene units, into the map: (M, 3) float32, in metres."""
         moved = np.asarray(points, np.float64) @ (self.scale * self.rotation.T) + self.translation
         return moved.astype(np.float32)
+
+    def box_to_map(self, box: OrientedBox) -> OrientedBox:
+        """Move the box of an object in the scene, in scene units, into the map, in metres."""
+        return box.moved(self.rotation, self.translation, self.scale)
 
     def world_to_camera(
         self,

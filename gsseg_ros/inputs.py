@@ -11,17 +11,20 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.lifecycle import LifecycleNode
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo, Image
 
 from gsseg_core.dataset import View
 from gsseg_core.errors import GssegError, PoseError
 from gsseg_core.live import Rejection
+from gsseg_ros.camera_images import CameraImages
 from gsseg_ros.conversions import camera_from_messages, labels_from_image, matrix_from_pose, stamp_ns
 from gsseg_ros.errors import NoSceneError
 from gsseg_ros.jobs import Worker
+from gsseg_ros.live_outputs import LiveOutputs
+from gsseg_ros.outputs import Outputs
 from gsseg_ros.pairing import ExactPoses, InterpolatedPoses, Paired, Pairing, PoseSource
+from gsseg_ros.qos import sensor_data
 from gsseg_ros.tf_poses import TfPoses
 from gsseg_ros.workspace import Workspace
 
@@ -47,7 +50,7 @@ class Inputs:
         By full name of the topic: quality of service of the subscription, overrides included.
     """
 
-    def __init__(self, node: LifecycleNode, workspace: Workspace) -> None:
+    def __init__(self, node: LifecycleNode, workspace: Workspace, outputs: Outputs) -> None:
         settings = workspace.settings
         self._node, self._workspace = node, workspace
         self.accepted = 0
@@ -64,6 +67,10 @@ class Inputs:
         poses: PoseSource = self.tf or (InterpolatedPoses() if settings.pose_source == "odometry" else ExactPoses())
         self.pairing = Pairing(poses)
         self.worker: Worker[Paired] = Worker(self._fuse, settings.queue_size)
+        self.live = LiveOutputs(
+            workspace, outputs, lambda: self.worker.waiting > 0, lambda: node.get_clock().now().to_msg(), self.complain
+        )
+        self._images = CameraImages(node, outputs, self.live, self.tf or type(poses)(), self._group)
         self._subscriptions = [
             self._listen(Image, "mask", self._on_mask),
             self._listen(CameraInfo, "camera_info", self._on_camera_info),
@@ -79,9 +86,11 @@ class Inputs:
         self._node.destroy_timer(self._timer)
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
+        self._images.close()
         if self.tf is not None:
             self.tf.close()
         self.worker.stop()
+        self.live.close()
 
     def publishers_of(self, topic: str) -> int:
         """How many publish on an input."""
@@ -121,7 +130,8 @@ class Inputs:
         self.pairing.add_mask(stamp_ns(message.header.stamp), (topic, message), message.header.frame_id)
 
     def _on_camera_info(self, topic: str, message: CameraInfo) -> None:
-        self.pairing.add_camera_info(stamp_ns(message.header.stamp), (topic, message))
+        for pairing in (self.pairing, self._images.pairing):
+            pairing.add_camera_info(stamp_ns(message.header.stamp), (topic, message))
 
     def _on_pose(self, topic: str, message: PoseStamped) -> None:
         self._add_pose(topic, message.header, message.pose)
@@ -142,11 +152,14 @@ class Inputs:
             self.last_refusal = (time.monotonic(), str(error))
             self.complain(f"pose {str(error)[:60]}", str(error))
             return
-        self.pairing.add_pose(stamp_ns(header.stamp), matrix)
+        for pairing in (self.pairing, self._images.pairing):
+            pairing.add_pose(stamp_ns(header.stamp), matrix)
 
     def _expire(self) -> None:
         self.pairing.expire(time.monotonic())
         self._hand_over()
+        self._images.tick()
+        self.live.tick()
 
     def _hand_over(self) -> None:
         for paired in self.pairing.take():
@@ -168,6 +181,7 @@ class Inputs:
             rejection = Rejection("unexpected", str(error))
         if rejection is None:
             self.accepted += 1
+            self.live.fused(paired)
             return
         self.rejected[rejection.reason] += 1
         self.complain(rejection.reason, f"a view was rejected ({rejection.reason}): {rejection.message}")
@@ -182,16 +196,3 @@ class Inputs:
             pose = pose @ settings.camera_in_base
         camera = camera_from_messages(paired.name, info, pose, settings.scene_to_map, info_topic)
         return session.fuse(View.from_arrays(camera, labels))
-
-
-def sensor_data() -> QoSProfile:
-    """Make a profile as for sensor data, deep enough for a burst while the interpreter is busy.
-
-    A new one for each topic: rclpy writes what the parameters override into it.
-    """
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=30,
-        reliability=ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.VOLATILE,
-    )

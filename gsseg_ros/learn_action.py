@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 from gsseg_msgs.action import Learn
@@ -10,6 +11,7 @@ from gsseg_msgs.msg import SegmentationReport
 from rclpy.action.server import ActionServer, CancelResponse, ServerGoalHandle
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.lifecycle import LifecycleNode
+from std_msgs.msg import Header
 
 from gsseg_core.dataset import Dataset
 from gsseg_core.live import LiveSession, Outcome
@@ -17,6 +19,7 @@ from gsseg_core.pipeline import LEARNERS
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_ros.errors import CanceledError, InvalidRequestError, error_code
 from gsseg_ros.jobs import Job
+from gsseg_ros.outputs import Outputs
 from gsseg_ros.reports import Selection, finish, report_message
 from gsseg_ros.services import explain
 from gsseg_ros.workspace import Run, Workspace
@@ -28,10 +31,13 @@ RAW = RefineSettings(cluster=False, filter=False)
 
 
 class LearnAction:
-    """Runs one learn job at a time; a second goal is aborted with BUSY. Canceled or failed, it changes nothing."""
+    """Runs one learn job at a time; a second goal is aborted with BUSY. Canceled or failed, it changes nothing.
 
-    def __init__(self, node: LifecycleNode, workspace: Workspace) -> None:
-        self._node, self._workspace = node, workspace
+    When it is done, the objects of the learnt codes are published, before refinement as in its report.
+    """
+
+    def __init__(self, node: LifecycleNode, workspace: Workspace, outputs: Callable[[], Outputs]) -> None:
+        self._node, self._workspace, self._outputs = node, workspace, outputs
         self._server = ActionServer(
             node,
             Learn,
@@ -84,6 +90,9 @@ class LearnAction:
         settings = self._workspace.settings
         raw = session.segmentation(RAW, run.watch)
         selection = Selection(session, raw, sorted(raw.class_names), 0.0, settings.scene_to_map)
+        with run.watch.stage("boxes"):
+            header = Header(stamp=run.stamp, frame_id=settings.map_frame)
+            self._outputs().publish_objects(selection.objects(header, run.revision))
         report = report_message(run, selection, RAW, settings.map_frame)
         if outcome.rejected:
             reasons = sorted(set(outcome.rejected.values()))

@@ -5,18 +5,21 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
-from gsseg_msgs.msg import SegmentationReport
+from gsseg_msgs.msg import ObjectArray, SegmentationReport
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNode
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Header
+from visualization_msgs.msg import MarkerArray
 
 from gsseg_ros.conversions import cloud, topic_tokens
+from gsseg_ros.object_messages import object_markers
+from gsseg_ros.qos import latched
 from gsseg_ros.reports import Selection
 
 FLOW_SECONDS = 0.5
@@ -24,21 +27,26 @@ FLOW_SECONDS = 0.5
 
 
 class Outputs:
-    """Publishes clouds, report and overlay.
+    """Publishes clouds, objects, report and overlay.
 
     A cloud that is latched always belongs to the last run: a class that this run was not asked for, or that is no more,
     gets an empty one.
+
+    Attributes
+    ----------
+    objects_count : int
+        How often objects were published.
     """
 
     def __init__(self, node: LifecycleNode) -> None:
         self._node = node
         self._lock = threading.Lock()
-        overridable = QoSOverridingOptions.with_default_policies()
-        self._cloud = node.create_publisher(PointCloud2, "~/cloud", latched(), qos_overriding_options=overridable)
-        self._report = node.create_publisher(
-            SegmentationReport, "~/report", latched(), qos_overriding_options=overridable
-        )
-        self._overlay = node.create_publisher(Image, "~/overlay", latched(), qos_overriding_options=overridable)
+        self.objects_count = 0
+        self._cloud = self._overridable(PointCloud2, "~/cloud")
+        self._report = self._overridable(SegmentationReport, "~/report")
+        self._overlay = self._overridable(Image, "~/overlay")
+        self._objects = self._overridable(ObjectArray, "~/objects")
+        self._markers = self._overridable(MarkerArray, "~/object_markers")
         self._classes: dict[str, Publisher] = {}
         self._filled: set[str] = set()
 
@@ -46,6 +54,11 @@ class Outputs:
     def wants_overlay(self) -> bool:
         """Whether anybody listens to `~/overlay`."""
         return self._overlay.get_subscription_count() > 0
+
+    @property
+    def wants_objects(self) -> bool:
+        """Whether anybody listens to `~/objects` or `~/object_markers`."""
+        return max(self._objects.get_subscription_count(), self._markers.get_subscription_count()) > 0
 
     def announce(self, class_names: Mapping[int, str]) -> dict[int, str]:
         """Make a topic for every class, so that subscribers find it before its first cloud; return their full names."""
@@ -67,6 +80,14 @@ class Outputs:
             self._filled = filled
             flow.publish(self._cloud, selection.objects_cloud(header))
 
+    def publish_objects(self, objects: ObjectArray, since: int | None = None) -> None:
+        """Publish the objects, and draw them for people; with `since`, only if `objects_count` is still that."""
+        with self._lock:
+            if since is None or since == self.objects_count:
+                self.objects_count += 1
+                self._objects.publish(objects)
+                self._markers.publish(object_markers(objects))
+
     def publish_report(self, report: SegmentationReport) -> None:
         """Publish the report of a run."""
         self._report.publish(report)
@@ -76,7 +97,8 @@ class Outputs:
         self._overlay.publish(image)
 
     def clear(self, header: Header) -> None:
-        """Replace all latched clouds by empty ones."""
+        """Replace all latched clouds by empty ones, and say that there is no object."""
+        self.publish_objects(ObjectArray(header=header))
         with self._lock:
             for token in self._filled:
                 self._class(token).publish(_empty(header))
@@ -86,19 +108,20 @@ class Outputs:
     def close(self) -> None:
         """Take all topics away."""
         with self._lock:
-            for publisher in (self._cloud, self._report, self._overlay, *self._classes.values()):
+            ours = (self._cloud, self._report, self._overlay, self._objects, self._markers)
+            for publisher in (*ours, *self._classes.values()):
                 self._node.destroy_publisher(publisher)
             self._classes.clear()
+
+    def _overridable(self, kind: Any, topic: str) -> Publisher:
+        return self._node.create_publisher(
+            kind, topic, latched(), qos_overriding_options=QoSOverridingOptions.with_default_policies()
+        )
 
     def _class(self, token: str) -> Publisher:
         if token not in self._classes:
             self._classes[token] = self._node.create_publisher(PointCloud2, f"~/classes/{token}", latched())
         return self._classes[token]
-
-
-def latched() -> QoSProfile:
-    """Make a profile for what those who come late get too; a new one for each topic, see `inputs.sensor_data`."""
-    return QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def _empty(header: Header) -> PointCloud2:

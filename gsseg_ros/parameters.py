@@ -13,12 +13,14 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from gsseg_core.devices import DEVICES, checked_device
 from gsseg_core.errors import GssegError, SettingsError
+from gsseg_core.pipeline import PER_VIEW
 from gsseg_core.refine_settings import MAX_K, RefineSettings
 from gsseg_ros.frames import Similarity, pose_from_parameters
 
 POSE_SOURCES = ("topic", "odometry", "tf")
-DEVICES = ("cpu", "cuda")
+IDS = ("given", PER_VIEW)
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,12 @@ DECLARATIONS = (
         "names of the classes, the index being the label in the masks (0: background); empty: classes are added and "
         "named after their numbers as they turn up",
     ),
+    Declaration(
+        "ids",
+        "given",
+        "what the labels of a mask are: given, the numbers of the classes; per-view, numbers that hold in their own "
+        "mask only, as automatic mask generators give, so that objects are found and named by the node",
+    ),
     Declaration("pose_source", "topic", f"where the camera's pose comes from: {', '.join(POSE_SOURCES)}"),
     Declaration("map_frame", "map", "frame of the poses and of all outputs"),
     Declaration("max_views", 200, "views kept for learning, the last ones [count]", 1, 100_000),
@@ -63,7 +71,7 @@ DECLARATIONS = (
     Declaration(
         "beta", RefineSettings.beta, "probability below which KNN clustering decides [0..1]", 0.0, 1.0, at_once=True
     ),
-    Declaration("device", "cpu", f"where views are rendered: {', '.join(DEVICES)}"),
+    Declaration("device", "cpu", f"where views are rendered: {DEVICES}"),
     Declaration("autostart", True, "configure and activate at start; false: wait for a lifecycle manager"),
     Declaration("queue_size", 30, "masks waiting to be fused; of more, the oldest are dropped [count]", 1, 1000),
     Declaration("scene_to_map.scale", 1.0, "metres of the map per unit of the scene [m]", 1e-9, 1e9),
@@ -96,6 +104,7 @@ class Settings:
     scene_path: str
     data_root: str
     class_names: tuple[str, ...]
+    ids: str
     pose_source: str
     map_frame: str
     max_views: int
@@ -109,9 +118,18 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Validate."""
-        for name, allowed in (("pose_source", POSE_SOURCES), ("device", DEVICES)):
+        for name, allowed in (("pose_source", POSE_SOURCES), ("ids", IDS)):
             if getattr(self, name) not in allowed:
                 raise SettingsError(f"parameter {name} is '{getattr(self, name)}'; expected {', '.join(allowed)}")
+        try:
+            checked_device(self.device)
+        except SettingsError as error:
+            raise SettingsError(f"parameter {error}") from error
+        if self.ids == PER_VIEW and self.class_names:
+            raise SettingsError(
+                f"parameter class_names gives {len(self.class_names)} names, but with ids '{PER_VIEW}' the node finds "
+                "the objects and names them itself; expected it to be empty"
+            )
         if not self.map_frame:
             raise SettingsError("parameter map_frame is empty; expected the name of a frame, such as 'map'")
         if "" in self.class_names:

@@ -1,4 +1,4 @@
-"""What the node says of a segmentation: the report, and one cloud per class."""
+"""What the node says of a segmentation: the report, one cloud per class, and the objects with their boxes."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from functools import cached_property
 
 import numpy as np
 from geometry_msgs.msg import Point
-from gsseg_msgs.msg import ClassSummary, SegmentationReport, StageTiming
+from gsseg_msgs.msg import ClassSummary, Object, ObjectArray, SegmentationReport, StageTiming
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import ColorRGBA, Header
 
+from gsseg_core.boxes import class_box
 from gsseg_core.live import LIVE, LiveSession
 from gsseg_core.pictures import palette
 from gsseg_core.refine_settings import RefineSettings
@@ -20,6 +21,7 @@ from gsseg_core.report import gaussian_counts
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.conversions import cloud
 from gsseg_ros.frames import Similarity
+from gsseg_ros.object_messages import object_message
 from gsseg_ros.workspace import Run
 
 
@@ -81,15 +83,31 @@ class Selection:
         labels = self.result.labels[index]
         return cloud(header, self._points[index], self._colors[labels], labels, self._confidence[index])
 
+    def objects(self, header: Header, revision: int) -> ObjectArray:
+        """Put boxes around all objects that were asked for."""
+        return ObjectArray(
+            header=header,
+            revision=revision,
+            objects=[self._object(k, index) for k, index in self.indices.items() if k > 0 and len(index)],
+        )
+
+    def _object(self, k: int, index: np.ndarray) -> Object:
+        confidence = self._confidence[index]
+        box = self.similarity.box_to_map(class_box(self.session.scene, index, confidence))
+        return object_message(k, self.result.class_names[k], self._color(k), confidence, box)
+
+    def _color(self, k: int) -> ColorRGBA:
+        red, green, blue = (float(part) / 255 for part in self._colors[k])
+        return ColorRGBA(r=red, g=green, b=blue, a=1.0)
+
     def class_summary(self, k: int, topic: str) -> ClassSummary:
         """Summarise one class in numbers."""
         index = self.indices[k]
-        red, green, blue = (float(part) / 255 for part in self._colors[k])
         summary = ClassSummary(
             class_id=k,
             name=self.result.class_names[k],
             topic=topic,
-            color=ColorRGBA(r=red, g=green, b=blue, a=1.0),
+            color=self._color(k),
             num_gaussians=len(index),
         )
         if len(index):

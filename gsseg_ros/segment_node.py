@@ -58,7 +58,7 @@ class SegmentNode(LifecycleNode):
         self.inputs: Inputs | None = None
         self._outputs: Outputs | None = None
         self._requests = Services(self, self.workspace, self._require_outputs, self._lookup)
-        self._learn = LearnAction(self, self.workspace)
+        self._learn = LearnAction(self, self.workspace, self._require_outputs)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._dropped_before: dict[str, int] = {}
         self.create_timer(1.0, self._tell)
@@ -94,7 +94,7 @@ class SegmentNode(LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Begin to listen."""
         try:
-            self.inputs = Inputs(self, self.workspace)
+            self.inputs = Inputs(self, self.workspace, self._require_outputs())
         except GssegError as error:
             self.get_logger().error(f"cannot be activated: {error}")
             return TransitionCallbackReturn.FAILURE

@@ -107,7 +107,7 @@ class Services:
 
     @answered
     def segment(self, request: Segment.Request, response: Segment.Response) -> None:
-        """Segment the scene, publish the clouds, and draw the viewpoint if there is one."""
+        """Segment the scene, publish clouds and objects, and draw the viewpoint if there is one."""
         settings, outputs = self.workspace.settings, self._outputs()
         with self.workspace.run("segment") as run:
             camera = None
@@ -117,6 +117,10 @@ class Services:
             with run.watch.stage("publish"):
                 topics = outputs.announce(selection.result.class_names)
                 outputs.publish_clouds(selection, self._header(run))
+            with run.watch.stage("boxes"):
+                objects = selection.objects(self._header(run), run.revision)
+                outputs.publish_objects(objects)
+                response.objects = objects.objects
             if camera is not None:
                 header = Header(stamp=run.stamp, frame_id=request.viewpoint_camera.header.frame_id)
                 with run.watch.stage("render"):

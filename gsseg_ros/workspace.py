@@ -15,6 +15,8 @@ from typing import Any
 from builtin_interfaces.msg import Time
 
 from gsseg_core.live import LiveSession
+from gsseg_core.live_ids import PerViewSession
+from gsseg_core.pipeline import PER_VIEW
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.report import Stopwatch
 from gsseg_core.scene import GaussianScene
@@ -123,7 +125,11 @@ class Workspace:
         """Load a scene in place of the one there is, with all that was known of that; on any error nothing changes."""
         settings = self.settings
         scene = GaussianScene.load(path)
-        session = LiveSession(scene, settings.names_by_id, max_views=settings.max_views, device=settings.device)
+        kept: dict[str, Any] = {"max_views": settings.max_views, "device": settings.device}
+        if settings.ids == PER_VIEW:
+            session: LiveSession = PerViewSession(scene, **kept)
+        else:
+            session = LiveSession(scene, settings.names_by_id, **kept)
         self.dropped = Counter()
         session.prepare(RefineSettings(k=settings.k))
         self._session = session

@@ -20,11 +20,12 @@ ARGUMENTS = (
     ("camera_info", "camera_info", "topic with the CameraInfo of the rectified camera"),
     ("pose", "pose", "topic with the camera's pose in the map"),
     ("odometry", "odometry", "topic with the odometry, where pose_source is odometry"),
+    ("image", "image", "topic with the rectified camera's pictures, for the overlay"),
     ("use_sim_time", "false", "whether time comes from /clock: true or false"),
     ("log_level", "info", "debug, info, warn, error or fatal"),
     ("rviz", "false", "whether to show the clouds in RViz: true or false; only where namespace is empty"),
 )
-INPUTS = ("mask", "camera_info", "pose", "odometry")
+INPUTS = ("mask", "camera_info", "pose", "odometry", "image")
 # What a launch argument changes only where it is given: its default must not hide what params_file says.
 OVERRIDES = ("scene_path", "data_root", "pose_source")
 

@@ -39,7 +39,7 @@ from gsseg_core.segmentation import Segmentation
 from gsseg_ros.conversions import camera_info, mask_image, pose_from_matrix, stamp_message
 from gsseg_ros.frames import Similarity
 
-KINDS = {"mask": Image, "camera_info": CameraInfo, "pose": PoseStamped, "odometry": Odometry}
+KINDS = {"mask": Image, "camera_info": CameraInfo, "pose": PoseStamped, "odometry": Odometry, "image": Image}
 SERVICES = {
     "segment": Segment, "render_view": RenderView, "load_scene": LoadScene, "save_state": SaveState,
     "load_state": LoadState, "export": Export, "reset": Reset, "change_state": ChangeState,
@@ -138,6 +138,21 @@ class Robot:
         """Lifecycle state."""
         return str(self.ask("get_state").current_state.label)
 
+    def brought_to(self, state: str) -> Robot:
+        """Take the steps from unconfigured to another state."""
+        for transition in {"unconfigured": (), "inactive": ("configure",), "active": ("configure", "activate")}[state]:
+            assert self.change(transition)
+        assert self.state == state
+        if state == "active":
+            self.wait_active()
+        return self
+
+    def brought_down(self) -> Robot:
+        """Take the steps from whichever state to unconfigured."""
+        while self.state != "unconfigured":
+            assert self.change({"active": "deactivate", "inactive": "cleanup"}[self.state])
+        return self
+
     def shutdown(self) -> bool:
         """Ask for the shutdown that belongs to the lifecycle state."""
         return self.change(f"{self.state}_shutdown")
@@ -193,9 +208,9 @@ class Robot:
         assert handle.accepted
         return Goal(handle, self.ros.run(handle.get_result_async), feedback)
 
-    def outcome(self, goal: Goal, timeout: float = PATIENCE) -> tuple[int, Any]:
-        """Wait for the end of a goal; returns status and result."""
-        answer = self.ros.result(goal.future, "the result", timeout)
+    def outcome(self, goal: Goal) -> tuple[int, Any]:
+        """Wait for the end of a goal; returns status and result. To learn may take a busy machine long."""
+        answer = self.ros.result(goal.future, "the result", 5 * PATIENCE)
         return answer.status, answer.result
 
     def learn(self, **fields: Any) -> tuple[int, Any]:
@@ -212,12 +227,16 @@ class Robot:
         """Cancel a goal and wait for its end; returns status and result."""
         answer = self.ros.result(self.ros.run(goal.handle.cancel_goal_async), "the answer to the cancel")
         assert len(answer.goals_canceling) == 1
-        return self.outcome(goal, timeout=10)
+        return self.outcome(goal)
 
     def exported(self, folder: Path, **fields: Any) -> Segmentation:
         """Export to a folder and read the segmentation back."""
         response = self.done("export", directory=str(folder), **fields)
         return Segmentation.load(folder / "segmentation.npz", GaussianScene.load(response.report.scene_path))
+
+    def out(self, name: str) -> Path:
+        """A folder below data_root to export to."""
+        return Path(self.get("data_root")) / "out" / name
 
     # Parameters
 

@@ -131,7 +131,7 @@ def test_learning_tells_its_progress_in_the_callers_thread_and_what_it_came_to(p
 
     result = place.client.learn("data", on_feedback=on_feedback)
     assert threads == {threading.current_thread()}
-    assert told[0][:3] == ("observe", 0, 4) and {stage for stage, *_ in told} == {"observe", "em"}
+    assert told[0][:3] == ("observe", 0, 4) and {stage for stage, *_ in told} >= {"observe", "em"}
     assert result.report.num_views == 4 and result.num_steps > 0
     assert np.isfinite(result.loss)
     assert {"observe", "learn"} <= result.seconds.keys() and min(result.seconds.values()) >= 0

@@ -350,9 +350,12 @@ def test_a_million_points_are_converted_at_once_even_where_rclpy_checks_fields()
 
         points, ones = np.ones((1_000_000, 3), np.float32), np.ones(1_000_000, np.int32)
         header, rgb = Header(), np.ones((1_000_000, 3), np.uint8)
-        start = time.perf_counter()
-        arrays_from_cloud(cloud(header, points, rgb, ones, ones))
-        print(time.perf_counter() - start)
+        seconds = []
+        for _ in range(5):
+            start = time.process_time()  # Of this process alone, however busy the machine.
+            arrays_from_cloud(cloud(header, points, rgb, ones, ones))
+            seconds.append(time.process_time() - start)
+        print(min(seconds))
         try:
             PointCloud2(height="not a number")
         except AssertionError:

@@ -199,9 +199,17 @@ def test_masks_published_by_hand_are_fused_learnt_and_turned_into_boxes(
     output, _ = run_example("objects_to_boxes.py", "box", "red ball", "--min-confidence", "0.6", ros=ros)
     boxes = {box["object"]: box for box in map(json.loads, output.splitlines())}
     assert set(boxes) == {"box", "red ball"}
-    # Where small_scenes puts it, and its radius.
-    np.testing.assert_allclose(boxes["red ball"]["centroid"], [1, 0, 0.45], atol=0.15)
-    assert boxes["red ball"]["frame"] == "map" and max(boxes["red ball"]["box_size"]) < 1
+    # Where small_scenes puts it, and its diameter.
+    ball = boxes["red ball"]
+    np.testing.assert_allclose(ball["mean"], [1, 0, 0.45], atol=0.15)
+    np.testing.assert_allclose(ball["center"], [1, 0, 0.45], atol=0.15)
+    assert ball["frame"] == "map" and 0.5 < ball["size"][2] <= ball["size"][0] < 1.1
+    assert ball["close_along"] is None, "it is wider than the hand"
+    np.testing.assert_allclose(np.linalg.norm(ball["axes"], axis=1), 1, atol=1e-3)
+
+    output, _ = run_example("objects_to_boxes.py", "box", "--opening", "2", ros=ros)
+    (box,) = map(json.loads, output.splitlines())
+    np.testing.assert_allclose(box["close_along"], box["axes"][2], atol=1e-3)
     assert robot.running
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import json
 import os
 import stat
 import subprocess
@@ -70,7 +71,7 @@ def test_every_file_that_setup_py_installs_is_there(monkeypatch: pytest.MonkeyPa
 
 def test_no_launch_or_configuration_file_is_forgotten_by_setup_py(monkeypatch: pytest.MonkeyPatch) -> None:
     installed = {file for _, names in _set_up(monkeypatch)["data_files"] for file in names}
-    folders = ("config", "launch", "resource", "rviz", "scripts", "sros2")
+    folders = ("config", "foxglove", "launch", "resource", "rviz", "scripts", "sros2")
     present = {file.relative_to(ROOT).as_posix() for name in folders for file in (ROOT / name).glob("*.*")}
     assert present - installed == set()
 
@@ -241,8 +242,11 @@ def test_rviz_shows_latched_topics_of_the_node_in_the_map_frame() -> None:
     manager = yaml.safe_load((ROOT / "rviz" / "gsseg.rviz").read_text())["Visualization Manager"]
     assert manager["Global Options"]["Fixed Frame"] == "map"
     displays = {display["Name"]: display for display in manager["Displays"]}
-    assert list(displays) == ["Grid", "TF", "Objects", "Objects by label", "Overlay"]
-    for name, topic in (("Objects", "cloud"), ("Objects by label", "cloud"), ("Overlay", "overlay")):
+    assert list(displays) == ["Grid", "TF", "Objects", "Objects by label", "Object boxes", "Overlay"]
+    shown = {name for name, display in displays.items() if display["Enabled"]}
+    assert shown == set(displays) - {"Objects by label"}, "at the first start; that one hides the other's colours"
+    topics = {"Objects": "cloud", "Objects by label": "cloud", "Object boxes": "object_markers", "Overlay": "overlay"}
+    for name, topic in topics.items():
         asked = displays[name]["Topic"]
         assert asked["Value"] == f"/gsseg/{topic}"
         assert (asked["Durability Policy"], asked["Reliability Policy"]) == ("Transient Local", "Reliable")
@@ -251,3 +255,27 @@ def test_rviz_shows_latched_topics_of_the_node_in_the_map_frame() -> None:
         "Intensity",
         "label",
     )
+
+
+def test_foxglove_shows_topics_that_the_node_publishes_in_the_map_frame() -> None:
+    layout = json.loads((ROOT / "foxglove" / "gsseg.json").read_text())
+    panels = layout["configById"]
+
+    def ids(part: str | dict[str, Any]) -> list[str]:
+        return [part] if isinstance(part, str) else [*ids(part["first"]), *ids(part["second"])]
+
+    assert sorted(ids(layout["layout"])) == sorted(panels), "every panel has its place, and every place its panel"
+    scene = next(panel for name, panel in panels.items() if name.startswith("3D!"))
+    assert scene["followTf"] == "map"
+    paths = [panel[key] for panel in panels.values() for key in ("topicPath", "topicToRender") if key in panel]
+    images = [panel["imageMode"]["imageTopic"] for panel in panels.values() if panel.get("imageMode")]
+    profile = ElementTree.parse(ROOT / "sros2" / "policy.xml").find("enclaves/enclave/profiles/profile")
+    assert profile is not None
+    published = {
+        (element.text or "").replace("~/", "/gsseg/")
+        for group in profile.findall("topics[@publish='ALLOW']")
+        for element in group
+    }
+    assert {*scene["topics"], *paths, *images} <= published
+    assert {"/gsseg/cloud", "/gsseg/object_markers"} <= {name for name, of in scene["topics"].items() if of["visible"]}
+    assert images == ["/gsseg/overlay"] and "/gsseg/objects" in paths and "/diagnostics" in paths

@@ -14,8 +14,8 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from rclpy.action import get_action_server_names_and_types_by_node
 
-# Of the kinds of pose source one is there at a time, and a clock only with use_sim_time.
-ONE_OF = {"/pose", "/odometry", "/tf", "/tf_static", "/clock"}
+# Of the kinds of pose source one is there at a time, a clock only with use_sim_time, and images while they are shown.
+ONE_OF = {"/pose", "/odometry", "/tf", "/tf_static", "/clock", "/image"}
 
 
 def listed(kind: str, permission: str) -> set[str]:

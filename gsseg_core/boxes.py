@@ -1,0 +1,341 @@
+"""Boxes around objects, for a planner: they lie as the object does, and a few stray Gaussians do not blow them up.
+
+With weights w_i = opacity times probability of the class, centres x_i and covariances S_i of an object's Gaussians:
+
+1. Floaters go. d_i is the distance from the geometric median (Weiszfeld 1937), d_90 the weighted 90 % quantile of
+   these; what is farther away than 3 d_90 is left out of all that follows. The median stays where it is until half of
+   the weight floats, the quantile until a tenth does. Of matter spread evenly along a line, over a disc or in a ball
+   nothing is left out.
+2. The matter: c = sum w_i x_i / sum w_i and S = sum w_i ((x_i - c)(x_i - c)^T + S_i) / sum w_i.
+3. Axes: those of S, or a box with a side on one of the three largest faces of the points' convex hull, whichever is
+   smaller; and then, about each axis, the turn for which the rectangle around the points is smallest, until none makes
+   the box smaller. One side of such a rectangle lies along an edge of the points' hull (Freeman and Shapira 1975). The
+   axes of S alone say little of a cube or a round table. Points outside the 0.5 % and 99.5 % quantiles along the axes
+   of S have no say in this.
+4. Sides: along an axis u a Gaussian reaches from u.x_i - s_i to u.x_i + s_i, where s_i^2 = u^T S_i u. The box begins
+   where 0.5 % of the weight has begun, and ends where all but 0.5 % has ended.
+
+All of this turns, moves and scales with the scene, and no direction is taken for up.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import ConvexHull, QhullError
+
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segmentation import Segmentation
+
+Array = npt.NDArray[np.float64]
+
+FAR = 3.0
+"""Floaters are so many times farther away than 90 % of the weight."""
+
+TRIM = 0.005
+"""Share of the weight that the box leaves out on each side."""
+
+ENOUGH = 0.999
+"""A turn has to make the rectangle smaller than this part of it; else the axes stay."""
+
+SAMPLE = 2000
+"""An object of more Gaussians is judged by so many of them at most, taken at even steps; that bounds the time."""
+
+_STEPS, _PASSES, _SIDES = 50, 4, 3
+_SETTLED = 1e-3
+"""The median may move by this part of the largest distance in the last step: it only has to be inside the object."""
+
+
+@dataclass(frozen=True, eq=False)
+class OrientedBox:
+    """Where an object lies and what room it takes, in the units of the scene.
+
+    Attributes
+    ----------
+    center : ndarray (3,) float64
+        Middle of the box.
+    axes : ndarray (3, 3) float64
+        Columns are the directions of its sides, the longest first; a rotation from the axes of the box to those of the
+        scene. Each is one of two opposite directions, and for sides of equal length so is their order: arbitrary.
+    size : ndarray (3,) float64
+        Lengths of the sides, descending.
+    mean : ndarray (3,) float64
+        Mean of the object's matter.
+    covariance : ndarray (3, 3) float64
+        Covariance of its matter about that mean, in squared units: how far it reaches, not how uncertain the mean is.
+    """
+
+    center: Array
+    axes: Array
+    size: Array
+    mean: Array
+    covariance: Array
+
+    @property
+    def corners(self) -> Array:
+        """The eight corners (8, 3)."""
+        signs = np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5], indexing="ij"), axis=-1).reshape(8, 3)
+        corners: Array = self.center + (signs * self.size) @ self.axes.T
+        return corners
+
+    def moved(
+        self,
+        rotation: Array,  # (3, 3)
+        translation: Array,  # (3,)
+        scale: float,
+    ) -> OrientedBox:
+        """Return the box after x -> scale * rotation @ x + translation; its axes stay in their order."""
+        turn = scale * rotation
+        return OrientedBox(
+            turn @ self.center + translation,
+            _pointed(rotation @ self.axes),
+            scale * self.size,
+            turn @ self.mean + translation,
+            turn @ self.covariance @ turn.T,
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Write it in plain lists, as in report.json: `axes` is a list of directions, the longest side's first."""
+        return {
+            "center": _rounded(self.center),
+            "axes": _rounded(self.axes.T),
+            "size": _rounded(self.size),
+            "mean": _rounded(self.mean),
+            "covariance": _rounded(self.covariance),
+        }
+
+
+def oriented_box(
+    means: np.ndarray,  # (M, 3)
+    covariances: np.ndarray,  # (M, 3, 3)
+    weights: np.ndarray,  # (M,)
+) -> OrientedBox:
+    """Put a box around some Gaussians; the module says how.
+
+    Parameters
+    ----------
+    means : (M, 3) float
+        Their centres; M is at least 1.
+    covariances : (M, 3, 3) float
+        Their shapes, in squared units.
+    weights : (M,) float
+        What each counts, from 0; if all are 0, all count the same.
+
+    Raises
+    ------
+    ValueError
+        There is no Gaussian, or the shapes do not go together.
+    """
+    count = len(means)
+    shapes = (np.shape(means), np.shape(covariances), np.shape(weights))
+    if count == 0 or shapes != ((count, 3), (count, 3, 3), (count,)):
+        raise ValueError(
+            f"means, covariances, weights have shapes {shapes}; expected (M, 3), (M, 3, 3), (M,), M at least 1"
+        )
+    every = -(-count // SAMPLE)
+    points, shape, weights = (np.asarray(values[::every], np.float64) for values in (means, covariances, weights))
+    if not weights.any():
+        weights = np.ones(len(points))
+    kept = _without_floaters(points, weights)
+    points, shape, weights = points[kept], shape[kept], weights[kept]
+    share = weights / weights.sum()
+    mean = share @ points
+    apart = points - mean
+    covariance = (apart * share[:, None]).T @ apart + np.einsum("m,mij->ij", share, shape)
+    axes = _turned(apart, share, np.linalg.eigh(covariance)[1])
+    reach = np.sqrt(np.maximum(np.einsum("ik,mij,jk->mk", axes, shape, axes, optimize=True), 0))
+    along = apart @ axes
+    low, high = _quantile(along - reach, share, TRIM), -_quantile(-along - reach, share, TRIM)
+    order = np.argsort(low - high, kind="stable")
+    center = mean + axes @ ((low + high) / 2)
+    return OrientedBox(center, _pointed(axes[:, order]), (high - low)[order], mean, covariance)
+
+
+def class_box(
+    scene: GaussianScene,
+    index: np.ndarray,  # (M,) int
+    confidence: np.ndarray,  # (M,)
+) -> OrientedBox:
+    """Put a box around the Gaussians of one object.
+
+    Parameters
+    ----------
+    scene : GaussianScene
+        N Gaussians.
+    index : (M,) int
+        Those of the object; M is at least 1.
+    confidence : (M,) float
+        Probability, for each of these, that it is.
+    """
+    every = -(-len(index) // SAMPLE)
+    index, confidence = index[::every], confidence[::every]
+    turns = _rotations(scene.quats[index].astype(np.float64)) * scene.scales[index][:, None, :]
+    return oriented_box(scene.means[index], turns @ turns.transpose(0, 2, 1), scene.opacities[index] * confidence)
+
+
+def object_boxes(scene: GaussianScene, result: Segmentation) -> dict[int, OrientedBox]:
+    """Put a box around every object of a segmentation.
+
+    Returns
+    -------
+    dict of int to OrientedBox
+        By class id, ascending; neither the background nor classes without a Gaussian.
+    """
+    order = np.argsort(result.labels, kind="stable")
+    bounds = np.searchsorted(result.labels[order], np.arange(1, result.num_classes + 1))
+    confidence = result.confidence
+    found = {}
+    for k, (first, last) in enumerate(zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True), start=1):
+        if last > first:
+            found[k] = class_box(scene, order[first:last], confidence[order[first:last]])
+    return found
+
+
+def _without_floaters(
+    points: Array,  # (M, 3)
+    weights: Array,  # (M,)
+) -> npt.NDArray[np.bool_]:
+    """Tell which points (M,) are no farther than `FAR` times 90 % of the weight from the geometric median."""
+    middle = weights @ points / weights.sum()
+    distance = np.linalg.norm(points - middle, axis=1)
+    for _ in range(_STEPS):
+        # A point that the median comes to lie on must not take all the weight.
+        pull = weights / np.maximum(distance, 1e-6 * distance.max() + 1e-300)
+        before, middle = middle, pull @ points / pull.sum()
+        distance = np.linalg.norm(points - middle, axis=1)
+        if np.linalg.norm(middle - before) <= _SETTLED * distance.max():
+            break
+    limit = FAR * _quantile(distance[:, None], weights / weights.sum(), 0.9)
+    kept: npt.NDArray[np.bool_] = (distance <= limit) & (weights > 0)
+    return kept
+
+
+def _turned(
+    apart: Array,  # (M, 3)
+    share: Array,  # (M,)
+    axes: Array,  # (3, 3)
+) -> Array:
+    """Find the axes (3, 3) of the smallest box around points, beginning with these and with the sides of their hull."""
+    along = apart @ axes
+    low, high = _quantile(along, share, TRIM), -_quantile(-along, share, TRIM)
+    points = apart[((along >= low) & (along <= high)).all(axis=1)]
+    starts = [axes]
+    if len(points) > 3:
+        with suppress(QhullError):  # All in one plane.
+            hull = ConvexHull(points)
+            corners = points[hull.simplices]
+            areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+            largest = np.argsort(-areas, kind="stable")[:_SIDES]
+            points = points[hull.vertices]
+            starts += [_turned_about(points, _completed(hull.equations[side, :3], axes), 0) for side in largest]
+    axes = min(starts, key=lambda start: _volume(points, start))
+    for _ in range(_PASSES):
+        before = axes
+        for k in range(3):
+            axes = _turned_about(points, axes, k)
+        if axes is before:
+            break
+    return axes
+
+
+def _completed(
+    normal: Array,  # (3,)
+    axes: Array,  # (3, 3)
+) -> Array:
+    """Complete a direction to a rotation (3, 3), with the one of `axes` that lies most across it."""
+    other = axes[:, np.abs(normal @ axes).argmin()]
+    other = other - normal * (normal @ other)
+    other /= np.linalg.norm(other)
+    return np.stack([normal, other, np.cross(normal, other)], axis=1)
+
+
+def _volume(
+    points: Array,  # (M, 3)
+    axes: Array,  # (3, 3)
+) -> float:
+    return float(np.prod(np.ptp(points @ axes, axis=0)))
+
+
+def _turned_about(
+    points: Array,  # (M, 3)
+    axes: Array,  # (3, 3)
+    k: int,
+) -> Array:
+    """Turn axes (3, 3) about the one in column k so that the box around the points is smallest."""
+    i, j = (k + 1) % 3, (k + 2) % 3
+    x, y, gain = _smallest_rectangle(points @ axes[:, [i, j]])
+    if gain >= ENOUGH:
+        return axes
+    turned = axes.copy()
+    turned[:, [i, j]] = axes[:, [i, j]] @ np.array([[x, -y], [y, x]])
+    return turned
+
+
+def _smallest_rectangle(
+    points: Array,  # (M, 2)
+) -> tuple[float, float, float]:
+    """Direction (x, y) of a side of the smallest rectangle around points, and its area by that of the upright one."""
+    try:
+        hull = points[ConvexHull(points).vertices] if len(points) > 2 else points[:0]
+    except QhullError:  # All on one line.
+        hull = points[:0]
+    upright = np.prod(np.ptp(hull, axis=0)) if len(hull) else 0.0
+    if upright <= 0:
+        return 1.0, 0.0, 1.0
+    edges = np.roll(hull, -1, axis=0) - hull
+    edges /= np.linalg.norm(edges, axis=1, keepdims=True)
+    across = np.stack([-edges[:, 1], edges[:, 0]], axis=1)
+    areas = np.ptp(hull @ edges.T, axis=0) * np.ptp(hull @ across.T, axis=0)
+    best = int(areas.argmin())
+    x, y = edges[best].tolist()
+    # A quarter of a turn makes the same rectangle; the least turn keeps the axes in their order.
+    if abs(x) < abs(y):
+        x, y = y, -x
+    return (x, y, float(areas[best] / upright)) if x > 0 else (-x, -y, float(areas[best] / upright))
+
+
+def _quantile(
+    values: Array,  # (M, C)
+    share: Array,  # (M,)
+    part: float,
+) -> Array:
+    """Least value (C,) of each column up to which `part` of the weight lies; shares sum to 1."""
+    order = np.argsort(values, axis=0, kind="stable")
+    reached = np.cumsum(share[order], axis=0) >= part * (1 - 1e-9)
+    rows = np.where(reached.any(axis=0), reached.argmax(axis=0), len(values) - 1)
+    columns = np.arange(values.shape[1])
+    found: Array = values[order[rows, columns], columns]
+    return found
+
+
+def _pointed(
+    axes: Array,  # (3, 3)
+) -> Array:
+    """Choose one of the two directions of each axis, the same way for all boxes, so that they make a rotation."""
+    first, second = (axis * np.copysign(1.0, axis[np.abs(axis).argmax()]) for axis in axes.T[:2])
+    pointed: Array = np.stack([first, second, np.cross(first, second)], axis=1)
+    return pointed
+
+
+def _rotations(
+    quats: Array,  # (M, 4) wxyz, unit
+) -> Array:
+    """Rotation matrices (M, 3, 3)."""
+    w, x, y, z = quats.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    matrices: Array = np.moveaxis(np.array(rows), 2, 0)
+    return matrices
+
+
+def _rounded(values: Array) -> Any:
+    """Six significant digits of the largest."""
+    largest = float(np.abs(values).max())
+    return values.round(5 - int(np.floor(np.log10(largest)))).tolist() if largest else values.tolist()

@@ -1,0 +1,79 @@
+"""Pictures of the camera, for the overlay: heard only while somebody looks at that, for they are large."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from rclpy.callback_groups import CallbackGroup
+from rclpy.lifecycle import LifecycleNode
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import Image
+
+from gsseg_ros.conversions import stamp_ns
+from gsseg_ros.live_outputs import LiveOutputs
+from gsseg_ros.outputs import Outputs
+from gsseg_ros.pairing import Pairing, PoseSource
+from gsseg_ros.qos import sensor_data
+
+
+class CameraImages:
+    """Listens to `image` while `~/overlay` has subscribers, and finds pose and camera of each picture.
+
+    Parameters
+    ----------
+    node : LifecycleNode
+        Listens.
+    outputs : Outputs
+        Knows who looks.
+    live : LiveOutputs
+        Gets the pictures.
+    poses : PoseSource
+        Of the pictures alone; that of the masks is emptied when time is set back, and so is this one.
+    group : CallbackGroup
+        Of the other inputs.
+
+    Attributes
+    ----------
+    pairing : Pairing
+        Wants every camera_info and every pose, and pairs pictures as masks are paired: at exactly their stamp.
+    """
+
+    def __init__(
+        self, node: LifecycleNode, outputs: Outputs, live: LiveOutputs, poses: PoseSource, group: CallbackGroup
+    ) -> None:
+        self._node, self._outputs, self._live, self._group = node, outputs, live, group
+        self.pairing = Pairing(poses)
+        self._subscription: Any = None
+
+    def tick(self) -> None:
+        """Begin or stop to listen, and hand over what has found its pose; call it some ten times a second."""
+        wanted = self._outputs.wants_overlay
+        if wanted and self._subscription is None:
+            self._subscription = self._node.create_subscription(
+                Image,
+                "image",
+                self._arrived,
+                sensor_data(),
+                callback_group=self._group,
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )
+        elif not wanted:
+            self.close()
+        self.pairing.expire(time.monotonic())
+        self._hand_over()
+
+    def close(self) -> None:
+        """Stop to listen."""
+        if self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)
+            self._subscription = None
+
+    def _arrived(self, message: Image) -> None:
+        topic = self._node.resolve_topic_name("image")
+        self.pairing.add_mask(stamp_ns(message.header.stamp), (topic, message), message.header.frame_id)
+        self._hand_over()
+
+    def _hand_over(self) -> None:
+        for paired in self.pairing.take():
+            self._live.image(paired)

@@ -1,0 +1,184 @@
+"""What the node shows by itself while views come in: pictures on ~/overlay, and the objects so far on ~/objects.
+
+All of it is made in a thread of its own, only while somebody listens, only of what is newest, and only while no mask
+waits to be fused. It goes by the codes as they are at that moment, without refinement.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from std_msgs.msg import Header
+
+from gsseg_core.errors import GssegError
+from gsseg_core.live import LiveSession
+from gsseg_core.operator import make_operator
+from gsseg_core.pictures import overlay, palette
+from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.segmentation import Segmentation
+from gsseg_ros.color_images import color_from_image
+from gsseg_ros.conversions import camera_from_messages, rgb_image
+from gsseg_ros.outputs import Outputs
+from gsseg_ros.pairing import Paired
+from gsseg_ros.reports import Selection
+from gsseg_ros.workspace import Workspace
+
+RAW = RefineSettings(cluster=False, filter=False)
+
+CODES_PERIOD, OBJECTS_PERIOD = 1.0, 2.0
+"""Seconds for which codes are gone by before they are looked up again, and between two messages of objects."""
+
+IMAGE_SILENCE = 2.0
+"""Seconds without a usable camera image until the classes are drawn without one."""
+
+_PAUSE = 0.05  # s, between two looks at whether masks still wait
+
+
+class LiveOutputs:
+    """Draws and boxes in a thread of its own, from activation to deactivation. Its methods return at once.
+
+    Parameters
+    ----------
+    workspace : Workspace
+        What is shown.
+    outputs : Outputs
+        Where.
+    busy : callable
+        Whether masks wait to be fused.
+    now : callable
+        The stamp of this moment.
+    complain : callable
+        Gets a key and what is wrong with a camera image.
+    """
+
+    def __init__(
+        self,
+        workspace: Workspace,
+        outputs: Outputs,
+        busy: Callable[[], bool],
+        now: Callable[[], Time],
+        complain: Callable[[str, str], None],
+    ) -> None:
+        self._workspace, self._outputs = workspace, outputs
+        self._busy, self._now, self._complain = busy, now, complain
+        self._changed = threading.Condition()
+        self._picture: tuple[Paired, bool] | None = None
+        self._objects_due = False
+        self._views_since_objects = False
+        self._stopping = False
+        self._codes: tuple[tuple[LiveSession, int], float, Segmentation] | None = None
+        self._last_image = self._last_objects = -np.inf
+        self._thread = threading.Thread(target=self._run, name="live outputs", daemon=True)
+        self._thread.start()
+
+    def fused(self, paired: Paired) -> None:
+        """Take note of a mask that has been fused; it is drawn if no camera image came lately."""
+        self._views_since_objects = True
+        if time.monotonic() - self._last_image > IMAGE_SILENCE:
+            self._show(paired, with_image=False)
+
+    def image(self, paired: Paired) -> None:
+        """Take in a camera image with its pose, in the place of the mask."""
+        self._last_image = time.monotonic()
+        self._show(paired, with_image=True)
+
+    def tick(self) -> None:
+        """See whether objects are due; call it some ten times a second."""
+        if (
+            self._views_since_objects
+            and self._outputs.wants_objects
+            and time.monotonic() - self._last_objects >= OBJECTS_PERIOD
+        ):
+            with self._changed:
+                self._objects_due = True
+                self._changed.notify()
+
+    def close(self, timeout_s: float = 5.0) -> None:
+        """Finish what is in hand, and end."""
+        with self._changed:
+            self._stopping = True
+            self._changed.notify()
+        self._thread.join(timeout_s)
+
+    def _show(self, paired: Paired, with_image: bool) -> None:
+        if self._outputs.wants_overlay:
+            with self._changed:
+                self._picture = (paired, with_image)
+                self._changed.notify()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._picture or self._objects_due or self._stopping)
+                while self._busy() and not self._stopping:
+                    self._changed.wait(_PAUSE)
+                if self._stopping:
+                    return
+                picture, self._picture = self._picture, None
+                objects_due, self._objects_due = self._objects_due, False
+            if picture is not None:
+                self._guarded(self._draw, *picture)
+            if objects_due:
+                self._guarded(self._publish_objects)
+
+    def _guarded(self, work: Callable[..., None], *arguments: Any) -> None:
+        try:
+            work(*arguments)
+        except GssegError as error:  # An image that cannot be used, or a reset in this moment.
+            self._complain(f"live {type(error).__name__}", str(error))
+        except Exception as error:  # Nothing that is only to be looked at may end the thread.
+            self._complain("live", f"overlay or objects: unexpected {type(error).__name__}: {error}")
+
+    def _draw(self, paired: Paired, with_image: bool) -> None:
+        session, settings = self._workspace.session, self._workspace.settings
+        if not session.has_codes:
+            return
+        (topic, image), (info_topic, info) = paired.mask, paired.camera_info
+        pose = paired.pose @ settings.camera_in_base if settings.pose_source == "odometry" else paired.pose
+        camera = camera_from_messages(paired.name, info, pose, settings.scene_to_map, info_topic)
+        result = self._current()
+        colors = palette(result.num_classes)
+        labels = result.render(make_operator(session.scene, camera, session.device)).labels
+        picture = colors[labels]
+        if with_image:
+            photo = color_from_image(image, topic)
+            if photo.shape != picture.shape:
+                raise GssegError(
+                    f"{topic}: image is {image.width} x {image.height} pixels; expected {info.width} x {info.height}, "
+                    f"as {info_topic} says"
+                )
+            picture = overlay(photo, labels, colors)
+        header = Header(stamp=image.header.stamp, frame_id=image.header.frame_id)
+        self._outputs.publish_overlay(rgb_image(picture, header))
+
+    def _publish_objects(self) -> None:
+        session, settings = self._workspace.session, self._workspace.settings
+        if not session.has_codes:
+            return
+        # What a run or a reset publishes while these are put together is newer.
+        since = self._outputs.objects_count
+        self._views_since_objects = False
+        result = self._current()
+        selection = Selection(session, result, sorted(result.class_names), 0.0, settings.scene_to_map)
+        header = Header(stamp=self._now(), frame_id=settings.map_frame)
+        self._outputs.publish_objects(selection.objects(header, revision=0), since)
+        self._last_objects = time.monotonic()
+
+    def _current(self) -> Segmentation:
+        """Codes as they are now, or were a second ago."""
+        session = self._workspace.session
+        key = (session, session.version)
+        if self._codes is not None:
+            kept, since, result = self._codes
+            if kept == key or (kept[0] is session and time.monotonic() - since < CODES_PERIOD):
+                return result
+        learnt = session.learnt
+        result = Segmentation.unfiltered(session.scene, session.codes(), session.class_names, RAW)
+        result = result.calibrated(1.0 if learnt is None else learnt.temperature)
+        self._codes = (key, time.monotonic(), result)
+        return result

@@ -1,0 +1,194 @@
+"""Codes of a running segmentation node for the viewer: the source "ros" of `gsseg view --ros`."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from gsseg_msgs.srv import Segment
+from rcl_interfaces.msg import ParameterValue
+from rcl_interfaces.srv import GetParameters
+from sensor_msgs.msg import PointCloud2
+
+from gsseg_core.errors import StateMismatchError
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segmentation import UNOBSERVED
+from gsseg_core.view_live import LiveUpdate
+from gsseg_core.view_model import Labelling
+from gsseg_ros.client_calls import Calls
+from gsseg_ros.conversions import CloudArrays, arrays_from_cloud, stamp_ns
+from gsseg_ros.errors import NodeUnavailableError, SegmentationError
+from gsseg_ros.frames import Similarity
+from gsseg_ros.qos import latched
+from gsseg_ros.spinner import Spinner
+
+ANSWER_SECONDS = 30.0
+"""How long a request, and the clouds that follow it, may take."""
+
+_PARAMETERS = ("scene_to_map.scale", "scene_to_map.translation", "scene_to_map.rotation")
+_CHANGING = ("views fused", "codes", "last job")
+"""Values of the node's diagnostics that say that its codes have changed."""
+
+
+class RosSource:
+    """Asks a node to segment whenever its diagnostics say that views have come in or codes were learnt.
+
+    A request has the node publish its clouds, for all who listen. They hold the class of a Gaussian and its confidence,
+    and no other probabilities.
+
+    Parameters
+    ----------
+    scene : GaussianScene
+        The scene that the node has, too.
+    node_name : str
+        Name of the node, with its namespace if it has one.
+    domain_id : int, optional
+        ROS domain, if not that of the environment.
+    find_timeout : float
+        Seconds to look for the node.
+
+    Raises
+    ------
+    NodeUnavailableError
+        There is no such node.
+    """
+
+    def __init__(
+        self,
+        scene: GaussianScene,
+        node_name: str = "gsseg",
+        *,
+        domain_id: int | None = None,
+        find_timeout: float = 10.0,
+    ) -> None:
+        self._scene, self._name = scene, "/" + node_name.strip("/")
+        self._said: tuple[str, ...] | None = None
+        self._shown: tuple[str, ...] | None = None
+        self._clouds: dict[str, PointCloud2] = {}
+        self._spinner = Spinner("gsseg_view", None, domain_id)
+        try:
+            self._calls = Calls(self._spinner, self._name, find_timeout)
+            node = self._spinner.node
+            self._segment = node.create_client(Segment, f"{self._name}/segment")
+            node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+            self._listen(f"{self._name}/cloud")
+            self._places = _Places(self._similarity().points_to_map(scene.means))
+        except BaseException:
+            self._spinner.close()
+            raise
+
+    def wait(self, timeout: float) -> LiveUpdate | None:
+        """Wait until the node knows more than it did, and ask it what.
+
+        Raises
+        ------
+        StateMismatchError
+            The node has another scene.
+        NodeUnavailableError
+            It does not answer.
+        """
+        if not self._spinner.wait_for(lambda: self._said != self._shown, timeout):
+            return None
+        said = self._said
+        try:
+            report = self._calls.call(self._segment, Segment.Request(), ANSWER_SECONDS).report
+        except SegmentationError as error:
+            if error.name == "NO_CODES":
+                self._shown = said
+                return None
+            raise
+        if report.scene_hash != self._scene.digest:
+            raise StateMismatchError(
+                f"{self._name} has the scene {report.scene_path}, which is not {self._scene.path or 'this one'}; "
+                "expected the same file"
+            )
+        update = LiveUpdate(self._labelling(report), int(report.num_views))
+        self._shown = said
+        return update
+
+    def close(self) -> None:
+        """Leave ROS; the node goes on."""
+        self._spinner.close()
+
+    def _labelling(self, report: Any) -> Labelling:
+        names = {summary.class_id: summary.name for summary in report.classes}
+        names = {k: names.get(k, f"class_{k:02d}") for k in range(max(names, default=0) + 1)}
+        labels = np.full(len(self._scene), UNOBSERVED, np.int32)
+        probabilities = np.zeros((len(self._scene), len(names)), np.float32)
+        # ~/cloud has all objects; the background is in a cloud of its own.
+        topics = [f"{self._name}/cloud", *(s.topic for s in report.classes if s.class_id == 0 and s.num_gaussians)]
+        for topic in topics:
+            self._listen(topic)
+            cloud = self._cloud(topic, stamp_ns(report.header.stamp))
+            index = self._places.find(cloud.points, topic)
+            labels[index] = cloud.labels
+            probabilities[index, cloud.labels] = cloud.confidence
+        return Labelling(labels, probabilities, names)
+
+    def _listen(self, topic: str) -> None:
+        if topic not in self._clouds:
+            self._clouds[topic] = PointCloud2()
+            self._spinner.run(
+                lambda: self._spinner.node.create_subscription(
+                    PointCloud2, topic, lambda message: self._clouds.update({topic: message}), latched()
+                )
+            )
+
+    def _cloud(self, topic: str, stamp: int) -> CloudArrays:
+        # A later run's cloud is as good as this one's: it is what is known now.
+        if not self._spinner.wait_for(lambda: stamp_ns(self._clouds[topic].header.stamp) >= stamp, ANSWER_SECONDS):
+            raise NodeUnavailableError(f"{topic}: no cloud of the last run within {ANSWER_SECONDS:g} s")
+        return arrays_from_cloud(self._clouds[topic], topic)
+
+    def _similarity(self) -> Similarity:
+        client = self._spinner.node.create_client(GetParameters, f"{self._name}/get_parameters")
+        deadline = time.monotonic() + ANSWER_SECONDS
+        self._calls.find(client.service_is_ready, f"service {client.srv_name}", ANSWER_SECONDS)
+        asked = self._spinner.run(lambda: client.call_async(GetParameters.Request(names=list(_PARAMETERS))))
+        self._calls.settle(asked.done, client.service_is_ready, client.srv_name, deadline)
+        scale, translation, rotation = (_value(value) for value in asked.result().values)
+        return Similarity.from_parameters(scale, translation, rotation)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name == self._name:
+                values = {value.key: value.value for value in status.values}
+                self._said = tuple(values.get(key, "") for key in _CHANGING)
+
+
+class _Places:
+    """Finds Gaussians by where they are in the map, bit for bit: a cloud does not say which they are.
+
+    Of two in the very same place, both go by what is said of the first.
+    """
+
+    def __init__(self, points: np.ndarray) -> None:  # (N, 3) float32
+        keys = _keys(points)
+        self._order = np.argsort(keys, kind="stable")
+        self._sorted = keys[self._order]
+
+    def find(self, points: np.ndarray, topic: str) -> np.ndarray:
+        """Give the indices (M,) of points (M, 3)."""
+        keys = _keys(points)
+        place = np.minimum(np.searchsorted(self._sorted, keys), len(self._sorted) - 1)
+        found = self._sorted[place] == keys
+        if not found.all():
+            raise StateMismatchError(
+                f"{topic}: {np.count_nonzero(~found)} of {len(points)} points are not centres of the scene; expected "
+                "the scene and the scene_to_map of the node"
+            )
+        index: np.ndarray = self._order[place]
+        return index
+
+
+def _keys(points: np.ndarray) -> np.ndarray:
+    """One key per point (M, 3): its 12 bytes, which numpy sorts and compares as such."""
+    keys: np.ndarray = np.ascontiguousarray(points, np.float32).view(np.dtype((np.void, 12)))[:, 0]
+    return keys
+
+
+def _value(value: ParameterValue) -> Any:
+    kinds = {3: value.double_value, 8: value.double_array_value}
+    return kinds[value.type]

@@ -1,0 +1,130 @@
+"""What the segmentation node says of its inputs: quality of service, diagnostics, and what is missing."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ros_fixtures import parameters_fixture, root_fixture  # noqa: F401
+from ros_helpers import Ros, ros_fixture  # noqa: F401
+from ros_robot import SECOND, Robot, private_ros
+from small_scenes import NUM_CLASSES, clean_views
+
+pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from lifecycle_msgs.msg import State
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+from gsseg_ros.conversions import stamp_ns
+
+
+@pytest.fixture(scope="module")
+def silent(tmp_path_factory: pytest.TempPathFactory, parameters: dict[str, Any]) -> Iterator[Robot]:
+    """A node that hears nothing; it may complain while other tests run."""
+    with private_ros(tmp_path_factory.mktemp("silent")) as ros:
+        robot = Robot(ros, "/silent")
+        ros.node.destroy_publisher(robot.publishers.pop("mask"))
+        ros.node.destroy_publisher(robot.publishers.pop("pose"))
+        robot.start(parameters, lossless=False)
+        yield robot
+
+
+@pytest.mark.parametrize("reliability", [None, "reliable"])
+def test_the_quality_of_service_of_an_input_can_be_overridden(
+    ros: Ros, parameters: dict[str, Any], reliability: str | None
+) -> None:
+    robot = Robot(ros)
+    override = {} if reliability is None else {"qos_overrides./mask.subscription.reliability": reliability}
+    robot.started({**parameters, **override}, lossless=False)
+    (found,) = ros.node.get_subscriptions_info_by_topic("/mask")
+    wanted = ReliabilityPolicy.BEST_EFFORT if reliability is None else ReliabilityPolicy.RELIABLE
+    assert found.qos_profile.reliability == wanted
+    assert found.qos_profile.durability == DurabilityPolicy.VOLATILE
+    (other,) = ros.node.get_subscriptions_info_by_topic("/pose")
+    assert other.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+
+    def fused() -> bool:
+        robot.drive(clean_views(1))  # One that is sent before the two have found each other may be lost.
+        return robot.ask("segment").error_code == 0
+
+    ros.wait_until(fused, "a view")
+
+
+def test_without_tf2_ros_the_pose_source_tf_is_one_clear_error(ros: Ros, parameters: dict[str, Any]) -> None:
+    try:
+        import tf2_ros  # noqa: F401
+    except ImportError:
+        pass
+    else:
+        pytest.skip("tf2_ros is installed")
+    robot = Robot(ros)
+    process = robot.start({**parameters, "pose_source": "tf"})
+    process.wait_for("cannot be activated")
+    errors = [line for line in process.output.splitlines() if "[ERROR]" in line]
+    assert len(errors) == 1 and "Traceback" not in process.output
+    assert "parameter pose_source is 'tf', but TF cannot be used here" in errors[0]
+    assert "expected the apt package ros-jazzy-tf2-ros-py to be installed, or pose_source 'topic'" in errors[0]
+    assert robot.ask("get_state").current_state.id == State.PRIMARY_STATE_INACTIVE
+
+
+def test_diagnostics_tell_what_there_is_once_a_second(ros: Ros, parameters: dict[str, Any], root: Path) -> None:
+    robot = Robot(ros).started(parameters)
+    robot.fuse(clean_views(3))
+    robot.learn(learner="em")
+    status = robot.wait_for_status(lambda status: status.get("codes") == "em", "the codes")
+    assert {
+        "active": "True", "scene": f"{root}/data/scene.ply", "gaussians": "626", "classes": str(NUM_CLASSES),
+        "views fused": "3", "views kept": "3",
+    }.items() <= status.items()  # fmt: skip
+    assert status["last job"].startswith("learn done in ")
+
+    # The robot may have been slow; once masks come again, it fuses.
+    robot.drive(clean_views(1))
+    robot.wait_for_status(lambda status: status.get("message") == "fusing", "a status that says so")
+
+    def stamps() -> list[float]:
+        return [stamp_ns(array.header.stamp) / SECOND for array in robot.received_status
+                if array.status[0].name == robot.name]  # fmt: skip
+
+    robot.ros.wait_until(lambda: len(stamps()) >= 5, "five messages")
+    assert np.median(np.diff(stamps())) > 0.6  # A busy machine may be late, and then catch up.
+    assert all(len(array.status) == 1 for array in robot.received_status)
+
+
+def test_the_log_says_which_input_is_missing_and_what_to_check_once_in_five_seconds(silent: Robot) -> None:
+    process = silent.process
+    assert process is not None
+
+    def complaints() -> dict[str, list[tuple[float, str]]]:
+        found: dict[str, list[tuple[float, str]]] = {}
+        for line in process.output.splitlines():
+            if match := re.search(r"\[WARN\] \[(\d+\.\d+)\].*no data on (\S+) for (\d+) s; (.*)", line):
+                found.setdefault(match[2], []).append((float(match[1]), match[4]))
+        return found
+
+    topics = ("/silent/mask", "/silent/camera_info", "/silent/pose")
+    silent.ros.wait_until(lambda: all(len(complaints().get(topic, ())) >= 2 for topic in topics), "two complaints each")
+    started = re.search(r"\[(\d+\.\d+)\].*active: listening", process.output)
+    assert started is not None
+    for topic, hint in zip(
+        topics,
+        (
+            "nobody publishes it: is the segmenter running, and is its topic remapped to this one (--ros-args -r mask",
+            "it has 1 publisher: do their QoS and type match (this side is best effort, volatile; ros2 topic info -v",
+            "nobody publishes it: expected geometry_msgs/PoseStamped of the camera's optical frame",
+        ),
+        strict=True,
+    ):
+        times, hints = zip(*complaints()[topic], strict=True)
+        assert times[0] - float(started[1]) > 4.9
+        assert np.diff(times).min() >= 4.9
+        assert all(found.startswith(hint) for found in hints)
+    status = silent.status()
+    assert status["message"].startswith("no data on /silent/mask for ")
+    assert status["/silent/mask age [s]"] == "never"
+    assert silent.received_status[-1].status[0].level == DiagnosticStatus.WARN

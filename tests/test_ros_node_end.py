@@ -1,0 +1,108 @@
+"""The end of the segmentation node: by a signal, and by force at any moment."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ros_fixtures import parameters_fixture, root_fixture  # noqa: F401
+from ros_helpers import Ros, ros_fixture  # noqa: F401
+from ros_robot import Goal, Robot, core_session, renamed
+from small_scenes import clean_views
+
+from gsseg_core.dataset import Dataset
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segmentation import Segmentation
+
+pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
+
+
+@pytest.mark.parametrize("doing", ["idle", "learning"])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_with_exit_code_zero_whatever_it_does(
+    ros: Ros, parameters: dict[str, Any], doing: str, number: signal.Signals
+) -> None:
+    robot = Robot(ros).started(parameters)
+    robot.fuse(clean_views(2))
+    if doing == "learning":
+        robot.begin(dataset_path="long")
+    process = robot.process
+    assert process is not None
+    process.send(number)
+    assert process.wait() == 0, process.output
+    assert "Traceback" not in process.output and "[ERROR]" not in process.output, process.output
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_while_it_is_not_configured(
+    ros: Ros, parameters: dict[str, Any], number: signal.Signals
+) -> None:
+    process = Robot(ros).start({**parameters, "autostart": False})
+    process.wait_for("autostart is false")
+    process.send(number)
+    assert process.wait() == 0, process.output
+
+
+@pytest.fixture(scope="module")
+def saved(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Segmentation:
+    """Write state.npz, of so many large views that to save it again takes a while; returns what it holds."""
+    scene = GaussianScene.load(root / "data" / "scene.ply")
+    views = Dataset(root / "long").views()[:6]
+    session = core_session(scene, renamed(views * 25))
+    session.save(root / "state.npz")
+    return session.segmentation()
+
+
+def assert_state_loads(robot: Robot, saved: Segmentation, root: Path) -> None:
+    assert robot.done("load_state", path="state.npz").num_views == 150
+    found = robot.exported(root / "out" / "loaded")
+    np.testing.assert_array_equal(found.probabilities, saved.probabilities)
+
+
+def test_killed_while_it_learns_the_saved_state_loads_in_a_new_process(
+    ros: Ros, parameters: dict[str, Any], root: Path, saved: Segmentation
+) -> None:
+    before = (root / "state.npz").read_bytes()
+    moments: list[tuple[str, str, int]] = [("long", "observe", 0), ("long", "observe", 300), ("", "em", 1)]
+    for i, (dataset, stage, done) in enumerate(moments):
+        # A namespace for each, since what was killed takes a while to be forgotten.
+        robot = Robot(ros, f"/learns{i}").started(parameters)
+        assert_state_loads(robot, saved, root)
+        goal = robot.goal(dataset_path=dataset)
+
+        def reached(goal: Goal = goal, stage: str = stage, done: int = done) -> bool:
+            return any(message.stage == stage and message.done >= done for message in goal.feedback)
+
+        ros.wait_until(reached, f"{stage} {done}")
+        assert robot.process is not None and not goal.future.done()
+        robot.process.kill()
+    assert (root / "state.npz").read_bytes() == before
+    assert_state_loads(Robot(ros, "/afterwards").started(parameters), saved, root)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
+def test_killed_while_it_saves_the_earlier_state_loads_in_a_new_process(
+    ros: Ros, parameters: dict[str, Any], root: Path, saved: Segmentation, share: float
+) -> None:
+    before = (root / "state.npz").read_bytes()
+    robot = Robot(ros, "/saves").started(parameters)
+    assert_state_loads(robot, saved, root)
+
+    def written() -> list[int]:
+        return [path.stat().st_size for path in root.glob(".gsseg-*.npz")]
+
+    answer = robot.send("save_state", path="state.npz")
+    ros.wait_until(lambda: any(size >= share * len(before) for size in written()), "the new file to grow")
+    assert robot.process is not None
+    robot.process.kill()
+    assert not answer.done()
+    assert written(), "it was killed before it was done"
+    assert (root / "state.npz").read_bytes() == before
+
+    robot = Robot(ros, "/loads").started(parameters)
+    assert_state_loads(robot, saved, root)
+    for left in root.glob(".gsseg-*.npz"):
+        left.unlink()

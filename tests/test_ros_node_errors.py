@@ -1,0 +1,267 @@
+"""Every error code that a request to the segmentation node may get, from another process."""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ros_checks import limited
+from ros_fixtures import parameters_fixture, root_fixture, shared_fixture  # noqa: F401
+from ros_helpers import Ros
+from ros_robot import SERVICES, Goal, Learn, Robot, core_session, viewpoint
+from small_scenes import build, clean_views
+
+pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
+
+from action_msgs.msg import GoalStatus
+from geometry_msgs.msg import Pose, PoseStamped, Quaternion
+
+from gsseg_ros.errors import PathNotAllowedError
+from gsseg_ros.parameters import DECLARATIONS, Settings
+from gsseg_ros.workspace import Workspace
+
+INTERFACES = {name: SERVICES[name].Response for name in (
+    "segment", "render_view", "load_scene", "save_state", "load_state", "export", "reset",
+)} | {"learn": Learn.Result}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """Nodes that differ in what they have, each in a namespace of its own."""
+
+    main: Robot  # scene, class names, and six views fused
+    fresh: Robot  # scene, but no view yet
+    bare: Robot  # no scene
+    unset: Robot  # no parameter set, thus no data_root
+    idle: Robot  # not configured
+
+
+@pytest.fixture(scope="module")
+def nodes(shared: Ros, root: Path, parameters: dict[str, Any]) -> Nodes:
+    scene = {"scene_path": parameters["scene_path"]}
+    nodes = Nodes(Robot(shared), *(Robot(shared, f"/{name}") for name in ("fresh", "bare", "unset", "idle")))
+    nodes.main.start(parameters)
+    nodes.fresh.start({**scene, "data_root": root})
+    nodes.bare.start({"data_root": root})
+    nodes.unset.start()
+    nodes.idle.start({**scene, "data_root": root, "autostart": False})
+    for robot in (nodes.main, nodes.fresh, nodes.bare, nodes.unset):
+        robot.wait_active()
+    nodes.main.fuse(clean_views(6))
+    return nodes
+
+
+@dataclass(frozen=True)
+class Case:
+    """A request, and the error that it has to give."""
+
+    service: str
+    code: str
+    on: str
+    says: str
+    fields: dict[str, Any] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return f"{self.service}-{self.code}"
+
+
+def nowhere(frame: str = "", **changes: Any) -> dict[str, Any]:
+    """A viewpoint in another frame, or with a camera that is changed."""
+    fields = viewpoint(clean_views(1)[0])
+    fields["viewpoint_pose"].header.frame_id = frame
+    for name, value in changes.items():
+        setattr(fields["viewpoint_camera"], name, value)
+    return fields
+
+
+NOT_BELOW = "is not below data_root; expected one below"
+CASES = [
+    Case("segment", "NOT_ACTIVE", "idle", "the node is not active"),
+    Case("segment", "INVALID_REQUEST", "main", "min_confidence is 1.5; expected 0 to 1", {"min_confidence": 1.5}),
+    Case("segment", "NO_SCENE", "bare", "no scene is loaded; expected the parameter scene_path, or a call"),
+    Case("segment", "NO_CODES", "fresh", "expected at least one posed mask"),
+    Case("segment", "UNKNOWN_CLASS", "main", "class 'sofa' does not exist; expected one of", {"classes": ["sofa"]}),
+    Case("segment", "INVALID_VIEWPOINT", "main", "use the rectified topic", nowhere(d=[0.1, 0.0, 0.0, 0.0, 0.0])),
+    Case("segment", "NO_TRANSFORM", "main", "frame_id is 'odom'", nowhere("odom")),
+    Case("segment", "UNKNOWN", "starved", "unexpected MemoryError"),
+    Case("render_view", "NOT_ACTIVE", "idle", "the node is not active"),
+    Case("render_view", "NO_SCENE", "bare", "no scene is loaded"),
+    Case("render_view", "NO_CODES", "fresh", "expected at least one posed mask"),
+    Case("render_view", "INVALID_VIEWPOINT", "main", "viewpoint_", {}),
+    Case("render_view", "NO_TRANSFORM", "main", "frame_id is 'odom'", nowhere("odom")),
+    Case("render_view", "UNKNOWN", "starved", "unexpected MemoryError", nowhere()),
+    Case("load_scene", "NOT_ACTIVE", "idle", "the node is not active"),
+    Case("load_scene", "BUSY", "busy", "learn is running"),
+    Case("load_scene", "INVALID_REQUEST", "bare", "path and the parameter scene_path are both empty"),
+    Case("load_scene", "PATH_NOT_ALLOWED", "main", NOT_BELOW, {"path": "../outside.ply"}),
+    Case("load_scene", "FILE_NOT_FOUND", "main", "no.ply: does not exist", {"path": "no.ply"}),
+    Case("load_scene", "INVALID_FILE", "main", "broken.ply: truncated or not a PLY", {"path": "broken.ply"}),
+    Case("load_scene", "UNKNOWN", "starved", "unexpected MemoryError"),
+    Case("save_state", "NOT_ACTIVE", "idle", "the node is not active"),
+    Case("save_state", "NO_SCENE", "bare", "no scene is loaded"),
+    Case("save_state", "NO_CODES", "fresh", "nothing to save"),
+    Case("save_state", "PATH_NOT_ALLOWED", "main", NOT_BELOW, {"path": "../state.npz"}),
+    Case("save_state", "WRITE_FAILED", "main", "taken.npz: cannot be written", {"path": "taken.npz"}),
+    Case("save_state", "UNKNOWN", "starved", "unexpected MemoryError"),
+    Case("load_state", "NOT_ACTIVE", "idle", "the node is not active"),
+    Case("load_state", "BUSY", "busy", "learn is running", {"path": "other_state.npz"}),
+    Case("load_state", "NO_SCENE", "bare", "no scene is loaded"),
+    Case("load_state", "PATH_NOT_ALLOWED", "main", NOT_BELOW, {"path": "../state.npz"}),
+    Case("load_state", "FILE_NOT_FOUND", "main", "gsseg_state.npz: does not exist"),
+    Case("load_state", "INVALID_FILE", "main", "broken.npz: is not a saved state", {"path": "broken.npz"}),
+    Case("load_state", "SCENE_MISMATCH", "main", "belongs to the scene", {"path": "other_state.npz"}),
+    Case("load_state", "UNKNOWN", "starved", "unexpected MemoryError", {"path": "narrow_state.npz"}),
+    Case("export", "NOT_ACTIVE", "idle", "the node is not active"),
+    Case("export", "INVALID_REQUEST", "main", "min_confidence is -0.5", {"min_confidence": -0.5}),
+    Case("export", "NO_SCENE", "bare", "no scene is loaded"),
+    Case("export", "NO_CODES", "fresh", "expected at least one posed mask"),
+    Case("export", "UNKNOWN_CLASS", "main", "class '4' does not exist", {"classes": ["4"]}),
+    Case("export", "PATH_NOT_ALLOWED", "main", NOT_BELOW, {"directory": "../out"}),
+    Case("export", "WRITE_FAILED", "main", "classes: is a file; expected a folder", {"directory": "taken"}),
+    Case("export", "UNKNOWN", "starved", "unexpected MemoryError"),
+    Case("reset", "NOT_ACTIVE", "idle", "the node is not active"),
+    Case("reset", "BUSY", "busy", "learn is running"),
+    Case("reset", "UNKNOWN", "starved", "unexpected MemoryError"),
+    Case("learn", "NOT_ACTIVE", "idle", "the node is not active"),
+    Case("learn", "BUSY", "busy", "learn is running"),
+    Case("learn", "INVALID_REQUEST", "main", "learner is 'magic'; expected one of em, votes", {"learner": "magic"}),
+    Case("learn", "NO_SCENE", "bare", "no scene is loaded"),
+    Case("learn", "NO_VIEWS", "fresh", "no view to learn from"),
+    Case("learn", "PATH_NOT_ALLOWED", "main", NOT_BELOW, {"dataset_path": ".."}),
+    Case("learn", "FILE_NOT_FOUND", "main", "nothing: does not exist", {"dataset_path": "nothing"}),
+    Case("learn", "INVALID_FILE", "main", "broken/labels/view1.png: broken PNG", {"dataset_path": "broken"}),
+    Case("learn", "CANCELED", "busy", "learn was canceled; all is as it was before"),
+    Case("learn", "UNKNOWN", "starved", "unexpected MemoryError"),
+]  # fmt: skip
+MORE_CASES = [
+    Case("segment", "INVALID_REQUEST", "main", "min_confidence is nan", {"min_confidence": float("nan")}),
+    Case("render_view", "INVALID_VIEWPOINT", "main", "all zeros: was it filled in?", {
+        "viewpoint_camera": nowhere()["viewpoint_camera"],
+        "viewpoint_pose": PoseStamped(pose=Pose(orientation=Quaternion(w=0.0))),
+    }),
+    Case("segment", "INVALID_VIEWPOINT", "main", "pixels; expected", nowhere(width=100_000, height=100_000)),
+    Case("learn", "NO_VIEWS", "main", "4 no mask", {"dataset_path": "unlabelled"}),
+    Case("learn", "INVALID_FILE", "main", "cameras.json", {"dataset_path": "taken"}),
+    Case("load_scene", "INVALID_FILE", "main", "taken: ", {"path": "taken"}),
+    *(
+        Case("save_state", "PATH_NOT_ALLOWED", "main", NOT_BELOW, {"path": path})
+        for path in ("link/state.npz", "data/../../state.npz", "/tmp/state.npz", "/", "data/../../root2/state.npz")
+    ),
+    Case("load_scene", "PATH_NOT_ALLOWED", "main", NOT_BELOW, {"path": "link/outside.ply"}),
+    Case("load_scene", "PATH_NOT_ALLOWED", "main", NOT_BELOW, {"path": "/etc/passwd"}),
+    Case("export", "PATH_NOT_ALLOWED", "main", NOT_BELOW, {"directory": "link"}),
+    *(
+        Case(service, "PATH_NOT_ALLOWED", "unset", "data_root is empty, so no path is allowed", fields)
+        for service, fields in (
+            ("load_scene", {"path": "a.ply"}), ("save_state", {}), ("export", {"directory": "/tmp"}),
+        )
+    ),
+    Case("load_scene", "FILE_NOT_FOUND", "main", "does not exist", {"path": "x" * 5000}),
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def starved(shared: Ros, root: Path) -> Robot:
+    """A node with so many Gaussians and classes that the votes take 200 MB."""
+    rng = np.random.default_rng(0)
+    scene = build(np.zeros(250_000, np.int64), rng.uniform(-1, 1, (250_000, 3)), np.full((250_000, 3), 0.004))
+    scene.save(root / "large.ply")
+    core_session(scene, clean_views(1)).save(root / "narrow_state.npz")
+    names = [f"class {k}" for k in range(100)]
+    robot = Robot(shared, "/starved")
+    robot.started({"scene_path": root / "large.ply", "data_root": root, "class_names": names})
+    robot.drive(clean_views(1))
+    robot.wait_for_status(lambda status: status.get("views fused") == "1", "the view")
+    return robot
+
+
+@contextmanager
+def short_of_memory(robot: Robot) -> Iterator[None]:
+    """Leave the node too little memory for another set of votes."""
+    assert robot.process is not None
+    pages = int(Path(f"/proc/{robot.process.pid}/statm").read_text().split()[0])
+    with limited(robot, resource.RLIMIT_AS, pages * resource.getpagesize() + (90 << 20)):
+        yield
+
+
+@contextmanager
+def busy(robot: Robot) -> Iterator[Goal]:
+    """The node learns, and goes on with it."""
+    goal = robot.begin(dataset_path="long")
+    yield goal
+    assert not goal.future.done()
+    robot.cancel(goal)
+
+
+def answer(robot: Robot, case: Case) -> Any:
+    if case.service != "learn":
+        return robot.ask(case.service, **case.fields)
+    status, result = robot.learn(**case.fields)
+    assert status == GoalStatus.STATUS_ABORTED
+    return result
+
+
+def provoke(case: Case, nodes: Nodes, request: pytest.FixtureRequest) -> Any:
+    if case.code == "CANCELED":
+        status, result = nodes.main.cancel(nodes.main.begin(dataset_path="long"))
+        assert status == GoalStatus.STATUS_CANCELED
+        return result
+    if case.on == "busy":
+        with busy(nodes.main):
+            return answer(nodes.main, case)
+    if case.on == "starved":
+        robot = request.getfixturevalue("starved")
+        with short_of_memory(robot):
+            return answer(robot, case)
+    return answer(getattr(nodes, case.on), case)
+
+
+@pytest.mark.parametrize("case", CASES + MORE_CASES, ids=str)
+def test_the_error_is_answered_with_its_code_and_one_line_that_says_why(
+    nodes: Nodes, case: Case, request: pytest.FixtureRequest
+) -> None:
+    response = provoke(case, nodes, request)
+    assert response.error_code == getattr(type(response), case.code), response.error_msg
+    assert case.says in response.error_msg
+    assert "\n" not in response.error_msg
+    # Nothing half filled in goes out.
+    assert response == type(response)(error_code=response.error_code, error_msg=response.error_msg)
+
+
+def test_every_error_code_of_every_interface_is_among_the_cases() -> None:
+    declared = {
+        (name, code)
+        for name, interface in INTERFACES.items()
+        for code in dir(interface)
+        if code.isupper() and isinstance(getattr(interface, code), int) and code != "NONE"
+    }
+    assert {(case.service, case.code) for case in CASES} == declared
+
+
+def test_links_in_a_circle_are_an_error_of_the_path(nodes: Nodes) -> None:
+    response = nodes.main.ask("load_scene", path="loop/scene.ply")
+    # Which of the two depends on the version of Python.
+    assert response.error_code in (response.PATH_NOT_ALLOWED, response.FILE_NOT_FOUND), response.error_msg
+
+
+def test_a_path_with_a_nul_is_refused(root: Path) -> None:
+    # rclpy cuts a string at a NUL; other clients and other versions may not.
+    values = {declaration.name: declaration.default for declaration in DECLARATIONS}
+    workspace = Workspace(Settings.of({**values, "data_root": str(root)}), lambda: None)
+    for path in ("data\0", "data/\0/../..", "\0"):
+        with pytest.raises(PathNotAllowedError, match="expected one below"):
+            workspace.path(path)
+
+
+def test_after_memory_ran_out_the_node_goes_on(starved: Robot) -> None:
+    with short_of_memory(starved):
+        assert starved.ask("segment").error_code == SERVICES["segment"].Response.UNKNOWN
+    assert starved.done("segment", skip_refinement=True).report.num_views == 1
+    assert "Traceback" in starved.process.output, "the log has the details"
+    assert starved.done("reset").num_views_dropped == 1

@@ -1,0 +1,124 @@
+"""Masks whose ids hold only inside their own frame: the node finds the objects as the masks come."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ros_helpers import Ros, ros_fixture  # noqa: F401
+from ros_robot import Robot, private_ros
+from small_scenes import balls_on_a_table, clean_views, write_dataset
+
+from gsseg_core.dataset import View
+from gsseg_core.segmentation import Segmentation
+
+pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
+
+from action_msgs.msg import GoalStatus
+from gsseg_msgs.action import Learn
+from gsseg_msgs.msg import SegmentationReport
+
+
+@pytest.fixture(scope="module")
+def parameters(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    data = write_dataset(tmp_path_factory.mktemp("root") / "data")
+    return {"scene_path": data / "scene.ply", "data_root": data.parent, "ids": "per-view"}
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory, parameters: dict[str, Any]) -> Iterator[Robot]:
+    with private_ros(tmp_path_factory.mktemp("ros")) as ros:
+        yield Robot(ros).started(parameters)
+
+
+@pytest.fixture
+def robot(running: Robot) -> Robot:
+    """A node without views, shared by the tests of this file."""
+    running.done("reset")
+    return running
+
+
+def shuffled_views(count: int = 6) -> list[View]:
+    """Views in which every object has another id, up to 250, in every view."""
+    rng, views = np.random.default_rng(0), []
+    for view in clean_views(count):
+        ids = np.concatenate([[0], rng.choice(np.arange(1, 250), 3, replace=False)])
+        views.append(View.from_arrays(view.camera, ids[view.read_labels()].astype(np.int32)))
+    return views
+
+
+def fused(robot: Robot, views: list[View]) -> SegmentationReport:
+    robot.drive(views)
+    robot.ros.wait_until(lambda: robot.ask("segment").report.num_views == len(views), f"{len(views)} views")
+    return robot.done("segment").report
+
+
+def assert_objects_are_the_balls(result: Segmentation) -> None:
+    """Each ball is one object, and each object one ball."""
+    _, truth = balls_on_a_table()
+    matches = []
+    for ball in (1, 2, 3):
+        found = result.labels[(truth == ball) & (result.labels > 0)]
+        assert len(found) > 20
+        values, counts = np.unique(found, return_counts=True)
+        assert counts.max() / counts.sum() > 0.95
+        matches.append(int(values[counts.argmax()]))
+    assert len(set(matches)) == 3
+    assert set(np.unique(result.labels[result.labels > 0])) == set(matches)
+
+
+def test_ids_that_change_from_mask_to_mask_become_objects_that_do_not(robot: Robot) -> None:
+    report = fused(robot, shuffled_views())
+    assert report.num_views_rejected == 0
+    filled = [summary for summary in report.classes if summary.num_gaussians]
+    assert [summary.name for summary in filled] == ["background", "object_001", "object_002", "object_003"]
+    assert_objects_are_the_balls(robot.exported(Path(robot.get("data_root")) / "out" / "fused"))
+    assert [thing.name for thing in robot.done("segment").objects] == ["object_001", "object_002", "object_003"]
+
+
+def test_learning_repairs_and_keeps_the_numbers_of_the_objects(robot: Robot) -> None:
+    fused(robot, shuffled_views())
+    folder = Path(robot.get("data_root")) / "out"
+    before = robot.exported(folder / "before")
+    status, result = robot.learn()
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.error_msg
+    assert (result.report.num_views, result.report.learner) == (6, "em")
+    after = robot.exported(folder / "after")
+    assert_objects_are_the_balls(after)
+    both = (before.labels > 0) & (after.labels > 0)
+    assert (before.labels[both] == after.labels[both]).mean() > 0.95
+
+
+def test_a_saved_state_comes_back_and_later_masks_are_matched_to_its_objects(robot: Robot) -> None:
+    views = shuffled_views()
+    fused(robot, views[:5])
+    robot.done("save_state")
+    robot.done("reset")
+    assert robot.done("load_state").num_views == 5
+    robot.drive(views[5:])
+    robot.ros.wait_until(lambda: robot.ask("segment").report.num_views == 6, "the last view")
+    assert_objects_are_the_balls(robot.exported(Path(robot.get("data_root")) / "out" / "loaded"))
+
+
+def test_a_dataset_folder_cannot_be_learnt_from(robot: Robot) -> None:
+    fused(robot, shuffled_views(2))
+    status, result = robot.learn(dataset_path="data")
+    assert status == GoalStatus.STATUS_ABORTED
+    assert result.error_code == Learn.Result.INVALID_REQUEST
+    assert "ids are per view; expected to learn from the views received only" in result.error_msg
+
+
+def test_class_names_cannot_be_given_too(ros: Ros, parameters: dict[str, Any]) -> None:
+    process = ros.start("segment_node", {**parameters, "class_names": ["background", "ball"]})
+    assert process.wait() == 2
+    (line,) = process.output.splitlines()
+    assert "parameter class_names gives 2 names, but with ids 'per-view' the node finds the objects" in line
+
+
+def test_given_ids_are_taken_for_classes_as_ever(ros: Ros, parameters: dict[str, Any]) -> None:
+    robot = Robot(ros).started({**parameters, "ids": "given"})
+    report = fused(robot, clean_views(2))
+    assert [summary.name for summary in report.classes] == ["background", "class_01", "class_02", "class_03"]

@@ -1,0 +1,177 @@
+"""The parameters of the segmentation node: what they may be, when they may change, and what a change does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ros_fixtures import parameters_fixture, root_fixture, shared_fixture  # noqa: F401
+from ros_helpers import REPOSITORY, Ros, ros_fixture  # noqa: F401
+from ros_robot import CLASSES, Robot
+from small_scenes import clean_views
+
+pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
+
+from rcl_interfaces.msg import ParameterType
+from rclpy.parameter import Parameter
+
+from gsseg_ros.parameters import DECLARATIONS
+
+
+@pytest.fixture(scope="module")
+def running(shared: Ros, parameters: dict[str, Any]) -> Robot:
+    robot = Robot(shared)
+    robot.start({**parameters, "autostart": False}).wait_for("autostart is false")
+    return robot
+
+
+@pytest.fixture
+def robot(running: Robot) -> Robot:
+    """A node that is not configured, shared by the tests of this file."""
+    return running.brought_down()
+
+
+def test_every_parameter_is_typed_described_and_ranged(robot: Robot) -> None:
+    names = [declaration.name for declaration in DECLARATIONS]
+    descriptors = robot.ask("describe_parameters", names=names).descriptors
+    assert [descriptor.name for descriptor in descriptors] == names
+    kinds = {str: "STRING", int: "INTEGER", float: "DOUBLE", bool: "BOOL"}
+    for declaration, descriptor in zip(DECLARATIONS, descriptors, strict=True):
+        default = declaration.default
+        kind = kinds[type(default)] if not isinstance(default, list) else f"{'DOUBLE' if default else 'STRING'}_ARRAY"
+        assert descriptor.type == getattr(ParameterType, f"PARAMETER_{kind}"), descriptor.name
+        assert descriptor.description == declaration.description != ""
+    ranges = {
+        descriptor.name: (limits.from_value, limits.to_value)
+        for descriptor in descriptors
+        for limits in (*descriptor.integer_range, *descriptor.floating_point_range)
+    }
+    wanted = {"k": (1, 2**20), "beta": (0.0, 1.0), "max_views": (1, 100_000), "queue_size": (1, 1000)}
+    assert wanted.items() <= ranges.items()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "why"),
+    [
+        ("k", 0, "out of range"),
+        ("k", 2.5, "type"),
+        ("beta", 1.5, "out of range"),
+        ("beta", float("nan"), "nan"),
+        ("max_views", 0, "out of range"),
+        ("queue_size", 1001, "out of range"),
+        ("autostart", "yes", "type"),
+        ("pose_source", "gps", "parameter pose_source is 'gps'; expected topic, odometry, tf"),
+        ("device", "tpu", "parameter device is 'tpu'; expected 'cpu', 'cuda' or 'cuda:' and the number of a GPU"),
+        ("device", "cuda:x", "parameter device is 'cuda:x'"),
+        ("ids", "mine", "parameter ids is 'mine'; expected given, per-view"),
+        ("ids", "per-view", "parameter class_names gives 4 names, but with ids 'per-view' the node finds the objects"),
+        ("map_frame", "", "parameter map_frame is empty; expected the name of a frame"),
+        ("data_root", "/no/such/folder", "parameter data_root: /no/such/folder is no folder; expected one that exists"),
+        ("class_names", ["background", "a", "a"], "parameter class_names: 'a' occurs more than once"),
+        ("class_names", ["background", ""], "parameter class_names: name 1 is empty"),
+        ("scene_to_map.scale", 0.0, "scene_to_map.scale"),
+        ("scene_to_map.translation", [1.0, 2.0], "scene_to_map.translation is [1.0, 2.0]; expected 3 finite numbers"),
+        ("scene_to_map.rotation", [0.0] * 4, "scene_to_map.rotation is all zeros"),
+        ("camera_in_base.rotation", [0.0, 0.0, float("nan"), 1.0], "expected 4 finite numbers"),
+    ],
+)
+def test_a_parameter_that_cannot_be_is_refused_when_it_is_set(robot: Robot, name: str, value: Any, why: str) -> None:
+    before = robot.get(name)
+    taken, reason = robot.set(name, value)
+    assert not taken
+    assert why.lower() in reason.lower()
+    assert robot.get(name) == before
+
+
+def test_a_parameter_that_does_not_exist_cannot_be_set(robot: Robot) -> None:
+    taken, reason = robot.set("scene_pth", "a.ply")
+    assert not taken and "undeclared parameter" in reason
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        ({"k": 0}, "k"),
+        ({"max_views": 2.5}, "max_views"),
+        ({"pose_source": "gps"}, "parameter pose_source is 'gps'; expected topic, odometry, tf"),
+        ({"scene_to_map.rotation": [0.0, 0.0, 0.0, 0.0]}, "scene_to_map.rotation is all zeros"),
+        ({"data_root": "/no/such/folder"}, "parameter data_root: /no/such/folder is no folder"),
+    ],
+)
+def test_a_bad_parameter_at_the_start_is_one_error_and_exit_code_two(
+    ros: Ros, arguments: dict[str, Any], why: str
+) -> None:
+    process = ros.start("segment_node", arguments)
+    assert process.wait() == 2
+    (line,) = process.output.splitlines()
+    assert line.startswith("segment_node: error: ") and why in line
+
+
+def test_arguments_that_ros_cannot_parse_are_one_error(ros: Ros) -> None:
+    process = ros.start("segment_node", None, "-p", "k")
+    assert process.wait() == 2 and "Traceback" not in process.output, process.output
+    assert "segment_node: error: " in process.output.splitlines()[-1]
+
+
+@pytest.mark.parametrize("state", ["inactive", "active"])
+def test_while_it_is_configured_only_k_and_beta_can_be_set(robot: Robot, state: str) -> None:
+    robot.brought_to(state)
+    for declaration in DECLARATIONS:
+        if declaration.name in ("k", "beta"):
+            continue
+        value = robot.get(declaration.name)
+        message = Parameter("", value=value)
+        kind = Parameter.Type.STRING_ARRAY if declaration.default == [] else message.type_
+        (result,) = robot.ask(
+            "set_parameters", parameters=[Parameter(declaration.name, kind, value).to_parameter_msg()]
+        ).results
+        assert not result.successful, declaration.name
+        assert result.reason == (
+            f"{declaration.name} can change only while the node is unconfigured: deactivate and clean it up first"
+        )
+    assert robot.set("k", 50) == robot.set("beta", 0.65) == (True, "")
+
+
+def test_k_and_beta_take_effect_at_once(robot: Robot) -> None:
+    robot.brought_to("active")
+    robot.fuse(clean_views(4))
+    try:
+        assert robot.set("k", 7) == robot.set("beta", 1.0) == (True, "")
+        report = robot.done("segment").report
+        assert (report.k, report.beta) == (7, 1.0)
+        found = robot.exported(robot.out("k"))
+        assert found.clustered.sum() > 100, "with beta 1 the neighbours decide nearly everywhere"
+    finally:
+        robot.set("k", 50), robot.set("beta", 0.65)
+    assert robot.done("segment").report.k == 50
+
+
+def test_what_was_set_while_unconfigured_holds_after_configuring(robot: Robot) -> None:
+    assert robot.set("max_views", 3) == (True, "")
+    try:
+        robot.brought_to("active")
+        robot.fuse(clean_views(5))
+        status = robot.wait_for_status(lambda status: status.get("views fused") == "5", "five views")
+        assert status["views kept"] == "3"
+        assert robot.learn()[1].report.num_views == 3
+    finally:
+        assert robot.change("deactivate") and robot.change("cleanup")
+        assert robot.set("max_views", 200) == (True, "")
+
+
+def test_parameters_come_from_a_file(ros: Ros, parameters: dict[str, Any], tmp_path: Path) -> None:
+    (tmp_path / "robot.yaml").write_text(
+        "gsseg:\n  ros__parameters:\n    k: 20\n    beta: 0.5\n    autostart: true\n"
+        f"    scene_path: {parameters['scene_path']}\n    class_names: [background, red ball, cup/mug, box, table]\n"
+        "    scene_to_map:\n      scale: 2.0\n      translation: [1.0, 2.0, 3.0]\n"
+    )
+    defaults = str(REPOSITORY / "config" / "segment_node.yaml")
+    robot = Robot(ros).started(None, "--params-file", defaults, "--params-file", str(tmp_path / "robot.yaml"))
+    wanted = {declaration.name: declaration.default for declaration in DECLARATIONS} | {
+        "k": 20, "beta": 0.5, "scene_path": str(parameters["scene_path"]), "scene_to_map.scale": 2.0,
+        "scene_to_map.translation": [1.0, 2.0, 3.0], "class_names": [*CLASSES, "table"],
+    }  # fmt: skip
+    found = {name: robot.get(name) for name in wanted}
+    assert {name: list(v) if isinstance(wanted[name], list) else v for name, v in found.items()} == wanted
+    robot.wait_for_status(lambda status: status.get("classes") == "5", "five classes")

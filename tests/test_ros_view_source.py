@@ -1,0 +1,65 @@
+"""The viewer's source of live codes against a real node: what it shows is what the node has, Gaussian by Gaussian."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ros_helpers import Ros, ros_fixture  # noqa: F401
+from small_scenes import NAMES, many_classes, write_dataset
+
+pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
+
+from gsseg_core.errors import SettingsError, StateMismatchError
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
+from gsseg_core.view_live import LiveUpdate, open_source
+from gsseg_ros.client import NodeUnavailableError, SegmentationClient
+from gsseg_ros.view_source import RosSource
+
+MOVED = {"scene_to_map.scale": 2.0, "scene_to_map.translation": [1.0, -2.0, 0.5]}
+
+
+def next_update(source: RosSource) -> LiveUpdate:
+    for _ in range(100):
+        update = source.wait(0.5)
+        if update is not None:
+            return update
+    pytest.fail("no codes came")
+
+
+def test_live_codes_are_those_of_the_node_wherever_the_scene_lies_in_the_map(ros: Ros, tmp_path: Path) -> None:
+    write_dataset(tmp_path / "data")
+    scene = GaussianScene.load(tmp_path / "data/scene.ply")
+    parameters = {"data_root": tmp_path, "scene_path": tmp_path / "data/scene.ply", "class_names": list(NAMES.values())}
+    ros.start("segment_node", {**parameters, **MOVED})
+    source = RosSource(scene, domain_id=ros.domain, find_timeout=60.0)
+    try:
+        with SegmentationClient(domain_id=ros.domain) as client:
+            client.wait_until_active()
+            client.learn("data")
+            update = next_update(source)
+            client.export("out")
+        truth = Segmentation.load(tmp_path / "out/segmentation.npz", scene)
+        labels, probabilities, names = update.labelling
+        assert names == NAMES and update.num_views == 4
+        assert np.array_equal(labels, np.where(truth.labels == REMOVED, UNOBSERVED, truth.labels))
+        known = labels >= 0
+        assert np.allclose(probabilities.max(axis=1)[known], truth.confidence[known], atol=1e-6)
+        assert not probabilities[~known].any()
+        other, _ = many_classes(30)
+        wrong = RosSource(other, domain_id=ros.domain)
+        with pytest.raises(StateMismatchError, match=r"has the scene .*scene.ply, which is not this one"):
+            next_update(wrong)
+        wrong.close()
+    finally:
+        source.close()
+
+
+def test_without_a_node_or_a_source_one_error_says_so(ros: Ros) -> None:
+    scene, _ = many_classes(30)
+    with pytest.raises(NodeUnavailableError, match=r"/gsseg: service /gsseg/get_parameters was not there within 0.5 s"):
+        RosSource(scene, domain_id=ros.domain, find_timeout=0.5)
+    with pytest.raises(SettingsError, match=r"live source 'nothing': none is installed"):
+        open_source("nothing", scene)
