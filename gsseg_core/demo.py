@@ -49,7 +49,7 @@ def run_demo(out: str | os.PathLike[str], *, seed: int = 0, progress: Progress =
             f"{report['views']['used']} views with missed, swapped and frayed masks; scored on {scores['views']} "
             f"others against the truth: mIoU {percent(scores['mean_iou'])}, mAcc {percent(scores['mean_accuracy'])}, "
             f"boundary IoU {percent(scores['mean_boundary_iou'])}",
-            f"Look at: {out}/segmented/pictures/contact_sheet.png and {out}/rendered/overlays\n"
+            f"Look at: {out}/segmented/report.html and {out}/rendered/overlays\n"
             f"Objects: {out}/segmented/classes, PLYs for any 3DGS viewer",
         ]
     )

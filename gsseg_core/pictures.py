@@ -81,7 +81,7 @@ def overlay(
     tint = colors[np.maximum(labels, 0)].astype(np.float32)
     grey = image.mean(axis=-1, keepdims=True, dtype=np.float32)
     blend = np.where(named[..., None], grey + FILL * (tint - grey), 0.35 * image + 0.65 * (0.75 * grey + 30))
-    line = _borders(labels)
+    line = outline(labels)
     blend[line & named] = np.minimum(1.12 * tint[line & named], 255)
     blend[line & ~named] *= 0.45
     picture: np.ndarray = blend.round().astype(np.uint8)
@@ -179,8 +179,10 @@ def save_png(path: str | Path, image: np.ndarray) -> None:
         Image.fromarray(image).save(temporary, format="PNG")
 
 
-def _borders(labels: np.ndarray) -> np.ndarray:
-    """(H, W) bool, pixels with another label beside, above or below them."""
+def outline(
+    labels: np.ndarray,  # (H, W)
+) -> np.ndarray:
+    """Mark the pixels with another label beside, above or below them, (H, W) bool."""
     border = np.zeros(labels.shape, bool)
     across, down = labels[:, 1:] != labels[:, :-1], labels[1:] != labels[:-1]
     border[:, 1:] |= across

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from gsseg_core.boxes import object_boxes
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 
@@ -67,7 +68,7 @@ def build_report(
         "settings": dict(settings),
         "objective": list(objective),
         "gaussians": gaussian_counts(result),
-        "classes": _class_table(result, plys),
+        "classes": _class_table(scene, result, plys),
         "pictures": list(pictures),
         "seconds": {name: round(value, 3) for name, value in seconds.items()},
         "versions": _versions(),
@@ -84,8 +85,8 @@ def gaussian_counts(result: Segmentation) -> dict[str, int]:
     }
 
 
-def _class_table(result: Segmentation, plys: Mapping[int, str]) -> list[dict[str, Any]]:
-    counts, confidence = result.counts(), result.confidence
+def _class_table(scene: GaussianScene, result: Segmentation, plys: Mapping[int, str]) -> list[dict[str, Any]]:
+    counts, confidence, boxes = result.counts(), result.confidence, object_boxes(scene, result)
     total = np.bincount(
         result.labels[result.labels >= 0], weights=confidence[result.labels >= 0], minlength=result.num_classes
     )
@@ -96,6 +97,7 @@ def _class_table(result: Segmentation, plys: Mapping[int, str]) -> list[dict[str
             "gaussians": int(counts[k]),
             "mean_confidence": round(float(total[k] / counts[k]), 4) if counts[k] else None,
             "ply": plys.get(k),
+            "box": boxes[k].as_dict() if k in boxes else None,
         }
         for k, name in result.class_names.items()
     ]

@@ -52,7 +52,7 @@ def segment_summary(report: Mapping[str, Any], out: str) -> str:
             f"filter, {gaussians['unobserved']:,} unobserved",
             seconds_table(report["seconds"]),
             f"Objects: {out}/classes\nPictures: {out}/pictures\n"
-            f"Labels: {out}/segmentation.npz\nReport: {out}/report.json",
+            f"Labels: {out}/segmentation.npz\nReport: {out}/report.html, to look at; {out}/report.json",
         ]
     )
 

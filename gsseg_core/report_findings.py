@@ -1,0 +1,168 @@
+"""What a run tells about its classes and its views: the figures of the report page, apart from how they are shown."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gsseg_core.dataset import View
+from gsseg_core.reliability import ViewCheck, worst_views
+
+SHOWN = 1 / 2000
+"""A view shows a class that fills at least this share of its checked pixels; less is an edge's blur."""
+
+TRUSTED = 0.7
+"""The page warns of masks with which the other views agree in a smaller share of their pixels, ..."""
+KNOWN_CLASS = 0.5
+"""... and of classes whose IoU with the masks is smaller than this."""
+FEW_VIEWS = 3
+NOTED = 5
+"""Names in a warning, at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Masks beside predictions of them.
+
+    Attributes
+    ----------
+    checks : list of ViewCheck
+        With what was predicted; of all views that were learnt from, or of some.
+    views : mapping from name to View
+        At least those.
+    held_out : bool
+        Whether a prediction comes from the other views alone; else the view itself has been learnt from, too.
+    """
+
+    checks: Sequence[ViewCheck]
+    views: Mapping[str, View]
+    held_out: bool
+
+    def confusion(self, num_classes: int) -> np.ndarray:
+        """Count pixels by class predicted (row) and label of the mask (column), over all views: (K, K) int64.
+
+        "None of these" of a partial mask is no class, and is not counted.
+        """
+        counts = np.zeros((num_classes, num_classes), np.int64)
+        for check in self.checks:
+            named = check.classes >= 0
+            counts[:, check.classes[named]] += check.counts[:, named]
+        return counts
+
+    def views_showing(self, num_classes: int) -> np.ndarray:
+        """Count the views that show each class, by what is predicted: (K,) int64."""
+        views = np.zeros(num_classes, np.int64)
+        for check in self.checks:
+            shown = check.counts.sum(axis=1)
+            views += (shown > 0) & (shown >= SHOWN * check.checked)
+        return views
+
+    def examples(self) -> list[tuple[str, ViewCheck]]:
+        """Choose the worst, the median and the best view by reliability; fewer if there are fewer."""
+        ranked = [check for check in worst_views(self.checks) if check.checked]
+        if not ranked:
+            return []
+        places = {0: "worst", len(ranked) // 2: "median", len(ranked) - 1: "best"}
+        return [(what, ranked[place]) for place, what in sorted(places.items())]
+
+
+def class_ious(
+    confusion: np.ndarray,  # (K, K)
+) -> np.ndarray:
+    """IoU of each class between prediction and masks, (K,); NaN for a class that is in neither."""
+    right = confusion.diagonal()
+    union = confusion.sum(axis=0) + confusion.sum(axis=1) - right
+    ious: np.ndarray = np.divide(right, union, out=np.full(len(right), np.nan), where=union > 0)
+    return ious
+
+
+def largest_confusions(
+    confusion: np.ndarray,  # (K, K)
+    count: int,
+) -> list[tuple[int, int, int]]:
+    """List what was most often taken for something else: class predicted, label of the mask, pixels."""
+    wrong = confusion.copy()
+    np.fill_diagonal(wrong, 0)
+    largest = np.argsort(-wrong, axis=None, kind="stable")[:count]
+    pairs = zip(*(index.tolist() for index in np.unravel_index(largest, wrong.shape)), strict=True)
+    return [(k, y, int(wrong[k, y])) for k, y in pairs if wrong[k, y]]
+
+
+def most_confused(
+    confusion: np.ndarray,  # (K, K)
+    count: int,
+) -> list[int]:
+    """Choose the classes with the most pixels in which prediction and mask differ, `count` at most, by id."""
+    wrong = confusion.sum(axis=0) + confusion.sum(axis=1) - 2 * confusion.diagonal()
+    order = [int(k) for k in np.argsort(-wrong, kind="stable")[:count] if confusion[k].any() or confusion[:, k].any()]
+    return sorted(order)
+
+
+def warnings_of(
+    report: Mapping[str, Any],
+    ious: np.ndarray | None = None,  # (K,)
+) -> list[str]:
+    """Say in sentences what about a run should make its user look twice, what weighs most first.
+
+    Parameters
+    ----------
+    report : mapping
+        What `report.json` holds.
+    ious : (K,) array, optional
+        IoU of each class with the masks, NaN where there is none.
+    """
+    views, gaussians = report["views"], report["gaussians"]
+    warnings = []
+    if views["used"] < FEW_VIEWS:
+        warnings.append(
+            f"Learnt from {_count(views['used'], 'view')} only. With fewer than {FEW_VIEWS}, "
+            "what a mask got wrong cannot be told from what is there."
+        )
+    if views["rejected"]:
+        reasons = ", ".join(f"{count} {why}" for why, count in views["rejected"].items())
+        warnings.append(f"{_count(sum(views['rejected'].values()), 'view')} could not be used: {reasons}.")
+    doubtful = [v for v in views.get("reliability", []) if v["reliability"] is not None and v["reliability"] < TRUSTED]
+    if doubtful:
+        whose = "masks disagree" if len(doubtful) > 1 else "masks disagrees"
+        warnings.append(
+            f"{len(doubtful)} of {len(views['reliability'])} {whose} with the other views in more than "
+            f"{100 - round(100 * TRUSTED)} % of {'their' if len(doubtful) > 1 else 'its'} pixels: "
+            f"{_some([view['name'] for view in doubtful])}. Wrong ids, a wrong pose, or a mask of another image?"
+        )
+    names = {entry["id"]: entry["name"] for entry in report["classes"]}
+    empty = [entry["name"] for entry in report["classes"] if entry["id"] and not entry["gaussians"]]
+    if empty:
+        warnings.append(f"{_count(len(empty), 'class', 'classes')} got no Gaussian: {_some(empty)}.")
+    if ious is not None:
+        weak = [names[k] for k in np.argsort(ious).tolist() if k in names and ious[k] < KNOWN_CLASS]
+        if weak:
+            warnings.append(
+                f"Of {_count(len(weak), 'class', 'classes')} masks and prediction overlap by less than half "
+                f"(IoU below {KNOWN_CLASS:g}): {_some(weak)}."
+            )
+    total = max(report["scene"]["gaussians"], 1)
+    if gaussians["unobserved"] > 0.02 * total:
+        warnings.append(
+            f"{100 * gaussians['unobserved'] / total:.0f} % of the Gaussians were seen by no mask and have no "
+            "neighbour that was; they belong to nothing."
+        )
+    return warnings
+
+
+def mean_reliability(report: Mapping[str, Any]) -> float:
+    """Mean over the views of which anything is known; NaN without any."""
+    known = [v["reliability"] for v in report["views"].get("reliability", []) if v["reliability"] is not None]
+    return sum(known) / len(known) if known else math.nan
+
+
+def _count(number: int, one: str, many: str | None = None) -> str:
+    return f"{number:,} {one if number == 1 else many or one + 's'}"
+
+
+def _some(names: Sequence[str]) -> str:
+    more = len(names) - NOTED
+    return ", ".join(names[:NOTED]) + (f" and {more} more" if more > 0 else "")

@@ -1,0 +1,216 @@
+"""Pictures in the report page: views with masks laid over them, and a thumbnail of every class, as data URIs."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable
+from io import BytesIO
+from typing import NamedTuple
+
+import numpy as np
+from PIL import Image
+
+from gsseg_core.dataset import View
+from gsseg_core.export import background_image
+from gsseg_core.masks import UNKNOWN, PackedLabels
+from gsseg_core.operator import make_operator
+from gsseg_core.pictures import outline, overlay
+from gsseg_core.reliability import ViewCheck
+from gsseg_core.report_findings import Evidence
+from gsseg_core.scene import GaussianScene
+
+PICTURE_PX = 480
+"""Views are shrunk to this many pixels a side."""
+THUMBNAIL_PX = 128
+MARGIN = 0.25
+"""Around the object in a thumbnail, as a share of its size."""
+SMALLEST_CROP_PX = 32
+CANDIDATES = 3
+"""Views, those that show most of a class, among which its thumbnail is chosen."""
+CUT = 0.3
+"""What a view in which the margin cuts an object counts, beside one that shows it whole."""
+
+_AGREE, _DIFFER, _UNKNOWN = (40, 44, 52), (236, 72, 60), (128, 131, 138)
+
+
+class Triple(NamedTuple):
+    """A view three times, each (H, W, 3) uint8: under its mask, under the prediction, and where the two differ."""
+
+    mask: np.ndarray
+    prediction: np.ndarray
+    difference: np.ndarray
+
+
+class ViewImages:
+    """What was seen from a view: its photo, else the scene's colours.
+
+    Parameters
+    ----------
+    scene : GaussianScene
+        What is rendered where there is no photo.
+    device : str
+        Where.
+    """
+
+    def __init__(self, scene: GaussianScene, device: str = "cpu") -> None:
+        self.scene, self.device = scene, device
+        self._images: dict[str, np.ndarray] = {}
+
+    def keep(
+        self,
+        view: View,
+        rendered: np.ndarray,  # (H, W, 3) uint8
+    ) -> None:
+        """Keep a rendering that has been made anyway, unless there is a photo."""
+        if view.image_path is None:
+            self._images[view.name] = rendered
+
+    def at_hand(self, view: View) -> bool:
+        """Whether nothing needs to be rendered."""
+        return view.name in self._images or view.image_path is not None
+
+    def of(self, view: View) -> np.ndarray:
+        """Give the image, (H, W, 3) uint8 of the camera's size."""
+        if view.name in self._images:
+            return self._images[view.name]
+        photo = _read_photo(view)
+        if photo is not None:
+            return photo
+        return background_image(self.scene, make_operator(self.scene, view.camera, self.device))
+
+
+def draw_triple(
+    check: ViewCheck,
+    view: View,
+    images: ViewImages,
+    colors: np.ndarray,  # (K, 3)
+) -> Triple:
+    """Lay a view's mask, and what is predicted, over its image, and show where they differ."""
+    image, mask, predicted = images.of(view), view.read_labels(), _predicted(check)
+    grey = image.mean(axis=2, keepdims=True)
+    unknown = (mask == UNKNOWN) | (predicted == UNKNOWN)
+    tint = np.where(unknown[..., None], _UNKNOWN, np.where((mask != predicted)[..., None], _DIFFER, _AGREE))
+    strength = np.where((mask != predicted) | unknown, 0.75, 0.6)[..., None]
+    difference = ((1 - strength) * grey + strength * tint).round().astype(np.uint8)
+    return Triple(overlay(image, mask, colors), overlay(image, predicted, colors), difference)
+
+
+def thumbnails(
+    classes: Iterable[int],
+    evidence: Evidence,
+    images: ViewImages,
+    colors: np.ndarray,  # (K, 3)
+) -> dict[int, tuple[str, np.ndarray]]:
+    """Cut classes out of the views that show them best.
+
+    That is, of the views in which most pixels are predicted as the class and labelled so, the one with the most; less
+    if the margin cuts the object, or if the view's image would have to be rendered.
+
+    Returns
+    -------
+    dict of int to (str, (THUMBNAIL_PX, THUMBNAIL_PX, 3) uint8)
+        For each of the classes that some view shows: the view's name, and the picture.
+    """
+    # Of each view only once, however many classes ask for it; packed, since they may be many and large.
+    agreed: dict[str, PackedLabels] = {}
+    chosen: dict[str, list[int]] = {}
+    for k in classes:
+        best = None
+        for check in _candidates(evidence, k):
+            view = evidence.views[check.name]
+            if check.name not in agreed:
+                mask, predicted = view.read_labels(), _predicted(check)
+                agreed[check.name] = PackedLabels(np.where(mask == predicted, mask, UNKNOWN))
+            own = agreed[check.name].unpack() == k
+            score = own.sum() * (CUT if _touches_margin(own) else 1) * (1 if images.at_hand(view) else 0.5)
+            if best is None or score > best[0]:
+                best = score, view.name
+        if best is not None:
+            chosen.setdefault(best[1], []).append(k)
+    found = {}
+    for name, shown in chosen.items():
+        image, labels = images.of(evidence.views[name]), agreed[name].unpack()
+        for k in shown:
+            found[k] = name, _crop(image, labels == k, colors[k])
+    return found
+
+
+def jpeg_uri(
+    image: np.ndarray,  # (H, W, 3) uint8
+    largest: int,
+    quality: int = 85,
+) -> str:
+    """Encode a picture as a data URI, shrunk so that neither side is longer than `largest` px."""
+    picture = Image.fromarray(image)
+    picture.thumbnail((largest, largest), Image.Resampling.BOX)
+    buffer = BytesIO()
+    # Thin lines in strong colours are what these pictures have to show; JPEG's usual subsampling smears them.
+    picture.save(buffer, "JPEG", quality=quality, subsampling=0)
+    return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+
+
+def _candidates(evidence: Evidence, k: int) -> list[ViewCheck]:
+    """Find the views with most pixels on which mask and prediction agree that they are of a class."""
+    pixels = []
+    for check in evidence.checks:
+        agreed = int(check.counts[k, check.classes == k].sum())
+        if agreed:
+            pixels.append((agreed, check))
+    return [check for _, check in sorted(pixels, key=lambda pair: -pair[0])[:CANDIDATES]]
+
+
+def _crop(
+    image: np.ndarray,  # (H, W, 3)
+    own: np.ndarray,  # (H, W) bool
+    color: np.ndarray,  # (3,)
+) -> np.ndarray:
+    """Cut a square around an object, the rest dimmed, the object outlined in its colour."""
+    rows, columns = np.flatnonzero(own.any(axis=1)), np.flatnonzero(own.any(axis=0))
+    # What makes up the object; a few pixels elsewhere should not shrink it to a dot.
+    top, bottom = _extent(own[rows].sum(axis=1), rows)
+    left, right = _extent(own[:, columns].sum(axis=0), columns)
+    side = max(round((1 + 2 * MARGIN) * max(bottom - top, right - left)), SMALLEST_CROP_PX)
+    side = min(side, *own.shape)
+    top = int(np.clip((top + bottom - side) // 2, 0, own.shape[0] - side))
+    left = int(np.clip((left + right - side) // 2, 0, own.shape[1] - side))
+    window = np.s_[top : top + side, left : left + side]
+    size = (THUMBNAIL_PX, THUMBNAIL_PX)
+    shown = np.asarray(Image.fromarray(image[window]).resize(size, Image.Resampling.BICUBIC))
+    inside = np.asarray(Image.fromarray(own[window]).resize(size, Image.Resampling.NEAREST))
+    picture = np.where(
+        inside[..., None], shown, (0.45 * shown + 0.15 * shown.mean(axis=2, keepdims=True)).astype(np.uint8)
+    )
+    # Two pixels wide: the page shows two of them as one.
+    picture[outline(inside)] = color
+    return picture
+
+
+def _extent(
+    weights: np.ndarray,  # (R,)
+    places: np.ndarray,  # (R,)
+) -> tuple[int, int]:
+    """First and last place, but for the hundredth of the weight at either end."""
+    share = np.cumsum(weights) / weights.sum()
+    first, last = np.searchsorted(share, [0.01, 0.99])
+    return int(places[first]), int(places[last]) + 1
+
+
+def _touches_margin(own: np.ndarray) -> bool:
+    return bool(own[0].any() or own[-1].any() or own[:, 0].any() or own[:, -1].any())
+
+
+def _predicted(check: ViewCheck) -> np.ndarray:
+    assert check.predicted is not None, f"check of {check.name} came without its prediction"
+    return check.predicted.unpack()
+
+
+def _read_photo(view: View) -> np.ndarray | None:
+    """Read the photo of a view; None if there is none of the camera's size, or none that can be read."""
+    if view.image_path is None:
+        return None
+    try:
+        with Image.open(view.image_path) as photo:
+            image = np.asarray(photo.convert("RGB"))
+    except (OSError, SyntaxError, ValueError):  # A picture for people is not worth an error.
+        return None
+    return image if image.shape[:2] == (view.camera.height, view.camera.width) else None

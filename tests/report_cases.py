@@ -1,0 +1,61 @@
+"""A small run whose report is looked at by several test files, its class names as nasty as they come."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, ring, taught, write_dataset
+
+from gsseg_core import pipeline
+from gsseg_core.em import EMLearner
+from gsseg_core.reliability import check_views
+from gsseg_core.report_findings import Evidence
+from gsseg_core.segmentation import Segmentation
+
+NASTY = {
+    0: "background",
+    1: "<script>document.title='pwned'</script>",
+    2: "\"'><img src=https://example.org/x onerror=\"document.title='pwned'\">",
+    3: "</script></td>&amp; \u202e\u05d1\x00\x1b",
+}
+
+
+def run_with_nasty_names(folder: Path, **options: Any) -> Path:
+    """Segment the balls; returns the folder of results."""
+    scene, truth = balls_on_a_table()
+    data = write_dataset(folder / "data", scene, truth, ring(9), NASTY)
+    pipeline.segment(data / "scene.ply", data, folder / "out", **options)
+    return folder / "out"
+
+
+@cache
+def segmented() -> tuple[Segmentation, Evidence]:
+    """What clean views of the balls give."""
+    scene, _ = balls_on_a_table()
+    views = clean_views(6)
+    learner = EMLearner(scene, NUM_CLASSES)
+    taught(learner, views).fit()
+    result = Segmentation.from_codes(scene, learner.codes_, {k: f"class {k}" for k in range(NUM_CLASSES)})
+    return result, Evidence(check_views(learner), {view.name: view for view in views}, held_out=True)
+
+
+def minimal_report(**changes: Any) -> dict[str, Any]:
+    """Give the parts of `report.json` of a run without fault that warnings are made from."""
+    report = {
+        "scene": {"gaussians": 100},
+        "views": {"used": 9, "rejected": {}, "reliability": [{"name": "a", "reliability": 0.99}]},
+        "gaussians": {"unobserved": 0},
+        "classes": [{"id": 0, "name": "background", "gaussians": 0}, {"id": 1, "name": "cup", "gaussians": 50}],
+    }
+    return {**report, **changes}
+
+
+def painted(*rectangles: tuple[int, slice, slice], size: tuple[int, int] = (48, 64)) -> np.ndarray:
+    """A label map of zeros with rectangles of labels."""
+    labels = np.zeros(size, np.int32)
+    for label, rows, columns in rectangles:
+        labels[rows, columns] = label
+    return labels

@@ -1,0 +1,136 @@
+"""The report page in a real Chromium: it draws, answers, is quiet, and does without JavaScript and on a phone."""
+
+from __future__ import annotations
+
+from io import BytesIO
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from PIL import Image
+from report_cases import run_with_nasty_names
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from playwright.sync_api import Browser, Locator, Page
+
+CANVAS = ".stage canvas"
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Address of a page."""
+    return (run_with_nasty_names(tmp_path_factory.mktemp("report")) / "report.html").as_uri()
+
+
+@pytest.fixture
+def opened(page: Page, report: str) -> Page:
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(report)
+    page.wait_for_selector(f"{CANVAS}[data-frames]")
+    assert [url for url in asked if not url.startswith("data:")] == [report]
+    return page
+
+
+def shot(place: Locator) -> np.ndarray:
+    return np.asarray(Image.open(BytesIO(place.screenshot())).convert("RGB")).astype(int)
+
+
+def after(page: Page, change: Callable[[], object]) -> np.ndarray:
+    """What the preview shows once it has drawn what changed."""
+    frames = int(page.locator(CANVAS).get_attribute("data-frames") or 0)
+    change()
+    # Not by wait_for_function, which needs eval, and that the page's policy forbids.
+    page.locator(f"{CANVAS}:not([data-frames='{frames}'])").wait_for(timeout=10_000)
+    return shot(page.locator(CANVAS))
+
+
+def changed(one: np.ndarray, other: np.ndarray) -> float:
+    """Share of the pixels that differ."""
+    return float((np.abs(one - other).max(axis=2) > 24).mean())
+
+
+def test_preview_draws_the_scene_and_toggles_of_classes_change_it(opened: Page) -> None:
+    whole = shot(opened.locator(CANVAS))
+    empty = after(opened, opened.locator("[data-all='0']").click)
+    assert empty[: len(empty) // 2].std(axis=(0, 1)).max() < 3
+    assert changed(whole, empty) > 0.2
+    only_one = after(opened, opened.locator(".only[data-label='1']").click)
+    assert 0.005 < changed(only_one, empty) < 0.2
+    again = after(opened, opened.locator("[data-all='1']").click)
+    assert changed(again, whole) < 0.05
+    without = after(opened, opened.locator(".legend input[data-label='1']").click)
+    # What goes is where the class alone was, unless something stood in front of it.
+    gone = np.abs(without - again).max(axis=2) > 24
+    alone = np.abs(only_one - empty).max(axis=2) > 24
+    assert gone.mean() > 0.002 and (gone & ~alone).mean() < 0.01
+
+
+def test_colours_can_be_switched(opened: Page) -> None:
+    shown = [after(opened, opened.locator(f"[data-mode='{mode}']").click) for mode in (0, 1, 2)]
+    assert min(changed(shown[i], shown[j]) for i, j in ((0, 1), (0, 2), (1, 2))) > 0.05
+    assert opened.locator("[data-mode='2']").get_attribute("aria-pressed") == "true"
+    assert opened.locator(".ramp").is_visible()
+
+
+def test_preview_turns_moves_zooms_and_cuts(opened: Page) -> None:
+    canvas = opened.locator(CANVAS)
+    before = shot(canvas)  # It scrolls the canvas into view, too.
+    box = canvas.bounding_box()
+    assert box is not None
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+    def drag() -> None:
+        opened.mouse.move(x, y)
+        opened.mouse.down()
+        opened.mouse.move(x + 120, y + 40)
+        opened.mouse.up()
+
+    turned = after(opened, drag)
+    canvas.focus()
+    nearer = after(opened, lambda: opened.keyboard.press("+"))
+    rolled = after(opened, lambda: opened.mouse.wheel(0, -400))
+    cut = after(opened, lambda: opened.locator(".cut").fill("70"))
+    outside = after(opened, lambda: opened.locator(".looks").select_option("-1"))
+    for one, other in ((before, turned), (turned, nearer), (nearer, rolled), (rolled, cut), (before, outside)):
+        assert changed(one, other) > 0.01
+
+
+def test_nasty_names_do_nothing(opened: Page) -> None:
+    assert opened.title() == "gsseg: scene.ply"
+    assert opened.locator("script").count() == 3
+    assert opened.locator("img[src^='http']").count() == 0
+    assert opened.locator("#classes bdi").nth(1).inner_text() == "<script>document.title='pwned'</script>"
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_a_phone_shows_all_of_it_without_scrolling_sideways(chromium: Browser, report: str, scheme: str) -> None:
+    context = chromium.new_context(viewport={"width": 360, "height": 740}, color_scheme=scheme)
+    try:
+        page = context.new_page()
+        page.goto(report)
+        page.wait_for_selector(f"{CANVAS}[data-frames]")
+        assert page.evaluate("document.documentElement.scrollWidth") <= 360
+        paper = [
+            int(x) for x in page.evaluate("getComputedStyle(document.body).backgroundColor").strip("rgb()").split(",")
+        ]
+        assert (sum(paper) < 150) == (scheme == "dark")
+        assert shot(page.locator(CANVAS)).std() > 5
+    finally:
+        context.close()
+
+
+def test_everything_but_the_preview_works_without_javascript(chromium: Browser, report: str) -> None:
+    context = chromium.new_context(java_script_enabled=False)
+    try:
+        page = context.new_page()
+        page.goto(report)
+        assert page.locator(".poster").is_visible() and not page.locator(CANVAS).is_visible()
+        assert not page.locator(".controls").is_visible() and page.locator("noscript p").is_visible()
+        assert page.locator(".classes tbody tr").count() == 4 and page.locator(".legend li").first.is_visible()
+        assert shot(page.locator(".poster")).std() > 5
+        assert page.locator(".triple img").count() == 9
+    finally:
+        context.close()
