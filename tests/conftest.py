@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import browser
 import pytest
 
 if TYPE_CHECKING:
     from operator_backends import Backend
+    from playwright.sync_api import Browser, Page
 
 DATA = Path(os.environ.get("GSSEG_DATA") or Path(__file__).parents[2] / "shared" / "data")
 _NO_DATA = "real data not found"
 _NO_GPU = "no GPU for gsplat"
+_NO_BROWSER = "no Chromium"
 
 
 def pytest_configure() -> None:
@@ -42,12 +46,30 @@ def backend(request: pytest.FixtureRequest) -> Backend:
     return BACKENDS[request.param]
 
 
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Browser]:
+    """A headless Chromium; the test is skipped where there is none. One a module: while it runs, so does its loop."""
+    why = browser.why_missing()
+    if why:
+        pytest.skip(f"{_NO_BROWSER}: {why}")
+    with browser.started_chromium() as started:
+        yield started
+
+
+@pytest.fixture
+def page(chromium: Browser) -> Iterator[Page]:
+    """An empty page of it; what the page logs as an error fails the test."""
+    with browser.opened_page(chromium) as opened:
+        yield opened
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say how many tests had to do without the real scenes or a GPU: a skip must not look like a pass."""
+    """Say how many tests had to do without the real scenes, a GPU or a browser: a skip must not look like a pass."""
     skips = [str(report.longrepr) for report in terminalreporter.stats.get("skipped", [])]
     without = {
         _NO_DATA: f"real data not found under {DATA} (set GSSEG_DATA)",
         _NO_GPU: "no GPU that gsplat can use, so the operator on CUDA was not tested (docs/gpu.md)",
+        _NO_BROWSER: f"no Chromium to open pages with (install one, or set {browser.VARIABLE})",
     }
     for reason, text in without.items():
         count = sum(reason in skip for skip in skips)

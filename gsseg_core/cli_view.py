@@ -1,0 +1,94 @@
+"""The command `gsseg view`."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import threading
+import webbrowser
+from contextlib import closing, suppress
+from pathlib import Path
+from types import ModuleType
+
+from gsseg_core.cli_shared import add_quiet, load_kernels
+from gsseg_core.errors import SettingsError
+
+HELP = "look at a scene in the browser, class by class, and correct labels"
+DESCRIPTION = """
+Serves a page in which the scene is drawn in true colours, by class or by confidence; classes can be shown alone,
+corrected and exported. With --ros it follows a node while that learns.
+"""
+EXAMPLES = """
+  gsseg view scene.ply --segmentation out/segmentation.npz --data DATASET
+  gsseg view scene.ply --ros
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the command takes."""
+    parser.add_argument("scene", metavar="SCENE.ply", help="trained 3DGS scene")
+    parser.add_argument("--segmentation", metavar="FILE", help="segmentation.npz of this scene")
+    parser.add_argument(
+        "--data", metavar="DATASET", help="folder of the views that it was learnt from, for jumping to them"
+    )
+    parser.add_argument("--ros", action="store_true", help="follow the ROS 2 node `gsseg` while it learns")
+    parser.add_argument("--host", default="127.0.0.1", help="0.0.0.0 lets other machines look (default: %(default)s)")
+    parser.add_argument("--port", type=int, default=8080, help="default: %(default)s, or the next one that is free")
+    parser.add_argument("--open", action="store_true", help="open the page, too")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="default: cpu")
+    add_quiet(parser)
+
+
+def run(options: argparse.Namespace) -> int:
+    """Show the scene until interrupted."""
+    viewer_module = load_viewer()
+    from gsseg_core.dataset import Dataset
+    from gsseg_core.scene import GaussianScene
+    from gsseg_core.segmentation import Segmentation
+    from gsseg_core.view_live import open_source
+    from gsseg_core.view_model import BY_CLASS, TRUE_COLOURS, Labelling, ViewModel, read_reliability
+
+    if not 0 < options.port < 2**16:
+        raise SettingsError(f"port is {options.port}; expected 1 to 65535")
+    if options.ros and options.segmentation:
+        raise SettingsError("both --ros and --segmentation are given; expected one: the node has codes of its own")
+    load_kernels(options.quiet, options.device)
+    scene = GaussianScene.load(options.scene)
+    dataset = Dataset(options.data) if options.data else None
+    views = [view for view in dataset.views("train") if view.has_mask] if dataset else []
+    reliability: dict[str, float] = {}
+    if options.segmentation:
+        labelling = Labelling.of(Segmentation.load(options.segmentation, scene))
+        reliability = read_reliability(Path(options.segmentation).parent / "report.json")
+    else:
+        labelling = Labelling.unknown(len(scene), dataset.class_names if dataset else None)
+    source = open_source("ros", scene) if options.ros else None
+    model = ViewModel(scene, labelling, mode=BY_CLASS if options.segmentation or options.ros else TRUE_COLOURS)
+    viewer = viewer_module.Viewer(
+        model, views, reliability, source, host=options.host, port=options.port, device=options.device
+    )
+    with closing(viewer):
+        print(f"gsseg: {len(scene):,} Gaussians at {viewer.url} (Ctrl-C ends it)", flush=True)
+        # Without a screen, that would start a browser of text in this very terminal.
+        if options.open and any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
+            webbrowser.open(viewer.url)
+        with suppress(KeyboardInterrupt):  # How it is meant to end.
+            threading.Event().wait()
+    return 0
+
+
+def load_viewer() -> ModuleType:
+    """Import the viewer.
+
+    Raises
+    ------
+    SettingsError
+        viser is not installed.
+    """
+    try:
+        from gsseg_core import viewer
+    except ModuleNotFoundError as missing:
+        if missing.name != "viser":
+            raise
+        raise SettingsError("`gsseg view` needs viser, which is missing: pip install 'gsseg[view]'") from missing
+    return viewer

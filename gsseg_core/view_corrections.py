@@ -1,0 +1,212 @@
+"""Corrections by a person: what was drawn in a view becomes a posed mask of its own, and is learnt at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy import ndimage
+
+from gsseg_core.cameras import Camera
+from gsseg_core.dataset import View
+from gsseg_core.errors import NoUsableViewsError, SettingsError
+from gsseg_core.lanes import HEIGHT, LOG_OPACITY, WIDTH
+from gsseg_core.live import LiveSession
+from gsseg_core.masks import UNKNOWN
+from gsseg_core.operator import make_operator
+from gsseg_core.projection import project
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segmentation import REMOVED, UNOBSERVED
+from gsseg_core.view_model import Labelling
+
+TRUST = 4.0
+"""A correction that sees the whole of a Gaussian weighs as much as so many times all that was learnt before."""
+
+
+def disc(
+    camera: Camera,
+    column: float,
+    row: float,
+    radius: float,
+    label: int,
+) -> View:
+    """Draw a disc: a view that says `label` there, and nothing anywhere else.
+
+    Parameters
+    ----------
+    camera : Camera
+        Of the picture that was drawn in.
+    column, row, radius : float
+        In pixels; at least the pixel of the middle is drawn.
+    label : int
+        What is there.
+
+    Raises
+    ------
+    SettingsError
+        The middle is not in the picture.
+    """
+    _check_inside(camera, column, row)
+    x, y = np.arange(camera.width) + 0.5, np.arange(camera.height)[:, None] + 0.5
+    drawn = (x - column) ** 2 + (y - row) ** 2 <= radius**2
+    drawn[int(row), int(column)] = True
+    return _view(camera, drawn, label)
+
+
+def box(
+    camera: Camera,
+    corner: tuple[float, float],
+    opposite: tuple[float, float],
+    label: int,
+) -> View:
+    """Draw a rectangle between two corners, column and row in pixels; see `disc`."""
+    (left, right), (top, bottom) = (sorted(pair) for pair in zip(corner, opposite, strict=True))
+    x, y = np.arange(camera.width) + 0.5, np.arange(camera.height)[:, None] + 0.5
+    return _view(camera, (x >= left) & (x <= right) & (y >= top) & (y <= bottom), label)
+
+
+def region(
+    camera: Camera,
+    label_map: np.ndarray,  # (H, W) int
+    column: float,
+    row: float,
+    label: int,
+) -> View:
+    """Draw the connected region of one label around a pixel, as it is shown now; see `disc`."""
+    _check_inside(camera, column, row)
+    parts, _ = ndimage.label(label_map == label_map[int(row), int(column)])
+    return _view(camera, parts == parts[int(row), int(column)], label)
+
+
+class Corrections:
+    """Corrections of one scene, in the order in which they came.
+
+    They are views like any other, fused by a `LiveSession` that has no others. How much a correction weighs against
+    what was learnt before goes by how much of a Gaussian it sees: the sum of its weights over what was drawn, divided
+    by that of its opacities over the whole image, which is 1 for one that lies open and inside the drawing, and near 0
+    for what lies behind. With e its sum over the corrections, c their codes and q those learnt before,
+
+        q' = normalise( q + TRUST e c )
+
+    Parameters
+    ----------
+    scene : GaussianScene
+        N Gaussians.
+    device : str
+        Where views are rendered.
+
+    Attributes
+    ----------
+    views : list of View
+        The corrections.
+    """
+
+    def __init__(self, scene: GaussianScene, *, device: str = "cpu") -> None:
+        self._scene, self._device = scene, device
+        self.views: list[View] = []
+        self._session = LiveSession(scene, device=device)
+        self._seen: list[np.ndarray] = []
+
+    def __len__(self) -> int:
+        """Count the corrections."""
+        return len(self.views)
+
+    def add(self, view: View) -> None:
+        """Learn a correction. A view of a name that is there already is another correction all the same.
+
+        Raises
+        ------
+        NoUsableViewsError
+            Nothing was drawn on any Gaussian.
+        """
+        camera = view.camera
+        name = f"correction_{len(self.views):04d}"
+        own = View.from_arrays(
+            Camera(name, camera.width, camera.height, camera.K, camera.world_to_camera), view.read_labels()
+        )
+        rejection = self._session.fuse(own)
+        if rejection is not None:
+            raise NoUsableViewsError(f"correction: {rejection.message}; expected something drawn on the scene")
+        self.views.append(own)
+        self._seen.append(share_seen(self._scene, own, self._device))
+
+    def undo(self) -> bool:
+        """Take the last correction back, exactly; return whether there was one."""
+        if not self.views:
+            return False
+        self.views.pop()
+        self._seen.pop()
+        self._session.reset()
+        for view in self.views:
+            self._session.fuse(view)
+        return True
+
+    def apply(self, before: Labelling, names: Mapping[int, str] | None = None) -> Labelling:
+        """Correct what was learnt before.
+
+        Parameters
+        ----------
+        before : Labelling
+            Of the same scene.
+        names : mapping from id to name, optional
+            Of classes that only the corrections have.
+
+        Returns
+        -------
+        Labelling
+            Where no correction has seen a Gaussian, it is as before.
+        """
+        if not self.views:
+            return before
+        codes = self._session.codes()
+        num_classes = max(codes.shape[1], before.probabilities.shape[1])
+        probabilities = _widened(before.probabilities, num_classes)
+        weight: np.ndarray = TRUST * np.stack(self._seen).sum(axis=0)
+        touched = np.flatnonzero(weight > 0)
+        mixed = probabilities[touched] + weight[touched, None] * _widened(codes[touched], num_classes)
+        mixed /= mixed.sum(axis=1, keepdims=True)
+        probabilities[touched] = mixed
+        labels = before.labels.copy()
+        # A Gaussian that the filter took out of its object stays out, unless it goes to another one.
+        best = mixed.argmax(axis=1).astype(np.int32)
+        filtered = (labels[touched] == REMOVED) & (best == before.probabilities[touched].argmax(axis=1))
+        labels[touched] = np.where(filtered, REMOVED, best)
+        known = {**(names or {}), **before.class_names}
+        return Labelling(labels, probabilities, {k: known.get(k, f"class_{k:02d}") for k in range(num_classes)})
+
+
+def share_seen(scene: GaussianScene, view: View, device: str = "cpu") -> np.ndarray:
+    """How much of each Gaussian the labelled pixels of a view see, (N,) float32 in [0, 1].
+
+    A Gaussian's alphas sum up to opacity * 2 pi sqrt(|S|) over an endless image, S being its covariance there.
+    """
+    operator = make_operator(scene, view.camera, device)
+    drawn = (view.read_labels() != UNKNOWN)[..., None].astype(np.float32)
+    seen = operator.adjoint(drawn)[:, 0]
+    projected = project(scene, view.camera)
+    table = projected.table
+    # |S| = var(x|y) S_yy, and the table has log2(e) / 2 over each of them.
+    area = np.pi * np.log2(np.e) / np.sqrt(table[:, WIDTH] * table[:, HEIGHT])
+    full = np.zeros(len(scene), np.float32)
+    full[projected.ids] = np.exp2(table[:, LOG_OPACITY]) * area
+    share: np.ndarray = np.divide(seen, full, out=np.zeros_like(seen), where=full > 0)
+    share = np.minimum(share, 1.0)
+    return share
+
+
+def _view(camera: Camera, drawn: np.ndarray, label: int) -> View:
+    if label <= UNOBSERVED:
+        raise SettingsError(f"correction: label is {label}; expected a class")
+    return View.from_arrays(camera, np.where(drawn, np.int32(label), np.int32(UNKNOWN)))
+
+
+def _check_inside(camera: Camera, column: float, row: float) -> None:
+    if not (0 <= column < camera.width and 0 <= row < camera.height):
+        raise SettingsError(
+            f"correction: pixel is (column {column:g}, row {row:g}); expected one of the "
+            f"{camera.width} x {camera.height} of the picture"
+        )
+
+
+def _widened(codes: np.ndarray, num_classes: int) -> np.ndarray:
+    return np.pad(codes, ((0, 0), (0, num_classes - codes.shape[1])))

@@ -1,0 +1,76 @@
+"""Where a viewer gets codes from that change while it runs: sources that other packages provide.
+
+A source is named by an entry point of the group `gsseg.live_sources`, so that the core knows none of them. It is called
+with the scene, and returns a `LiveSource`. `gsseg view --ros` looks for the name "ros".
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+from typing import NamedTuple, Protocol
+
+from gsseg_core.errors import SettingsError
+from gsseg_core.scene import GaussianScene
+from gsseg_core.view_model import Labelling
+
+GROUP = "gsseg.live_sources"
+
+
+class LiveUpdate(NamedTuple):
+    """What a source knows now.
+
+    Attributes
+    ----------
+    labelling : Labelling
+        Of the scene that the source was made for.
+    num_views : int
+        Views that it comes from.
+    """
+
+    labelling: Labelling
+    num_views: int
+
+
+class LiveSource(Protocol):
+    """Hands out codes as they change."""
+
+    def wait(self, timeout: float) -> LiveUpdate | None:
+        """Wait for the next codes, `timeout` seconds at most.
+
+        Returns
+        -------
+        LiveUpdate or None
+            None where nothing has changed.
+
+        Raises
+        ------
+        GssegError
+            The source cannot be asked now, and why; it may be asked again.
+        """
+
+    def close(self) -> None:
+        """Let go of what it holds."""
+
+
+def open_source(name: str, scene: GaussianScene) -> LiveSource:
+    """Make the source of a name.
+
+    Raises
+    ------
+    SettingsError
+        There is none of this name, or what it needs is not installed.
+    GssegError
+        It cannot be used with this scene.
+    """
+    found = entry_points(group=GROUP, name=name)
+    if not found:
+        raise SettingsError(f"live source {name!r}: none is installed; expected an entry point in the group {GROUP}")
+    try:
+        make = next(iter(found)).load()
+    except ModuleNotFoundError as missing:
+        raise SettingsError(
+            f"live source {name!r}: the Python package {missing.name!r} is missing; expected ROS 2 Jazzy, from apt "
+            "with its setup.sh sourced, or as wheels: pip install ./msg_defs 'gsseg[ros]'"
+        ) from missing
+    source: LiveSource = make(scene)
+    return source

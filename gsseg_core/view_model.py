@@ -1,0 +1,244 @@
+"""What a viewer shows of a segmentation: which Gaussians, in which colours. Pure numpy; it knows no viewer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from gsseg_core.errors import StateFileError, UnknownLabelError
+from gsseg_core.json_files import read_json
+from gsseg_core.masks import BACKGROUND_NAME
+from gsseg_core.pictures import palette
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
+
+TRUE_COLOURS, BY_CLASS, BY_CONFIDENCE, BY_RELIABILITY = "true colours", "class", "confidence", "view reliability"
+MODES = (TRUE_COLOURS, BY_CLASS, BY_CONFIDENCE, BY_RELIABILITY)
+
+NO_CLASS = {UNOBSERVED: "(unobserved)", REMOVED: "(removed by the filter)"}
+"""What the list of classes calls the labels that are no class."""
+
+NOTHING_KNOWN = (120, 120, 120)
+"""The colour of what a mode has nothing to say of."""
+
+# From bad to good: dark red, orange, pale yellow, green, dark green; it can be told apart without seeing red and green,
+# since brightness rises to the middle and the ends differ in blue.
+_RAMP = np.array([(122, 1, 30), (230, 120, 40), (250, 230, 140), (90, 180, 140), (0, 90, 130)], np.float32)
+
+
+class Labelling(NamedTuple):
+    """What is known of each Gaussian, wherever it comes from.
+
+    Attributes
+    ----------
+    labels : (N,) int32
+        Class, or `UNOBSERVED` (-1), or `REMOVED` (-2).
+    probabilities : (N, K) float32
+        By class; zeros where nothing is known. Rows sum to at most 1: a source may know the largest one only.
+    class_names : dict of int to str
+        Names by id, for all K.
+    """
+
+    labels: np.ndarray
+    probabilities: np.ndarray
+    class_names: dict[int, str]
+
+    @classmethod
+    def of(cls, segmentation: Segmentation) -> Labelling:
+        """Take over what a segmentation says."""
+        return cls(segmentation.labels, segmentation.probabilities, dict(segmentation.class_names))
+
+    @classmethod
+    def unknown(cls, num_gaussians: int, class_names: Mapping[int, str] | None = None) -> Labelling:
+        """Nothing is known of any Gaussian."""
+        names = {0: BACKGROUND_NAME, **(class_names or {})}
+        names = {k: names.get(k, f"class_{k:02d}") for k in range(max(names) + 1)}
+        empty = np.zeros((num_gaussians, len(names)), np.float32)
+        return cls(np.full(num_gaussians, UNOBSERVED, np.int32), empty, names)
+
+
+class ClassRow(NamedTuple):
+    """A line of the list of classes."""
+
+    label: int
+    name: str
+    color: tuple[int, int, int]
+    size: int
+    shown: bool
+
+
+@dataclass(eq=False)
+class ViewModel:
+    """The state of a viewer. Change it with its methods; `shown` and `colors` say what follows from it.
+
+    Attributes
+    ----------
+    scene : GaussianScene
+        N Gaussians.
+    labelling : Labelling
+        What is known of them; replaced as a whole by `relabel`.
+    reliability : (N,) float32 or None
+        Mean reliability of the views that spoke for each Gaussian, in [0, 1], NaN where none did; None while unknown.
+    mode : str
+        One of `MODES`.
+    min_confidence : float
+        Gaussians that are less sure of their own class are not shown.
+    min_probability : float
+        If above 0, a Gaussian is shown not for its label, but for having at least this probability of a shown class.
+    hidden, removed : set of int
+        Labels that are switched off; and those that are off the list, too.
+    """
+
+    scene: GaussianScene
+    labelling: Labelling
+    reliability: np.ndarray | None = None
+    mode: str = BY_CLASS
+    min_confidence: float = 0.0
+    min_probability: float = 0.0
+    hidden: set[int] = field(default_factory=set)
+    removed: set[int] = field(default_factory=set)
+
+    def relabel(self, labelling: Labelling) -> None:
+        """Show what is known now; what was switched off stays so."""
+        self.labelling = labelling
+        self.__dict__.pop("confidence", None)
+
+    @cached_property
+    def confidence(self) -> np.ndarray:
+        """Largest probability of each Gaussian, (N,) float32; 0 where nothing is known."""
+        largest: np.ndarray = self.labelling.probabilities.max(axis=1)
+        return largest
+
+    @property
+    def labels_in_use(self) -> list[int]:
+        """Labels of the list, classes first, in ascending order; those that were removed from it are not there."""
+        counts = self._counts()
+        listed = [k for k in self.labelling.class_names if counts.get(k)] + [k for k in NO_CLASS if counts.get(k)]
+        return [k for k in listed if k not in self.removed]
+
+    def rows(self) -> list[ClassRow]:
+        """List the classes that have Gaussians, and what is of no class."""
+        counts = self._counts()
+        return [ClassRow(k, self.name(k), self.color(k), counts[k], k not in self.hidden) for k in self.labels_in_use]
+
+    def name(self, label: int) -> str:
+        """Name of a label, also of those that are no class."""
+        return NO_CLASS.get(label) or self.labelling.class_names.get(label, f"class_{label:02d}")
+
+    def color(self, label: int) -> tuple[int, int, int]:
+        """Colour of a label."""
+        if label < 0:
+            return NOTHING_KNOWN
+        red, green, blue = palette(max(self.labelling.class_names, default=0) + 1)[label].tolist()
+        return red, green, blue
+
+    def toggle(self, label: int) -> None:
+        """Switch a class off, or on again.
+
+        Raises
+        ------
+        UnknownLabelError
+            It is not in the list.
+        """
+        self.hidden ^= {self._listed(label)}
+
+    def isolate(self, label: int) -> None:
+        """Show this class alone; asked for a second time, show all again."""
+        others = set(self.labels_in_use) - {self._listed(label)}
+        self.hidden = set() if self.hidden == others else others
+
+    def remove(self, label: int) -> None:
+        """Take a class off the list, and its Gaussians out of the picture and of exports."""
+        self.removed |= {self._listed(label)}
+        self.hidden -= {label}
+
+    def show_all(self) -> None:
+        """Switch all on, also what was removed, and lower both thresholds to 0."""
+        self.hidden, self.removed = set(), set()
+        self.min_confidence = self.min_probability = 0.0
+
+    def shown(self) -> np.ndarray:
+        """Which Gaussians are shown, (N,) bool."""
+        off = self.hidden | self.removed
+        labels, probabilities = self.labelling.labels, self.labelling.probabilities
+        if self.min_probability > 0:
+            on = [k for k in range(probabilities.shape[1]) if k not in off]
+            best = probabilities[:, on].max(axis=1) if on else np.zeros(len(labels), np.float32)
+            kept: np.ndarray = best >= np.float32(self.min_probability)
+        else:
+            table = np.ones(probabilities.shape[1] + len(NO_CLASS), bool)  # labels -1 and -2 are its last two
+            table[[k for k in off if k < probabilities.shape[1]]] = False
+            kept = table[labels]
+        if self.min_confidence > 0:
+            kept &= self.confidence >= np.float32(self.min_confidence)
+        return kept
+
+    def colors(self) -> np.ndarray:
+        """Colour of every Gaussian in the present mode, (N, 3) uint8."""
+        if self.mode == TRUE_COLOURS:
+            return self._true_colors
+        if self.mode == BY_CONFIDENCE:
+            return ramp(np.where(self.confidence > 0, self.confidence, np.nan))
+        if self.mode == BY_RELIABILITY:
+            nothing = np.full(len(self.scene), np.nan, np.float32)
+            return ramp(nothing if self.reliability is None else self.reliability)
+        table = np.array([self.color(k) for k in range(self.labelling.probabilities.shape[1])] + [NOTHING_KNOWN] * 2)
+        by_class: np.ndarray = table.astype(np.uint8)[self.labelling.labels]
+        return by_class
+
+    @cached_property
+    def _true_colors(self) -> np.ndarray:
+        colors: np.ndarray = np.rint(self.scene.colors() * 255).astype(np.uint8)
+        return colors
+
+    def _counts(self) -> dict[int, int]:
+        labels = self.labelling.labels
+        counts = np.bincount(labels + len(NO_CLASS), minlength=len(NO_CLASS))
+        return {i - len(NO_CLASS): n for i, n in enumerate(counts.tolist()) if n}
+
+    def _listed(self, label: int) -> int:
+        if label not in self.labels_in_use:
+            raise UnknownLabelError(f"class {label} is not in the list; expected one of {self.labels_in_use}")
+        return label
+
+
+def ramp(
+    values: np.ndarray,  # (N,)
+) -> np.ndarray:
+    """Colours (N, 3) uint8 from bad (0, dark red) to good (1, dark blue); grey where the value is NaN."""
+    position = np.clip(np.nan_to_num(values), 0, 1) * (len(_RAMP) - 1)
+    first = np.minimum(position.astype(np.int64), len(_RAMP) - 2)
+    part = (position - first)[:, None]
+    colors: np.ndarray = np.rint(_RAMP[first] * (1 - part) + _RAMP[first + 1] * part).astype(np.uint8)
+    colors[np.isnan(values)] = NOTHING_KNOWN
+    return colors
+
+
+def read_reliability(report: Path) -> dict[str, float]:
+    """Read from the `report.json` of a run how far each view can be trusted.
+
+    Returns
+    -------
+    dict of str to float
+        By name of the view, in [0, 1], without those of which nothing is known; empty where the run did not find out.
+
+    Raises
+    ------
+    StateFileError
+        The file is there, but no report.
+    """
+    if not report.is_file():
+        return {}
+    content = read_json(report, StateFileError)
+    try:
+        entries = content["views"].get("reliability", [])  # type: ignore[index]
+        return {str(e["name"]): float(e["reliability"]) for e in entries if e["reliability"] is not None}
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise StateFileError(
+            f"{report}: no report of a run ({error}); expected the report.json of `gsseg segment`"
+        ) from error

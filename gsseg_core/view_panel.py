@@ -1,0 +1,312 @@
+"""The panel of the viewer: its widgets, and what they call."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import viser
+
+from gsseg_core.cameras import Camera
+from gsseg_core.dataset import View
+from gsseg_core.errors import GssegError
+from gsseg_core.view_corrections import box, disc, region
+from gsseg_core.view_model import MODES, ClassRow
+from gsseg_core.view_nodes import BANDS
+from gsseg_core.view_picking import Picked, Voice
+
+if TYPE_CHECKING:
+    from gsseg_core.viewer import Viewer
+
+MOST_CLASSES, MOST_VIEWS = 5, 8
+"""Of probabilities and views that the answer to a click names."""
+
+ONLY, REMOVE = "only this", "remove"
+REGION, DISC = "the whole region", "a disc"
+_OFF = (73, 80, 87)
+_ASK = "Click on something in the picture to ask what it is."
+
+
+class Panel:
+    """All widgets of a viewer, and the callbacks behind them.
+
+    Parameters
+    ----------
+    viewer : Viewer
+        Whose state it shows and changes.
+    """
+
+    def __init__(self, viewer: Viewer) -> None:
+        self._viewer, self._gui = viewer, viewer.server.gui
+        self._rows: dict[int, tuple[ClassRow, viser.GuiButtonHandle, viser.GuiButtonGroupHandle]] = {}
+        self._live: viser.GuiMarkdownHandle | None = None
+        self._gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="medium")
+        self._gui.set_panel_label("gsseg")
+        self._answer = self._gui.add_markdown(_ASK)
+        tabs = self._gui.add_tab_group()
+        with tabs.add_tab("Classes"):
+            self._build_classes()
+        if viewer.views:
+            with tabs.add_tab("Views"):
+                self._build_views()
+        with tabs.add_tab("Correct"):
+            self._build_correct()
+        with tabs.add_tab("Save"):
+            self._build_save()
+
+    # Tabs.
+
+    def _build_classes(self) -> None:
+        gui, viewer = self._gui, self._viewer
+        self._mode = gui.add_dropdown("colour by", MODES, initial_value=viewer.model.mode)
+        self._confidence = gui.add_slider(
+            "confidence", 0.0, 1.0, 1 / BANDS, 0.0, hint="hide Gaussians that are less sure of their class than this"
+        )
+        self._probability = gui.add_slider(
+            "probability",
+            0.0,
+            1.0,
+            1 / BANDS,
+            0.0,
+            hint="above 0: show what has at least this probability of a shown class, whatever its label is",
+        )
+        self._listen(self._mode, self._choose_mode)
+        self._listen(self._confidence, lambda: self._threshold("min_confidence", self._confidence.value))
+        self._listen(self._probability, lambda: self._threshold("min_probability", self._probability.value))
+        show_all = gui.add_button("show all", icon=viser.Icon.EYE)
+        self._press(show_all, self._show_all)
+        self._list = gui.add_folder("classes")
+
+    def _build_views(self) -> None:
+        gui = self._gui
+        self._names = {self._view_text(view): view for view in self._viewer.views}
+        self._view = gui.add_dropdown("view", tuple(self._names))
+        self._with_mask = gui.add_checkbox("mask over it", True)
+        go = gui.add_button("go there", icon=viser.Icon.CAMERA)
+        steps = gui.add_button_group("", ("previous", "next"))
+        leave = gui.add_button("take the mask off")
+
+        def jump(event: viser.GuiEvent[Any]) -> None:
+            if event.client is None:  # It was set from here, and whoever did that goes there.
+                return
+            with self.telling(event.client):
+                self._viewer.jump(event.client, self._names[self._view.value], self._with_mask.value)
+
+        go.on_click(jump)
+        self._view.on_update(jump)
+        self._with_mask.on_update(jump)
+
+        @steps.on_click
+        def _step(event: viser.GuiEvent[Any]) -> None:
+            names = list(self._names)
+            step = 1 if event.target.value == "next" else -1
+            _set(self._view, names[(names.index(self._view.value) + step) % len(names)])
+            jump(event)
+
+        self._press(leave, self._viewer.hide_mask)
+
+    def _build_correct(self) -> None:
+        gui = self._gui
+        gui.add_markdown("**Shift + click** or **shift + drag** a box in the picture: what is there is")
+        self._target = gui.add_dropdown("class", self._target_names())
+        self._new = gui.add_text("new class", "")
+        add = gui.add_button("add the class", icon=viser.Icon.PLUS)
+        self._tool = gui.add_dropdown("a click means", (REGION, DISC))
+        self._radius = gui.add_slider("disc, % of height", 0.5, 20.0, 0.5, 3.0)
+        undo = gui.add_button("take the last one back", icon=viser.Icon.ARROW_BACK_UP)
+        self._corrected = gui.add_markdown("No corrections yet.")
+        self._press(add, self._add_class)
+        self._press(undo, self._undo)
+
+    def _build_save(self) -> None:
+        ply = self._gui.add_button("what is shown, as PLY", icon=viser.Icon.DOWNLOAD)
+        npz = self._gui.add_button("the segmentation, as npz", icon=viser.Icon.DOWNLOAD)
+
+        @ply.on_click
+        def _ply(event: viser.GuiEvent[Any]) -> None:
+            with self.telling(event.client):
+                self._send(event.client, "selection.ply", self._viewer.selection_ply())
+
+        @npz.on_click
+        def _npz(event: viser.GuiEvent[Any]) -> None:
+            with self.telling(event.client):
+                self._send(event.client, "segmentation.npz", self._viewer.segmentation_npz())
+
+        if self._viewer.follows:
+            self._live = self._gui.add_markdown("live: waiting for the first codes")
+
+    # What the viewer tells.
+
+    def refresh(self) -> None:
+        """Have the list of classes agree with the model; widgets that are right stay."""
+        with self._viewer.lock:
+            rows = self._viewer.model.rows()
+        listed = [(row.label, row.name) for row in rows]
+        if listed != [(row.label, row.name) for row, _, _ in self._rows.values()]:
+            for _, button, group in self._rows.values():
+                button.remove()
+                group.remove()
+            with self._list:
+                self._rows = {row.label: (row, *self._add_row(row)) for row in rows}
+            self._target.options = self._target_names()
+        for row in rows:
+            known, button, group = self._rows[row.label]
+            if row != known:
+                button.label, button.color, button.icon = _text(row), _color(row), _icon(row)
+                self._rows[row.label] = row, button, group
+
+    def show_picked(self, picked: Picked | None, voices: Sequence[Voice] | None) -> None:
+        """Answer a click: what it hit, and what the views say of that, if that is known."""
+        if picked is None:
+            self._answer.content = "Nothing is there."
+            return
+        model = self._viewer.model
+        i = picked.gaussian
+        label, probabilities = int(model.labelling.labels[i]), model.labelling.probabilities[i]
+        best = [k for k in np.argsort(-probabilities, kind="stable")[:MOST_CLASSES].tolist() if probabilities[k] > 0]
+        lines = [
+            f"**{model.name(label)}**" + (f", class {label}" if label >= 0 else ""),
+            f"Gaussian {i}, {100 * picked.weight:.0f} % of the pixel",
+            "probabilities: " + (", ".join(f"{model.name(k)} {probabilities[k]:.2f}" for k in best) or "none"),
+        ]
+        if voices is not None:
+            said = [f"{v.view}: {model.name(v.label)}, {v.weight:.1f} px" for v in voices[:MOST_VIEWS]]
+            count = len({voice.view for voice in voices})
+            lines.append(f"{count} view{'s' * (count != 1)} spoke for it" + (", the loudest:" if said else ""))
+            lines += said
+        self._answer.content = "  \n".join(lines)
+
+    def show_progress(self, stage: str, done: int, total: int) -> None:
+        """Say how far a long job is."""
+        if done < total:
+            self._answer.content = f"{stage}: {done} of {total} views"
+        else:
+            self._answer.content = _ASK
+
+    def show_live(self, text: str) -> None:
+        """Say what the live source has."""
+        if self._live is not None:
+            self._live.content = f"live: {text}"
+
+    def tell_corrected(self, changed: int) -> None:
+        """Say what the last correction did."""
+        count = len(self._viewer.corrections)
+        self._corrected.content = (
+            f"{count} correction{'s' if count != 1 else ''}; the last one changed {changed:,} Gaussians."
+        )
+
+    @contextmanager
+    def telling(self, client: viser.ClientHandle | None) -> Iterator[None]:
+        """Tell the browser of errors that its user can do something about."""
+        try:
+            yield
+        except GssegError as error:
+            self._answer.content = f"**That did not work.** {error}"
+            if client is not None:
+                client.add_notification("That did not work", str(error), color="red", auto_close_seconds=10.0)
+
+    # Corrections as they are set up in the panel.
+
+    def drawn(self, camera: Camera, column: float, row: float, label_map: Callable[[], np.ndarray]) -> View:
+        """Turn a click into a correction."""
+        if self._tool.value == REGION:
+            return region(camera, label_map(), column, row, self._label())
+        return disc(camera, column, row, self._radius.value / 100 * camera.height, self._label())
+
+    def drawn_box(self, camera: Camera, corner: tuple[float, ...], opposite: tuple[float, ...]) -> View:
+        """Turn a rectangle into a correction."""
+        return box(camera, (corner[0], corner[1]), (opposite[0], opposite[1]), self._label())
+
+    def _label(self) -> int:
+        return self._target_names().index(self._target.value)
+
+    # Callbacks.
+
+    def _choose_mode(self) -> None:
+        try:
+            self._viewer.set_mode(self._mode.value)
+        except GssegError:
+            _set(self._mode, self._viewer.model.mode)
+            raise
+
+    def _threshold(self, name: str, value: float) -> None:
+        self._viewer.change(lambda model: setattr(model, name, value))
+
+    def _show_all(self) -> None:
+        self._viewer.change(lambda model: model.show_all())
+        _set(self._confidence, 0.0)
+        _set(self._probability, 0.0)
+
+    def _add_class(self) -> None:
+        name, names = self._new.value.strip(), self._target_names()
+        if name and name not in names:
+            self._viewer.added_names[len(names)] = name
+            self._target.options = (*names, name)
+        if name:
+            _set(self._target, name)
+
+    def _undo(self) -> None:
+        if self._viewer.undo():
+            count = len(self._viewer.corrections)
+            self._corrected.content = f"{count} correction{'s' if count != 1 else ''} left." if count else "None left."
+
+    def _add_row(self, row: ClassRow) -> tuple[viser.GuiButtonHandle, viser.GuiButtonGroupHandle]:
+        button = self._gui.add_button(_text(row), color=_color(row), icon=_icon(row), hint="switch it on or off")
+        group = self._gui.add_button_group("", (ONLY, REMOVE))
+        label = row.label
+        self._press(button, lambda: self._viewer.change(lambda model: model.toggle(label)))
+
+        @group.on_click
+        def _pressed(event: viser.GuiEvent[Any]) -> None:
+            with self.telling(event.client):
+                only = event.target.value == ONLY
+                self._viewer.change(lambda model: model.isolate(label) if only else model.remove(label))
+
+        return button, group
+
+    def _target_names(self) -> tuple[str, ...]:
+        """Names by class id; one that occurs twice gets its id appended, since the names are the only key there is."""
+        known = {**self._viewer.added_names, **self._viewer.model.labelling.class_names}
+        names = [known.get(k, f"class_{k:02d}") for k in range(max(known) + 1)]
+        return tuple(name if names.index(name) == k else f"{name} ({k})" for k, name in enumerate(names))
+
+    def _view_text(self, view: View) -> str:
+        trust = self._viewer.reliability.get(view.name, math.nan)
+        return view.name if math.isnan(trust) else f"{view.name} ({100 * trust:.0f} % reliable)"
+
+    def _listen(self, widget: Any, action: Callable[[], object]) -> None:
+        @widget.on_update
+        def _updated(event: viser.GuiEvent[Any]) -> None:
+            with self.telling(event.client):
+                action()
+
+    def _press(self, button: viser.GuiButtonHandle, action: Callable[[], object]) -> None:
+        @button.on_click
+        def _pressed(event: viser.GuiEvent[Any]) -> None:
+            with self.telling(event.client):
+                action()
+
+    @staticmethod
+    def _send(client: viser.ClientHandle | None, name: str, content: bytes) -> None:
+        if client is not None:
+            client.send_file_download(name, content, save_immediately=True)
+
+
+def _set(widget: Any, value: object) -> None:
+    """Set a widget from here; to mypy, the decorator that viser has around its setters hides them."""
+    widget.value = value
+
+
+def _text(row: ClassRow) -> str:
+    return f"{row.name}  {row.size:,}"
+
+
+def _color(row: ClassRow) -> tuple[int, int, int]:
+    return row.color if row.shown else _OFF
+
+
+def _icon(row: ClassRow) -> viser.IconName:
+    return viser.Icon.EYE if row.shown else viser.Icon.EYE_OFF

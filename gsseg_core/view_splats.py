@@ -1,0 +1,82 @@
+"""The scene in the browser: sends what has changed, and counts it."""
+
+from __future__ import annotations
+
+import numpy as np
+import viser
+
+from gsseg_core.scene import GaussianScene
+from gsseg_core.view_nodes import BYTES_PER_GAUSSIAN, Key, Node, after, changes
+
+_LARGEST = 200.0
+"""The largest standard deviation is sent as this many units: its square fits a 16-bit float, and so do small ones."""
+
+
+class SplatNodes:
+    """The nodes of a scene in a viser server.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+        Shows them to all its clients.
+    scene : GaussianScene
+        N Gaussians.
+
+    Attributes
+    ----------
+    bytes_sent : int
+        Of Gaussians, before compression, since the start.
+    """
+
+    def __init__(self, server: viser.ViserServer, scene: GaussianScene) -> None:
+        self._server = server
+        # viser sends covariances as 16-bit floats, which know nothing below 6e-8: a millimetre squared, in metres, is
+        # hardly there. So the scene is sent in units of its own, and scaled back by the node.
+        self._unit = float(scene.scales.max()) / _LARGEST
+        self._centers = scene.means / np.float32(self._unit)
+        self._covariances = covariances(scene.quats, scene.scales / np.float32(self._unit))
+        self._handles: dict[Key, viser.GaussianSplatHandle] = {}
+        self._sent: dict[Key, Node] = {}
+        self.bytes_sent = 0
+
+    def show(self, wanted: dict[Key, Node]) -> None:
+        """Make the picture look like this; what is there already is not sent again."""
+        todo = changes(self._sent, wanted)
+        with self._server.atomic():
+            for key in todo.drop:
+                self._handles.pop(key).remove()
+            for key in todo.put:
+                self._put(key, wanted[key])
+            for key, visible in todo.switch.items():
+                self._handles[key].visible = visible
+        self._server.flush()
+        self._sent = after(self._sent, wanted, todo)
+
+    def _put(self, key: Key, node: Node) -> None:
+        gaussians = {
+            "centers": self._centers[node.members],
+            "covariances": self._covariances[node.members],
+            "rgbs": node.rgba[:, :3],
+            "opacities": node.rgba[:, 3:],
+        }
+        self.bytes_sent += BYTES_PER_GAUSSIAN * len(node.members)
+        if key in self._handles:
+            self._handles[key].set_gaussians(**gaussians)
+        else:
+            name = f"/splats/{key[0]}/{key[1]}"
+            self._handles[key] = self._server.scene.add_gaussian_splats(name, **gaussians, scale=self._unit)
+
+
+def covariances(
+    quats: np.ndarray,  # (N, 4) unit, w x y z
+    scales: np.ndarray,  # (N, 3)
+) -> np.ndarray:
+    """Covariances of Gaussians, R diag(scales^2) R^T: (N, 3, 3) float32."""
+    w, x, y, z = quats.T
+    rotation = np.empty((len(quats), 3, 3), np.float32)
+    rotation[:, 0] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=1)
+    rotation[:, 1] = np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=1)
+    rotation[:, 2] = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    half = rotation * scales[:, None, :]
+    product: np.ndarray = half @ half.transpose(0, 2, 1)
+    return product

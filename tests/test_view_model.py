@@ -1,0 +1,201 @@
+"""What a viewer shows, and what it sends for that: laws of the model and of its nodes, without a viewer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_scenes import NAMES, balls_on_a_table
+
+from gsseg_core.errors import StateFileError, UnknownLabelError
+from gsseg_core.segmentation import REMOVED, UNOBSERVED
+from gsseg_core.view_model import (
+    BY_CLASS,
+    BY_CONFIDENCE,
+    BY_RELIABILITY,
+    NOTHING_KNOWN,
+    TRUE_COLOURS,
+    Labelling,
+    ViewModel,
+    ramp,
+    read_reliability,
+)
+from gsseg_core.view_nodes import BANDS, Node, after, changes, cut, paint
+
+SCENE, TRUTH = balls_on_a_table()
+N, K = len(SCENE), len(NAMES)
+
+
+def model(seed: int = 0) -> ViewModel:
+    """The table, of which the first Gaussians are unobserved, and some others were removed by the filter."""
+    rng = np.random.default_rng(seed)
+    probabilities = rng.dirichlet(np.ones(K), N).astype(np.float32) * 0.5
+    probabilities[np.arange(N), TRUTH] += 0.5
+    labels = TRUTH.astype(np.int32).copy()
+    labels[:7], probabilities[:7] = UNOBSERVED, 0
+    labels[10:13] = REMOVED
+    return ViewModel(SCENE, Labelling(labels, probabilities, dict(NAMES)))
+
+
+def test_the_list_has_every_class_with_its_colour_and_size_and_what_is_of_no_class() -> None:
+    rows = model().rows()
+    assert [(row.label, row.size) for row in rows] == [(0, 436), (1, 60), (2, 60), (3, 60), (-1, 7), (-2, 3)]
+    assert sum(row.size for row in rows) == N and all(row.shown for row in rows)
+    assert len({row.color for row in rows}) == 5  # what is of no class shares one
+
+
+def test_a_toggle_hides_one_class_and_a_second_one_shows_it_again() -> None:
+    shown = model()
+    shown.toggle(2)
+    assert np.array_equal(shown.shown(), shown.labelling.labels != 2)
+    shown.toggle(2)
+    assert shown.shown().all()
+
+
+def test_an_isolated_class_is_alone_and_a_second_time_shows_all() -> None:
+    shown = model()
+    shown.isolate(3)
+    assert np.array_equal(shown.shown(), shown.labelling.labels == 3)
+    shown.isolate(3)
+    assert shown.shown().all()
+
+
+def test_a_removed_class_is_off_the_list_until_all_is_shown_again() -> None:
+    shown = model()
+    shown.remove(1)
+    assert 1 not in shown.labels_in_use and not shown.shown()[shown.labelling.labels == 1].any()
+    with pytest.raises(UnknownLabelError, match=r"class 1 is not in the list; expected one of \[0, 2, 3, -1, -2\]"):
+        shown.toggle(1)
+    shown.show_all()
+    assert shown.shown().all()
+
+
+def test_what_has_no_class_can_be_switched_off() -> None:
+    shown = model()
+    shown.toggle(UNOBSERVED)
+    shown.toggle(REMOVED)
+    assert np.array_equal(shown.shown(), shown.labelling.labels >= 0)
+
+
+def test_the_threshold_for_confidence_hides_the_less_sure() -> None:
+    shown = model()
+    shown.min_confidence = 0.75
+    assert np.array_equal(shown.shown(), shown.labelling.probabilities.max(axis=1) >= np.float32(0.75))
+
+
+def test_the_threshold_for_probability_goes_by_the_shown_classes_and_not_by_labels() -> None:
+    shown = model()
+    shown.isolate(2)
+    shown.min_probability = 0.15
+    assert np.array_equal(shown.shown(), shown.labelling.probabilities[:, 2] >= np.float32(0.15))
+    assert (shown.labelling.labels[shown.shown()] != 2).any()
+
+
+def test_colours_are_of_the_mode() -> None:
+    shown = model()
+    assert shown.mode == BY_CLASS and {tuple(c) for c in shown.colors()[TRUTH == 3].tolist()} == {shown.color(3)}
+    shown.mode = TRUE_COLOURS
+    assert np.array_equal(shown.colors(), np.rint(SCENE.colors() * 255))
+    shown.mode = BY_CONFIDENCE
+    assert (shown.colors()[:7] == NOTHING_KNOWN).all() and (shown.colors()[7:] != NOTHING_KNOWN).any(axis=1).all()
+    shown.mode = BY_RELIABILITY
+    assert (shown.colors() == NOTHING_KNOWN).all()
+    shown.reliability = np.linspace(0, 1, N, dtype=np.float32)
+    assert len(np.unique(shown.colors(), axis=0)) > 100
+
+
+def test_the_ramp_has_its_ends_and_grey_for_what_is_unknown() -> None:
+    assert ramp(np.array([-1, 0, 1, 2, np.nan])).tolist() == [[122, 1, 30]] * 2 + [[0, 90, 130]] * 2 + [[120] * 3]
+
+
+def test_reliability_is_read_from_a_report(tmp_path: Path) -> None:
+    report = tmp_path / "report.json"
+    assert read_reliability(report) == {}
+    entries = [{"name": "a", "reliability": 0.5}, {"name": "b", "reliability": None}]
+    report.write_text(json.dumps({"views": {"reliability": entries}}))
+    assert read_reliability(report) == {"a": 0.5}
+    report.write_text("[]")
+    with pytest.raises(StateFileError, match=r"report.json: no report of a run .*; expected the report.json of `gsseg"):
+        read_reliability(report)
+
+
+LABELS = st.lists(st.integers(-2, 30), min_size=1, max_size=200)
+
+
+@given(LABELS, st.integers(0, 2**31), st.integers(1, 40))
+@settings(max_examples=60, deadline=None)
+def test_a_cut_has_every_gaussian_in_exactly_one_node_and_no_more_nodes_than_allowed(
+    labels: list[int], seed: int, max_nodes: int
+) -> None:
+    confidence = np.random.default_rng(seed).random(len(labels)).astype(np.float32)
+    parts = cut(np.array(labels, np.int32), confidence, max_nodes)
+    assert len(parts) <= max_nodes
+    assert np.array_equal(np.sort(np.concatenate(list(parts.values()))), np.arange(len(labels)))
+
+
+def test_what_the_browser_has_is_what_is_wanted_whatever_happens() -> None:
+    """Random walks over all switches: a browser that obeys `changes` shows what is wanted."""
+    rng = np.random.default_rng(1)
+    shown = model()
+    opacities = np.full(N, 200, np.uint8)
+    parts = cut(shown.labelling.labels, shown.confidence)
+    browser: dict[tuple[int, int], Node] = {}
+    sent: dict[tuple[int, int], Node] = {}
+    for _ in range(120):
+        label = int(rng.choice(shown.labels_in_use or [0]))
+        step = int(rng.integers(8))
+        if step == 0 and len(shown.labels_in_use) > 2:
+            shown.remove(label)
+        elif step == 1:
+            shown.isolate(label)
+        elif step == 2:
+            shown.mode = str(rng.choice([BY_CLASS, BY_CONFIDENCE, TRUE_COLOURS]))
+        elif step == 3:
+            shown.min_confidence = float(rng.random())
+        elif step == 4:
+            shown.min_probability = float(rng.choice([0, rng.random()]))
+        elif step == 5:
+            shown.show_all()
+        elif step == 6:
+            relabelled = np.roll(shown.labelling.labels, 3)
+            shown.relabel(shown.labelling._replace(labels=relabelled))
+            parts = cut(relabelled, shown.confidence)
+        else:
+            shown.toggle(label)
+        wanted = paint(parts, shown.shown(), shown.colors(), opacities)
+        todo = changes(sent, wanted)
+        for key in todo.drop:
+            browser.pop(key)
+        for key in todo.put:
+            browser[key] = wanted[key]
+        for key, visible in todo.switch.items():
+            browser[key] = browser[key]._replace(visible=visible)
+        sent = after(sent, wanted, todo)
+        picture = np.zeros((N, 4), np.uint8)
+        for node in browser.values():
+            if node.visible:
+                picture[node.members] = node.rgba
+        expected = np.concatenate([shown.colors(), opacities[:, None]], axis=1)
+        assert np.array_equal(picture[shown.shown()], expected[shown.shown()])
+        assert not picture[~shown.shown(), 3].any()
+        assert changes(sent, wanted) == ([], {}, [])
+
+
+def test_a_class_and_a_mark_of_the_slider_are_switched_without_sending_a_gaussian() -> None:
+    shown = model()
+    parts = cut(shown.labelling.labels, shown.confidence)
+    opacities = np.full(N, 200, np.uint8)
+
+    def wanted() -> dict[tuple[int, int], Node]:
+        return paint(parts, shown.shown(), shown.colors(), opacities)
+
+    sent = wanted()
+    shown.toggle(1)
+    assert not changes(sent, wanted()).put and changes(sent, wanted()).switch
+    for mark in range(BANDS + 1):
+        shown.min_confidence = mark * (1 / BANDS)
+        assert not changes(sent, wanted()).put

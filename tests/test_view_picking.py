@@ -1,0 +1,158 @@
+"""Clicks and corrections without a viewer: the ray hits what is seen, and what was drawn changes that and no more."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from small_scenes import NAMES, balls_on_a_table, clean_views, ring, true_labels
+
+from gsseg_core.cameras import Camera
+from gsseg_core.dataset import View
+from gsseg_core.errors import NoUsableViewsError, SettingsError
+from gsseg_core.masks import UNKNOWN
+from gsseg_core.operator import make_operator
+from gsseg_core.segmentation import REMOVED, UNOBSERVED
+from gsseg_core.view_corrections import Corrections, box, disc, region, share_seen
+from gsseg_core.view_model import Labelling
+from gsseg_core.view_picking import Evidence, pick, scene_camera, without
+
+SCENE, TRUTH = balls_on_a_table()
+CAMERA = ring(5)[0]
+LABELS = true_labels(SCENE, TRUTH, CAMERA)
+LEARNT = Labelling(TRUTH.astype(np.int32), np.eye(4, dtype=np.float32)[TRUTH], dict(NAMES))
+
+
+def ray(camera: Camera, column: float, row: float) -> np.ndarray:
+    """Direction of the ray through a point of the image."""
+    return camera.world_to_camera[:3, :3].T @ np.linalg.solve(camera.K, [column, row, 1])
+
+
+def test_a_ray_hits_the_class_that_its_pixel_shows() -> None:
+    hits = 0
+    for row in range(2, 46, 3):
+        for column in range(2, 62, 3):
+            picked = pick(SCENE, CAMERA.center, ray(CAMERA, column + 0.5, row + 0.5), focal=CAMERA.fx)
+            if picked is not None and picked.weight > 0.3:
+                assert TRUTH[picked.gaussian] == LABELS[row, column]
+                hits += 1
+    assert hits > 100
+
+
+def test_a_ray_hits_the_gaussian_of_the_greatest_weight_of_that_pixel() -> None:
+    row, column = (int(i) for i in np.argwhere(LABELS == 2)[20])
+    weights = make_operator(SCENE, CAMERA).weights(row, column)
+    picked = pick(SCENE, CAMERA.center, ray(CAMERA, column + 0.5, row + 0.5), focal=CAMERA.fx)
+    assert picked is not None and picked.gaussian == weights.gaussians[weights.weights.argmax()]
+    # The images are linearised alike but seen from different angles, so weights are not the same to the last digit.
+    assert picked.weight == pytest.approx(weights.weights.max(), abs=0.05)
+
+
+def test_what_is_hidden_is_looked_through_and_a_ray_into_nothing_hits_nothing() -> None:
+    row, column = (int(i) for i in np.argwhere(LABELS == 3)[30])
+    picked = pick(SCENE, CAMERA.center, ray(CAMERA, column, row), TRUTH != 3)
+    assert picked is None or TRUTH[picked.gaussian] != 3
+    assert pick(SCENE, CAMERA.center, -ray(CAMERA, column, row)) is None
+    assert pick(SCENE, CAMERA.center, ray(CAMERA, column, row), np.zeros(len(SCENE), bool)) is None
+
+
+def test_a_scene_without_some_gaussians_is_drawn_without_them() -> None:
+    image = make_operator(without(SCENE, TRUTH == 1), CAMERA).render(np.eye(4, dtype=np.float32)[TRUTH])
+    assert not image[..., 1].any() and image[..., 2].any()
+
+
+def test_a_camera_of_a_viewer_sees_what_the_viewer_sees() -> None:
+    fov = 2 * np.arctan(CAMERA.height / 2 / CAMERA.fy)
+    camera = scene_camera("v", CAMERA.width, CAMERA.height, fov, np.linalg.inv(CAMERA.world_to_camera))
+    assert np.allclose(camera.K, CAMERA.K) and np.allclose(camera.world_to_camera, CAMERA.world_to_camera)
+
+
+def test_voices_are_the_votes_of_each_view_the_loudest_first() -> None:
+    views = clean_views(4)
+    evidence = Evidence(SCENE, [*views, View(CAMERA)])  # the last one has no mask, and no say
+    assert len(evidence) == 4
+    i = int(np.flatnonzero(TRUTH == 2)[5])
+    voices = evidence.voices(i)
+    assert [v.weight for v in voices] == sorted((v.weight for v in voices), reverse=True)
+    for view in views:
+        labels = view.read_labels()
+        votes = make_operator(SCENE, view.camera).adjoint(np.eye(4, dtype=np.float32)[labels])[i]
+        mine = {v.label: v.weight for v in voices if v.view == view.name}
+        assert mine == pytest.approx({k: votes[k] for k in range(4) if votes[k] > 0}, rel=1e-4, abs=1e-6)
+    assert evidence.voices(len(SCENE) - 1) == []  # out of sight
+
+
+def test_mean_reliability_weighs_views_by_how_much_they_saw() -> None:
+    views = clean_views(3)
+    mean = Evidence(SCENE, views).mean_reliability({views[0].name: 1.0, views[2].name: 0.25})
+    seen = np.stack([make_operator(SCENE, views[v].camera).visibility() for v in (0, 2)])
+    known = seen.sum(axis=0) > 1e-3
+    expected = (seen[0] + 0.25 * seen[1])[known] / seen.sum(axis=0)[known]
+    assert np.allclose(mean[known], expected, atol=1e-3) and np.isnan(mean[-1])
+
+
+def test_what_was_drawn_is_labelled_and_all_else_is_unknown() -> None:
+    spot = disc(CAMERA, 20.5, 10.5, 3, 2).read_labels()
+    assert set(np.unique(spot)) == {UNKNOWN, 2} and spot[10, 20] == 2 and (spot == 2).sum() == 29
+    assert (disc(CAMERA, 20.5, 10.5, 0, 2).read_labels() == 2).sum() == 1
+    square = box(CAMERA, (30, 20), (10, 12), 3).read_labels()
+    assert (square[12:20, 10:30] == 3).all() and (square == 3).sum() == 20 * 8
+    row, column = (int(i) for i in np.argwhere(LABELS == 1)[0])
+    assert np.array_equal(region(CAMERA, LABELS, column, row, 2).read_labels() == 2, LABELS == 1)
+    with pytest.raises(SettingsError, match=r"pixel is \(column 64, row 3\); expected one of the 64 x 48"):
+        disc(CAMERA, 64, 3, 1, 1)
+
+
+def test_the_share_seen_is_one_for_what_lies_open_and_nearly_nothing_for_what_lies_behind() -> None:
+    """The slow way: alphas of each Gaussian, alone in the scene, summed over the image."""
+    drawn = View.from_arrays(CAMERA, np.zeros((CAMERA.height, CAMERA.width), np.int32))
+    share = share_seen(SCENE, drawn)
+    seen = make_operator(SCENE, CAMERA).visibility()
+    for i in np.flatnonzero(seen > 0.5)[::25]:
+        alone = make_operator(without(SCENE, np.arange(len(SCENE)) != i), CAMERA).visibility()[i]
+        assert share[i] == pytest.approx(seen[i] / alone, abs=0.08)  # alphas below 1/255 count as nothing
+    assert share.max() <= 1 and not share[-1]
+
+
+def test_a_correction_relabels_what_was_drawn_on_and_nothing_else() -> None:
+    corrections = Corrections(SCENE)
+    corrections.add(region(CAMERA, LABELS, *np.argwhere(LABELS == 1)[9][::-1].tolist(), 2))
+    now = corrections.apply(LEARNT)
+    changed = now.labels != LEARNT.labels
+    assert changed[TRUTH == 1].sum() > 15 and not changed[TRUTH != 1].any()
+    assert np.allclose(now.probabilities.sum(axis=1), 1, atol=1e-5)
+    assert (true_labels(SCENE, now.labels, CAMERA)[LABELS == 1] == 2).mean() > 0.75
+
+
+def test_a_correction_is_taken_back_exactly_and_the_ones_before_it_stay() -> None:
+    corrections = Corrections(SCENE)
+    corrections.add(disc(CAMERA, 32, 24, 4, 1))
+    once = corrections.apply(LEARNT)
+    corrections.add(disc(CAMERA, 10, 30, 6, 3))
+    assert (corrections.apply(LEARNT).labels != once.labels).any() and len(corrections) == 2
+    assert corrections.undo()
+    assert np.array_equal(corrections.apply(LEARNT).probabilities, once.probabilities)
+    assert corrections.undo() and not corrections.undo()
+    assert corrections.apply(LEARNT) is LEARNT
+
+
+def test_a_correction_may_bring_a_class_of_its_own_and_wake_what_was_unobserved_or_removed() -> None:
+    labels = np.where(TRUTH == 1, REMOVED, UNOBSERVED).astype(np.int32)
+    probabilities = np.where((TRUTH == 1)[:, None], LEARNT.probabilities, 0).astype(np.float32)
+    corrections = Corrections(SCENE)
+    corrections.add(region(CAMERA, LABELS, *np.argwhere(LABELS == 3)[9][::-1].tolist(), 5))
+    corrections.add(region(CAMERA, LABELS, *np.argwhere(LABELS == 1)[9][::-1].tolist(), 1))
+    now = corrections.apply(Labelling(labels, probabilities, dict(NAMES)), {5: "vase"})
+    assert now.class_names[5] == "vase" and now.class_names[4] == "class_04"
+    assert (now.labels[TRUTH == 3] == 5).sum() > 15
+    assert (now.labels[TRUTH == 1] == REMOVED).all()  # it said no more than what was known of them
+
+
+def test_a_correction_that_meets_nothing_is_refused_and_changes_nothing() -> None:
+    K = np.array([[8.0, 0, 4], [0, 8, 4], [0, 0, 1]])
+    corrections = Corrections(SCENE)
+    away = Camera("away", 8, 8, K, np.block([[np.eye(3), np.array([[0], [0], [-500.0]])], [np.zeros(3), 1.0]]))
+    with pytest.raises(
+        NoUsableViewsError, match=r"correction: .*sees no Gaussian; expected something drawn on the scene"
+    ):
+        corrections.add(disc(away, 4, 4, 3, 1))
+    assert not len(corrections) and corrections.apply(LEARNT) is LEARNT

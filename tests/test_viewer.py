@@ -1,0 +1,308 @@
+"""The viewer in a real browser: what is seen on the page, and what its buttons, sliders and clicks do."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from browser import opened_page, screenshot
+from small_scenes import NAMES, balls_on_a_table, clean_views, write_dataset
+
+from gsseg_core.cli import main
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segmentation import Segmentation
+from gsseg_core.view_live import LiveUpdate
+from gsseg_core.view_model import BY_RELIABILITY, TRUE_COLOURS, Labelling, ViewModel
+
+pytest.importorskip("viser")
+
+from gsseg_core.viewer import Viewer
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+PATIENCE = 30.0
+SCENE, TRUTH = balls_on_a_table()
+LEARNT = Labelling(TRUTH.astype(np.int32), np.eye(4, dtype=np.float32)[TRUTH] * np.float32(0.9), dict(NAMES))
+
+
+class Shown:
+    """A viewer, and a page of it."""
+
+    def __init__(self, viewer: Viewer, page: Page) -> None:
+        self.viewer, self.page = viewer, page
+
+    @property
+    def client(self) -> Any:
+        return next(iter(self.viewer.server.get_clients().values()))
+
+    def picture(self) -> np.ndarray:
+        """The part of the page that the panel leaves free, (H, W, 3)."""
+        return screenshot(self.page)[200:, :600].astype(int)
+
+    def wait(self, condition: Callable[[], Any], what: str) -> None:
+        deadline = time.monotonic() + PATIENCE
+        while not condition():
+            assert time.monotonic() < deadline, f"waited {PATIENCE:g} s in vain for {what}"
+            self.page.wait_for_timeout(50)
+
+    def looks_like(self, label: int) -> bool:
+        """Whether the colour of a class is anywhere in the picture."""
+        off = np.abs(self.picture() - self.viewer.model.color(label)).max(axis=2)
+        return int((off < 12).sum()) > 40
+
+    def pixel_of(self, label: int) -> tuple[float, float]:
+        """Where the middle of a class is on the page."""
+        camera = self.viewer.camera_of(self.client, self.client.camera.image_height)
+        (uv,), _ = camera.project(SCENE.means[label == TRUTH].mean(axis=0, keepdims=True))
+        return float(uv[0]), float(uv[1])
+
+    def press(self, name: str, nth: int = 0) -> None:
+        self.page.get_by_role("button", name=name).nth(nth).click()
+
+    def tab(self, name: str) -> None:
+        self.page.get_by_role("tab", name=name).click()
+
+    def says(self, text: str) -> None:
+        self.page.get_by_text(text).first.wait_for(timeout=PATIENCE * 1000)
+
+
+@pytest.fixture(scope="module")
+def opened(chromium: Browser) -> Iterator[Shown]:
+    views = clean_views(3)
+    reliability = {view.name: 0.2 + 0.3 * i for i, view in enumerate(views)}
+    # three.js complains of the splats' own geometry, which is flat, wherever one points at it.
+    viewer = Viewer(ViewModel(SCENE, LEARNT), views, reliability, port=18080)
+    with closing(viewer), opened_page(chromium, 960, 640, tolerated="computeBoundingSphere") as page:
+        page.goto(viewer.url)
+        shown = Shown(viewer, page)
+        shown.wait(lambda: viewer.server.get_clients(), "the page")
+        shown.wait(lambda: shown.looks_like(1), "the first picture")
+        yield shown
+
+
+@pytest.fixture
+def shown(opened: Shown) -> Shown:
+    """The page with everything switched on."""
+    while opened.viewer.undo():
+        pass
+    opened.viewer.change(lambda model: model.show_all())
+    opened.tab("Classes")
+    opened.wait(lambda: opened.looks_like(1) and opened.looks_like(2), "all classes")
+    return opened
+
+
+def test_the_page_loads_and_splats_are_drawn(shown: Shown) -> None:
+    background = shown.picture()[-1, 0]
+    assert (np.abs(shown.picture() - background).max(axis=2) > 30).mean() > 0.05
+    for k in NAMES:
+        assert shown.page.get_by_role("button", name=f"{NAMES[k]} {int((k == TRUTH).sum())}").count() == 1
+
+
+def test_a_class_toggle_changes_the_picture_and_sends_no_gaussian(shown: Shown) -> None:
+    before, sent = shown.picture(), shown.viewer.splats.bytes_sent
+    shown.press("red ball 60")
+    shown.wait(lambda: not shown.looks_like(1), "the red ball to go")
+    assert shown.looks_like(2)
+    shown.press("red ball 60")
+    shown.wait(lambda: shown.looks_like(1), "the red ball to come back")
+    shown.wait(lambda: np.abs(shown.picture() - before).max(axis=2).mean() < 2, "the picture as it was")
+    assert shown.viewer.splats.bytes_sent == sent
+
+
+def test_a_class_is_isolated_and_another_is_removed(shown: Shown) -> None:
+    rows = [row.label for row in shown.viewer.model.rows()]
+    shown.press("only this", rows.index(2))
+    shown.wait(lambda: shown.looks_like(2) and not shown.looks_like(1), "the mug alone")
+    shown.press("remove", rows.index(2))
+    shown.wait(lambda: not shown.looks_like(2), "nothing")
+    assert 2 in shown.viewer.model.removed
+    shown.press("show all")
+    shown.wait(lambda: shown.looks_like(1) and shown.looks_like(2), "all classes")
+
+
+def test_a_slider_acts_at_once(shown: Shown) -> None:
+    slider = shown.page.get_by_role("slider").first
+    slider.focus()
+    slider.press("End")
+    shown.wait(lambda: not shown.looks_like(1) and not shown.looks_like(2), "all to be less sure than that")
+    assert shown.viewer.model.min_confidence == 1.0
+    slider.press("Home")
+    shown.wait(lambda: shown.looks_like(1), "the red ball")
+
+
+def test_true_colours_and_reliability_change_the_picture(shown: Shown) -> None:
+    shown.viewer.change(lambda model: model.isolate(0))
+    shown.wait(lambda: not shown.looks_like(1), "the table alone")
+    before = shown.picture()
+    shown.viewer.set_mode(BY_RELIABILITY)
+    assert shown.viewer.model.reliability is not None
+    shown.wait(lambda: np.abs(shown.picture() - before).mean() > 3, "other colours")
+    shown.viewer.set_mode(TRUE_COLOURS)
+    shown.wait(lambda: np.abs(shown.picture() - before).mean() < 3, "the table's own, that of its class")
+    shown.viewer.set_mode("class")
+
+
+def test_a_click_tells_the_class_its_probabilities_and_the_views_that_spoke_for_it(shown: Shown) -> None:
+    for k in (1, 3):
+        shown.page.mouse.click(*shown.pixel_of(k))
+        shown.says(f"{NAMES[k]}, class {k}")
+        shown.says(f"probabilities: {NAMES[k]} 0.90")
+        shown.says("3 views spoke for it")
+        shown.says(f"view0: {NAMES[k]}")
+    shown.page.mouse.click(5, 200)
+    shown.says("Nothing is there.")
+
+
+def test_the_camera_jumps_to_a_view_and_its_mask_lies_over_it(shown: Shown) -> None:
+    shown.tab("Views")
+    shown.press("next")
+    view = shown.viewer.views[1]
+    shown.wait(lambda: np.allclose(shown.client.camera.position, view.camera.center, atol=1e-3), "the camera")
+    shown.viewer.change(lambda model: model.isolate(3))
+    x, y = shown.pixel_of(1)
+    tinted = np.array(shown.viewer.model.color(1))
+
+    def is_tinted() -> bool:
+        pixel = screenshot(shown.page)[int(y), int(x)].astype(int)
+        return bool(np.argmax(pixel) == np.argmax(tinted) and np.ptp(pixel) > 40)
+
+    shown.wait(is_tinted, "the mask")
+    shown.press("take the mask off")
+    shown.wait(lambda: not is_tinted(), "the scene")
+
+
+def test_an_export_is_a_valid_ply_of_what_is_shown(shown: Shown, tmp_path: Path) -> None:
+    shown.viewer.change(lambda model: model.isolate(2))
+    shown.tab("Save")
+    with shown.page.expect_download(timeout=PATIENCE * 1000) as download:
+        shown.press("what is shown, as PLY")
+    download.value.save_as(tmp_path / "some.ply")
+    exported = GaussianScene.load(tmp_path / "some.ply")
+    assert exported.vertices.tobytes() == SCENE.subset(TRUTH == 2).vertices.tobytes()
+    shown.viewer.change(lambda model: model.toggle(2))
+    shown.press("what is shown, as PLY")
+    shown.says("none of its 626 Gaussians is in the subset")
+
+
+def test_a_shift_click_corrects_a_label_and_can_be_taken_back(shown: Shown, tmp_path: Path) -> None:
+    shown.tab("Correct")
+    shown.page.locator("input[role=combobox][value=background]").click()
+    shown.page.get_by_role("option", name="cup/mug").click()
+    x, y = shown.pixel_of(1)
+    shown.page.keyboard.down("Shift")
+    shown.page.mouse.click(x, y)
+    shown.page.keyboard.up("Shift")
+    shown.says("1 correction; the last one changed")
+    now = shown.viewer.model.labelling.labels
+    assert (now[TRUTH == 1] == 2).sum() > 10 and (now[TRUTH != 1] == TRUTH[TRUTH != 1]).mean() > 0.99
+    with shown.page.expect_download(timeout=PATIENCE * 1000) as download:
+        shown.tab("Save")
+        shown.press("the segmentation, as npz")
+    download.value.save_as(tmp_path / "s.npz")
+    assert np.array_equal(Segmentation.load(tmp_path / "s.npz", SCENE).labels, now)
+    shown.tab("Correct")
+    shown.press("take the last one back")
+    shown.wait(lambda: np.array_equal(shown.viewer.model.labelling.labels, TRUTH), "the old labels")
+
+
+def test_a_shift_drag_corrects_what_is_in_the_box(shown: Shown) -> None:
+    x, y = shown.pixel_of(1)
+    shown.page.keyboard.down("Shift")
+    shown.page.mouse.move(x - 15, y - 15)
+    shown.page.mouse.down()
+    shown.page.mouse.move(x, y, steps=3)
+    shown.page.mouse.move(x + 15, y + 15, steps=3)
+    shown.page.mouse.up()
+    shown.page.keyboard.up("Shift")
+    shown.wait(lambda: len(shown.viewer.corrections) == 1, "the correction")
+    assert (shown.viewer.corrections.views[0].read_labels() >= 0).sum() > 300
+
+
+def test_codes_of_a_live_source_refresh_the_picture(chromium: Browser) -> None:
+    class Source:
+        """Says nothing at first, and then all at once."""
+
+        ready = False
+
+        def wait(self, timeout: float) -> LiveUpdate | None:
+            if not self.ready:
+                time.sleep(0.02)
+                return None
+            self.ready = False
+            return LiveUpdate(LEARNT, 7)
+
+        def close(self) -> None:
+            pass
+
+    source = Source()
+    viewer = Viewer(ViewModel(SCENE, Labelling.unknown(len(SCENE))), source=source, port=18080)
+    with closing(viewer), opened_page(chromium, 960, 640, tolerated="computeBoundingSphere") as page:
+        page.goto(viewer.url)
+        shown = Shown(viewer, page)
+        shown.wait(lambda: (np.ptp(shown.picture(), axis=(0, 1)) > 30).any(), "grey splats")
+        assert {row.label for row in viewer.model.rows()} == {-1}
+        source.ready = True
+        shown.wait(lambda: shown.looks_like(1) and shown.looks_like(2), "the classes")
+        shown.tab("Save")
+        shown.says("live: 7 views so far")
+
+
+def test_the_command_serves_the_page_until_it_is_interrupted(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data")
+    command = [sys.executable, "-m", "gsseg_core.cli", "view", str(data / "scene.ply"), "--data", str(data), "--quiet"]
+    process = subprocess.Popen([*command, "--port", "18085"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None and process.stderr is not None
+        said = process.stdout.readline()
+        assert said.startswith("gsseg: 626 Gaussians at http://localhost:"), process.stderr.read()
+        with urllib.request.urlopen(said.split(" at ")[1].split()[0], timeout=PATIENCE) as page:
+            assert b"<html" in page.read()
+        process.send_signal(signal.SIGINT)
+        assert process.communicate(timeout=PATIENCE) == ("", "") and process.returncode == 0
+    finally:
+        process.kill()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere.ply"], "nowhere.ply"),
+        (["data/scene.ply", "--segmentation", "nowhere.npz"], "nowhere.npz"),
+        (["data/scene.ply", "--data", "nowhere"], "nowhere"),
+        (["data/scene.ply", "--port", "70000"], "port is 70000; expected 1 to 65535"),
+        (["data/scene.ply", "--ros", "--segmentation", "s.npz"], "both --ros and --segmentation are given"),
+    ],
+)
+def test_wrong_inputs_give_one_clear_error(
+    arguments: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    write_dataset(tmp_path / "data")
+    monkeypatch.chdir(tmp_path)
+    assert main(["view", *arguments, "--quiet"]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.startswith("gsseg: error: ") and error.count("\n") == 1
+
+
+def test_without_viser_one_error_says_what_to_install(tmp_path: Path) -> None:
+    code = (
+        "import sys; sys.modules['viser'] = None\n"
+        "from gsseg_core.cli import main\n"
+        f"sys.exit(main(['view', {str(tmp_path / 'scene.ply')!r}]))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    expected = "gsseg: error: `gsseg view` needs viser, which is missing: pip install 'gsseg[view]'\n"
+    assert (done.returncode, done.stderr) == (2, expected)
