@@ -9,13 +9,13 @@ MSGS_READY := $(VENV)/.ready-msgs
 COLCON_VENV := .venv-colcon
 COLCON_READY := $(COLCON_VENV)/.ready
 
-INSTALLED := setup.py package.xml $(wildcard config/* launch/* resource/* rviz/* scripts/* sros2/*)
+INSTALLED := setup.py package.xml $(wildcard config/* foxglove/* launch/* resource/* rviz/* scripts/* sros2/*)
 MSGS := $(wildcard msg_defs/*.* msg_defs/action/* msg_defs/msg/* msg_defs/srv/*)
 
 # Both builders of the messages obey it; without it one of them compiles file after file.
 export CMAKE_BUILD_PARALLEL_LEVEL ?= $(shell nproc 2>/dev/null || echo 1)
 
-.PHONY: help demo demo-local test colcon results robustness bench clean
+.PHONY: help demo demo-local view test docs colcon results robustness bench clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{ printf "%-16s %s\n", $$1, $$2 }'
@@ -26,11 +26,19 @@ demo: $(READY) $(ROS_READY) $(MSGS_READY)  ## segment a small scene with known t
 demo-local: $(READY)  ## the same scene without ROS, by the command line
 	$(BIN)/gsseg demo --out demo_out
 
+view: $(READY)  ## segment a small scene and look at it in the browser; Ctrl-C ends it
+	$(BIN)/gsseg demo --out demo_out
+	$(BIN)/gsseg view demo_out/scene/scene.ply --segmentation demo_out/segmented/segmentation.npz \
+		--data demo_out/scene --open
+
 test: $(READY) $(ROS_READY) $(MSGS_READY)  ## lint, check the types and run the tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -W error
+
+docs: $(READY)  ## build the documentation into site/index.html, and refuse links that lead nowhere
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 colcon: $(COLCON_READY)  ## build both packages with colcon, as a robot does, and run the node that comes out
 	.ci/colcon $(COLCON_VENV) .colcon
@@ -45,7 +53,7 @@ bench: $(READY)  ## measure speed, memory and peers: BENCHMARK.md, compared with
 	$(BIN)/python benchmarks/bench.py
 
 clean:  ## remove the environments, the caches, what was built and the demo's output
-	rm -rf $(VENV) $(COLCON_VENV) .venv-peers .colcon build install log demo_out results_out gsseg.egg-info
+	rm -rf $(VENV) $(COLCON_VENV) .venv-peers .colcon build install log demo_out results_out site gsseg.egg-info
 	rm -rf .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find benchmarks gsseg_core gsseg_ros tests -name __pycache__ -prune -exec rm -rf {} +
 

@@ -25,11 +25,13 @@ setup(
     author="gsseg developers",
     license="Apache-2.0",
     packages=["gsseg_core", "gsseg_ros"],
+    package_data={"gsseg_core": ["report_page.css", "report_page.js"]},
     # What ROS looks for, at the places where it looks: the same after pip, colcon and colcon --symlink-install.
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/gsseg_ros"]),
         (SHARE, ["package.xml"]),
         (f"{SHARE}/config", ["config/segment_node.yaml"]),
+        (f"{SHARE}/foxglove", ["foxglove/gsseg.json"]),
         (f"{SHARE}/launch", ["launch/replay.launch.py", "launch/segment.launch.py"]),
         (f"{SHARE}/rviz", ["rviz/gsseg.rviz"]),
         (f"{SHARE}/sros2", ["sros2/policy.xml"]),
@@ -43,6 +45,7 @@ setup(
         "plyfile>=1.0",
         "pycolmap>=3.11",
         "scipy>=1.13",
+        "shtab>=1.8",
         "torch>=2.3",
         "tqdm>=4.64",
     ],
@@ -51,13 +54,21 @@ setup(
         "dev": [
             "distributed>=2024.8",
             "hypothesis>=6.100",
+            "mkdocs-material>=9.6",
+            "mkdocstrings-python>=1.16",
             "mypy>=1.15",
+            "playwright>=1.45",
             "pytest>=8",
             "pyyaml>=6.0",
             "ruff>=0.9",
+            "rosbags>=0.10",
+            "scikit-image>=0.25",
             "scikit-learn>=1.5",
             "threadpoolctl>=3.1",
+            "viser>=1.0",
         ],
+        "docs": ["mkdocs-material>=9.6", "mkdocstrings-python>=1.16"],
+        "examples": ["rosbags>=0.10", "scikit-image>=0.25"],
         # The view operator on CUDA. Below 1.6, since docs/gpu.md bounds what the rules of this version change. gsplat
         # imports packaging without asking for it.
         "gsplat": ["gsplat>=1.5.3,<1.6", "packaging>=21", "torch>=2.3"],
@@ -68,6 +79,7 @@ setup(
             "ros-jazzy-rmw-fastrtps-cpp==8.4.3",
             "rosbags>=0.10",
         ],
+        "view": ["viser>=1.0"],
         "test": ["pytest"],  # colcon test runs pytest only where an extra of this name asks for it.
     },
     entry_points={
@@ -75,6 +87,8 @@ setup(
             "gsseg = gsseg_core.cli:main",
             "replay_node = gsseg_ros.replay_node:main",
             "segment_node = gsseg_ros.segment_node:main",
-        ]
+        ],
+        # Where `gsseg view` gets codes from that change while it runs; see gsseg_core/view_live.py.
+        "gsseg.live_sources": ["ros = gsseg_ros.view_source:RosSource"],
     },
 )

@@ -264,7 +264,9 @@ go to `results_out/`.
 
 COMMAND = """## The whole command
 
-    gsseg segment replica_apartment/scene.ply --data replica_apartment --out out
+```bash title="not run by the tests: needs the apartment's scene"
+gsseg segment replica_apartment/scene.ply --data replica_apartment --out out
+```
 
 In a process of its own, with export and pictures, its kernels compiled before; then `gsseg render` and `gsseg eval` on
 the test views. Peak memory is that of the largest process so far.

@@ -15,6 +15,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gsseg_core.boxes import OrientedBox, object_boxes
     from gsseg_core.cameras import Camera
     from gsseg_core.dataset import Dataset, View
     from gsseg_core.em import EMLearner, EMSettings
@@ -38,6 +39,7 @@ _HOMES = {
     "GradientLearner": "gradient",
     "GradientSettings": "gradient",
     "GssegError": "errors",
+    "OrientedBox": "boxes",
     "RefineSettings": "refine_settings",
     "Segmentation": "segmentation",
     "View": "dataset",
@@ -45,6 +47,7 @@ _HOMES = {
     "VoteLearner": "votes",
     "export_classes": "export",
     "make_operator": "operator",
+    "object_boxes": "boxes",
 }
 
 __all__ = [
@@ -57,6 +60,7 @@ __all__ = [
     "GradientLearner",
     "GradientSettings",
     "GssegError",
+    "OrientedBox",
     "RefineSettings",
     "Segmentation",
     "View",
@@ -64,6 +68,7 @@ __all__ = [
     "VoteLearner",
     "export_classes",
     "make_operator",
+    "object_boxes",
 ]
 
 

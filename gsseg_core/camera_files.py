@@ -16,6 +16,7 @@ import numpy.typing as npt
 from gsseg_core.cameras import Camera
 from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError
 from gsseg_core.json_files import read_json
+from gsseg_core.layout import camera_hint
 
 if TYPE_CHECKING:
     import pycolmap
@@ -67,7 +68,7 @@ def read_cameras(folder: str | os.PathLike[str]) -> list[Camera]:
             what = "has no cameras" if folder.is_dir() else "is not a folder"
             raise CameraFileError(
                 f"{folder}: {what}; looked for cameras.json (3DGS), transforms.json (nerfstudio), and cameras.bin or "
-                "cameras.txt in sparse/0 or sparse (COLMAP)"
+                f"cameras.txt in sparse/0 or sparse (COLMAP){camera_hint(folder)}"
             )
         path = models[0]
         cameras = _read_colmap(path)

@@ -75,8 +75,9 @@ def mask_bits(path: str | os.PathLike[str]) -> int:
         return 8
     if kind == "gray" and depth in (8, 16):
         return depth
+    fix = "; a photo is no mask, and of ids drawn in colours save the ids themselves" if "RGB" in kind else ""
     raise MaskFormatError(
-        f"{path}: is {kind} of {depth} bits per channel; expected a one-channel 8- or 16-bit PNG of labels"
+        f"{path}: is {kind} of {depth} bits per channel; expected a one-channel 8- or 16-bit PNG of labels{fix}"
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -11,17 +11,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gsseg_core.dataset import Dataset, spread
+from gsseg_core.dataset import Dataset, View, spread
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import NoUsableViewsError, SettingsError
-from gsseg_core.export import draw_views, export_classes, write_json, write_overview, write_pictures
-from gsseg_core.learner import MEMORY_BUDGET, Learner, Progress, silent
+from gsseg_core.export import Drawn, draw_views, export_classes, write_json, write_overview, write_pictures
+from gsseg_core.graph import GraphSettings, graph_of, propagate
+from gsseg_core.held_out import calibrate
+from gsseg_core.layout import mask_hint
+from gsseg_core.learner import MEMORY_BUDGET, NO_MASK, Learner, Progress, silent
 from gsseg_core.masks import write_mask
 from gsseg_core.object_table import find_objects
 from gsseg_core.pictures import save_png
 from gsseg_core.refine_settings import RefineSettings
-from gsseg_core.reliability import OtherViews, draw_worst_views, reliability_report
+from gsseg_core.reliability import OtherViews, ViewCheck, draw_worst_views, hold_against, reliability_report
 from gsseg_core.report import Stopwatch, build_report
+from gsseg_core.report_findings import Evidence
+from gsseg_core.report_page import write_report_page
+from gsseg_core.report_pictures import ViewImages
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.votes import VoteLearner
@@ -108,6 +114,7 @@ def segment(
     learner: str = "em",
     views: int | None = None,
     refine: RefineSettings | None = None,
+    graph: bool = True,
     device: str = "cpu",
     memory_budget: int = MEMORY_BUDGET,
     seed: int = 0,
@@ -124,7 +131,7 @@ def segment(
     data : path
         Dataset folder.
     out : path
-        Gets `segmentation.npz`, `classes/`, `pictures/`, and at last `report.json`.
+        Gets `segmentation.npz`, `classes/`, `pictures/`, and at last `report.html` and `report.json`.
     labels : str
         Sub-folder of the dataset with the masks.
     learner : str
@@ -133,6 +140,8 @@ def segment(
         Learn from this many train views, spread evenly; from all by default.
     refine : RefineSettings, optional
         The paper's by default.
+    graph : bool
+        Let codes spread to Gaussians that few or no pixels saw, before refinement; see `gsseg_core.graph`.
     memory_budget : int
         Bytes of prepared views to keep between the steps of learning; see docs/memory.md.
     scheduler : str, optional
@@ -185,7 +194,12 @@ def segment(
             try:
                 teacher.fit(progress)
             except NoUsableViewsError as error:
-                raise NoUsableViewsError(f"{data}: {error}") from error
+                blank = set(teacher.rejected.values()) == {NO_MASK}
+                hint = mask_hint(dataset.root, labels, [view.name for view in train]) if blank else ""
+                raise NoUsableViewsError(f"{data}: {error}{hint}") from error
+        if type(teacher) is not EMLearner:
+            with watch.stage("calibrate"):  # while there still are workers
+                calibration = calibrate(teacher, progress=progress)
     out = Path(out)
     learnt: dict[str, Any] = {
         "views": {"used": len(teacher.views), "rejected": teacher.reject_summary(), "names": teacher.rejected},
@@ -193,24 +207,40 @@ def segment(
     }
     more = _settings_of(teacher)
     worst: np.ndarray | None = None
+    masks, checks, held_out = dict(teacher.views), list[ViewCheck](), False
     if type(teacher) is EMLearner:
         with watch.stage("check views"):
             others = OtherViews(teacher, progress)
-            checks = others.check_all(progress)
+            checks, held_out = others.check_all(progress), True
             learnt["views"]["reliability"] = reliability_report(checks, class_names)
             worst = draw_worst_views(others, checks)
-            del others
-    codes = teacher.codes_
+        with watch.stage("calibrate"):
+            calibration = calibrate(teacher, others, progress)
+        del others
+    codes, evidence = teacher.codes_, teacher.evidence()
     del teacher  # Its votes take as much memory as all that follows.
     with watch.stage("refine"):
-        result = Segmentation.from_codes(scene, codes, class_names, refine)
+        if graph:
+            codes = propagate(graph_of(scene), codes, evidence)
+        result = Segmentation.from_codes(scene, codes, class_names, refine).calibrated(calibration.temperature)
         del codes
+    if refine.carve:
+        # Only now: the kernels of the carving take a while to compile, and most runs do without.
+        from gsseg_core.carve import carved
+
+        with watch.stage("carve"):
+            cameras = [view.camera for view in spread(train, refine.carve_views)]
+            result = carved(scene, result, cameras, device)
     with watch.stage("export"):
         result.save(out / "segmentation.npz")
         plys = export_classes(scene, result, out / "classes")
     with watch.stage("pictures"):
         chosen = spread(dataset.views("all"), PICTURED_VIEWS)
-        pictures = write_pictures(scene, result, chosen, out / "pictures", device=device)
+        images = ViewImages(scene, device)
+        drawn = draw_views(scene, result, chosen, device=device)
+        if not held_out:
+            drawn = _held_against_masks(drawn, masks, result.num_classes, checks)
+        pictures = write_pictures(result, _keeping_images(drawn, images), out / "pictures")
         if worst is not None:
             pictures.append(out / "pictures" / "worst_views.png")
             save_png(pictures[-1], worst)
@@ -220,14 +250,20 @@ def segment(
         **learnt,
         settings={
             "learner": learner, "labels": labels, "views": views, "device": device, "memory_budget": memory_budget,
-            "seed": seed, "scheduler": scheduler, "ids": ids, "refine": asdict(refine), **more,
+            "seed": seed, "scheduler": scheduler, "ids": ids, "refine": asdict(refine),
+            "graph": asdict(GraphSettings()) if graph else None, **more,
         },
         plys={k: str(path.relative_to(out)) for k, path in plys.items()},
         pictures=[str(path.relative_to(out)) for path in pictures],
         seconds=watch.seconds,
     )  # fmt: skip
+    report["calibration"] = calibration.as_dict()
     if table is not None:
         report["ids"] = table.summary()
+    with watch.stage("report page"):
+        write_report_page(out / "report.html", report, scene, result, Evidence(checks, masks, held_out), images)
+    report["page"] = "report.html"
+    report["seconds"]["report page"] = round(watch.seconds["report page"], 3)
     write_json(out / "report.json", report)
     return report
 
@@ -258,7 +294,7 @@ def render(
     out = Path(out)
     bits = 16 if result.num_classes > 255 else max((view.mask_bits or 8 for view in views), default=8)
     paths, overlays = [], []
-    for done, (view, labels, image) in enumerate(draw_views(scene, result, views, device=device)):
+    for done, (view, labels, image, _) in enumerate(draw_views(scene, result, views, device=device)):
         progress("render", done, len(views))
         paths.append(out / f"{view.name}.png")
         write_mask(paths[-1], labels, bits)
@@ -267,6 +303,23 @@ def render(
     progress("render", len(views), len(views))
     write_overview(result, overlays, [view.name for view in views], out / "overlays")
     return paths
+
+
+def _keeping_images(drawn: Iterable[Drawn], images: ViewImages) -> Iterator[Drawn]:
+    """Pass drawn views on; what was rendered for them, the report page need not render again."""
+    for one in drawn:
+        images.keep(one.view, one.image)
+        yield one
+
+
+def _held_against_masks(
+    drawn: Iterable[Drawn], masks: Mapping[str, View], num_classes: int, checks: list[ViewCheck]
+) -> Iterator[Drawn]:
+    """Pass drawn views on, and note how the masks of those that were learnt from compare."""
+    for one in drawn:
+        if one.view.name in masks:
+            checks.append(hold_against(masks[one.view.name], one.labels, num_classes))
+        yield one
 
 
 def _settings_of(learner: Learner) -> Mapping[str, Any]:

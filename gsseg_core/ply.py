@@ -12,6 +12,7 @@ import plyfile
 
 from gsseg_core.atomic import write_atomically
 from gsseg_core.errors import SceneFileError, ScenePropertyError
+from gsseg_core.layout import scene_hint
 
 
 def read_vertices(path: str | os.PathLike[str]) -> npt.NDArray[np.void]:
@@ -38,7 +39,9 @@ def read_vertices(path: str | os.PathLike[str]) -> npt.NDArray[np.void]:
     try:
         ply = plyfile.PlyData.read(str(path))
     except OSError as error:
-        raise SceneFileError(f"{path}: cannot be read ({error.strerror or error}); expected a 3DGS PLY") from error
+        raise SceneFileError(
+            f"{path}: cannot be read ({error.strerror or error}); expected a 3DGS PLY{scene_hint(path)}"
+        ) from error
     except (plyfile.PlyParseError, ValueError, OverflowError, MemoryError) as error:
         raise SceneFileError(f"{path}: truncated or not a PLY file ({error}); expected a whole 3DGS PLY") from error
     if "vertex" not in ply:

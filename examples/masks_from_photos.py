@@ -1,0 +1,73 @@
+"""Make masks of photos with a 2D segmenter, and write them as a dataset wants them.
+
+    pip install scikit-image
+    python examples/masks_from_photos.py DATASET --out auto
+    gsseg segment scene.ply --data DATASET --out out --labels auto --ids per-view
+
+The segmenter here is Felzenszwalb and Huttenlocher's (2004), which needs no weights. It knows no objects: it finds
+areas of one colour, and numbers them anew in every photo, as automatic mask generators do. To use another one, rewrite
+`segment_photo`; all else stays.
+
+Without images/ in DATASET, `--scene` renders the scene in the place of photos.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from skimage.segmentation import felzenszwalb
+
+from gsseg_core import Dataset, GaussianScene, GssegError, View, make_operator
+from gsseg_core.masks import UNKNOWN, write_mask
+
+SCALE = 300
+"""How unlike two areas have to be to stay apart; larger means fewer areas."""
+
+LEAST, MOST = 0.001, 0.25
+"""Share of the image below which an area is taken for noise, and above which for the background."""
+
+
+def segment_photo(
+    photo: np.ndarray,  # (H, W, 3) uint8
+) -> np.ndarray:
+    """Find areas: (H, W) int32 with a number for each, 0 for the background and -1 where nothing is known."""
+    areas = felzenszwalb(photo, scale=SCALE, sigma=0.8, min_size=int(LEAST * photo[..., 0].size))
+    share = np.bincount(areas.ravel()) / areas.size
+    numbers = np.where(share > MOST, 0, np.where(share < LEAST, UNKNOWN, 1 + np.arange(len(share))))
+    return numbers[areas].astype(np.int32)
+
+
+def photo_of(view: View, scene: GaussianScene | None) -> np.ndarray:
+    """Read the photo of a view, or render it: (H, W, 3) uint8."""
+    if scene is not None:
+        image = make_operator(scene, view.camera).render(scene.colors(view.camera.center))
+        return (255 * image.clip(0, 1)).astype(np.uint8)
+    if view.image_path is None:
+        raise GssegError(f"view '{view.name}' has no photo in images/; give --scene SCENE.ply to render it")
+    return np.array(Image.open(view.image_path).convert("RGB"))
+
+
+def main() -> None:
+    """Write a mask for each train view."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("dataset", metavar="DATASET", help="folder with cameras, and photos in images/")
+    parser.add_argument("--out", default="auto", metavar="NAME", help="folder in DATASET for masks (default: auto)")
+    parser.add_argument("--scene", metavar="SCENE.ply", help="render photos from it")
+    options = parser.parse_args()
+    try:
+        views = Dataset(options.dataset).views("train")
+        scene = GaussianScene.load(options.scene) if options.scene else None
+        for view in views:
+            labels = segment_photo(photo_of(view, scene))
+            write_mask(Path(options.dataset) / options.out / f"{view.name}.png", labels, bits=16)
+            print(f"{view.name}: {len(np.unique(labels[labels > 0]))} areas")
+    except GssegError as error:
+        sys.exit(f"masks_from_photos: {error}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,29 @@
+"""The command `gsseg doctor`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+HELP = "say what this machine has and lacks, and how to get it"
+DESCRIPTION = """
+Prints the versions of gsseg, Python and its packages, the devices, whether the kernels run and where they are cached,
+which options are installed, and what is there of ROS 2. For everything that is missing it says what to type.
+The exit code is 0 if gsseg works without the options, and 2 if not.
+"""
+EXAMPLES = """
+  gsseg doctor
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the command takes: nothing."""
+
+
+def run(options: argparse.Namespace) -> int:
+    """Look, and print what was found."""
+    from gsseg_core.doctor import describe, examine, works
+
+    findings = examine(lambda text: print(f"gsseg: {text}", file=sys.stderr))
+    print(describe(findings))
+    return 0 if works(findings) else 2

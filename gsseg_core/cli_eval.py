@@ -1,0 +1,40 @@
+"""The command `gsseg eval`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from gsseg_core.export import write_json
+
+HELP = "score label maps: mIoU, mAcc, boundary IoU"
+DESCRIPTION = """
+Scores predicted label maps against true ones of the same names: IoU, accuracy and boundary IoU of each class, and
+their means over the classes that occur. Pixels whose truth is unknown do not count.
+"""
+EXAMPLES = """
+  gsseg eval --pred rendered --truth DATASET/labels
+  gsseg eval --pred rendered --truth DATASET/labels --json scores.json
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the command takes."""
+    parser.add_argument("--pred", required=True, metavar="DIR", help="folder of predicted label maps <stem>.png")
+    parser.add_argument("--truth", required=True, metavar="DIR", help="folder of true label maps <stem>.png")
+    parser.add_argument("--json", metavar="FILE", help="write the scores there, too")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Score, and print a table."""
+    from gsseg_core.masks import read_classes
+    from gsseg_core.metrics import evaluate_folders
+    from gsseg_core.tables import evaluation_summary
+
+    classes = Path(options.truth).parent / "classes.json"
+    names = read_classes(classes) if classes.is_file() else None
+    scores = evaluate_folders(options.pred, options.truth).as_dict(names)
+    if options.json:
+        write_json(options.json, scores)
+    print(evaluation_summary(scores))
+    return 0

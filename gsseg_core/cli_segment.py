@@ -1,0 +1,109 @@
+"""The command `gsseg segment`."""
+
+from __future__ import annotations
+
+import argparse
+
+from gsseg_core.cli_shared import add_scene, load_kernels
+from gsseg_core.progress import progress_bars
+from gsseg_core.refine_settings import RefineSettings
+
+HELP = "learn from masks, refine, write labels and one PLY per object"
+DESCRIPTION = """
+Learns from the masks of the train views which Gaussian belongs to which class, refines that by the neighbours in
+space, and writes OUT/segmentation.npz, one PLY per class, a report and pictures.
+"""
+EXAMPLES = """
+  gsseg segment scene.ply --data DATASET --out out
+  gsseg segment scene.ply --data DATASET --out out --labels sam --ids per-view
+  gsseg segment scene.ply --data DATASET --out out --learner votes --views 20
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the command takes."""
+    add_scene(parser)
+    parser.add_argument("--out", required=True, metavar="OUT", help="folder to write to")
+    parser.add_argument(
+        "--labels", default="labels", metavar="DIR", help="folder of the masks in DATASET (default: labels)"
+    )
+    learning = parser.add_argument_group("learning")
+    learning.add_argument("--learner", choices=("em", "gradient", "votes"), default="em", help="default: em")
+    learning.add_argument(
+        "--views", type=int, metavar="N", help="learn from N train views, spread evenly (default: all)"
+    )
+    refinement = parser.add_argument_group("refinement")
+    refinement.add_argument(
+        "--k", type=int, default=RefineSettings.k, help="neighbours in KNN and filter (default: %(default)s)"
+    )
+    refinement.add_argument(
+        "--beta",
+        type=float,
+        default=RefineSettings.beta,
+        help="confidence below which KNN decides (default: %(default)s)",
+    )
+    refinement.add_argument(
+        "--no-graph", action="store_true", help="leave what few or no pixels saw to KNN, without spreading codes"
+    )
+    refinement.add_argument(
+        "--no-knn", action="store_true", help="leave uncertain and unobserved Gaussians as they are"
+    )
+    refinement.add_argument(
+        "--no-filter", action="store_true", help="keep Gaussians that lie far from the rest of their object"
+    )
+    refinement.add_argument(
+        "--carve", action="store_true", help="cut objects to their silhouettes in the views, in place of the filter"
+    )
+    learning.add_argument("--seed", type=int, default=0, help="for learners that draw at random (default: %(default)s)")
+    parser.add_argument(
+        "--ids",
+        choices=("global", "per-view"),
+        default="global",
+        help="whether an id means the same in every view, or holds in its own view only (default: %(default)s)",
+    )
+    learning.add_argument(
+        "--memory-budget",
+        type=int,
+        default=2048,
+        metavar="MIB",
+        help="for prepared views; those beyond it are prepared anew in each step (default: %(default)s)",
+    )
+    learning.add_argument(
+        "--scheduler", metavar="ADDRESS", help="learn on the workers of this Dask scheduler (em and votes)"
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Segment, and print a summary."""
+    # The rasteriser's kernels load with the pipeline; `gsseg --help` need not wait for them.
+    from gsseg_core import pipeline
+
+    refine = RefineSettings(
+        k=options.k,
+        beta=options.beta,
+        cluster=not options.no_knn,
+        filter=not (options.no_filter or options.carve),
+        carve=options.carve,
+    )
+    load_kernels(options.quiet, options.device)
+    with progress_bars(options.quiet) as progress:
+        report = pipeline.segment(
+            options.scene,
+            options.data,
+            options.out,
+            labels=options.labels,
+            learner=options.learner,
+            views=options.views,
+            refine=refine,
+            graph=not options.no_graph,
+            device=options.device,
+            memory_budget=options.memory_budget << 20,
+            seed=options.seed,
+            scheduler=options.scheduler,
+            ids=options.ids,
+            progress=progress,
+        )
+    from gsseg_core.tables import segment_summary
+
+    print(segment_summary(report, options.out))
+    return 0

@@ -1,0 +1,41 @@
+"""Arguments and steps that several commands of `gsseg` share."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+from gsseg_core.devices import DEVICES, checked_device
+from gsseg_core.errors import SettingsError
+
+
+def add_scene(parser: argparse.ArgumentParser) -> None:
+    """Add the scene, the dataset, the device and `--quiet`."""
+    parser.add_argument("scene", metavar="SCENE.ply", help="trained 3DGS scene")
+    parser.add_argument(
+        "--data",
+        required=True,
+        metavar="DATASET",
+        help="folder with cameras, labels/<stem>.png, classes.json, split.json",
+    )
+    parser.add_argument("--device", type=_device, default="cpu", help=f"{DEVICES} (default: cpu)")
+    add_quiet(parser)
+
+
+def add_quiet(parser: argparse.ArgumentParser) -> None:
+    """Add `--quiet`."""
+    parser.add_argument("--quiet", action="store_true", help="no progress bars")
+
+
+def load_kernels(quiet: bool, device: str = "cpu") -> None:
+    """Compile the kernels or load them, and say so if it takes long."""
+    from gsseg_core.warm_up import warm_up
+
+    warm_up(device, lambda text: None if quiet else print(f"gsseg: {text}", file=sys.stderr))
+
+
+def _device(text: str) -> str:
+    try:
+        return checked_device(text)
+    except SettingsError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error

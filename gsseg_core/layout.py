@@ -1,0 +1,153 @@
+"""What a dataset folder of another layout looks like, and what to type then: the ends of error messages.
+
+Nothing here decides anything: the folder was refused already. What is told is what lies near to what was looked for.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Collection
+from pathlib import Path
+
+from gsseg_core.errors import GssegError
+from gsseg_core.masks import mask_bits
+
+_CAMERA_FILES = ("cameras.json", "transforms.json")
+_COLMAP_FILES = ("cameras.bin", "cameras.txt")
+# Camera files of other programs, and how one gets from each to one that is read.
+_FOREIGN_CAMERAS = {
+    "transforms_train.json": "its cameras are nerfstudio's: copy it to transforms.json, with the image size as w and h",
+    "poses_bounds.npy": "it is LLFF's: run nerfstudio's ns-process-data, or COLMAP, on the photos",
+    "database.db": "it is COLMAP's database without a model: run `colmap mapper`, and give the folder with its sparse/",
+}
+_IMAGES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".npy", ".npz", ".json"}
+_DEPTH = 3
+_MOST_FOLDERS = 200
+
+
+def camera_hint(folder: Path) -> str:
+    """Tell where cameras lie near a dataset folder that has none; "" where there is nothing to tell."""
+    if folder.is_file():
+        return f"; it is a file: type --data {_quoted(folder.parent)}"
+    if not folder.is_dir():
+        near = [path for path in _parent_of_missing(folder) if _has_cameras(path)]
+        return f"; {near[0]} has cameras: type --data {_quoted(near[0])}" if near else ""
+    is_dataset = any((folder / name).is_dir() for name in ("labels", "images"))
+    near = [path for path in [*_folders(folder), folder.parent] if _has_cameras(path)]
+    if near and not is_dataset:
+        return f"; found cameras in {near[0]}: type --data {_quoted(near[0])}"
+    found = [path for path in (_camera_file(below) for below in _folders(folder)) if path is not None]
+    if found:
+        # Masks are here and cameras below, as ns-process-data leaves them: the cameras have to come up.
+        place = folder / ("sparse" if found[0].is_dir() else found[0].name)
+        return f"; found cameras in {found[0]}: type ln -s {_quoted(found[0].resolve())} {_quoted(place)}"
+    for name, advice in _FOREIGN_CAMERAS.items():
+        if (folder / name).is_file():
+            return f"; found {name}: {advice}"
+    names = sorted(path.name + "/" * path.is_dir() for path in folder.iterdir() if not path.name.startswith("."))
+    return f"; found {', '.join(names[:8])}{' ...' if len(names) > 8 else ''}" if names else "; the folder is empty"
+
+
+def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
+    """Tell where masks of the cameras' names lie, if a dataset has none where they were looked for.
+
+    Parameters
+    ----------
+    root : pathlib.Path
+        The dataset.
+    labels : str
+        Its sub-folder in which masks were looked for.
+    stems : collection of str
+        Names of the cameras: the stems of the masks' names.
+    """
+    looked = f"; looked for {root / labels}/{next(iter(stems), '<stem>')}.png and so on"
+    others = [(len(_masks(path, stems)), path) for path in _folders(root) if path != root / labels]
+    count, folder = max(others, key=lambda found: found[0], default=(0, root))
+    if count:
+        name = os.path.relpath(folder, root)
+        return f"{looked}, found {count} masks of these names in {name}/: type --labels {shlex.quote(name)}"
+    if not (root / labels).is_dir():
+        photos = [path for path in _folders(root) if _stems(path) & set(stems)]
+        return f"{looked}, but there is no folder {labels}/" + (
+            f" ({photos[0].name}/ holds photos; a 2D segmenter makes masks of them)" if photos else ""
+        )
+    files = [path for path in sorted((root / labels).iterdir()) if path.suffix.lower() in _IMAGES]
+    if not files:
+        return f"{looked}, but {labels}/ holds no image"
+    if files[0].suffix.lower() != ".png":
+        return f"{looked}, but {labels}/ holds files such as {files[0].name}; expected label images as PNG"
+    return f"{looked}, but {labels}/ holds names such as {files[0].name}: rename them to the names of the images"
+
+
+def scene_hint(path: Path) -> str:
+    """Tell where a PLY lies, if a folder or nothing was found in the place of a scene."""
+    if path.is_dir():
+        # Trainers write point_cloud/iteration_30000/point_cloud.ply; the one of most steps is wanted.
+        found = sorted(path.glob("*.ply")) or sorted(path.glob("point_cloud/iteration_*/*.ply"), key=_iteration)
+        return f"; it is a folder: type {_quoted(found[-1])}" if found else "; it is a folder without a PLY"
+    if not path.exists():
+        near = sorted(path.parent.glob("*.ply")) if path.parent.is_dir() else []
+        return f"; found {', '.join(file.name for file in near[:4])} in {path.parent}" if near else ""
+    return ""
+
+
+def _iteration(path: Path) -> int:
+    number = path.parent.name.rpartition("_")[2]
+    return int(number) if number.isdecimal() else -1
+
+
+def _has_cameras(folder: Path) -> bool:
+    return any(_camera_file(place) is not None for place in (folder, folder / "sparse/0", folder / "sparse"))
+
+
+def _camera_file(folder: Path) -> Path | None:
+    """Find the file with cameras in a folder, or the folder itself if it is a COLMAP model."""
+    if any((folder / name).is_file() for name in _COLMAP_FILES):
+        return folder
+    return next((folder / name for name in _CAMERA_FILES if (folder / name).is_file()), None)
+
+
+def _parent_of_missing(folder: Path) -> list[Path]:
+    """List folders beside one that is not there."""
+    parent = folder.parent
+    return sorted(path for path in parent.iterdir() if path.is_dir()) if parent.is_dir() else []
+
+
+def _folders(root: Path) -> list[Path]:
+    """List the folders below one, the nearest first; a capture may be large, so neither all the way nor all of them."""
+    found: list[Path] = []
+    level = [root]
+    for _ in range(_DEPTH):
+        below = [path for folder in level for path in _subfolders(folder)]
+        found, level = found + below, below
+    return found[:_MOST_FOLDERS]
+
+
+def _subfolders(folder: Path) -> list[Path]:
+    try:
+        return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    except OSError:
+        return []
+
+
+def _stems(folder: Path) -> set[str]:
+    try:
+        return {path.stem for path in folder.iterdir() if path.suffix.lower() in _IMAGES}
+    except OSError:
+        return set()
+
+
+def _masks(folder: Path, stems: Collection[str]) -> list[Path]:
+    """List label images of the given stems; none where the first is a photo."""
+    try:
+        found = sorted(path for path in folder.glob("*.png") if path.stem in stems)
+        if found:
+            mask_bits(found[0])
+    except (GssegError, OSError):
+        return []
+    return found
+
+
+def _quoted(path: Path) -> str:
+    return shlex.quote(str(path))

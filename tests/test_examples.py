@@ -1,0 +1,158 @@
+"""Examples that need no running ROS: the notebook, masks from photos, a bag without a node."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from small_scenes import NAMES, write_dataset
+
+from gsseg_core.cli import main
+from gsseg_core.dataset import Dataset, View
+from gsseg_core.demo_scene import build_demo
+from gsseg_core.masks import read_mask
+from gsseg_core.scene import GaussianScene
+
+REPOSITORY = Path(__file__).parents[1]
+NOTEBOOK = REPOSITORY / "examples/from_ply_to_objects.ipynb"
+
+
+def run_example(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, str(REPOSITORY / "examples" / name), *map(str, arguments)],
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY)}, text=True, capture_output=True, timeout=120, check=False,
+    )  # fmt: skip
+
+
+def test_every_example_is_listed() -> None:
+    listing = (REPOSITORY / "examples/README.md").read_text()
+    for path in (REPOSITORY / "examples").iterdir():
+        assert path.suffix not in (".py", ".ipynb") or f"({path.name})" in listing, path.name
+
+
+def test_the_notebook_runs_from_its_first_cell_to_its_last_and_stores_no_output(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    notebook = json.loads(NOTEBOOK.read_text())
+    assert notebook["nbformat"] == 4
+    cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert cells and all(cell["outputs"] == [] and cell["execution_count"] is None for cell in cells)
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    for cell in cells:
+        exec(compile("".join(cell["source"]), cell["id"], "exec"), names)
+    out = capsys.readouterr().out
+    assert "10 classes" in out and "class of the pixel: " in out
+    objects = sorted((tmp_path / "notebook_demo/objects").iterdir())
+    assert len(objects) == 10 and len(GaussianScene.load(objects[1])) > 500
+
+
+def test_masks_of_a_segmenter_that_knows_no_objects_are_segmented_per_view(tmp_path: Path) -> None:
+    pytest.importorskip("skimage", reason="scikit-image is not installed")
+    data = build_demo(tmp_path / "data").root
+    split = json.loads((data / "split.json").read_text())
+    (data / "split.json").write_text(json.dumps({**split, "train": split["train"][::6]}))
+    ran = run_example("masks_from_photos.py", data, "--scene", data / "scene.ply", "--out", "auto")
+    assert ran.returncode == 0, ran.stderr
+    assert [read_mask(data / f"auto/{stem}.png").bits for stem in split["train"][::6]] == [16] * 5
+    command = ["segment", f"{data}/scene.ply", "--data", str(data), "--labels", "auto", "--ids", "per-view"]
+    assert main([*command, "--out", f"{tmp_path}/out", "--quiet"]) == 0
+    with np.load(tmp_path / "out/segmentation.npz") as file:
+        found = file["labels"]
+    with np.load(data / "truth.npz") as file:
+        truth = file["labels"]
+    # Each of most objects is one found class: half of what either has is of both.
+    best = [
+        max(
+            ((found == k) & (truth == t)).sum() / ((found == k) | (truth == t)).sum() for k in range(1, found.max() + 1)
+        )
+        for t in range(1, 9)
+    ]
+    assert sum(iou > 0.5 for iou in best) >= 5, best
+
+
+def test_masks_from_photos_says_what_is_missing_without_photos(tmp_path: Path) -> None:
+    pytest.importorskip("skimage", reason="scikit-image is not installed")
+    ran = run_example("masks_from_photos.py", write_dataset(tmp_path / "data"))
+    assert ran.returncode == 1
+    assert ran.stderr.count("\n") == 1 and "no photo in images/; give --scene" in ran.stderr
+
+
+def write_bag(path: Path, views: list[View], distorted: int = -1, topics: tuple[str, ...] = ()) -> None:
+    """A bag made without ROS; the message of `distorted` has a lens with distortion."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    types = {name.rpartition("/")[2]: store.types[name] for name in (
+        "builtin_interfaces/msg/Time", "std_msgs/msg/Header", "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo",
+        "sensor_msgs/msg/RegionOfInterest", "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/Pose",
+        "geometry_msgs/msg/Point", "geometry_msgs/msg/Quaternion")}  # fmt: skip
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections = {
+            name: writer.add_connection(topic, types[kind].__msgtype__, typestore=store)
+            for topic, name, kind in zip(
+                topics or ("/mask", "/camera_info", "/pose"), ("mask", "camera_info", "pose"),
+                ("Image", "CameraInfo", "PoseStamped"), strict=True,
+            )
+        }  # fmt: skip
+        for i, view in enumerate(views):
+            header = types["Header"](types["Time"](100 + i, 5), "optical")
+            labels, camera = view.read_labels(), view.camera
+            height, width = labels.shape
+            pixels = np.where(labels < 0, 255, labels).astype(np.uint8)
+            padded = np.pad(pixels, ((0, 0), (0, 3))).ravel()  # A row may be longer than the image is wide.
+            pose = np.linalg.inv(camera.world_to_camera)
+            quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
+            d = np.array([0.1 if i == distorted else 0.0] * 5)
+            messages = {
+                "mask": types["Image"](header, height, width, "mono8", 0, width + 3, padded),
+                "camera_info": types["CameraInfo"](
+                    header, height, width, "plumb_bob", d, camera.K.ravel(), np.eye(3).ravel(), np.zeros(12), 0, 0,
+                    types["RegionOfInterest"](0, 0, 0, 0, False),
+                ),
+                "pose": types["PoseStamped"](
+                    header, types["Pose"](types["Point"](*pose[:3, 3]), types["Quaternion"](*quaternion))
+                ),
+            }  # fmt: skip
+            for name, message in messages.items():
+                data = store.serialize_cdr(message, message.__msgtype__)
+                writer.write(connections[name], 10**9 * (100 + i), bytes(data))
+
+
+def test_a_bag_becomes_objects_without_ros_as_its_dataset_does_by_the_command_line(tmp_path: Path) -> None:
+    pytest.importorskip("rosbags", reason="rosbags is not installed")
+    data = write_dataset(tmp_path / "data")
+    write_bag(tmp_path / "bag", Dataset(data).views("train"))
+    names = [name for label, name in NAMES.items() if label]
+    ran = run_example(
+        "bag_to_objects.py", data / "scene.ply", tmp_path / "bag", tmp_path / "out", "--class-names", *names
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert "learnt from 4 masks" in ran.stdout
+    command = ["segment", f"{data}/scene.ply", "--data", str(data), "--out", f"{tmp_path}/told", "--quiet"]
+    assert main(command) == 0
+    expected = sorted((tmp_path / "told/classes").iterdir())
+    assert [path.name for path in expected] == sorted(path.name for path in (tmp_path / "out").iterdir())
+    for path in expected:
+        mine, theirs = GaussianScene.load(tmp_path / "out" / path.name).means, GaussianScene.load(path).means
+        # A pose as a quaternion has other last digits than as a matrix.
+        assert abs(len(mine) - len(theirs)) <= 2 and len({*map(tuple, mine)} ^ {*map(tuple, theirs)}) <= 4
+
+
+def test_a_bag_skips_what_cannot_be_used_and_names_a_topic_that_is_missing(tmp_path: Path) -> None:
+    pytest.importorskip("rosbags", reason="rosbags is not installed")
+    data = write_dataset(tmp_path / "data")
+    views, scene = Dataset(data).views("train"), data / "scene.ply"
+    write_bag(tmp_path / "bag", views, distorted=1)
+    ran = run_example("bag_to_objects.py", scene, tmp_path / "bag", tmp_path / "out")
+    assert "learnt from 3 masks" in ran.stdout and "skipped 1 masks: camera_info has distortion" in ran.stdout
+    ran = run_example("bag_to_objects.py", scene, tmp_path / "bag", tmp_path / "out", "--mask", "/front/mask")
+    assert ran.returncode == 1 and ran.stderr.count("\n") == 1
+    assert "no topic /front/mask; topics in the bag: /camera_info, /mask, /pose" in ran.stderr

@@ -1,0 +1,159 @@
+"""What a dataset folder of another layout gets: what was looked for, what lies near, and what to type."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from small_scenes import write_dataset
+
+from gsseg_core.cli import main
+from gsseg_core.layout import camera_hint, mask_hint, scene_hint
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    return write_dataset(tmp_path / "data")
+
+
+def error_of(capsys: pytest.CaptureFixture[str], data: Path, *more: str, scene: str = "scene.ply") -> str:
+    """The one line of `segment`; no kernel is compiled before it."""
+    command = ["segment", f"{data}/{scene}", "--data", str(data), "--out", f"{data}/../out", "--quiet", *more]
+    assert main(command) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1, lines
+    return lines[0]
+
+
+def typed(error: str, option: str) -> list[str]:
+    """What the error says to type after an option."""
+    assert f"type {option} " in error, error
+    return shlex.split(error[error.index(f"type {option} ") + 5 :])[1:2]
+
+
+def test_masks_in_a_folder_of_another_name_are_found_and_the_option_that_is_told_works(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (data / "deep").mkdir()
+    (data / "labels").rename(data / "deep/my masks")
+    error = error_of(capsys, data)
+    assert f"looked for {data}/labels/view" in error and "found 4 masks of these names in deep/my masks/" in error
+    (folder,) = typed(error, "--labels")
+    assert main(["segment", f"{data}/scene.ply", "--data", str(data), "--out", f"{data}/../out", "--quiet",
+                 "--labels", folder]) == 0  # fmt: skip
+
+
+def photos(data: Path) -> None:
+    shutil.rmtree(data / "labels")
+    (data / "images").mkdir()
+    for i in range(6):
+        Image.fromarray(np.zeros((48, 64, 3), np.uint8)).save(data / f"images/view{i}.png")
+
+
+def other_names(data: Path) -> None:
+    for path in (data / "labels").iterdir():
+        path.rename(path.with_name(f"{path.stem}_mask.png"))
+
+
+def other_files(data: Path) -> None:
+    for path in (data / "labels").iterdir():
+        path.rename(path.with_suffix(".tif"))
+
+
+def emptied(data: Path) -> None:
+    shutil.rmtree(data / "labels")
+    (data / "labels").mkdir()
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (photos, "there is no folder labels/ (images/ holds photos; a 2D segmenter makes masks of them)"),
+        (other_names, "labels/ holds names such as view0_mask.png: rename them"),
+        (other_files, "labels/ holds files such as view0.tif; expected label images as PNG"),
+        (emptied, "labels/ holds no image"),
+        (lambda data: shutil.rmtree(data / "labels"), "there is no folder labels/"),
+    ],
+)
+def test_a_dataset_without_masks_says_what_lies_in_their_place(
+    data: Path, capsys: pytest.CaptureFixture[str], change: Callable[[Path], None], told: str
+) -> None:
+    change(data)
+    assert told in error_of(capsys, data)
+
+
+def test_photos_in_the_place_of_masks_are_refused_as_photos(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    photos(data)
+    error = error_of(capsys, data, "--labels", "images")
+    assert "view0.png: is RGB" in error and "ids themselves" in error
+
+
+@pytest.mark.parametrize(
+    ("file", "link"),
+    [("colmap/sparse/7/cameras.bin", "sparse"), ("a/b/cameras.json", "cameras.json"),
+     ("model/transforms.json", "transforms.json")],
+)  # fmt: skip
+def test_cameras_below_the_masks_are_linked_to_where_they_are_read(data: Path, file: str, link: str) -> None:
+    (data / "cameras.json").unlink()
+    (data / file).parent.mkdir(parents=True)
+    (data / file).touch()
+    source = (data / file).parent if link == "sparse" else data / file
+    assert camera_hint(data).endswith(f"type ln -s {source} {data}/{link}")
+
+
+@pytest.mark.parametrize("file", ["cameras.json", "sparse/0/images.bin"])
+def test_a_dataset_below_the_folder_that_was_given_is_found(tmp_path: Path, file: str) -> None:
+    folder = tmp_path / "captures/room one"
+    (folder / file).parent.mkdir(parents=True)
+    (folder / file).with_name(file.rpartition("/")[2].replace("images", "cameras")).touch()
+    assert typed(camera_hint(tmp_path / "captures"), "--data") == [str(folder)]
+
+
+def test_cameras_above_or_beside_a_wrong_data_folder_are_found(data: Path) -> None:
+    for wrong in (data / "labels", data / "scene.ply", data.parent / "dataa"):
+        assert typed(camera_hint(wrong), "--data") == [str(data)]
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [("transforms_train.json", "copy it to transforms.json"), ("poses_bounds.npy", "LLFF"), ("database.db", "mapper")],
+)
+def test_cameras_of_other_programs_are_recognised(tmp_path: Path, name: str, told: str) -> None:
+    (tmp_path / "capture").mkdir()
+    (tmp_path / "capture" / name).touch()
+    assert told in camera_hint(tmp_path / "capture")
+
+
+def test_a_folder_in_which_nothing_is_known_is_listed(tmp_path: Path) -> None:
+    (tmp_path / "capture/photos").mkdir(parents=True)
+    assert camera_hint(tmp_path / "capture/photos") == "; the folder is empty"
+    assert camera_hint(tmp_path / "capture") == "; found photos/"
+
+
+def test_a_folder_in_the_place_of_a_scene_leads_to_the_ply_of_most_steps(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for steps in (7000, 30000):
+        (data / f"model/point_cloud/iteration_{steps}").mkdir(parents=True)
+        shutil.copy(data / "scene.ply", data / f"model/point_cloud/iteration_{steps}/point_cloud.ply")
+    error = error_of(capsys, data, scene="model")
+    assert error.endswith(f"it is a folder: type {data}/model/point_cloud/iteration_30000/point_cloud.ply")
+    assert error_of(capsys, data, scene="scen.ply").endswith(f"found scene.ply in {data}")
+    (data / "nothing").mkdir()
+    assert scene_hint(data / "nothing") == "; it is a folder without a PLY"
+    assert scene_hint(data / "no/where/scene.ply") == ""
+
+
+def test_hints_do_not_read_a_large_tree(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for i in range(30):
+        (tmp_path / f"a{i}/b/c/d/e").mkdir(parents=True)
+    seen: list[Path] = []
+    iterdir = Path.iterdir
+    monkeypatch.setattr(Path, "iterdir", lambda self: (seen.append(self), iterdir(self))[1])
+    assert "there is no folder labels/" in mask_hint(tmp_path, "labels", ["x"])
+    assert not [path for path in seen if len(path.relative_to(tmp_path).parts) > 3]
