@@ -35,7 +35,7 @@ from gsseg_core.em import EMLearner
 from gsseg_core.graph import GraphSettings, graph_of, propagate
 from gsseg_core.metrics import Evaluation
 from gsseg_core.operator import ViewOperator, make_operator
-from gsseg_core.pick import Pick, pick_click, pick_mask
+from gsseg_core.pick import Pick, pick_clicks, pick_mask
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
@@ -198,7 +198,7 @@ def pick_all(bench: Bench) -> str:
         row, column = np.unravel_index(int(inside.argmax()), labels.shape)
         picks["mask, lifted only"].append(pick_mask(bench.scene, prompt, GraphSettings(strength=0)))
         picks["mask, graph"].append(pick_mask(bench.scene, prompt))
-        picks["click"].append(pick_click(bench.scene, view.camera, int(row), int(column)))
+        picks["click"].append(pick_clicks(bench.scene, view.camera, [(int(row), int(column))]))
     for way, made in picks.items():
         ious = score_picks(bench, wanted, made)
         share = [float((ious >= least).mean()) for least in (0.5, 0.75, 0.9)]

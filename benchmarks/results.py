@@ -264,7 +264,7 @@ go to `results_out/`.
 
 COMMAND = """## The whole command
 
-```bash title="not run by the tests: needs the apartment's scene"
+```bash
 gsseg segment replica_apartment/scene.ply --data replica_apartment --out out
 ```
 

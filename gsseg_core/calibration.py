@@ -59,13 +59,14 @@ def tempered(
     Parameters
     ----------
     shares : array (..., K) of float32
-        Not negative.
+        Not negative; a row sums to at most 1, up to rounding.
     temperature : float
         Above 0.
 
     Returns
     -------
     ndarray (..., K) float32
+        None above 1, unless the temperature is 1.
     """
     if temperature == 1:
         return shares
@@ -75,7 +76,8 @@ def tempered(
     total = powers.sum(axis=-1, keepdims=True)
     known = shares.sum(axis=-1, keepdims=True)
     powers *= np.divide(known, total, out=np.zeros_like(total), where=total > 0)
-    np.minimum(powers, known, out=powers)  # rounding may take the only class of a row above the whole
+    # Rounding may take the only class of a row above the whole, and the whole above 1.
+    np.minimum(powers, np.minimum(known, 1), out=powers)
     return powers
 
 

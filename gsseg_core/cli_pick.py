@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from gsseg_core.cli_shared import add_scene, load_kernels
 from gsseg_core.errors import SettingsError
 
-HELP = "pick one object by a mask or a click in one view, and write it as a PLY"
+HELP = "pick one object by a mask or clicks in one view, and write it as a PLY"
 DESCRIPTION = """
-Finds the Gaussians of one object that is shown in one view, by a mask (best) or by a click, and writes it as
+Finds the Gaussians of one object that is shown in one view, by a mask (best) or by clicks, and writes it as
 DIR/object.ply, with the indices in DIR/pick.npz and a picture of the view. Needs no other masks.
 """
 EXAMPLES = """
   gsseg pick scene.ply --data DATASET --view 0001 --mask chair.png --out chair
   gsseg pick scene.ply --data DATASET --view 0001 --click 160 120 --out cup
+  gsseg pick scene.ply --data DATASET --view 0001 --click 160 120 --click 170 95 --not 200 120 --out cup
 """
 
 
@@ -25,11 +27,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", required=True, metavar="STEM", help="the view in which it is shown")
     how = parser.add_mutually_exclusive_group(required=True)
     how.add_argument("--mask", metavar="FILE", help="label image of the view: all that is not 0 is the object")
-    how.add_argument("--click", nargs=2, type=int, metavar=("COLUMN", "ROW"), help="a pixel of the object")
+    pixel: dict[str, Any] = {"nargs": 2, "type": int, "action": "append", "metavar": ("COLUMN", "ROW")}
+    how.add_argument("--click", **pixel, help="a pixel of the object; several add up")
+    parser.add_argument("--not", **pixel, dest="outside", default=[], help="with --click: a pixel that is not of it")
     parser.add_argument("--label", type=int, help="with --mask: the object is this label alone")
-    parser.add_argument(
-        "--reach", type=float, help="with --click: how far to grow, in squared colour steps (default: 48)"
-    )
     parser.add_argument("--out", required=True, metavar="DIR", help="gets object.ply, pick.npz and pick.png")
 
 
@@ -38,13 +39,15 @@ def run(options: argparse.Namespace) -> int:
     from gsseg_core.dataset import Dataset, View
     from gsseg_core.export import background_image
     from gsseg_core.operator import make_operator
-    from gsseg_core.pick import REACH, pick_click, pick_mask, read_object_mask
+    from gsseg_core.pick import pick_clicks, pick_mask, read_object_mask
     from gsseg_core.pictures import overlay, palette, save_png
     from gsseg_core.scene import GaussianScene
 
     cameras = {camera.name: camera for camera in Dataset(options.data).cameras}
     if options.view not in cameras:
         raise SettingsError(f"{options.data}: has no view {options.view!r}; expected a stem such as {min(cameras)!r}")
+    if options.mask and options.outside:
+        raise SettingsError("--not goes with --click; found it with --mask, which says itself what is not the object")
     camera, out = cameras[options.view], Path(options.out)
     scene = GaussianScene.load(options.scene)
     load_kernels(options.quiet, options.device)
@@ -52,9 +55,8 @@ def run(options: argparse.Namespace) -> int:
         view = View.from_arrays(camera, read_object_mask(options.mask, options.label))
         picked = pick_mask(scene, view, device=options.device)
     else:
-        column, row = options.click
-        reach = REACH if options.reach is None else options.reach
-        picked = pick_click(scene, camera, row, column, reach, device=options.device)
+        inside, outside = ([(row, column) for column, row in clicks] for clicks in (options.click, options.outside))
+        picked = pick_clicks(scene, camera, inside, outside, device=options.device)
     scene.subset(picked.ids).save(out / "object.ply")
     picked.save(out / "pick.npz")
     shown = picked.silhouette(scene, camera, device=options.device)

@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="confidence below which KNN decides (default: %(default)s)",
     )
     refinement.add_argument(
-        "--no-graph", action="store_true", help="leave what few or no pixels saw to KNN, without spreading codes"
+        "--no-graph", action="store_true", help="few views: leave what they hardly saw to KNN, without spreading codes"
     )
     refinement.add_argument(
         "--no-knn", action="store_true", help="leave uncertain and unobserved Gaussians as they are"

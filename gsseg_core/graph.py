@@ -38,6 +38,9 @@ BLOCK = 16
 SETTLED = np.float32(3e-4)
 """A Gaussian is left alone while no probability around it changes by more than this in a step."""
 
+SCARCE = 1 / 6
+"""Share of Gaussians seen with less px than all neighbours count, from which on the graph is worth its time."""
+
 NEVER = 2**31 - 1
 _TINY = np.float32(1e-30)
 
@@ -138,6 +141,35 @@ def graph_of(scene: GaussianScene, k: int = GraphSettings.k) -> Graph:
         if known is None or known.k != k:
             known = _KNOWN[scene] = Graph.build(scene.means, scene.colors(), k)
         return known
+
+
+def is_scarce(
+    evidence: np.ndarray,  # (N,)
+    settings: GraphSettings | None = None,
+) -> bool:
+    """Tell whether evidence is scarce in enough of a scene for the graph to matter.
+
+    Of what is seen often it changes nothing, yet takes as long to build; docs/few_views.md has figures of both cases.
+    """
+    strength = (settings or GraphSettings()).strength
+    return len(evidence) > 0 and float((evidence < strength).mean()) > SCARCE
+
+
+def spread_if_scarce(
+    scene: GaussianScene,
+    codes: np.ndarray,  # (N, K)
+    evidence: np.ndarray,  # (N,)
+) -> np.ndarray:
+    """Spread codes along the graph of a scene where evidence is scarce; else return the very same array.
+
+    Parameters
+    ----------
+    scene : GaussianScene
+        N Gaussians.
+    codes, evidence
+        As `propagate` takes them.
+    """
+    return propagate(graph_of(scene), codes, evidence) if is_scarce(evidence) else codes
 
 
 def propagate(

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from gsseg_core.errors import GssegError
 from gsseg_core.masks import mask_bits
+from gsseg_core.soft_files import SUPERVISES, mask_files
 
 _CAMERA_FILES = ("cameras.json", "transforms.json")
 _COLMAP_FILES = ("cameras.bin", "cameras.txt")
@@ -22,6 +23,7 @@ _FOREIGN_CAMERAS = {
     "database.db": "it is COLMAP's database without a model: run `colmap mapper`, and give the folder with its sparse/",
 }
 _IMAGES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".npy", ".npz", ".json"}
+_MORE = "docs/masks.md has all forms"
 _DEPTH = 3
 _MOST_FOLDERS = 200
 
@@ -61,7 +63,14 @@ def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
     stems : collection of str
         Names of the cameras: the stems of the masks' names.
     """
-    looked = f"; looked for {root / labels}/{next(iter(stems), '<stem>')}.png and so on"
+    stem = next(iter(stems), "<stem>")
+    looked = f"; looked for {root / labels}/{stem}.png ({stem}.npz, or a folder {stem}/) and so on"
+    classes = _folders_by_class(root / labels, stems)
+    if classes:
+        return (
+            f"{looked}, but {labels}/ has a folder for each class, such as {classes[0].name}/: make one for each view, "
+            f"{labels}/{stem}/<class id>.png ({_MORE})"
+        )
     others = [(len(_masks(path, stems)), path) for path in _folders(root) if path != root / labels]
     count, folder = max(others, key=lambda found: found[0], default=(0, root))
     if count:
@@ -72,12 +81,16 @@ def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
         return f"{looked}, but there is no folder {labels}/" + (
             f" ({photos[0].name}/ holds photos; a 2D segmenter makes masks of them)" if photos else ""
         )
-    files = [path for path in sorted((root / labels).iterdir()) if path.suffix.lower() in _IMAGES]
-    if not files:
-        return f"{looked}, but {labels}/ holds no image"
-    if files[0].suffix.lower() != ".png":
-        return f"{looked}, but {labels}/ holds files such as {files[0].name}; expected label images as PNG"
-    return f"{looked}, but {labels}/ holds names such as {files[0].name}: rename them to the names of the images"
+    there = sorted(path for path in (root / labels).iterdir() if path.name != SUPERVISES)
+    found = [path for path in there if path.suffix.lower() in _IMAGES or _has_detections(path)]
+    if not found:
+        return f"{looked}, but {labels}/ holds no mask"
+    if found[0].is_file() and found[0].suffix.lower() not in (".png", ".npz"):
+        return (
+            f"{looked}, but {labels}/ holds files such as {found[0].name}; expected label images as PNG, and "
+            f"probabilities as {stem}.npz or {stem}/<class id>.tif ({_MORE})"
+        )
+    return f"{looked}, but {labels}/ holds names such as {found[0].name}: rename them to the names of the images"
 
 
 def scene_hint(path: Path) -> str:
@@ -139,14 +152,27 @@ def _stems(folder: Path) -> set[str]:
 
 
 def _masks(folder: Path, stems: Collection[str]) -> list[Path]:
-    """List label images of the given stems; none where the first is a photo."""
+    """List masks of the given stems, of every kind; none where the first label image is a photo."""
     try:
-        found = sorted(path for path in folder.glob("*.png") if path.stem in stems)
-        if found:
-            mask_bits(found[0])
+        found = list(mask_files(folder, stems).values())
+        images = [path for path in found if path.suffix.lower() == ".png"]
+        if images:
+            mask_bits(images[0])
     except (GssegError, OSError):
         return []
-    return found
+    return [path for path in found if path.is_file() or _has_detections(path)]
+
+
+def _has_detections(folder: Path) -> bool:
+    """Whether a folder may hold what detectors of one class each say of a view: images that are named by numbers."""
+    return folder.is_dir() and any(stem.isdecimal() for stem in _stems(folder))
+
+
+def _folders_by_class(folder: Path, stems: Collection[str]) -> list[Path]:
+    """List folders with images of several views, if there is one for each class, as some detectors write them."""
+    wanted = set(stems)
+    found = [path for path in _subfolders(folder) if _stems(path) & wanted and path.name not in wanted]
+    return found if len(found) > 1 or any(path.name.isdecimal() for path in found) else []
 
 
 def _quoted(path: Path) -> str:

@@ -1,48 +1,49 @@
-"""One object from one view: from a mask, from scribbles, or from a single click.
+"""One object from one view: from a mask, from scribbles, or from clicks.
 
 A mask says of one view what is the object (1), what is not (0), and where nothing is said (-1). The view's operator
-carries that to the Gaussians, W^T onehot(y): what lies behind the object is hidden there, so that the mask says nothing
-of it, however many of its pixels it would cover. What the view does not show takes its neighbours' answer along the
-graph of the scene (`gsseg_core.graph`): the back of a chair hangs together with its front, and the wall behind it with
-the wall beside it.
+carries that to the Gaussians, W^T onehot(y) px of each. What the view does not show takes its neighbours' answer along
+the graph of the scene (`gsseg_core.graph`): the back of a chair hangs together with its front, and the wall behind it
+with the wall beside it.
 
-A click knows a single pixel, and nothing that is *not* the object. From the Gaussian that made most of the pixel a
-region grows along the graph. A step from i to j costs
+Two things would make a mask flood rooms that its view does not show. A thousandth of the light of a pixel comes from
+behind what it shows, and no pixel says otherwise of a Gaussian that is hidden so: its share of the votes is that of the
+object, whole. And where no vote is near, neighbours agree on whatever reaches them. So each Gaussian has a little
+evidence against the object besides what was seen, the more, the farther away it lies for the object's own size:
 
-    |c_i - c_j|^2 / s^2 + |c_0 - c_j|^2 / (2 s)^2 + 1 - |n_i . n_j|
+    FAR |x_i - c|^2 / R^2 px
 
-with colours c, c_0 that of the first, s their typical difference between neighbours, and n the shortest axis of a
-Gaussian. The region is what can be reached for less than `reach`. It stops at edges in colour and shape, leaks where an
-object has none, and is no substitute for a mask: docs/few_views.md has figures of both.
+with c and R^2 the mean and the mean squared distance of what the mask shows, each Gaussian weighed by its votes. Within
+the object that is next to nothing; it knows no unit of length.
+
+Clicks become a mask first (`gsseg_core.clicks`).
 """
 
 from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.csgraph import dijkstra
-from scipy.spatial.transform import Rotation
 
 from gsseg_core.atomic import write_atomically
 from gsseg_core.cameras import Camera
+from gsseg_core.clicks import Pixel, click_labels
 from gsseg_core.dataset import View
 from gsseg_core.errors import MaskFormatError, NoUsableViewsError, SettingsError
-from gsseg_core.graph import Graph, GraphSettings, graph_of, propagate
+from gsseg_core.graph import GraphSettings, graph_of, propagate
 from gsseg_core.masks import UNKNOWN, read_mask
 from gsseg_core.operator import make_operator
 from gsseg_core.scene import GaussianScene
 
 FORMAT = "gsseg-pick-1"
 
-REACH = 48.0
-"""Cost at which a region that grows from a click ends, unless asked otherwise."""
+FAR = 0.04
+"""Evidence against the object, in px, for what lies as far from its middle as its Gaussians do on average."""
 
-GRAPH = GraphSettings(k=24, strength=4.0)
+GRAPH = GraphSettings(strength=4.0)
 """How a mask's word spreads: one view says little of each Gaussian, and nothing of most, so neighbours say more."""
 
 
@@ -128,56 +129,38 @@ def pick_mask(
                 f"view '{view.name}': no Gaussian is seen in a pixel with the label {k} ({what}); expected pixels of "
                 "both kinds, or a click"
             )
+    votes[:, 0] += FAR * _distance(scene.means, votes[:, 1])
     evidence = votes.sum(axis=1)
     codes = np.divide(votes, evidence[:, None], out=np.zeros_like(votes), where=evidence[:, None] > 0)
     return Pick(propagate(graph_of(scene, settings.k), codes, evidence, settings)[:, 1].copy(), scene.digest)
 
 
-def pick_click(
+def pick_clicks(
     scene: GaussianScene,
     camera: Camera,
-    row: int,
-    column: int,
-    reach: float = REACH,
+    inside: Sequence[Pixel],
+    outside: Sequence[Pixel] = (),
     *,
     device: str = "cpu",
 ) -> Pick:
-    """Pick what a click hits, and what looks like it around.
+    """Pick the object around one click or several in a view, leaving out what clicks say is not of it.
 
     Parameters
     ----------
     scene : GaussianScene
         N Gaussians.
     camera : Camera
-        Where the click was made.
-    row, column : int
-        The pixel.
-    reach : float
-        How far the region grows, 0 or more: typical differences between neighbours, squared, that may add up.
-
-    Returns
-    -------
-    Pick
-        The membership is 1 where the click hit, one half where the cost is `reach`.
+        Where the clicks were made.
+    inside, outside : sequence of (row, column)
+        Pixels of the object, at least one, and others; see `gsseg_core.clicks.click_labels`.
 
     Raises
     ------
-    SettingsError
-        There is no such pixel, or `reach` is negative.
-    NoUsableViewsError
-        The pixel shows no Gaussian.
+    SettingsError, NoUsableViewsError
+        As `click_labels` and `pick_mask` do.
     """
-    if not 0 <= reach < float("inf"):
-        raise SettingsError(f"reach is {reach}; expected 0 or more, finite")
-    hit = make_operator(scene, camera, device).weights(row, column)
-    if not len(hit.gaussians):
-        raise NoUsableViewsError(
-            f"view '{camera.name}': no Gaussian is seen at row {row}, column {column}; expected a click on something"
-        )
-    seed = int(hit.gaussians[hit.weights.argmax()])
-    cost = _costs(scene, graph_of(scene, GRAPH.k), seed, 2 * reach)
-    membership = np.exp2(-cost / reach) if reach > 0 else (cost == 0)
-    return Pick(membership.astype(np.float32), scene.digest)
+    labels = click_labels(scene, camera, inside, outside, device=device)
+    return pick_mask(scene, View.from_arrays(camera, labels), device=device)
 
 
 def read_object_mask(path: str | os.PathLike[str], label: int | None = None) -> np.ndarray:
@@ -211,25 +194,12 @@ def read_object_mask(path: str | os.PathLike[str], label: int | None = None) -> 
     return np.where(mine, 1, np.where(labels == UNKNOWN, UNKNOWN, 0)).astype(np.int32)
 
 
-def _costs(scene: GaussianScene, graph: Graph, seed: int, limit: float) -> np.ndarray:
-    """Cost of the cheapest way from a Gaussian to each other one, infinite beyond the limit: (N,) float64."""
-    order, of = graph.order, np.repeat(np.arange(len(graph.order)), np.diff(graph.start))
-    colors = scene.colors()[order]
-    normals = _shortest_axes(scene)[order]
-    contrast = ((colors[of] - colors[graph.places]) ** 2).sum(axis=1)
-    typical = float(np.median(contrast)) or float(contrast.mean()) or 1.0
-    strange = ((colors - scene.colors()[seed]) ** 2).sum(axis=1)
-    turned = 1 - np.abs((normals[of] * normals[graph.places]).sum(axis=1))
-    # Zeros would be no edges at all.
-    steps = (contrast + strange[graph.places] / 4) / typical + np.maximum(turned, 1e-6)
-    matrix = sparse.csr_array((steps, graph.places, graph.start), shape=(len(order), len(order)))
-    out = np.empty(len(order))
-    out[order] = dijkstra(matrix, indices=int(np.flatnonzero(order == seed)[0]), limit=limit)
-    return out
-
-
-def _shortest_axes(scene: GaussianScene) -> np.ndarray:
-    """Directions of the shortest axes, (N, 3)."""
-    turns = Rotation.from_quat(scene.quats[:, [1, 2, 3, 0]]).as_matrix()
-    axes: np.ndarray = turns[np.arange(len(scene)), :, scene.scales.argmin(axis=1)]
-    return axes
+def _distance(
+    means: np.ndarray,  # (N, 3)
+    votes: np.ndarray,  # (N,) for the object
+) -> np.ndarray:
+    """Squared distance of each Gaussian to the middle of the object, as a multiple of the mean of its own, (N,)."""
+    weights = votes / votes.sum(dtype=np.float64)
+    squared: np.ndarray = ((means - weights @ means) ** 2).sum(axis=1)
+    typical = float(weights @ squared)
+    return squared / typical if typical > 0 else np.zeros_like(squared)

@@ -15,7 +15,7 @@ from gsseg_core.dataset import Dataset, View, spread
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.export import Drawn, draw_views, export_classes, write_json, write_overview, write_pictures
-from gsseg_core.graph import GraphSettings, graph_of, propagate
+from gsseg_core.graph import GraphSettings, is_scarce, spread_if_scarce
 from gsseg_core.held_out import calibrate
 from gsseg_core.layout import mask_hint
 from gsseg_core.learner import MEMORY_BUDGET, NO_MASK, Learner, Progress, silent
@@ -141,7 +141,8 @@ def segment(
     refine : RefineSettings, optional
         The paper's by default.
     graph : bool
-        Let codes spread to Gaussians that few or no pixels saw, before refinement; see `gsseg_core.graph`.
+        Where views are few, let codes spread to Gaussians that few or no pixels saw, before refinement; see
+        `gsseg_core.graph`.
     memory_budget : int
         Bytes of prepared views to keep between the steps of learning; see docs/memory.md.
     scheduler : str, optional
@@ -221,7 +222,7 @@ def segment(
     del teacher  # Its votes take as much memory as all that follows.
     with watch.stage("refine"):
         if graph:
-            codes = propagate(graph_of(scene), codes, evidence)
+            codes = spread_if_scarce(scene, codes, evidence)
         result = Segmentation.from_codes(scene, codes, class_names, refine).calibrated(calibration.temperature)
         del codes
     if refine.carve:
@@ -251,7 +252,7 @@ def segment(
         settings={
             "learner": learner, "labels": labels, "views": views, "device": device, "memory_budget": memory_budget,
             "seed": seed, "scheduler": scheduler, "ids": ids, "refine": asdict(refine),
-            "graph": asdict(GraphSettings()) if graph else None, **more,
+            "graph": asdict(GraphSettings()) if graph and is_scarce(evidence) else None, **more,
         },
         plys={k: str(path.relative_to(out)) for k, path in plys.items()},
         pictures=[str(path.relative_to(out)) for path in pictures],

@@ -12,7 +12,7 @@ import numpy as np
 
 from gsseg_core.neighbours import Neighbours
 from gsseg_core.refine_settings import RefineSettings
-from gsseg_core.rows import Rows
+from gsseg_core.rows import Rows, largest
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ def cluster(
     [[0.0, 1.0], [0.0, 1.0], [0.25, 0.75]]
     """
     codes = np.ascontiguousarray(probabilities, np.float32)
-    wanted = ~observed | (codes.max(axis=1, initial=0) < beta)
+    wanted = ~observed | (largest(codes)[0] < beta)
     refined, changed = codes.copy(), np.zeros(len(codes), bool)
     if len(means) > 1 and wanted.any() and observed.any():
         known = neighbours or Neighbours.find(means, k)

@@ -121,6 +121,24 @@ def starts(
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
+def largest(
+    array: np.ndarray,  # (N, K) float32
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find the largest entry of each row, (N,) float32, and its column, (N,) int32: the first of equal ones.
+
+    0 and column -1 where no entry is above 0.
+    """
+    entries, columns = np.empty(array.shape[0], np.float32), np.empty(array.shape[0], np.int32)
+    for i in nb.prange(array.shape[0]):
+        most, column = np.float32(0), np.int32(-1)
+        for k in range(array.shape[1]):
+            if array[i, k] > most:
+                most, column = array[i, k], np.int32(k)
+        entries[i], columns[i] = most, column
+    return entries, columns
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
 def _count(array: np.ndarray, counts: np.ndarray) -> None:
     for i in nb.prange(array.shape[0]):
         n = 0

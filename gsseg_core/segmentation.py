@@ -20,6 +20,7 @@ from gsseg_core.npz_files import open_npz
 from gsseg_core.operator import ViewOperator
 from gsseg_core.refine import cluster, statistical_filter
 from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.rows import largest
 from gsseg_core.scene import GaussianScene
 
 UNOBSERVED, REMOVED = -1, -2
@@ -109,12 +110,11 @@ class Segmentation:
         """Label learnt codes, after KNN clustering unless that is switched off, and leave the filter to the caller."""
         names = {k: class_names.get(k, f"class_{k:02d}") for k in range(codes.shape[1])}
         probabilities, clustered = codes, np.zeros(len(codes), bool)
-        observed: np.ndarray = codes.max(axis=1) > 0
+        observed: np.ndarray = largest(codes)[0] > 0
         if settings.cluster:
             refined = cluster(scene.means, codes, observed, settings.k, settings.beta, neighbours_of(scene, settings.k))
             probabilities, clustered = refined.probabilities, refined.changed
-        known = probabilities.any(axis=1)
-        labels = np.where(known, probabilities.argmax(axis=1), UNOBSERVED).astype(np.int32)
+        _, labels = largest(probabilities)  # -1, which is UNOBSERVED, where nothing is known
         return cls(labels, probabilities, names, scene.digest, clustered, codes[clustered])
 
     def filtered(self, scene: GaussianScene, settings: RefineSettings) -> Segmentation:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,9 @@ NASTY = {
     2: "\"'><img src=https://example.org/x onerror=\"document.title='pwned'\">",
     3: "</script></td>&amp; \u202e\u05d1\x00\x1b",
 }
+
+
+_VOID = {"meta", "link", "img", "input", "br", "hr"}
 
 
 def run_with_nasty_names(folder: Path, **options: Any) -> Path:
@@ -59,3 +63,35 @@ def painted(*rectangles: tuple[int, slice, slice], size: tuple[int, int] = (48, 
     for label, rows, columns in rectangles:
         labels[rows, columns] = label
     return labels
+
+
+class Outline(HTMLParser):
+    """Elements of a page, after checking that each one is closed where it should be."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str]]] = []
+        self.said: list[str] = []
+        self._open: list[str] = []
+        self.feed(page)
+        self.close()
+        assert not self._open, f"never closed: {self._open}"
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, {name: value or "" for name, value in attrs}))
+        if tag not in _VOID:
+            self._open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, {name: value or "" for name, value in attrs}))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open and self._open[-1] == tag, f"</{tag}> closes {self._open[-1:]}, line {self.getpos()[0]}"
+        self._open.pop()
+
+    def handle_data(self, data: str) -> None:
+        if not self._open or self._open[-1] not in ("script", "style"):
+            self.said.append(data)
+
+    def tagged(self, tag: str) -> list[dict[str, str]]:
+        return [attributes for name, attributes in self.elements if name == tag]

@@ -106,7 +106,8 @@ def test_risk_grows_with_coverage_from_the_surest_on_and_ties_count_as_their_mea
 @given(st.integers(1, 8), st.integers(1, 5), st.floats(0.2, 5), st.integers(0, 2**32 - 1))
 def test_tempering_keeps_order_sums_and_zeros_and_can_be_undone(n: int, k: int, temperature: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    shares = (rng.integers(0, 9, (n, k)) / 8).astype(np.float32)
+    shares = rng.integers(0, 9, (n, k)) / 8
+    shares = (shares / np.maximum(shares.sum(axis=1, keepdims=True), 1)).astype(np.float32)
     out = tempered(shares, temperature)
     assert out.dtype == np.float32
     np.testing.assert_allclose(out.sum(axis=1), shares.sum(axis=1), rtol=1e-5)
@@ -115,6 +116,11 @@ def test_tempering_keeps_order_sums_and_zeros_and_can_be_undone(n: int, k: int, 
     np.testing.assert_allclose(tempered(out, 1 / temperature), shares, rtol=1e-3, atol=1e-6)
     order = rng.permutation(k)
     np.testing.assert_allclose(tempered(shares[:, order], temperature), out[:, order], rtol=1e-5)
+
+
+def test_the_only_class_of_a_row_that_rounding_brought_above_one_gets_one() -> None:
+    above = np.nextafter(np.float32(1), np.float32(2))
+    assert tempered(np.array([[above, 0]]), 0.5).tolist() == [[1, 0]]
 
 
 @pytest.mark.parametrize("true", [0.4, 1.0, 2.5])

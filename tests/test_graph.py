@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from gsseg_core.dataset import View
 from gsseg_core.em import EMLearner
 from gsseg_core.errors import SceneValueError, SettingsError
-from gsseg_core.graph import Graph, GraphSettings, graph_of, propagate
+from gsseg_core.graph import Graph, GraphSettings, graph_of, is_scarce, propagate, spread_if_scarce
 
 FEW = GraphSettings(k=4, steps=60)
 
@@ -140,6 +140,20 @@ def test_the_graph_of_a_scene_is_built_once() -> None:
     scene, _ = small_scenes.balls_on_a_table()
     assert graph_of(scene, 5) is graph_of(scene, 5)
     assert graph_of(scene, 6).k == 6
+
+
+def test_where_hardly_anything_is_scarce_codes_stay_and_no_graph_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, _ = small_scenes.balls_on_a_table()
+    codes, evidence = some_codes(count=len(scene))
+    evidence[:] = 2.0
+    evidence[: len(scene) // 7] = 0
+    assert not is_scarce(evidence)
+    monkeypatch.setattr("gsseg_core.graph.graph_of", lambda scene: pytest.fail("the graph was asked for"))
+    assert spread_if_scarce(scene, codes, evidence) is codes
+    monkeypatch.undo()
+    evidence[: len(scene) // 5] = 0
+    assert is_scarce(evidence)
+    np.testing.assert_array_equal(spread_if_scarce(scene, codes, evidence), propagate(graph_of(scene), codes, evidence))
 
 
 def test_wrong_settings_and_shapes_are_refused() -> None:

@@ -13,7 +13,9 @@ from PIL import Image
 from small_scenes import write_dataset
 
 from gsseg_core.cli import main
+from gsseg_core.dataset import Dataset
 from gsseg_core.layout import camera_hint, mask_hint, scene_hint
+from gsseg_core.masks import read_mask
 
 
 @pytest.fixture
@@ -65,6 +67,20 @@ def other_files(data: Path) -> None:
         path.rename(path.with_suffix(".tif"))
 
 
+def by_class(data: Path) -> None:
+    for path in list((data / "labels").iterdir()):
+        for label in (1, 2):
+            (data / f"labels/{label}").mkdir(exist_ok=True)
+            shutil.copy(path, data / f"labels/{label}")
+        path.unlink()
+
+
+def other_detections(data: Path) -> None:
+    for path in list((data / "labels").iterdir()):
+        (data / f"labels/{path.stem}_objects").mkdir()
+        path.rename(data / f"labels/{path.stem}_objects/1.png")
+
+
 def emptied(data: Path) -> None:
     shutil.rmtree(data / "labels")
     (data / "labels").mkdir()
@@ -75,8 +91,10 @@ def emptied(data: Path) -> None:
     [
         (photos, "there is no folder labels/ (images/ holds photos; a 2D segmenter makes masks of them)"),
         (other_names, "labels/ holds names such as view0_mask.png: rename them"),
-        (other_files, "labels/ holds files such as view0.tif; expected label images as PNG"),
-        (emptied, "labels/ holds no image"),
+        (other_files, "labels/ holds files such as view0.tif; expected label images as PNG, and probabilities as view"),
+        (by_class, "labels/ has a folder for each class, such as 1/: make one for each view, labels/view"),
+        (other_detections, "labels/ holds names such as view0_objects: rename them"),
+        (emptied, "labels/ holds no mask"),
         (lambda data: shutil.rmtree(data / "labels"), "there is no folder labels/"),
     ],
 )
@@ -85,6 +103,35 @@ def test_a_dataset_without_masks_says_what_lies_in_their_place(
 ) -> None:
     change(data)
     assert told in error_of(capsys, data)
+
+
+def into_npz(folder: Path) -> None:
+    for path in list(folder.iterdir()):
+        labels = read_mask(path).labels
+        probabilities = np.stack([labels == k for k in range(labels.max() + 1)]).astype(np.float32)
+        np.savez_compressed(path.with_suffix(".npz"), probabilities=probabilities)
+        path.unlink()
+
+
+def into_detections(folder: Path) -> None:
+    for path in list(folder.iterdir()):
+        labels = read_mask(path).labels
+        (folder / path.stem).mkdir()
+        for k in (1, 2, 3):
+            Image.fromarray((labels == k).astype(np.float32)).save(folder / path.stem / f"{k}.tif")
+        path.unlink()
+
+
+@pytest.mark.parametrize("change", [into_npz, into_detections])
+def test_soft_masks_in_a_folder_of_another_name_are_found_as_plain_ones_are(
+    data: Path, capsys: pytest.CaptureFixture[str], change: Callable[[Path], None]
+) -> None:
+    change(data / "labels")
+    (data / "labels").rename(data / "soft")
+    error = error_of(capsys, data)
+    assert ".npz, or a folder view" in error and "found 4 masks of these names in soft/" in error
+    assert typed(error, "--labels") == ["soft"]
+    assert all(view.has_mask for view in Dataset(data, "soft").views("train"))
 
 
 def test_photos_in_the_place_of_masks_are_refused_as_photos(data: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numba as nb
@@ -24,9 +25,14 @@ from small_scenes import (
     write_dataset,
 )
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+
+from object_ceiling import best_selection
+
 from gsseg_core.cameras import Camera
 from gsseg_core.carve import Silhouette, carve, carved, shares
 from gsseg_core.cli import main
+from gsseg_core.dataset import View
 from gsseg_core.errors import EmptySceneError, MaskSizeError, SceneValueError, SettingsError
 from gsseg_core.export import export_classes
 from gsseg_core.operator import make_operator
@@ -112,6 +118,19 @@ def test_carving_takes_the_fringe_away_and_leaves_the_objects() -> None:
     before, after = scores(labels), scores(np.where(out, 0, labels))
     assert np.nanmean(after.visible.iou) > np.nanmean(before.visible.iou) + 0.1
     assert np.nanmean(after.visible.boundary_iou) > np.nanmean(before.visible.boundary_iou)
+
+
+def test_who_knows_the_truth_chooses_at_least_as_well_as_who_carves() -> None:
+    """To a point of IoU: both find local optima."""
+    scene, labels, fringe = with_fringe()
+    views = [View.from_arrays(camera, true_labels(SCENE, TRUTH, camera)) for camera in ring(3, turn=0.3)]
+    best = best_selection(scene, labels, views, scene)
+    gone = best != labels
+    assert (best[gone] == REMOVED).all() and not gone[labels <= 0].any() and gone[fringe].mean() > 0.8
+    without = scores(labels).visible.iou
+    carved_away = scores(np.where(carve(scene, labels, silhouettes()), REMOVED, labels)).visible.iou
+    assert (scores(best).visible.iou[1:] > without[1:] + 0.05).all()
+    assert np.nanmean(scores(best).visible.iou) > np.nanmean(carved_away) - 0.01
 
 
 def test_background_and_what_no_view_sees_is_never_carved() -> None:

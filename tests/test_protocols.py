@@ -9,54 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import small_scenes
-from PIL import Image
+from protocol_layouts import CAMERAS, save, true_segmentation, write_lerf, write_nvos, write_spin
 
 from gsseg_core.camera_files import read_cameras
 from gsseg_core.errors import CameraFileError, MaskFormatError, MaskSizeError
-from gsseg_core.protocols import Task, lerf_mask, nvos, resized, score_task, spin_nerf
-from gsseg_core.segmentation import Segmentation
+from gsseg_core.protocols import Task, lerf_mask, nvos, score_task, spin_nerf
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import evaluate_protocol
-
-CAMERAS = small_scenes.ring(6)
-SCENE, TRUTH = small_scenes.balls_on_a_table()
-BALL = 1
 
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
     return small_scenes.write_dataset(tmp_path / "data")
-
-
-def save(path: Path, mask: np.ndarray, mode: str = "L") -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray((255 * mask).astype(np.uint8)).convert(mode).save(path)
-
-
-def ball(index: int, scale: int = 1) -> np.ndarray:
-    camera = CAMERAS[index]
-    camera = resized(camera, scale * camera.width, scale * camera.height)
-    return small_scenes.true_labels(SCENE, TRUTH, camera) == BALL
-
-
-def write_nvos(root: Path) -> Path:
-    """As published: one folder a kind, one in it a scene; masks larger than the images that were trained on."""
-    inside, spots = ball(0), np.arange(ball(0).size).reshape(ball(0).shape) % 5 == 0
-    save(root / "reference_image/fern/view0.png", inside)
-    save(root / "scribbles/fern/pos_0.png", inside & spots, "RGB")
-    save(root / "scribbles/fern/neg_0.png", ~inside & spots, "RGB")
-    save(root / "masks/fern/view2_mask.png", ball(2, 2))
-    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(root / "masks/fern/view2.JPG")
-    return root
-
-
-def write_spin(folder: Path, names: list[str]) -> Path:
-    for index, name in enumerate(names):
-        save(folder / f"{name}.png", ball(index))
-        save(folder / f"{name}_cutout.png", ball(index), "RGB")
-        save(folder / f"{name}_pseudo.png", ball(index))
-    return folder
 
 
 def run(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> list[list[str]]:
@@ -104,15 +69,10 @@ def test_spin_nerf_masks_of_some_views_are_paired_by_a_file(tmp_path: Path, data
 def test_lerf_mask_is_scored_by_the_name_of_the_class(
     tmp_path: Path, data: Path, capsys: pytest.CaptureFixture[str], numbered: bool
 ) -> None:
-    for i in (0, 1, 3, 4):
-        save(data / f"images_train/view{i}.jpg", ball(i))
-    for number, index in enumerate((2, 5)):
-        save(data / f"test_mask/{number if numbered else f'view{index}'}/red ball.png", ball(index))
+    write_lerf(data, numbered)
     tasks = lerf_mask(data, read_cameras(data))
     assert [(task.name, [view.name for view in task.targets]) for task in tasks] == [("red ball", ["view2", "view5"])]
-    Segmentation.from_codes(SCENE, np.eye(small_scenes.NUM_CLASSES, dtype=np.float32)[TRUTH], small_scenes.NAMES).save(
-        tmp_path / "segmentation.npz"
-    )
+    true_segmentation().save(tmp_path / "segmentation.npz")
     arguments = ["lerf-mask", str(data / "scene.ply"), "--data", str(data)]
     table = run([*arguments, "--segmentation", str(tmp_path / "segmentation.npz")], capsys)
     assert table[0][:2] == ["red ball", "2"]

@@ -1,124 +1,26 @@
-"""The client library against a real node in another process: results as arrays, errors by name, waits that end."""
+"""The client library against a real node in another process: results as arrays, errors by name."""
 
 from __future__ import annotations
 
-import signal
-import subprocess
-import sys
-import textwrap
 import threading
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
-from ros_helpers import REPOSITORY, Process, Ros, ros_fixture  # noqa: F401
-from small_scenes import NAMES, balls_on_a_table, ring, write_dataset
+from ros_client_cases import Background, Place, failure, learnt_fixture, place_fixture, shared_fixture  # noqa: F401
+from small_scenes import NAMES, balls_on_a_table, ring
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 import rclpy
-from gsseg_msgs.srv import Reset
 from rclpy.signals import SignalHandlerOptions
 
 from gsseg_core.cameras import Camera
-from gsseg_core.dataset import Dataset, View
 from gsseg_core.errors import IntrinsicsError, PoseError
 from gsseg_core.pictures import palette
 from gsseg_core.segmentation import Segmentation
-from gsseg_ros.client import NodeUnavailableError, SegmentationClient, SegmentationError, Viewpoint
-
-FOREVER: dict[str, Any] = {"learner": "gradient", "max_steps": 10_000_000}
-"""A goal that does not come to its end while a test waits."""
-
-
-def start_node(ros: Ros, folder: Path, **parameters: Any) -> Process:
-    names = list(NAMES.values())
-    parameters = {"data_root": folder, "class_names": names, **parameters}
-    return ros.start("segment_node", {"scene_path": folder / "data/scene.ply", **parameters})
-
-
-class Place:
-    """A node that is active, a client, and a dataset `data` below the node's data_root."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        write_dataset(folder / "data")
-        self.ros = Ros(folder)
-        self.node = start_node(self.ros, folder)
-        self.client = SegmentationClient(domain_id=self.ros.domain)
-
-    @property
-    def views(self) -> list[View]:
-        return Dataset(self.folder / "data").views("all")
-
-    def close(self) -> None:
-        self.client.close()
-        self.ros.close()
-
-
-@pytest.fixture(scope="module")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
-    folder = tmp_path_factory.mktemp("client")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        patch.setenv("ROS_LOG_DIR", str(folder / "ros_log"))
-        place = Place(folder)
-        place.client.wait_until_active()
-        yield place
-        place.close()
-
-
-@pytest.fixture
-def place(shared: Place) -> Place:
-    """The node without views and codes."""
-    shared.client.load_scene("data/scene.ply")
-    return shared
-
-
-@pytest.fixture
-def learnt(place: Place) -> Place:
-    place.client.learn("data")
-    return place
-
-
-class Background:
-    """A call in a thread of its own, and what came of it."""
-
-    def __init__(self, function: Callable[[], Any]) -> None:
-        self.result: Any = None
-        self.error: BaseException | None = None
-        self._function = function
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def join(self) -> None:
-        self._thread.join(30)
-        assert not self._thread.is_alive(), "the call does not return"
-
-    def _run(self) -> None:
-        try:
-            self.result = self._function()
-        except BaseException as error:
-            self.error = error
-
-
-def learning_forever(client: SegmentationClient) -> Background:
-    """A `learn` that is under way."""
-    began = threading.Event()
-    running = Background(lambda: client.learn("data", **FOREVER, on_feedback=lambda *_: began.set()))
-    assert began.wait(30), running.error
-    return running
-
-
-def failure(call: Callable[[], Any]) -> SegmentationError:
-    with pytest.raises(SegmentationError) as caught:
-        call()
-    return caught.value
-
-
-# Results
+from gsseg_ros.client import NodeUnavailableError, SegmentationClient, Viewpoint
 
 
 def test_learning_tells_its_progress_in_the_callers_thread_and_what_it_came_to(place: Place) -> None:
@@ -256,9 +158,6 @@ def test_views_are_awaited_and_counted_and_forgotten(place: Place) -> None:
         place.client.wait_for_views(1, timeout=1.5)
 
 
-# Errors
-
-
 def test_an_error_of_the_node_has_code_name_and_message(place: Place) -> None:
     error = failure(place.client.segment)
     assert (error.code, error.name) == (10205, "NO_CODES")
@@ -309,165 +208,6 @@ def test_a_viewpoint_is_the_camera_that_it_was_made_of() -> None:
     np.testing.assert_array_equal(there.K, camera.K)
 
 
-# Cancel
-
-
-def test_cancel_from_another_thread_ends_learning_and_changes_nothing(learnt: Place) -> None:
-    before = learnt.client.segment().points
-    running = learning_forever(learnt.client)
-    assert len(learnt.client.segment().points) == len(before)  # It answers meanwhile.
-    assert learnt.client.cancel()
-    running.join()
-    assert isinstance(running.error, SegmentationError) and running.error.name == "CANCELED"
-    np.testing.assert_array_equal(learnt.client.segment().points, before)
-    assert not learnt.client.cancel()
-
-
-def test_a_second_learn_is_refused_while_one_runs(place: Place) -> None:
-    running = learning_forever(place.client)
-    with SegmentationClient(domain_id=place.ros.domain) as other:
-        assert failure(lambda: other.learn("data")).name == "BUSY"
-        assert failure(other.reset).name == "BUSY"
-        assert not other.cancel()  # It is not this client's.
-    place.client.cancel()
-    running.join()
-
-
-def test_an_error_in_the_feedback_cancels_and_comes_out(place: Place) -> None:
-    def complain(*_: object) -> None:
-        raise LookupError("enough")
-
-    with pytest.raises(LookupError, match="enough"):
-        place.client.learn("data", **FOREVER, on_feedback=complain)
-    assert place.client.learn("data").report.num_views == 4
-
-
-def test_learning_that_takes_too_long_is_canceled(place: Place) -> None:
-    with pytest.raises(NodeUnavailableError, match="did not answer in time during learn"):
-        place.client.learn("data", **FOREVER, timeout=1.0)
-    assert place.client.learn("data").report.num_views == 4
-
-
-def run_script(ros: Ros, text: str) -> subprocess.Popen[str]:
-    environment = {**ros.environment, "PYTHONPATH": str(REPOSITORY)}
-    return subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(text)], env=environment, text=True, stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-    )  # fmt: skip
-
-
-def test_ctrl_c_in_a_plain_script_cancels_learning(place: Place) -> None:
-    script = run_script(
-        place.ros,
-        f"""
-        from gsseg_ros.client import SegmentationClient
-        with SegmentationClient() as client:
-            try:
-                client.learn("data", **{FOREVER}, on_feedback=lambda *told: print("told", flush=True))
-            except KeyboardInterrupt:
-                print("interrupted")
-        """,
-    )
-    assert script.stdout is not None and script.stdout.readline() == "told\n"
-    script.send_signal(signal.SIGINT)
-    output, _ = script.communicate(timeout=30)
-    assert script.returncode == 0 and output.endswith("interrupted\n"), output
-    assert place.client.learn("data").report.num_views == 4
-
-
-def test_a_script_that_forgets_to_close_ends_cleanly(place: Place) -> None:
-    script = run_script(
-        place.ros,
-        """
-        from gsseg_ros.client import SegmentationClient
-        client = SegmentationClient()
-        client.wait_until_active()
-        print("active")
-        """,
-    )
-    output, _ = script.communicate(timeout=60)
-    assert (script.returncode, output) == (0, "active\n")
-
-
-# Who is there
-
-
-def test_an_absent_node_is_an_error_that_says_what_to_check(ros: Ros) -> None:
-    with SegmentationClient("robot1/gsseg", domain_id=ros.domain, find_timeout=1.0) as client:
-        # So that the two have found each other.
-        ros.wait_until(lambda: "gsseg_client" in ros.node.get_node_names(), "the client")
-        for call, what in (
-            (client.segment, "service /robot1/gsseg/segment"),
-            (client.learn, "action /robot1/gsseg/learn"),
-            (lambda: client.wait_until_active(0.5), "service /robot1/gsseg/get_state"),
-            (lambda: client.wait_for_views(1, 0.5), "its status on /diagnostics"),
-        ):
-            with pytest.raises(TimeoutError) as caught:
-                call()
-            assert isinstance(caught.value, NodeUnavailableError)
-            message = str(caught.value)
-            assert message.startswith(f"/robot1/gsseg: {what} was not there within ")
-            assert f"ROS_DOMAIN_ID ({ros.domain})" in message and message.endswith("nodes seen: /test")
-
-
-def test_a_node_that_is_not_active_is_waited_for_and_its_state_named(ros: Ros, tmp_path: Path) -> None:
-    write_dataset(tmp_path / "data")
-    node = start_node(ros, tmp_path, autostart=False)
-    node.wait_for("waiting to be configured")
-    with SegmentationClient(domain_id=ros.domain) as client:
-        with pytest.raises(NodeUnavailableError, match="/gsseg is unconfigured after 1 s; expected active"):
-            client.wait_until_active(1.0)
-        assert failure(client.segment).name == "NOT_ACTIVE"
-
-
-def test_a_node_in_a_namespace_is_found_under_its_name(ros: Ros, tmp_path: Path) -> None:
-    write_dataset(tmp_path / "data")
-    parameters = {"scene_path": tmp_path / "data/scene.ply"}
-    ros.start("segment_node", parameters, "-r", "__ns:=/robot1", "-r", "__node:=eyes")
-    with SegmentationClient("robot1/eyes", domain_id=ros.domain) as client:
-        client.wait_until_active()
-        assert failure(client.segment).name == "NO_CODES"
-
-
-def test_a_node_that_hangs_is_not_waited_for_for_ever(ros: Ros, tmp_path: Path) -> None:
-    write_dataset(tmp_path / "data")
-    node = start_node(ros, tmp_path)
-    with SegmentationClient(domain_id=ros.domain) as client:
-        client.wait_until_active()
-        node.send(signal.SIGSTOP)
-        with pytest.raises(NodeUnavailableError, match="/gsseg did not answer in time during /gsseg/segment"):
-            client.segment(timeout=0.5)
-        node.send(signal.SIGCONT)
-        assert failure(client.segment).name == "NO_CODES"
-
-
-def test_a_node_that_is_asked_to_end_cancels_learning_and_says_so(ros: Ros, tmp_path: Path) -> None:
-    write_dataset(tmp_path / "data")
-    node = start_node(ros, tmp_path)
-    with SegmentationClient(domain_id=ros.domain) as client:
-        client.wait_until_active()
-        running = learning_forever(client)
-        node.send(signal.SIGTERM)
-        running.join()
-        assert isinstance(running.error, SegmentationError) and running.error.name == "CANCELED"
-        assert node.wait() == 0
-
-
-def test_a_service_that_goes_away_unanswered_ends_the_wait(ros: Ros) -> None:
-    silent = rclpy.create_node("gsseg", context=ros.context)  # Nobody spins it.
-    service = silent.create_service(Reset, "/gsseg/reset", lambda request, response: response)
-    with SegmentationClient(domain_id=ros.domain) as client:
-        running = Background(client.reset)
-        ros.wait_until(lambda: service.handle.service_take_request(Reset.Request)[0] is not None, "the request")
-        silent.destroy_node()
-        running.join()
-    assert isinstance(running.error, NodeUnavailableError)
-    assert "/gsseg went away during /gsseg/reset" in str(running.error)
-
-
-# Beside other things of ROS
-
-
 def test_it_lives_in_a_context_of_the_program_and_leaves_that_as_it_is(place: Place) -> None:
     with SegmentationClient(context=place.ros.context) as client:
         client.wait_until_active()
@@ -489,24 +229,3 @@ def test_it_lives_beside_the_default_context_of_the_program(place: Place) -> Non
     finally:
         rclpy.shutdown()
     assert place.client.learn("data").report.num_views == 4
-
-
-def test_the_end_of_the_programs_context_ends_the_wait(place: Place) -> None:
-    context = rclpy.Context()
-    context.init(args=[], domain_id=place.ros.domain)
-    client = SegmentationClient(context=context)
-    began = threading.Event()
-    running = Background(lambda: client.wait_for_views(1_000_000, on_views=lambda _: began.set()))
-    assert began.wait(30), running.error
-    context.try_shutdown()
-    running.join()
-    assert isinstance(running.error, RuntimeError) and "its ROS context was shut down" in str(running.error)
-    client.close()
-
-
-def test_a_closed_client_says_so_and_can_be_closed_again(place: Place) -> None:
-    client = SegmentationClient(domain_id=place.ros.domain)
-    client.close()
-    client.close()
-    with pytest.raises(RuntimeError, match="is closed"):
-        client.segment()

@@ -1,0 +1,97 @@
+"""Measure what the graph does to label maps and to confidence, from few views and many, with true and wrong masks.
+
+Usage: python benchmarks/graph_term.py [--data FOLDER] [--out results_out/graph_term.md]
+
+Views are spread evenly over the train views, of which every seventh is held out and scored; test views are not looked
+at. A quarter of the objects of the wrong masks are missed or carry another's id, and edges are off by up to 3 px. The
+share of Gaussians seen with less than 1 px is what `gsseg_core.graph.is_scarce` goes by.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from few_views import Bench, split
+from machine import DATA, REPOSITORY
+from results import markdown
+
+from gsseg_core.atomic import write_atomically
+from gsseg_core.calibration import ReliabilityDiagram
+from gsseg_core.dataset import Dataset, View
+from gsseg_core.demo_scene import build_demo
+from gsseg_core.em import EMLearner
+from gsseg_core.graph import GraphSettings, graph_of, is_scarce, propagate
+from gsseg_core.held_out import calibrate
+from gsseg_core.mask_errors import MaskErrors, corrupt
+from gsseg_core.metrics import Evaluation
+from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segmentation import Segmentation
+from gsseg_core.warm_up import warm_up
+
+COUNTS = (4, 8, 16, 32)
+SEED = 5
+COLUMNS = ["scene", "masks", "views", "seen < 1 px", "used", "mIoU without", "with", "ECE without", "with"]
+
+
+def main() -> int:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", default=DATA, type=Path, help="folder that holds replica_apartment/")
+    parser.add_argument("--out", default=REPOSITORY / "results_out/graph_term.md", type=Path, help="table to write")
+    options = parser.parse_args()
+    warm_up()
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        rows += compare(split("Demo scene", build_demo(folder).scene, Dataset(folder, "labels_true"), {}, True), 0)
+    real = options.data / "replica_apartment"
+    if real.is_dir():
+        scene = GaussianScene.load(real / "scene.ply")
+        rows += compare(split("Replica apartment", scene, Dataset(real), {}, True), None)
+    else:
+        print(f"{real}: not there; set GSSEG_DATA or --data to the folder that holds replica_apartment/")
+    with write_atomically(options.out) as temporary:
+        temporary.write_text(markdown(COLUMNS, rows) + "\n", encoding="utf-8")
+    print(options.out)
+    return 0
+
+
+def compare(bench: Bench, missed_label: int | None) -> Iterator[list[str]]:
+    """Learn from so many views, and score with the graph and without."""
+    rng, errors = np.random.default_rng(SEED), MaskErrors(missed_label=missed_label)
+    wrong = [View.from_arrays(view.camera, corrupt(view.read_labels(), rng, errors)) for view in bench.train]
+    for count in [*(count for count in COUNTS if count < len(bench.train)), len(bench.train)]:
+        chosen = np.linspace(0, len(bench.train) - 1, count).round().astype(int)
+        for masks, views in (("true", bench.train), ("wrong", wrong)):
+            row = [bench.name, masks, str(count), *score(bench, [views[i] for i in chosen])]
+            print(*row, sep=", ", flush=True)
+            yield row
+
+
+def score(bench: Bench, views: Sequence[View]) -> list[str]:
+    """Cells of one row: how scarce evidence is, mIoU and ECE."""
+    learner = EMLearner(bench.scene, bench.num_classes)
+    learner.observe_all(views)
+    codes = learner.fit().codes_
+    temperature, evidence = calibrate(learner).temperature, learner.evidence()
+    iou, ece = [], []
+    for tried in (codes, propagate(graph_of(bench.scene), codes, evidence)):
+        result = Segmentation.from_codes(bench.scene, tried, {}, RefineSettings(filter=False)).calibrated(temperature)
+        evaluation, diagram = Evaluation(), ReliabilityDiagram()
+        for operator, truth in bench.scored:
+            found, known = result.render(operator), truth >= 0
+            evaluation.add(truth, found.labels)
+            diagram.add(found.confidence[known], (found.labels == truth)[known])
+        iou.append(f"{evaluation.mean_iou:.4f}")
+        ece.append(f"{diagram.ece:.4f}")
+    share = float((evidence < GraphSettings().strength).mean())
+    return [f"{share:.3f}", "yes" if is_scarce(evidence) else "no", *iou, *ece]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,110 @@
+"""A node in another process with a client, and calls that run in the background.
+
+A test file imports the fixtures and its tests take `place` or `learnt`; all tests of the file share the node:
+
+    from ros_client_cases import Place, learnt_fixture, place_fixture, shared_fixture  # noqa: F401
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ros_helpers import Process, Ros
+from small_scenes import NAMES, write_dataset
+
+pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
+
+from gsseg_core.dataset import Dataset, View
+from gsseg_ros.client import SegmentationClient, SegmentationError
+
+FOREVER: dict[str, Any] = {"learner": "gradient", "max_steps": 10_000_000}
+"""A goal that does not come to its end while a test waits."""
+
+
+def start_node(ros: Ros, folder: Path, **parameters: Any) -> Process:
+    names = list(NAMES.values())
+    parameters = {"data_root": folder, "class_names": names, **parameters}
+    return ros.start("segment_node", {"scene_path": folder / "data/scene.ply", **parameters})
+
+
+class Place:
+    """A node that is active, a client, and a dataset `data` below the node's data_root."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        write_dataset(folder / "data")
+        self.ros = Ros(folder)
+        self.node = start_node(self.ros, folder)
+        self.client = SegmentationClient(domain_id=self.ros.domain)
+
+    @property
+    def views(self) -> list[View]:
+        return Dataset(self.folder / "data").views("all")
+
+    def close(self) -> None:
+        self.client.close()
+        self.ros.close()
+
+
+@pytest.fixture(name="shared", scope="module")
+def shared_fixture(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
+    folder = tmp_path_factory.mktemp("client")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        patch.setenv("ROS_LOG_DIR", str(folder / "ros_log"))
+        place = Place(folder)
+        place.client.wait_until_active()
+        yield place
+        place.close()
+
+
+@pytest.fixture(name="place")
+def place_fixture(shared: Place) -> Place:
+    """The node without views and codes."""
+    shared.client.load_scene("data/scene.ply")
+    return shared
+
+
+@pytest.fixture(name="learnt")
+def learnt_fixture(place: Place) -> Place:
+    place.client.learn("data")
+    return place
+
+
+class Background:
+    """A call in a thread of its own, and what came of it."""
+
+    def __init__(self, function: Callable[[], Any]) -> None:
+        self.result: Any = None
+        self.error: BaseException | None = None
+        self._function = function
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def join(self) -> None:
+        self._thread.join(30)
+        assert not self._thread.is_alive(), "the call does not return"
+
+    def _run(self) -> None:
+        try:
+            self.result = self._function()
+        except BaseException as error:
+            self.error = error
+
+
+def learning_forever(client: SegmentationClient) -> Background:
+    """A `learn` that is under way."""
+    began = threading.Event()
+    running = Background(lambda: client.learn("data", **FOREVER, on_feedback=lambda *_: began.set()))
+    assert began.wait(30), running.error
+    return running
+
+
+def failure(call: Callable[[], Any]) -> SegmentationError:
+    with pytest.raises(SegmentationError) as caught:
+        call()
+    return caught.value

@@ -1,0 +1,87 @@
+"""Pictures of the report page show what they should."""
+
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+
+import numpy as np
+from report_cases import painted
+from small_scenes import balls_on_a_table, look_at
+
+from gsseg_core.dataset import View
+from gsseg_core.masks import UNKNOWN
+from gsseg_core.pictures import palette
+from gsseg_core.reliability import hold_against
+from gsseg_core.report_findings import Evidence
+from gsseg_core.report_pictures import THUMBNAIL_PX, ViewImages, draw_triple, jpeg_uri, thumbnails
+
+SCENE, TRUTH = balls_on_a_table()
+
+
+def view_of(name: str, labels: np.ndarray) -> View:
+    return View.from_arrays(look_at(name, np.array([3.0, 0, 3])), labels)
+
+
+def test_thumbnail_is_cut_from_the_view_that_shows_the_class_whole() -> None:
+    cut_off = view_of("cut_off", painted((1, slice(0, 20), slice(0, 30))))
+    whole = view_of("whole", painted((1, slice(10, 26), slice(20, 44))))
+    tiny = view_of("tiny", painted((1, slice(10, 12), slice(20, 22))))
+    views = {view.name: view for view in (cut_off, whole, tiny)}
+    evidence = Evidence([hold_against(view, view.read_labels(), 3) for view in views.values()], views, True)
+    images = ViewImages(SCENE)
+    for view in views.values():
+        images.keep(view, np.where(view.read_labels()[..., None] == 1, np.uint8(200), np.uint8(100)).repeat(3, axis=2))
+    found = thumbnails(range(3), evidence, images, palette(3))
+    assert set(found) == {0, 1}
+    name, picture = found[1]
+    assert name == "whole" and picture.shape == (THUMBNAIL_PX, THUMBNAIL_PX, 3)
+    bright, middle = (picture == 200).all(axis=2), THUMBNAIL_PX // 2
+    # 16 x 24 px in a square of 36: two thirds of the width, the rest dimmed.
+    assert bright[middle, middle] and 0.2 < bright.mean() < 0.35
+    assert (picture[:8] < 100).all() and (picture == palette(3)[1]).all(axis=2).any()
+
+
+def test_what_only_the_mask_says_is_on_no_thumbnail() -> None:
+    view = view_of("a", painted((1, slice(10, 20), slice(10, 20)), (2, slice(30, 40), slice(10, 20))))
+    predicted = painted((1, slice(10, 20), slice(10, 20)))
+    evidence = Evidence([hold_against(view, predicted, 3)], {"a": view}, True)
+    assert set(thumbnails(range(3), evidence, ViewImages(SCENE), palette(3))) == {0, 1}
+
+
+def test_differences_are_red_and_only_they() -> None:
+    labels = painted((1, slice(10, 20), slice(10, 20)))
+    labels[0] = UNKNOWN
+    view = view_of("a", labels)
+    predicted = painted((1, slice(10, 20), slice(15, 25)))
+    images = ViewImages(SCENE)
+    images.keep(view, np.full((48, 64, 3), 120, np.uint8))
+    triple = draw_triple(hold_against(view, predicted, 2), view, images, palette(2))
+    red = triple.difference[..., 0] > triple.difference[..., 1].astype(int) + 80
+    np.testing.assert_array_equal(red, (labels != predicted) & (labels != UNKNOWN))
+    assert all(picture.shape == (48, 64, 3) and picture.dtype == np.uint8 for picture in triple)
+
+
+def test_pictures_are_shrunk_not_grown() -> None:
+    from io import BytesIO
+
+    from PIL import Image
+
+    for width, shown in ((640, 100), (40, 40)):
+        uri = jpeg_uri(np.zeros((20, width, 3), np.uint8), 100)
+        with Image.open(BytesIO(base64.b64decode(uri.removeprefix("data:image/jpeg;base64,")))) as image:
+            assert image.size[0] == shown
+
+
+def test_a_photo_is_preferred_and_a_broken_one_or_one_of_another_size_is_rendered_over(tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    from PIL import Image
+
+    Image.new("RGB", (64, 48), (10, 200, 30)).save(tmp_path / "good.png")
+    Image.new("RGB", (32, 24), (10, 200, 30)).save(tmp_path / "small.png")
+    (tmp_path / "broken.png").write_bytes(b"\x89PNG\r\n\x1a\nno")
+    for name, is_photo in (("good", True), ("small", False), ("broken", False), ("missing", False)):
+        view = replace(view_of(name, painted()), image_path=tmp_path / f"{name}.png")
+        image = ViewImages(SCENE).of(view)
+        assert image.shape == (48, 64, 3) and (image == (10, 200, 30)).all() == is_photo

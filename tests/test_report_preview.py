@@ -1,0 +1,87 @@
+"""The 3D preview of the report page holds the scene, smaller."""
+
+from __future__ import annotations
+
+import base64
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_scenes import NUM_CLASSES, balls_on_a_table, look_at
+
+from gsseg_core.report_preview import RECORD, look_from, make_preview, up_of
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
+
+SCENE, TRUTH = balls_on_a_table()
+
+
+def result_of(labels: np.ndarray, scene: GaussianScene = SCENE) -> Segmentation:
+    codes = np.eye(NUM_CLASSES, dtype=np.float32)[np.maximum(labels, 0)] * 0.75
+    names = {k: str(k) for k in range(NUM_CLASSES)}
+    none = np.zeros(len(labels), bool)
+    return Segmentation(labels.astype(np.int32), codes, names, scene.digest, none, codes[none])
+
+
+def test_preview_reads_back_to_half_a_step_and_marks_what_has_no_class() -> None:
+    labels = TRUTH.copy()
+    labels[:3], labels[3:5] = UNOBSERVED, REMOVED
+    preview = make_preview(SCENE, result_of(labels))
+    assert RECORD.itemsize == 20 and len(base64.b64decode(preview.as_text())) == 20 * len(preview.records)
+    assert preview.left_out == 5 and preview.records["position"].max() == 65535  # those that hang far above
+    kept = slice(0, len(SCENE) - 5)
+    step = (preview.high - preview.low) / 65535
+    means = preview.low + preview.records["position"] * step
+    assert (np.abs(means - SCENE.means[kept]) <= 0.51 * step + 1e-6).all()
+    np.testing.assert_array_equal(preview.records["label"][5:], labels[5:-5])
+    assert (preview.records["label"][:3] == NUM_CLASSES).all() and (
+        preview.records["label"][3:5] == NUM_CLASSES + 1
+    ).all()
+    low, high = preview.log_scales
+    scales = np.exp(low + preview.records["scale"] / 255 * (high - low))
+    np.testing.assert_allclose(scales, SCENE.scales[kept], rtol=0.51 * (high - low) / 255 + 1e-6)
+    np.testing.assert_allclose(preview.records["color"] / 255, SCENE.colors()[kept], atol=0.51 / 255)
+    np.testing.assert_allclose(preview.records["quat"] / 127, SCENE.quats[kept], atol=0.51 / 127)
+    assert (preview.records["confidence"] == 191).all()
+    json.dumps(preview.header(), allow_nan=False)
+
+
+def test_a_thinned_preview_keeps_small_classes_covers_as_much_and_is_always_the_same() -> None:
+    rng = np.random.default_rng(1)
+    labels = np.repeat([1, 2, 3], [4900, 60, 40])
+    scene = GaussianScene.from_arrays(
+        rng.uniform(-1, 1, (5000, 3)), np.tile([1.0, 0, 0, 0], (5000, 1)), np.full((5000, 3), 0.01),
+        np.full(5000, 0.9), np.zeros((5000, 1, 3)),
+    )  # fmt: skip
+    preview, again = (make_preview(scene, result_of(labels, scene), 1000) for _ in range(2))
+    np.testing.assert_array_equal(preview.records, again.records)
+    assert len(preview.records) == 1000 and preview.left_out == 4000
+    assert np.bincount(preview.records["label"]).tolist() == [0, 900, 60, 40]
+    growth = np.exp(preview.log_scales[0]) / 0.01
+    assert growth == pytest.approx(np.sqrt(5), rel=0.05)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 40), st.integers(1, 50), st.integers(0, 1000))
+def test_no_scene_is_too_small_or_too_flat_for_a_preview(count: int, most: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    means = rng.normal(size=(count, 3)) * rng.choice([0.0, 1e-6, 1e6], 3)
+    scene = GaussianScene.from_arrays(
+        means, rng.normal(size=(count, 4)), rng.uniform(1e-8, 10, (count, 3)), rng.uniform(0.01, 0.99, count),
+        rng.normal(size=(count, 1, 3)) * 5,
+    )  # fmt: skip
+    preview = make_preview(scene, result_of(rng.integers(-2, NUM_CLASSES, count), scene), most)
+    assert len(preview.records) + preview.left_out == count and len(preview.records) <= most
+    assert json.loads(json.dumps(preview.header(), allow_nan=False))["count"] == len(preview.records)
+
+
+def test_a_camera_looks_at_what_it_sees_and_up_is_where_people_hold_it() -> None:
+    preview = make_preview(SCENE, result_of(TRUTH))
+    (place,) = look_from([look_at("a", np.array([3.0, 0, 3]))], preview)
+    np.testing.assert_allclose(place["eye"], [3, 0, 3], atol=1e-6)
+    assert np.linalg.norm(place["target"]) < 1.5  # the table lies around the origin
+    assert place["fov"] == pytest.approx(2 * np.arctan(24 / 55))
+    assert up_of([look_at("a", np.array([3.0, 0, 3])), look_at("b", np.array([-3.0, 0, 3]))])[2] > 0.99
+    assert up_of([]) == [0, -1, 0]
