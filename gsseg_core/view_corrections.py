@@ -186,7 +186,7 @@ def share_seen(scene: GaussianScene, view: View, device: str = "cpu") -> np.ndar
     projected = project(scene, view.camera)
     table = projected.table
     # |S| = var(x|y) S_yy, and the table has log2(e) / 2 over each of them.
-    area = np.pi * np.log2(np.e) / np.sqrt(table[:, WIDTH] * table[:, HEIGHT])
+    area = np.pi / np.log(2.0) / np.sqrt(table[:, WIDTH] * table[:, HEIGHT])
     full = np.zeros(len(scene), np.float32)
     full[projected.ids] = np.exp2(table[:, LOG_OPACITY]) * area
     share: np.ndarray = np.divide(seen, full, out=np.zeros_like(seen), where=full > 0)
