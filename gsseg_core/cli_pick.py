@@ -17,7 +17,7 @@ DIR/object.ply, with the indices in DIR/pick.npz and a picture of the view. Need
 EXAMPLES = """
   gsseg pick scene.ply --data DATASET --view 0001 --mask chair.png --out chair
   gsseg pick scene.ply --data DATASET --view 0001 --click 160 120 --out cup
-  gsseg pick scene.ply --data DATASET --view 0001 --click 160 120 --click 170 95 --not 200 120 --out cup
+  gsseg pick scene.ply --data D --view 0001 --click 16 12 --not 20 12 --out cup
 """
 
 

@@ -14,8 +14,8 @@ CHUNKS = 4
 
 def sort_by_depth(
     depth: np.ndarray,  # (M,) float32 > 0
-) -> np.ndarray:
-    """Order (M,) int32 that sorts depths, nearest first; equal ones stay in their order.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Order (M,) int32 that sorts depths, nearest first, and the sorted depths; equal ones stay in their order.
 
     A radix sort: every pass moves the keys stably by one digit, the least significant first.
     """
@@ -30,7 +30,7 @@ def sort_by_depth(
         moved_keys, moved_order = np.empty_like(keys), np.empty_like(order)
         _move(keys, order, shift, place, moved_keys, moved_order)
         keys, order = moved_keys, moved_order
-    return order
+    return order, keys.view(np.float32)
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)

@@ -44,8 +44,6 @@ LARGEST_REACH = np.sqrt(2.0 * np.log(255.0))
 
 ROOT = np.sqrt(DILATION)
 
-_ALPHA_MIN = np.float32(ALPHA_MIN)
-
 BLOCK = 256
 """Gaussians that are looked at together before those among them that may be visible are projected."""
 
@@ -83,26 +81,26 @@ def project(scene: GaussianScene, camera: Camera) -> Projected:
     table, depth = np.empty((len(scene), 8), np.float32), np.empty(len(scene), np.float32)
     ids, found = np.empty(len(scene), np.int32), np.zeros(CHUNKS, np.int64)
     _project(
-        scene.means, scene.quats, scene.scales, scene.opacities, camera.world_to_camera, camera.K,
+        scene.means, scene.quats, scene.scales, scene.log_opacities, camera.world_to_camera, camera.K,
         float(camera.width), float(camera.height), table, depth, ids, found,
     )  # fmt: skip
     begins = np.arange(CHUNKS) * len(scene) // CHUNKS
     rows = np.concatenate([np.arange(first, first + count) for first, count in zip(begins, found, strict=True)])
-    order = sort_by_depth(depth[rows])
+    order, depth = sort_by_depth(depth[rows])
     _break_ties(order, rows, depth, table)
     return Projected(*_gather(rows, order, ids, table))
 
 
 def _break_ties(
     order: np.ndarray,  # (M,) of `rows`, sorted by depth; changed in place
-    rows: np.ndarray,  # (M,) of depth and table
-    depth: np.ndarray,  # (N,)
+    rows: np.ndarray,  # (M,) of the table
+    depth: np.ndarray,  # (M,) sorted
     table: np.ndarray,  # (N, 8)
 ) -> None:
     left = _break_short_ties(order, rows, depth, table)
     if len(left):
         group = rows[order[left]]
-        keys = (*table[group].T[::-1], depth[group])
+        keys = (*table[group].T[::-1], depth[left])
         order[left] = order[left][np.lexsort(keys)]
 
 
@@ -113,9 +111,9 @@ def _break_short_ties(order: np.ndarray, rows: np.ndarray, depth: np.ndarray, ta
     left, n = np.empty(many, np.int64), 0
     first = 0
     while first < many:
-        own = depth[rows[order[first]]]
+        own = depth[first]
         last = first + 1
-        while last < many and depth[rows[order[last]]] == own:
+        while last < many and depth[last] == own:
             last += 1
         if last - first > SHORT:
             for m in range(first, last):
@@ -156,7 +154,7 @@ def _project(
     means: np.ndarray,  # (N, 3)
     quats: np.ndarray,  # (N, 4) w, x, y, z
     scales: np.ndarray,  # (N, 3)
-    opacities: np.ndarray,  # (N,)
+    log_opacities: np.ndarray,  # (N,)
     viewmat: np.ndarray,  # (4, 4)
     K: np.ndarray,  # (3, 3)
     width: float,
@@ -174,11 +172,11 @@ def _project(
         for begin in range(first, last, BLOCK):
             end = min(begin + BLOCK, last)
             _find_near(
-                means[begin:end], scales[begin:end], opacities[begin:end], viewmat, K, width, height, limits, near
+                means[begin:end], scales[begin:end], log_opacities[begin:end], viewmat, K, width, height, limits, near
             )
             for i in range(begin, end):
                 if near[i - begin]:
-                    z = _project_one(i, means, quats, scales, opacities, viewmat, K, width, height, limits, table[n])
+                    z = _project_one(i, means, quats, scales, log_opacities, viewmat, K, width, height, limits, table[n])
                     if z > 0:
                         depth[n], ids[n] = z, i
                         n += 1
@@ -201,7 +199,7 @@ def _limits(
 def _find_near(
     means: np.ndarray,  # (B, 3)
     scales: np.ndarray,  # (B, 3)
-    opacities: np.ndarray,  # (B,)
+    log_opacities: np.ndarray,  # (B,)
     viewmat: np.ndarray,  # (4, 4)
     K: np.ndarray,  # (3, 3)
     width: float,
@@ -222,14 +220,14 @@ def _find_near(
         mx, my, mz = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
         z = r20 * mx + r21 * my + r22 * mz + tz
         ahead = z >= NEAR
-        z = z if ahead else 1.0
-        x, y = (r00 * mx + r01 * my + r02 * mz + tx) / z, (r10 * mx + r11 * my + r12 * mz + ty) / z
+        inverse = 1.0 / (z if ahead else 1.0)
+        x, y = (r00 * mx + r01 * my + r02 * mz + tx) * inverse, (r10 * mx + r11 * my + r12 * mz + ty) * inverse
         u, v = fx * x + cx, fy * y + cy
-        longest = np.float64(max(scales[i, 0], max(scales[i, 1], scales[i, 2]))) / z
+        longest = np.float64(max(scales[i, 0], max(scales[i, 1], scales[i, 2]))) * inverse
         bound_x = LARGEST_REACH * (longest * fx * (1.0 + abs(min(max(x, x_low), x_high))) + ROOT)
         bound_y = LARGEST_REACH * (longest * fy * (1.0 + abs(min(max(y, y_low), y_high))) + ROOT)
         across = (u + bound_x >= 0.0) & (u - bound_x <= width)
-        near[i] = ahead & (opacities[i] >= _ALPHA_MIN) & across & (v + bound_y >= 0.0) & (v - bound_y <= height)
+        near[i] = ahead & (log_opacities[i] >= LOG_ALPHA_MIN) & across & (v + bound_y >= 0.0) & (v - bound_y <= height)
 
 
 @nb.njit(error_model="numpy")
@@ -238,7 +236,7 @@ def _project_one(
     means: np.ndarray,
     quats: np.ndarray,
     scales: np.ndarray,
-    opacities: np.ndarray,
+    log_opacities: np.ndarray,
     viewmat: np.ndarray,
     K: np.ndarray,
     width: float,
@@ -249,21 +247,22 @@ def _project_one(
     """Project one Gaussian; returns its depth, 0 if it is not visible."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     x_low, x_high, y_low, y_high = limits
-    log_opacity = np.log2(np.float64(opacities[i]))
     mx, my, mz = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
     z = viewmat[2, 0] * mx + viewmat[2, 1] * my + viewmat[2, 2] * mz + viewmat[2, 3]
-    x = (viewmat[0, 0] * mx + viewmat[0, 1] * my + viewmat[0, 2] * mz + viewmat[0, 3]) / z
-    y = (viewmat[1, 0] * mx + viewmat[1, 1] * my + viewmat[1, 2] * mz + viewmat[1, 3]) / z
+    # Divisions and roots cost more than all else here, so each is done once.
+    inverse = 1.0 / z
+    x = (viewmat[0, 0] * mx + viewmat[0, 1] * my + viewmat[0, 2] * mz + viewmat[0, 3]) * inverse
+    y = (viewmat[1, 0] * mx + viewmat[1, 1] * my + viewmat[1, 2] * mz + viewmat[1, 3]) * inverse
     u, v = fx * x + cx, fy * y + cy
     xc, yc = min(max(x, x_low), x_high), min(max(y, y_low), y_high)
-    cut = max((log_opacity - LOG_ALPHA_MIN) / HALF_LOG2E, 0.0)
+    cut = max((np.float64(log_opacities[i]) - LOG_ALPHA_MIN) * (1.0 / HALF_LOG2E), 0.0)
     # Rows of J R_view, with J the Jacobian of the pinhole projection.
-    ax = (fx / z) * (viewmat[0, 0] - xc * viewmat[2, 0])
-    ay = (fx / z) * (viewmat[0, 1] - xc * viewmat[2, 1])
-    az = (fx / z) * (viewmat[0, 2] - xc * viewmat[2, 2])
-    bx = (fy / z) * (viewmat[1, 0] - yc * viewmat[2, 0])
-    by = (fy / z) * (viewmat[1, 1] - yc * viewmat[2, 1])
-    bz = (fy / z) * (viewmat[1, 2] - yc * viewmat[2, 2])
+    ax = fx * inverse * (viewmat[0, 0] - xc * viewmat[2, 0])
+    ay = fx * inverse * (viewmat[0, 1] - xc * viewmat[2, 1])
+    az = fx * inverse * (viewmat[0, 2] - xc * viewmat[2, 2])
+    bx = fy * inverse * (viewmat[1, 0] - yc * viewmat[2, 0])
+    by = fy * inverse * (viewmat[1, 1] - yc * viewmat[2, 1])
+    bz = fy * inverse * (viewmat[1, 2] - yc * viewmat[2, 2])
     qw, qx, qy, qz = (
         np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3]),
     )  # fmt: skip
@@ -289,11 +288,12 @@ def _project_one(
         return 0.0
     out[U] = u
     out[V] = v
-    out[SHEAR] = sxy / syy
+    inverse_syy = 1.0 / syy
+    out[SHEAR] = sxy * inverse_syy
     # var(x|y) = S_xx - S_xy^2 / S_yy is at least the dilation; rounding must not bring it below.
-    out[WIDTH] = HALF_LOG2E / max(sxx - sxy * sxy / syy, DILATION)
-    out[HEIGHT] = HALF_LOG2E / syy
-    out[LOG_OPACITY] = log_opacity
+    out[WIDTH] = HALF_LOG2E / max(sxx - sxy * sxy * inverse_syy, DILATION)
+    out[HEIGHT] = HALF_LOG2E * inverse_syy
+    out[LOG_OPACITY] = log_opacities[i]
     out[Y_REACH] = reach_y
-    out[X_TURN] = min(max(sxy * np.sqrt(cut / sxx), -REACH_MAX), REACH_MAX)
+    out[X_TURN] = min(max(sxy * (reach_x / sxx), -REACH_MAX), REACH_MAX)
     return float(z)

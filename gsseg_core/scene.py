@@ -233,6 +233,11 @@ class GaussianScene:
         return np.ascontiguousarray(sh)
 
     @cached_property
+    def log_opacities(self) -> npt.NDArray[np.float32]:
+        """Logarithm of the opacities to base 2, (N,) float32, in which alphas are computed."""
+        return np.log2(self.opacities, dtype=np.float64).astype(np.float32)
+
+    @cached_property
     def digest(self) -> str:
         """SHA-256 (hex) of the geometry: positions, opacities, scales and rotations as stored, colours apart."""
         geometry = _columns(self.vertices, _MEANS + _OPACITY + _SCALES + _QUATS)

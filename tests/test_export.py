@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views
 
+from gsseg_core import export
 from gsseg_core.errors import WriteError
 from gsseg_core.export import class_file_name, draw_views, export_classes, write_json, write_pictures
 from gsseg_core.refine_settings import RefineSettings
@@ -39,8 +40,11 @@ def test_every_class_is_a_valid_ply_of_exactly_its_gaussians(tmp_path: Path) -> 
     assert sorted(paths.values()) == sorted((tmp_path / "classes").iterdir())
     assert (RESULT.labels == -2).any()
     for k, path in paths.items():
-        part = GaussianScene.load(path)
-        np.testing.assert_array_equal(part.vertices, SCENE.vertices[RESULT.labels == k])
+        part, mine = GaussianScene.load(path), RESULT.labels == k
+        assert part.vertices.dtype.names == (*(SCENE.vertices.dtype.names or ()), "label", "confidence")
+        np.testing.assert_array_equal(part.vertices[list(SCENE.vertices.dtype.names or ())], SCENE.vertices[mine])
+        assert (part.vertices["label"] == k).all()
+        np.testing.assert_array_equal(part.vertices["confidence"], RESULT.confidence[mine])
     assert list(tmp_path.iterdir()) == [tmp_path / "classes"]
 
 
@@ -58,15 +62,16 @@ def test_a_failed_export_leaves_the_earlier_folder_whole(
 ) -> None:
     folder = tmp_path / "classes"
     export_classes(SCENE, only(1), folder)
-    before, save, saved = contents(folder), GaussianScene.save, []
+    before, write = contents(folder), export.write_vertices
+    written: list[Path] = []
 
-    def fails_at_the_third(scene: GaussianScene, path: Path) -> None:
-        saved.append(path)
-        if len(saved) == 3:
+    def fails_at_the_third(path: Path, vertices: np.ndarray) -> None:
+        written.append(path)
+        if len(written) == 3:
             raise error
-        save(scene, path)
+        write(path, vertices)
 
-    monkeypatch.setattr(GaussianScene, "save", fails_at_the_third)
+    monkeypatch.setattr(export, "write_vertices", fails_at_the_third)
     with pytest.raises(WriteError if isinstance(error, OSError) else KeyboardInterrupt):
         export_classes(SCENE, RESULT, folder)
     assert contents(folder) == before and list(tmp_path.iterdir()) == [folder]
