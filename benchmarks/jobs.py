@@ -19,6 +19,7 @@ from workloads import RoomSize, make_room, split, true_labels, write_room
 from gsseg_core import pipeline
 from gsseg_core.dataset import Dataset, View, spread
 from gsseg_core.em import EMLearner, EMSettings
+from gsseg_core.freed_memory import keep_freed_memory
 from gsseg_core.learner import Learner
 from gsseg_core.metrics import Evaluation
 from gsseg_core.operator import make_operator
@@ -40,6 +41,7 @@ def room(folder: str, size: dict[str, int], wrong: bool = False) -> float:
 
 def stages(folder: str, runs: int, sampled: int, labels: str = "labels") -> dict[str, list[float]]:
     """Time each stage on a dataset."""
+    keep_freed_memory()  # as the command and the node do
     warm_up()
     return measure_stages(Path(folder), runs, sampled, labels)
 

@@ -21,6 +21,7 @@ from gsseg_core import (
     cli_view,
 )
 from gsseg_core.errors import GssegError
+from gsseg_core.freed_memory import keep_freed_memory
 
 _INTERRUPTED = 130
 
@@ -50,6 +51,7 @@ first steps:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code: 0, 2 on an error of the input, 130 when interrupted."""
     options = build_parser().parse_args(arguments)
+    keep_freed_memory()
     try:
         code: int = options.run(options)
     except GssegError as error:

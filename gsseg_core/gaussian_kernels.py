@@ -10,7 +10,10 @@ import numpy as np
 from llvmlite import ir
 from numba.core import types
 
-from gsseg_core.lanes import intrinsic
+from gsseg_core.lanes import intrinsic, prefetch
+
+AHEAD = 16
+"""How many rows ahead memory is asked for."""
 
 BLOCKS = 16
 """Counts are summed in this many parts, then together, so that they do not depend on the number of threads."""
@@ -202,6 +205,7 @@ def add_votes(
 ) -> None:
     """Add a view's votes, or take them away, in whole units."""
     for m in nb.prange(ids.shape[0]):
+        prefetch(total, ids[min(m + AHEAD, ids.shape[0] - 1)])
         row = total[ids[m]]
         for s in range(start[m], start[m + 1]):
             for j in range(said_start[labels[s]], said_start[labels[s] + 1]):

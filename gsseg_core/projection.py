@@ -12,6 +12,7 @@ root.
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 
 import numba as nb
@@ -19,7 +20,7 @@ import numpy as np
 
 from gsseg_core.cameras import Camera
 from gsseg_core.depth_sort import sort_by_depth
-from gsseg_core.lanes import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
+from gsseg_core.lanes import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V, prefetch
 from gsseg_core.scene import GaussianScene
 
 NEAR = 0.01
@@ -46,6 +47,9 @@ ROOT = np.sqrt(DILATION)
 
 BLOCK = 256
 """Gaussians that are looked at together before those among them that may be visible are projected."""
+
+AHEAD = 16
+"""How many rows ahead memory is asked for."""
 
 SHORT = 32
 """Gaussians at one depth, at most, that are sorted by insertion."""
@@ -78,8 +82,8 @@ def project(scene: GaussianScene, camera: Camera) -> Projected:
     Gaussians at exactly the same depth are ordered by their projected shape, so the order in the scene matters only to
     those that are alike in all of it.
     """
-    table, depth = np.empty((len(scene), 8), np.float32), np.empty(len(scene), np.float32)
-    ids, found = np.empty(len(scene), np.int32), np.zeros(CHUNKS, np.int64)
+    table, depth, ids = _room(len(scene))
+    found = np.zeros(CHUNKS, np.int64)
     _project(
         scene.means, scene.quats, scene.scales, scene.log_opacities, camera.world_to_camera, camera.K,
         float(camera.width), float(camera.height), table, depth, ids, found,
@@ -91,13 +95,26 @@ def project(scene: GaussianScene, camera: Camera) -> Projected:
     return Projected(*_gather(rows, order, ids, table))
 
 
+_KEPT = threading.local()
+
+
+def _room(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Scratch of this thread for so many Gaussians: to touch fresh memory takes longer than to project."""
+    kept: tuple[np.ndarray, np.ndarray, np.ndarray] | None = getattr(_KEPT, "room", None)
+    if kept is None or len(kept[0]) != count:
+        kept = np.empty((count, 8), np.float32), np.empty(count, np.float32), np.empty(count, np.int32)
+        _KEPT.room = kept
+    return kept
+
+
 def _break_ties(
     order: np.ndarray,  # (M,) of `rows`, sorted by depth; changed in place
     rows: np.ndarray,  # (M,) of the table
     depth: np.ndarray,  # (M,) sorted
     table: np.ndarray,  # (N, 8)
 ) -> None:
-    left = _break_short_ties(order, rows, depth, table)
+    tied = np.flatnonzero(depth[1:] == depth[:-1])
+    left = _break_short_ties(order, rows, tied, table)
     if len(left):
         group = rows[order[left]]
         keys = (*table[group].T[::-1], depth[left])
@@ -105,16 +122,20 @@ def _break_ties(
 
 
 @nb.njit(nogil=True, cache=True)
-def _break_short_ties(order: np.ndarray, rows: np.ndarray, depth: np.ndarray, table: np.ndarray) -> np.ndarray:
+def _break_short_ties(
+    order: np.ndarray,  # (M,)
+    rows: np.ndarray,  # (M,)
+    tied: np.ndarray,  # (Z,) places whose depth is that of the next place, ascending
+    table: np.ndarray,  # (N, 8)
+) -> np.ndarray:
     """Sort runs of equal depth by their rows of the table; returns the places of those too long for it."""
-    many = order.shape[0]
-    left, n = np.empty(many, np.int64), 0
-    first = 0
-    while first < many:
-        own = depth[first]
-        last = first + 1
-        while last < many and depth[last] == own:
-            last += 1
+    left, n = np.empty(2 * tied.shape[0], np.int64), 0
+    t = 0
+    while t < tied.shape[0]:
+        first = last = tied[t]
+        while t < tied.shape[0] and tied[t] == last:
+            t, last = t + 1, last + 1
+        last += 1
         if last - first > SHORT:
             for m in range(first, last):
                 left[n] = m
@@ -126,7 +147,6 @@ def _break_short_ties(order: np.ndarray, rows: np.ndarray, depth: np.ndarray, ta
                     order[free] = order[free - 1]
                     free -= 1
                 order[free] = moving
-        first = last
     return left[:n].copy()
 
 
@@ -142,6 +162,7 @@ def _is_before(one: np.ndarray, other: np.ndarray) -> bool:
 def _gather(rows: np.ndarray, order: np.ndarray, ids: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     sorted_ids, sorted_table = np.empty(order.shape[0], np.int32), np.empty((order.shape[0], 8), np.float32)
     for m in nb.prange(order.shape[0]):
+        prefetch(table, rows[order[min(m + AHEAD, order.shape[0] - 1)]])
         row = rows[order[m]]
         sorted_ids[m] = ids[row]
         for j in range(8):
@@ -174,12 +195,10 @@ def _project(
             _find_near(
                 means[begin:end], scales[begin:end], log_opacities[begin:end], viewmat, K, width, height, limits, near
             )
-            for i in range(begin, end):
-                if near[i - begin]:
-                    z = _project_one(i, means, quats, scales, log_opacities, viewmat, K, width, height, limits, table[n])
-                    if z > 0:
-                        depth[n], ids[n] = z, i
-                        n += 1
+            n = _project_near(
+                begin, near[: end - begin], means, quats, scales, log_opacities, viewmat, K, width, height, limits,
+                n, table, depth, ids,
+            )  # fmt: skip
         found[chunk] = n - first
 
 
@@ -231,69 +250,80 @@ def _find_near(
 
 
 @nb.njit(error_model="numpy")
-def _project_one(
-    i: int,
-    means: np.ndarray,
-    quats: np.ndarray,
-    scales: np.ndarray,
-    log_opacities: np.ndarray,
-    viewmat: np.ndarray,
-    K: np.ndarray,
+def _project_near(
+    begin: int,
+    near: np.ndarray,  # (B,) bool: which of the Gaussians from `begin` on
+    means: np.ndarray,  # (N, 3)
+    quats: np.ndarray,  # (N, 4)
+    scales: np.ndarray,  # (N, 3)
+    log_opacities: np.ndarray,  # (N,)
+    viewmat: np.ndarray,  # (4, 4)
+    K: np.ndarray,  # (3, 3)
     width: float,
     height: float,
     limits: tuple[float, float, float, float],
-    out: np.ndarray,  # (8,) a row of the table
-) -> float:
-    """Project one Gaussian; returns its depth, 0 if it is not visible."""
+    n: int,
+    table: np.ndarray,  # (N, 8) out, from row n on
+    depth: np.ndarray,  # (N,) out, the same
+    ids: np.ndarray,  # (N,) out, the same
+) -> int:
+    """Project those that may be visible, and keep those that are; returns the row after the last one.
+
+    Divisions and roots cost more than all else here, so each is done once.
+    """
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    v00, v01, v02, tx = viewmat[0, 0], viewmat[0, 1], viewmat[0, 2], viewmat[0, 3]
+    v10, v11, v12, ty = viewmat[1, 0], viewmat[1, 1], viewmat[1, 2], viewmat[1, 3]
+    v20, v21, v22, tz = viewmat[2, 0], viewmat[2, 1], viewmat[2, 2], viewmat[2, 3]
     x_low, x_high, y_low, y_high = limits
-    mx, my, mz = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
-    z = viewmat[2, 0] * mx + viewmat[2, 1] * my + viewmat[2, 2] * mz + viewmat[2, 3]
-    # Divisions and roots cost more than all else here, so each is done once.
-    inverse = 1.0 / z
-    x = (viewmat[0, 0] * mx + viewmat[0, 1] * my + viewmat[0, 2] * mz + viewmat[0, 3]) * inverse
-    y = (viewmat[1, 0] * mx + viewmat[1, 1] * my + viewmat[1, 2] * mz + viewmat[1, 3]) * inverse
-    u, v = fx * x + cx, fy * y + cy
-    xc, yc = min(max(x, x_low), x_high), min(max(y, y_low), y_high)
-    cut = max((np.float64(log_opacities[i]) - LOG_ALPHA_MIN) * (1.0 / HALF_LOG2E), 0.0)
-    # Rows of J R_view, with J the Jacobian of the pinhole projection.
-    ax = fx * inverse * (viewmat[0, 0] - xc * viewmat[2, 0])
-    ay = fx * inverse * (viewmat[0, 1] - xc * viewmat[2, 1])
-    az = fx * inverse * (viewmat[0, 2] - xc * viewmat[2, 2])
-    bx = fy * inverse * (viewmat[1, 0] - yc * viewmat[2, 0])
-    by = fy * inverse * (viewmat[1, 1] - yc * viewmat[2, 1])
-    bz = fy * inverse * (viewmat[1, 2] - yc * viewmat[2, 2])
-    qw, qx, qy, qz = (
-        np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3]),
-    )  # fmt: skip
-    s0, s1, s2 = np.float64(scales[i, 0]), np.float64(scales[i, 1]), np.float64(scales[i, 2])
-    r00, r01, r02 = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy - qw * qz), 2 * (qx * qz + qw * qy)
-    r10, r11, r12 = 2 * (qx * qy + qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz - qw * qx)
-    r20, r21, r22 = 2 * (qx * qz - qw * qy), 2 * (qy * qz + qw * qx), 1 - 2 * (qx * qx + qy * qy)
-    a0, a1, a2 = (
-        s0 * (ax * r00 + ay * r10 + az * r20),
-        s1 * (ax * r01 + ay * r11 + az * r21),
-        s2 * (ax * r02 + ay * r12 + az * r22),
-    )
-    b0, b1, b2 = (
-        s0 * (bx * r00 + by * r10 + bz * r20),
-        s1 * (bx * r01 + by * r11 + bz * r21),
-        s2 * (bx * r02 + by * r12 + bz * r22),
-    )
-    sxx = a0 * a0 + a1 * a1 + a2 * a2 + DILATION
-    sxy = a0 * b0 + a1 * b1 + a2 * b2
-    syy = b0 * b0 + b1 * b1 + b2 * b2 + DILATION
-    reach_x, reach_y = min(np.sqrt(cut * sxx), REACH_MAX), min(np.sqrt(cut * syy), REACH_MAX)
-    if not (u + reach_x >= 0.5 and u - reach_x <= width - 0.5 and v + reach_y >= 0.5 and v - reach_y <= height - 0.5):
-        return 0.0
-    out[U] = u
-    out[V] = v
-    inverse_syy = 1.0 / syy
-    out[SHEAR] = sxy * inverse_syy
-    # var(x|y) = S_xx - S_xy^2 / S_yy is at least the dilation; rounding must not bring it below.
-    out[WIDTH] = HALF_LOG2E / max(sxx - sxy * sxy * inverse_syy, DILATION)
-    out[HEIGHT] = HALF_LOG2E * inverse_syy
-    out[LOG_OPACITY] = log_opacities[i]
-    out[Y_REACH] = reach_y
-    out[X_TURN] = min(max(sxy * (reach_x / sxx), -REACH_MAX), REACH_MAX)
-    return float(z)
+    for j in range(near.shape[0]):
+        if not near[j]:
+            continue
+        i = begin + j
+        mx, my, mz = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+        z = v20 * mx + v21 * my + v22 * mz + tz
+        inverse = 1.0 / z
+        x, y = (v00 * mx + v01 * my + v02 * mz + tx) * inverse, (v10 * mx + v11 * my + v12 * mz + ty) * inverse
+        u, v = fx * x + cx, fy * y + cy
+        xc, yc = min(max(x, x_low), x_high), min(max(y, y_low), y_high)
+        cut = max((np.float64(log_opacities[i]) - LOG_ALPHA_MIN) * (1.0 / HALF_LOG2E), 0.0)
+        # Rows of J R_view, with J the Jacobian of the pinhole projection.
+        ax, ay, az = fx * inverse * (v00 - xc * v20), fx * inverse * (v01 - xc * v21), fx * inverse * (v02 - xc * v22)
+        bx, by, bz = fy * inverse * (v10 - yc * v20), fy * inverse * (v11 - yc * v21), fy * inverse * (v12 - yc * v22)
+        qw, qx, qy, qz = (
+            np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3]),
+        )  # fmt: skip
+        s0, s1, s2 = np.float64(scales[i, 0]), np.float64(scales[i, 1]), np.float64(scales[i, 2])
+        r00, r01, r02 = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy - qw * qz), 2 * (qx * qz + qw * qy)
+        r10, r11, r12 = 2 * (qx * qy + qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz - qw * qx)
+        r20, r21, r22 = 2 * (qx * qz - qw * qy), 2 * (qy * qz + qw * qx), 1 - 2 * (qx * qx + qy * qy)
+        a0, a1, a2 = (
+            s0 * (ax * r00 + ay * r10 + az * r20),
+            s1 * (ax * r01 + ay * r11 + az * r21),
+            s2 * (ax * r02 + ay * r12 + az * r22),
+        )
+        b0, b1, b2 = (
+            s0 * (bx * r00 + by * r10 + bz * r20),
+            s1 * (bx * r01 + by * r11 + bz * r21),
+            s2 * (bx * r02 + by * r12 + bz * r22),
+        )
+        sxx = a0 * a0 + a1 * a1 + a2 * a2 + DILATION
+        sxy = a0 * b0 + a1 * b1 + a2 * b2
+        syy = b0 * b0 + b1 * b1 + b2 * b2 + DILATION
+        reach_x, reach_y = min(np.sqrt(cut * sxx), REACH_MAX), min(np.sqrt(cut * syy), REACH_MAX)
+        across = (u + reach_x >= 0.5) & (u - reach_x <= width - 0.5)
+        if not (across & (v + reach_y >= 0.5) & (v - reach_y <= height - 0.5)):
+            continue
+        inverse_syy = 1.0 / syy
+        table[n, U] = u
+        table[n, V] = v
+        table[n, SHEAR] = sxy * inverse_syy
+        # var(x|y) = S_xx - S_xy^2 / S_yy is at least the dilation; rounding must not bring it below.
+        table[n, WIDTH] = HALF_LOG2E / max(sxx - sxy * sxy * inverse_syy, DILATION)
+        table[n, HEIGHT] = HALF_LOG2E * inverse_syy
+        table[n, LOG_OPACITY] = log_opacities[i]
+        table[n, Y_REACH] = reach_y
+        table[n, X_TURN] = min(max(sxy * (reach_x / sxx), -REACH_MAX), REACH_MAX)
+        depth[n], ids[n] = z, i
+        n += 1
+    return n

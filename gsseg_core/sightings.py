@@ -128,6 +128,19 @@ def settle(
             numbers[i] = (numbers[i] & _NUMBER) + before[numbers[i] >> _CHUNK]
 
 
+@nb.njit(parallel=True, nogil=True, cache=True)
+def take(
+    table: np.ndarray,  # (M, 8)
+    chosen: np.ndarray,  # (M',)
+) -> np.ndarray:
+    """Copy some rows of the table, (M', 8)."""
+    out = np.empty((chosen.shape[0], table.shape[1]), table.dtype)
+    for m in nb.prange(chosen.shape[0]):
+        for j in range(table.shape[1]):
+            out[m, j] = table[chosen[m], j]
+    return out
+
+
 @nb.njit(parallel=True, nogil=True, cache=True, fastmath=FAST, error_model="numpy")
 def share(
     columns: int,

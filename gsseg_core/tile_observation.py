@@ -67,7 +67,7 @@ class TileObservation(Observation):
         sightings.settle(self._entries, before[:, 0])
         sightings.settle(self._sighting, before[:, 1])
         seen = _joined(gaussians, chunks, found[:, 0])
-        self.ids, self._table = ids[seen], table[seen]
+        self.ids, self._table = ids[seen], sightings.take(table, seen)
         self.start = starts(_joined(label_counts, chunks, found[:, 0]))
         self.labels, self._votes = _joined(labels, room, found[:, 1]), _joined(votes, room, found[:, 1])
 

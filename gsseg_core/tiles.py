@@ -13,6 +13,11 @@ from gsseg_core.projection import Projected
 TILE = LANES
 """Side of a tile in px. One row of a tile is one vector register of sixteen float32."""
 
+TYPICAL = 4
+"""Tiles that a Gaussian touches, at first; where they touch more on average, they are listed once more."""
+
+_LEAST = np.float32(LOG_ALPHA_MIN)
+
 CHUNKS = 16
 """Parts into which Gaussians are cut, to be sorted beside each other; fixed, so that threads change nothing."""
 
@@ -46,9 +51,15 @@ class Tiles:
 def assign(projected: Projected, width: int, height: int) -> Tiles:
     """Sort projected Gaussians into the tiles that their ellipse of alpha >= 1/255 touches."""
     columns, rows = -(-width // TILE), -(-height // TILE)
-    gaussian_start = np.zeros(len(projected.ids) + 1, np.int64)
-    place = np.zeros((CHUNKS, columns * rows), np.int64)
-    _count(projected.table, columns, rows, gaussian_start[1:], place)
+    many = len(projected.ids)
+    gaussian_start = np.zeros(many + 1, np.int64)
+    place, room = np.zeros((CHUNKS, columns * rows), np.int64), TYPICAL * (many // CHUNKS + 1)
+    while True:
+        touched = np.empty((CHUNKS, room), np.int32)
+        most = _list(projected.table, columns, rows, gaussian_start[1:], place, touched)
+        if most <= room:
+            break
+        room = most
     np.cumsum(gaussian_start, out=gaussian_start)
     start = np.concatenate([[0], np.cumsum(place.sum(axis=0))])
     # From counts to places: chunks follow each other within a tile, so that its entries stay sorted by depth.
@@ -56,88 +67,96 @@ def assign(projected: Projected, width: int, height: int) -> Tiles:
     place[0] = 0
     place += start[:-1]
     entries, gaussian_entries = np.empty(start[-1], np.int32), np.empty(start[-1], np.int32)
-    _fill(projected.table, columns, rows, gaussian_start, place, entries, gaussian_entries)
+    _fill(touched, gaussian_start, place, entries, gaussian_entries)
     return Tiles(columns, rows, start, entries, gaussian_start, gaussian_entries)
 
 
 @nb.njit(inline="always")
-def _rows_of(
-    table: np.ndarray,  # (M, 8)
-    g: int,
-    rows: int,
-) -> tuple[int, int]:
-    """First and last tile row (exclusive) that Gaussian g may touch."""
-    v, reach = table[g, V], table[g, Y_REACH]
-    first, last = np.floor((v - reach - 0.5) / TILE), np.floor((v + reach - 0.5) / TILE) + 1
-    return int(max(first, 0.0)), int(min(max(last, 0.0), rows))
+def _rows_of(v: np.float32, reach: np.float32, rows: int) -> tuple[int, int]:
+    """First and last tile row (exclusive) that a Gaussian may touch."""
+    first = np.floor((v - reach - np.float32(0.5)) * np.float32(1 / TILE))
+    last = np.floor((v + reach - np.float32(0.5)) * np.float32(1 / TILE)) + np.float32(1)
+    return int(max(first, np.float32(0))), int(min(max(last, np.float32(0)), np.float32(rows)))
 
 
 @nb.njit(inline="always")
 def _touched(
-    table: np.ndarray,  # (M, 8)
-    g: int,
+    u: np.float32,
+    v: np.float32,
+    shear: np.float32,
+    reach: np.float32,
+    turn: np.float32,
+    cut: np.float32,  # LOG_OPACITY less its least
+    height: np.float32,
+    narrowness: float,  # 1 / WIDTH
     row: int,
     columns: int,
 ) -> tuple[int, int]:
-    """First and last tile column (exclusive) that Gaussian g touches in one row of tiles."""
-    top, bottom = row * TILE + 0.5 - table[g, V], row * TILE + TILE - 0.5 - table[g, V]
-    reach = table[g, Y_REACH]
+    """First and last tile column (exclusive) that a Gaussian touches in one row of tiles."""
+    top, bottom = np.float32(row * TILE + 0.5) - v, np.float32(row * TILE + TILE - 0.5) - v
     if bottom < -reach or top > reach:
         return 0, 0
-    cut = table[g, LOG_OPACITY] - LOG_ALPHA_MIN
     # The outline x(dy) is concave on the right and convex on the left: its extremes in the band are at the turning
     # points or the ends.
-    dy = min(max(table[g, X_TURN], top), bottom)
-    right = table[g, SHEAR] * dy + np.sqrt(max(cut - table[g, HEIGHT] * dy * dy, 0.0) / table[g, WIDTH])
-    dy = min(max(-table[g, X_TURN], top), bottom)
-    left = table[g, SHEAR] * dy - np.sqrt(max(cut - table[g, HEIGHT] * dy * dy, 0.0) / table[g, WIDTH])
+    dy = min(max(turn, top), bottom)
+    right = shear * dy + np.sqrt(max(cut - height * dy * dy, np.float32(0)) * narrowness)
+    dy = min(max(-turn, top), bottom)
+    left = shear * dy - np.sqrt(max(cut - height * dy * dy, np.float32(0)) * narrowness)
     # A hundredth of a pixel of slack covers float32 rounding; the blend tests alpha itself.
-    first = np.floor((table[g, U] + left - 0.51) / TILE)
-    last = np.floor((table[g, U] + right - 0.49) / TILE) + 1
-    return int(max(first, 0.0)), int(min(max(last, 0.0), columns))
+    first = np.floor((u + left - np.float32(0.51)) * np.float32(1 / TILE))
+    last = np.floor((u + right - np.float32(0.49)) * np.float32(1 / TILE)) + np.float32(1)
+    return int(max(first, np.float32(0))), int(min(max(last, np.float32(0)), np.float32(columns)))
 
 
 @nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
-def _count(
+def _list(
     table: np.ndarray,  # (M, 8)
     columns: int,
     rows: int,
-    per_gaussian: np.ndarray,  # (M,) out
-    per_tile: np.ndarray,  # (CHUNKS, T) out: of each chunk of Gaussians
-) -> None:
-    many = table.shape[0]
+    per_gaussian: np.ndarray,  # (M,) out: tiles that it touches
+    per_tile: np.ndarray,  # (CHUNKS, T) out: Gaussians of each chunk that touch it
+    touched: np.ndarray,  # (CHUNKS, R) int32 out: these tiles, Gaussian after Gaussian, as far as there is room
+) -> int:
+    """List which tiles Gaussians touch; returns the room that the chunk with most of them needs."""
+    many, room = table.shape[0], touched.shape[1]
+    needed = np.zeros(CHUNKS, np.int64)
     for chunk in nb.prange(CHUNKS):
-        counts = per_tile[chunk]
+        counts, mine, n = per_tile[chunk], touched[chunk], 0
+        counts[:] = 0
         for g in range(chunk * many // CHUNKS, (chunk + 1) * many // CHUNKS):
-            low, high = _rows_of(table, g, rows)
+            u, v, shear, reach = table[g, U], table[g, V], table[g, SHEAR], table[g, Y_REACH]
+            turn, cut = table[g, X_TURN], table[g, LOG_OPACITY] - _LEAST
+            height, narrowness = table[g, HEIGHT], np.float32(1) / table[g, WIDTH]
+            before = n
+            low, high = _rows_of(v, reach, rows)
             for row in range(low, high):
-                first, last = _touched(table, g, row, columns)
-                for column in range(first, last):
-                    counts[row * columns + column] += 1
-                per_gaussian[g] += max(last - first, 0)
+                first, last = _touched(u, v, shear, reach, turn, cut, height, narrowness, row, columns)
+                for tile in range(row * columns + first, row * columns + last):
+                    counts[tile] += 1
+                    if n < room:
+                        mine[n] = tile
+                    n += 1
+            per_gaussian[g] = n - before
+        needed[chunk] = n
+    return int(needed.max())
 
 
-@nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+@nb.njit(parallel=True, nogil=True, cache=True)
 def _fill(
-    table: np.ndarray,  # (M, 8)
-    columns: int,
-    rows: int,
+    touched: np.ndarray,  # (CHUNKS, R)
     gaussian_start: np.ndarray,  # (M + 1,)
     place: np.ndarray,  # (CHUNKS, T) where each chunk's next entry of a tile goes
     entries: np.ndarray,  # (E,) out
     gaussian_entries: np.ndarray,  # (E,) out
 ) -> None:
-    many = table.shape[0]
+    many = gaussian_start.shape[0] - 1
     for chunk in nb.prange(CHUNKS):
-        cursor = place[chunk]
+        cursor, mine = place[chunk], touched[chunk]
+        begin = gaussian_start[chunk * many // CHUNKS]
         for g in range(chunk * many // CHUNKS, (chunk + 1) * many // CHUNKS):
-            n = gaussian_start[g]
-            low, high = _rows_of(table, g, rows)
-            for row in range(low, high):
-                first, last = _touched(table, g, row, columns)
-                for column in range(first, last):
-                    e = cursor[row * columns + column]
-                    cursor[row * columns + column] = e + 1
-                    entries[e] = g
-                    gaussian_entries[n] = e
-                    n += 1
+            for n in range(gaussian_start[g], gaussian_start[g + 1]):
+                tile = mine[n - begin]
+                e = cursor[tile]
+                cursor[tile] = e + 1
+                entries[e] = g
+                gaussian_entries[n] = e

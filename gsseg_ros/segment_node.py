@@ -20,6 +20,7 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
 from gsseg_core.errors import GssegError
+from gsseg_core.freed_memory import keep_freed_memory
 from gsseg_core.warm_up import warm_up
 from gsseg_ros import diagnostics, parameters
 from gsseg_ros.inputs import Inputs
@@ -200,6 +201,7 @@ def _spin_once(executor: MultiThreadedExecutor, node: SegmentNode) -> None:
 
 def main(args: list[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM; returns the exit code: 0, or 2 for arguments that cannot be used."""
+    keep_freed_memory()
     # rclpy's own handlers would take the context away under a running job, and its spin() does not always notice.
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):

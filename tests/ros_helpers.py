@@ -51,7 +51,7 @@ _counter = itertools.count()
 
 
 def next_domain() -> int:
-    """A ROS domain that the tests of this run, and of one beside it, do not use soon: 1 to 100, by worker odd or even."""
+    """A ROS domain that the tests of this run, and of one beside it, do not use soon: 1 to 100."""
     worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
     return (os.getpid() // 2 * 17 + next(_counter)) % 50 * 2 + worker % 2 + 1
 

@@ -1,0 +1,36 @@
+"""Programs keep freed memory for the next view, so that it need not be got from the system again."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from gsseg_core.freed_memory import keep_freed_memory
+
+SCRIPT = """
+import resource
+import numpy as np
+from gsseg_core.freed_memory import keep_freed_memory
+
+def pages():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(8):
+        arrays = [np.ones(2_500_000, np.float32) for _ in range(4)]
+        del arrays
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+without = pages()
+keep_freed_memory()
+pages()
+print(without, pages())
+"""
+
+
+def test_what_was_freed_is_used_again_without_asking_the_system() -> None:
+    if not keep_freed_memory():
+        pytest.skip("the C library is not glibc")
+    done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True)
+    without, kept = map(int, done.stdout.split())
+    assert kept < without / 4
