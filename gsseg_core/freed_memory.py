@@ -1,7 +1,7 @@
 """What a program asks of the C library's allocator, once, before it works on view after view.
 
 The arrays of a view are freed before the next view needs as many. glibc gives such memory back to the system and gets
-it again page by page, each of which the system zeroes: that is up to a fifth of the time in which a mask is fused into a
+it again page by page, each of which the system zeroes: up to a fifth of the time in which a mask is fused into a
 million Gaussians. Programs keep it instead. A library leaves that choice to the program that it is in.
 """
 
