@@ -105,7 +105,8 @@ def measure(
             figures = [points(float(np.nanmean(value))) for pair in values for value in pair]
             rows.append([name, kind, way, *figures])
             print(*rows[-1], sep=", ", flush=True)
-        draw(parts, truth.class_names, scores, scored, pictures / f"objects_{name}_{kind}.png")
+        shown = pictures if (name, kind) == ("demo", "wrong") else REPOSITORY / "results_out"
+        draw(parts, truth.class_names, scores, scored, shown / f"objects_{name}_{kind}.png")
     return rows
 
 

@@ -234,8 +234,9 @@ class GaussianScene:
 
     @cached_property
     def log_opacities(self) -> npt.NDArray[np.float32]:
-        """Logarithm of the opacities to base 2, (N,) float32, in which alphas are computed."""
-        return np.log2(self.opacities, dtype=np.float64).astype(np.float32)
+        """Logarithm of the opacities to base 2, (N,) float32, in which alphas are computed; of 0 it is -inf."""
+        with np.errstate(divide="ignore"):
+            return np.log2(self.opacities, dtype=np.float64).astype(np.float32)
 
     @cached_property
     def digest(self) -> str:
