@@ -35,7 +35,7 @@ test: $(READY) $(ROS_READY) $(MSGS_READY)  ## lint, check the types and run the 
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -W error -n 2 --dist loadgroup
+	$(BIN)/python -m pytest -W error
 
 docs: $(READY)  ## build the documentation into site/index.html, and refuse links that lead nowhere
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

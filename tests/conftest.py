@@ -21,17 +21,10 @@ _NO_GPU = "no GPU for gsplat"
 _NO_BROWSER = "no Chromium"
 
 
-def pytest_configure(config: pytest.Config) -> None:
+def pytest_configure() -> None:
     """Let processes that tests start hear SIGINT: a test run in the background is deaf to it, and they inherit that."""
-    config.addinivalue_line("markers", "xdist_group(name): which worker of pytest-xdist a test goes to")
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Leave what waits for ROS to one worker, so that it runs beside all that computes (`-n 2 --dist loadgroup`)."""
-    for item in items:
-        item.add_marker(pytest.mark.xdist_group("ros" if item.path.name.startswith("test_ros_") else "core"))
 
 
 @pytest.fixture

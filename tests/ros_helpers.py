@@ -52,8 +52,7 @@ _counter = itertools.count()
 
 def next_domain() -> int:
     """A ROS domain that the tests of this run, and of one beside it, do not use soon: 1 to 100."""
-    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-    return (os.getpid() // 2 * 17 + next(_counter)) % 50 * 2 + worker % 2 + 1
+    return (os.getpid() * 17 + next(_counter)) % 100 + 1
 
 
 def wait_until(condition: Callable[[], Any], what: str, timeout: float = PATIENCE) -> None:
