@@ -69,7 +69,7 @@ class LiveOutputs:
         self._changed = threading.Condition()
         self._picture: tuple[Paired, bool] | None = None
         self._objects_due = False
-        self._views_since_objects = False
+        self._news: int | None = None  # `objects_count` when the newest view came whose objects nobody has been told
         self._stopping = False
         self._codes: tuple[tuple[LiveSession, int], float, Segmentation] | None = None
         self._last_image = self._last_objects = -np.inf
@@ -78,7 +78,7 @@ class LiveOutputs:
 
     def fused(self, paired: Paired) -> None:
         """Take note of a mask that has been fused; it is drawn if no camera image came lately."""
-        self._views_since_objects = True
+        self._news = self._outputs.objects_count
         if time.monotonic() - self._last_image > IMAGE_SILENCE:
             self._show(paired, with_image=False)
 
@@ -88,9 +88,12 @@ class LiveOutputs:
         self._show(paired, with_image=True)
 
     def tick(self) -> None:
-        """See whether objects are due; call it some ten times a second."""
+        """See whether objects are due; call it some ten times a second.
+
+        What a run has published since the newest view came stays: it is refined, and of codes that were learnt.
+        """
         if (
-            self._views_since_objects
+            self._news == self._outputs.objects_count
             and self._outputs.wants_objects
             and time.monotonic() - self._last_objects >= OBJECTS_PERIOD
         ):
@@ -162,11 +165,12 @@ class LiveOutputs:
             return
         # What a run or a reset publishes while these are put together is newer.
         since = self._outputs.objects_count
-        self._views_since_objects = False
+        self._news = None
         result = self._current()
         selection = Selection(session, result, sorted(result.class_names), 0.0, settings.scene_to_map)
         header = Header(stamp=self._now(), frame_id=settings.map_frame)
-        self._outputs.publish_objects(selection.objects(header, revision=0), since)
+        if self._outputs.publish_objects(selection.objects(header, revision=0), since) and self._news == since:
+            self._news = self._outputs.objects_count  # A view came meanwhile.
         self._last_objects = time.monotonic()
 
     def _current(self) -> Segmentation:

@@ -80,13 +80,18 @@ class Outputs:
             self._filled = filled
             flow.publish(self._cloud, selection.objects_cloud(header))
 
-    def publish_objects(self, objects: ObjectArray, since: int | None = None) -> None:
-        """Publish the objects, and draw them for people; with `since`, only if `objects_count` is still that."""
+    def publish_objects(self, objects: ObjectArray, since: int | None = None) -> bool:
+        """Publish the objects, and draw them for people; with `since`, only if `objects_count` is still that.
+
+        Returns whether they were published.
+        """
         with self._lock:
-            if since is None or since == self.objects_count:
-                self.objects_count += 1
-                self._objects.publish(objects)
-                self._markers.publish(object_markers(objects))
+            if since is not None and since != self.objects_count:
+                return False
+            self.objects_count += 1
+            self._objects.publish(objects)
+            self._markers.publish(object_markers(objects))
+            return True
 
     def publish_report(self, report: SegmentationReport) -> None:
         """Publish the report of a run."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from gsseg_ros.conversions import pose_from_matrix
 from gsseg_ros.frames import rigid
+from gsseg_ros.live_outputs import OBJECTS_PERIOD
 from gsseg_ros.object_messages import box_from_object
 
 RAW = RefineSettings(cluster=False, filter=False)
@@ -122,6 +124,16 @@ def test_learning_publishes_the_objects_of_its_run(robot: Robot, scene: Gaussian
     session = core_session(scene, clean_views(6))
     session.learn()
     assert [thing.id for thing in latched.objects] == list(object_boxes(scene, session.segmentation(RAW)))
+
+
+def test_the_objects_of_a_run_stay_until_another_view_comes(robot: Robot) -> None:
+    _, result = robot.learn()
+    heard = robot.ros.collect(ObjectArray, f"{robot.name}/objects", LATCHED)
+    robot.ros.wait_until(lambda: heard, "the latched message")
+    time.sleep(OBJECTS_PERIOD + 0.5)
+    assert {array.revision for array in heard} == {result.report.revision}
+    robot.drive(clean_views(1))
+    robot.ros.wait_until(lambda: heard[-1].revision == 0, "objects of the view")
 
 
 @pytest.mark.parametrize("request_", ["reset", "load_scene"])

@@ -185,6 +185,7 @@ class Shown:
 
     wants_overlay = True
     wants_objects = False
+    objects_count = 0
 
     def __init__(self) -> None:
         self.stamps: list[int] = []
