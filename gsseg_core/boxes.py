@@ -28,6 +28,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 
+from gsseg_core.rotations import rotations
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
@@ -173,7 +174,7 @@ def class_box(
     """
     every = -(-len(index) // SAMPLE)
     index, confidence = index[::every], confidence[::every]
-    turns = _rotations(scene.quats[index].astype(np.float64)) * scene.scales[index][:, None, :]
+    turns = rotations(scene.quats[index].astype(np.float64)) * scene.scales[index][:, None, :]
     return oriented_box(scene.means[index], turns @ turns.transpose(0, 2, 1), scene.opacities[index] * confidence)
 
 
@@ -319,20 +320,6 @@ def _pointed(
     first, second = (axis * np.copysign(1.0, axis[np.abs(axis).argmax()]) for axis in axes.T[:2])
     pointed: Array = np.stack([first, second, np.cross(first, second)], axis=1)
     return pointed
-
-
-def _rotations(
-    quats: Array,  # (M, 4) wxyz, unit
-) -> Array:
-    """Rotation matrices (M, 3, 3)."""
-    w, x, y, z = quats.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    matrices: Array = np.moveaxis(np.array(rows), 2, 0)
-    return matrices
 
 
 def _rounded(values: Array) -> Any:

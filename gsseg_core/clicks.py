@@ -21,12 +21,12 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 from scipy import ndimage
-from scipy.spatial.transform import Rotation
 
 from gsseg_core.cameras import Camera
 from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.masks import UNKNOWN
 from gsseg_core.operator import make_operator
+from gsseg_core.rotations import rotations
 from gsseg_core.scene import GaussianScene
 
 CELLS = 160
@@ -216,7 +216,7 @@ def _merge(cells: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.n
 
 def _features(scene: GaussianScene, camera: Camera, device: str) -> tuple[np.ndarray, np.ndarray]:
     """Blend colours and normals into a view, weighted, (H, W, 6); and how much of each pixel they cover."""
-    turns = Rotation.from_quat(scene.quats[:, [1, 2, 3, 0]]).as_matrix()
+    turns = rotations(scene.quats.astype(np.float64))
     normals = turns[np.arange(len(scene)), :, scene.scales.argmin(axis=1)]
     normals *= -np.sign((normals * (scene.means - camera.center)).sum(axis=1, keepdims=True))
     # Square roots: a step between dark tones looks as large as one between bright ones.

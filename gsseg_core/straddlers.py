@@ -21,6 +21,7 @@ import numpy as np
 
 from gsseg_core.carve import Shares
 from gsseg_core.errors import SceneValueError
+from gsseg_core.rotations import rotations
 from gsseg_core.scene import GaussianScene
 
 DISTANCE = 0.5
@@ -63,7 +64,8 @@ def split(
     grown = scene.subset(parents)  # copies, to be changed
     axis = scene.scales[chosen].argmax(axis=1)
     longest = scene.scales[chosen, axis].astype(np.float64)
-    offsets = DISTANCE * longest[:, None] * _axes(scene.quats[chosen], axis)
+    turns = rotations(scene.quats[chosen].astype(np.float64))
+    offsets = DISTANCE * longest[:, None] * turns[np.arange(len(chosen)), :, axis]
     opacity = half_opacity(scene.opacities[chosen])
     for sign, rows in ((1, chosen), (-1, len(scene) + np.arange(len(chosen)))):
         grown.means[rows] = scene.means[chosen] + sign * offsets
@@ -109,15 +111,3 @@ def half_opacity(
     whole = opacities.astype(np.float64) / np.sqrt(v)
     halves: np.ndarray = whole / (1 + np.sqrt(1 - overlap * whole))
     return halves
-
-
-def _axes(
-    quats: np.ndarray,  # (M, 4) w, x, y, z
-    axis: np.ndarray,  # (M,) 0 to 2
-) -> np.ndarray:
-    """Direction of one axis of each Gaussian in the world, (M, 3): a column of its rotation matrix."""
-    w, v = quats[:, 0].astype(np.float64), quats[:, 1:].astype(np.float64)
-    unit = np.eye(3)[axis]
-    turned = np.cross(v, unit)
-    direction: np.ndarray = unit + 2 * (w[:, None] * turned + np.cross(v, turned))
-    return direction

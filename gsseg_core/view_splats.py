@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import viser
 
+from gsseg_core.rotations import rotations
 from gsseg_core.scene import GaussianScene
 from gsseg_core.view_nodes import BYTES_PER_GAUSSIAN, Key, Node, after, changes
 
@@ -72,11 +73,6 @@ def covariances(
     scales: np.ndarray,  # (N, 3)
 ) -> np.ndarray:
     """Covariances of Gaussians, R diag(scales^2) R^T: (N, 3, 3) float32."""
-    w, x, y, z = quats.T
-    rotation = np.empty((len(quats), 3, 3), np.float32)
-    rotation[:, 0] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=1)
-    rotation[:, 1] = np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=1)
-    rotation[:, 2] = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)
-    half = rotation * scales[:, None, :]
+    half = rotations(quats) * scales[:, None, :]
     product: np.ndarray = half @ half.transpose(0, 2, 1)
     return product

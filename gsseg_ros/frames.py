@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from gsseg_core.boxes import OrientedBox
 from gsseg_core.errors import SettingsError
+from gsseg_core.rotations import rotations
 
 Array: TypeAlias = npt.NDArray[np.float64]
 Quaternion: TypeAlias = tuple[float, float, float, float]
@@ -132,14 +133,8 @@ def rotation_from_quaternion(x: float, y: float, z: float, w: float) -> Array:
     """Turn a quaternion of any length but zero into a rotation matrix (3, 3)."""
     q = np.array([x, y, z, w], np.float64)
     q /= abs(q).max()  # First, so that no square over- or underflows.
-    x, y, z, w = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    rotation: Array = rotations(np.roll(q / np.linalg.norm(q), 1)[None])[0]  # w comes first there
+    return rotation
 
 
 def quaternion_from_rotation(

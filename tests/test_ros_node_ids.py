@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from ros_fixtures import shared_fixture  # noqa: F401
 from ros_helpers import Ros, ros_fixture  # noqa: F401
-from ros_robot import Robot, private_ros
+from ros_robot import Robot
 from small_scenes import balls_on_a_table, clean_views, write_dataset
 
 from gsseg_core.dataset import View
@@ -29,9 +29,8 @@ def parameters(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def running(tmp_path_factory: pytest.TempPathFactory, parameters: dict[str, Any]) -> Iterator[Robot]:
-    with private_ros(tmp_path_factory.mktemp("ros")) as ros:
-        yield Robot(ros).started(parameters)
+def running(shared: Ros, parameters: dict[str, Any]) -> Robot:
+    return Robot(shared).started(parameters)
 
 
 @pytest.fixture

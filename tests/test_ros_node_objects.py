@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros, ros_fixture  # noqa: F401
-from ros_robot import CLASSES, LATCHED, Robot, core_session, private_ros
-from small_scenes import clean_views, write_dataset
+from ros_robot import LATCHED, Robot, core_session
+from small_scenes import clean_views
 
 from gsseg_core.boxes import object_boxes
 from gsseg_core.pictures import palette
@@ -34,24 +33,8 @@ RAW = RefineSettings(cluster=False, filter=False)
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_dataset(tmp_path_factory.mktemp("root") / "data")
-
-
-@pytest.fixture(scope="module")
-def scene(data: Path) -> GaussianScene:
-    return GaussianScene.load(data / "scene.ply")
-
-
-@pytest.fixture(scope="module")
-def parameters(data: Path) -> dict[str, Any]:
-    return {"scene_path": data / "scene.ply", "data_root": data.parent, "class_names": CLASSES}
-
-
-@pytest.fixture(scope="module")
-def running(tmp_path_factory: pytest.TempPathFactory, parameters: dict[str, Any]) -> Iterator[Robot]:
-    with private_ros(tmp_path_factory.mktemp("ros")) as ros:
-        yield Robot(ros).started(parameters)
+def running(shared: Ros, parameters: dict[str, Any]) -> Robot:
+    return Robot(shared).started(parameters)
 
 
 @pytest.fixture

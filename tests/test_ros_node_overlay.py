@@ -5,15 +5,15 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from ros_helpers import wait_until
-from ros_robot import CLASSES, LATCHED, Robot, core_session, messages, private_ros
-from small_scenes import balls_on_a_table, clean_views, write_dataset
+from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
+from ros_helpers import Ros, wait_until
+from ros_robot import CLASSES, LATCHED, Robot, core_session, messages
+from small_scenes import balls_on_a_table, clean_views
 
 from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
@@ -40,19 +40,8 @@ RAW = RefineSettings(cluster=False, filter=False)
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_dataset(tmp_path_factory.mktemp("root") / "data")
-
-
-@pytest.fixture(scope="module")
-def scene(data: Path) -> GaussianScene:
-    return GaussianScene.load(data / "scene.ply")
-
-
-@pytest.fixture(scope="module")
-def running(tmp_path_factory: pytest.TempPathFactory, data: Path) -> Iterator[Robot]:
-    with private_ros(tmp_path_factory.mktemp("ros")) as ros:
-        yield Robot(ros).started({"scene_path": data / "scene.ply", "data_root": data.parent, "class_names": CLASSES})
+def running(shared: Ros, parameters: dict[str, Any]) -> Robot:
+    return Robot(shared).started(parameters)
 
 
 @pytest.fixture
