@@ -46,6 +46,9 @@ ENOUGH = 0.999
 SAMPLE = 2000
 """An object of more Gaussians is judged by so many of them at most, taken at even steps; that bounds the time."""
 
+_TIED = 1e-9
+"""Areas and volumes that differ by less than this part of them differ by rounding."""
+
 _STEPS, _PASSES, _SIDES = 50, 4, 3
 _SETTLED = 1e-3
 """The median may move by this part of the largest distance in the last step: it only has to be inside the object."""
@@ -224,16 +227,18 @@ def _turned(
     along = apart @ axes
     low, high = _quantile(along, share, TRIM), -_quantile(-along, share, TRIM)
     points = apart[((along >= low) & (along <= high)).all(axis=1)]
+    if len(points) < 4:  # In one plane, so that boxes of no volume contain them: nothing to choose by.
+        return axes
     starts = [axes]
-    if len(points) > 3:
-        with suppress(QhullError):  # All in one plane.
-            hull = ConvexHull(points)
-            corners = points[hull.simplices]
-            areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-            largest = np.argsort(-areas, kind="stable")[:_SIDES]
-            points = points[hull.vertices]
-            starts += [_turned_about(points, _completed(hull.equations[side, :3], axes), 0) for side in largest]
-    axes = min(starts, key=lambda start: _volume(points, start))
+    with suppress(QhullError):  # All in one plane.
+        hull = ConvexHull(points)
+        corners = points[hull.simplices]
+        areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        largest = np.argsort(-areas, kind="stable")[:_SIDES]
+        points = points[hull.vertices]
+        starts += [_turned_about(points, _completed(hull.equations[side, :3], axes), 0) for side in largest]
+    sides = np.stack([np.ptp(points @ start, axis=0) for start in starts])
+    axes = starts[_least(sides.prod(axis=1), sides.sum(axis=1))]
     for _ in range(_PASSES):
         before = axes
         for k in range(3):
@@ -254,11 +259,16 @@ def _completed(
     return np.stack([normal, other, np.cross(normal, other)], axis=1)
 
 
-def _volume(
-    points: Array,  # (M, 3)
-    axes: Array,  # (3, 3)
-) -> float:
-    return float(np.prod(np.ptp(points @ axes, axis=0)))
+def _least(
+    room: Array,  # (C,)
+    girth: Array,  # (C,)
+) -> int:
+    """Choose the candidate that takes the least area or volume, of those that tie the least girth.
+
+    On all sides of a triangle stand rectangles of one area, on the faces of a tetrahedron often boxes of one volume:
+    rounding must not choose.
+    """
+    return int(np.where(room <= room.min() * (1 + _TIED), girth, np.inf).argmin())
 
 
 def _turned_about(
@@ -284,14 +294,16 @@ def _smallest_rectangle(
         hull = points[ConvexHull(points).vertices] if len(points) > 2 else points[:0]
     except QhullError:  # All on one line.
         hull = points[:0]
-    upright = np.prod(np.ptp(hull, axis=0)) if len(hull) else 0.0
-    if upright <= 0:
+    spans = np.ptp(hull, axis=0) if len(hull) else np.zeros(2)
+    if spans.min() <= _TIED * spans.max():  # Seen edge on: there is nothing to make smaller.
         return 1.0, 0.0, 1.0
+    upright = spans.prod()
     edges = np.roll(hull, -1, axis=0) - hull
     edges /= np.linalg.norm(edges, axis=1, keepdims=True)
     across = np.stack([-edges[:, 1], edges[:, 0]], axis=1)
-    areas = np.ptp(hull @ edges.T, axis=0) * np.ptp(hull @ across.T, axis=0)
-    best = int(areas.argmin())
+    lengths, widths = np.ptp(hull @ edges.T, axis=0), np.ptp(hull @ across.T, axis=0)
+    areas = lengths * widths
+    best = _least(areas, lengths + widths)
     x, y = edges[best].tolist()
     # A quarter of a turn makes the same rectangle; the least turn keeps the axes in their order.
     if abs(x) < abs(y):

@@ -7,7 +7,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from small_scenes import NAMES, balls_on_a_table, clean_views
 
@@ -80,6 +80,8 @@ def test_a_round_plate_gets_its_diameter_and_thickness() -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 10_000), scale=st.floats(0.01, 100), count=st.integers(1, 120))
+@example(seed=101, scale=1.0, count=3)
+@example(seed=2, scale=1.0, count=4)
 def test_a_box_turns_moves_and_scales_with_the_scene(seed: int, scale: float, count: int) -> None:
     rng = np.random.default_rng(seed)
     points, weights = rng.normal(size=(count, 3)) * [0.7, 0.3, 0.1], rng.uniform(0.1, 1, count)
