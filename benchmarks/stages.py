@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from gsseg_core.dataset import Dataset, View, spread
 from gsseg_core.depth_sort import sort_by_depth
 from gsseg_core.em import EMLearner
 from gsseg_core.export import export_classes
+from gsseg_core.live import LiveSession
 from gsseg_core.neighbours import Neighbours
 from gsseg_core.operator import make_operator
 from gsseg_core.projection import project
@@ -93,17 +95,17 @@ def _depths(scene: GaussianScene, camera: Camera, ids: np.ndarray) -> np.ndarray
 
 
 def _fuse(scene: GaussianScene, data: Dataset, runs: int, sampled: int) -> list[float]:
-    """Seconds from a mask in memory to votes that hold it, per mask."""
-    views = [View.from_arrays(v.camera, v.read_labels()) for v in spread(data.views("train"), sampled)]
-    seconds = []
-    for _ in range(runs + 1):
-        learner = VoteLearner(scene, data.num_classes)
-        for view in views:  # Memory that is touched for the first time is slow, and a robot that runs has it.
-            learner.observe(view)
-        for view in views:
-            learner.retract(view.name)
-        seconds.append(once(lambda: [learner.observe(v) for v in views]) / len(views))  # noqa: B023 - called at once
-    return seconds[1:]
+    """Seconds from a mask as an array to votes that hold it, per mask, as the node does it."""
+    session = LiveSession(scene, data.class_names)
+    masks = [(view.camera, view.read_labels()) for view in spread(data.views("train"), sampled)]
+
+    def fuse(turn: int) -> None:
+        for camera, labels in masks:
+            rejection = session.fuse(View.from_arrays(replace(camera, name=f"{camera.name} {turn}"), labels))
+            assert rejection is None, rejection
+
+    # Memory that is touched for the first time is slow, and a robot that runs has it.
+    return [once(lambda turn=turn: fuse(turn)) / len(masks) for turn in range(runs + 1)][1:]
 
 
 def _learning(scene: GaussianScene, data: Dataset) -> Times:

@@ -16,7 +16,7 @@ import numpy as np
 from gsseg_core.calibration import VIEWS, Sample, fit_temperature, sample_pixels
 from gsseg_core.dataset import View, spread
 from gsseg_core.em import EMLearner
-from gsseg_core.learner import Learner, Progress, count_votes, silent
+from gsseg_core.learner import UNITS, Learner, Progress, silent
 from gsseg_core.operator import make_operator
 from gsseg_core.reliability import OtherViews
 from gsseg_core.votes import VoteLearner
@@ -85,8 +85,8 @@ def _sample(learner: Learner, others: OtherViews | None, view: View) -> Sample:
 def votes_without(learner: Learner, name: str) -> np.ndarray:
     """Votes of all views but one as probabilities, (N, K) float32; a row of zeros where no other saw the Gaussian."""
     observation = learner.observation(name)
-    count_votes(learner._votes, observation, -1)
+    observation.vote(learner._votes, UNITS, -1)
     try:
         return learner.vote_codes()
     finally:
-        count_votes(learner._votes, observation, 1)
+        observation.vote(learner._votes, UNITS)

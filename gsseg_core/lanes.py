@@ -402,7 +402,7 @@ def dot(typing: Any, a: Any, i: Any, b: Any, j: Any) -> tuple[Any, Callable[...,
 
 @intrinsic
 def prefetch(typing: Any, table: Any, row: Any) -> tuple[Any, Callable[..., Any]]:
-    """Ask for a row of any 2D array of float32 to be in the cache soon."""
+    """Ask for a row of any array to be in the cache soon."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         array = context.make_array(signature.args[0])(context, builder, arguments[0])

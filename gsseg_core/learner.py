@@ -12,7 +12,7 @@ import numpy as np
 
 from gsseg_core.dataset import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
-from gsseg_core.gaussian_kernels import add_votes, share_votes
+from gsseg_core.gaussian_kernels import share_votes
 from gsseg_core.meaning import decided, guess
 from gsseg_core.operator import Observation, make_operator
 from gsseg_core.scene import GaussianScene
@@ -21,6 +21,9 @@ from gsseg_core.state_file import State
 
 VOTE_UNIT = 2.0**-24
 """Votes are counted in whole multiples of this many px, so that adding and taking back are exact."""
+
+UNITS = 1 / VOTE_UNIT
+"""Units per px."""
 
 MEMORY_BUDGET = 2 << 30
 """Bytes of prepared views to keep between steps, unless asked otherwise."""
@@ -100,16 +103,13 @@ class Learner(ABC):
         MaskFormatError, MaskSizeError, UnknownLabelError
             The mask is broken, of another size than the camera, or has labels beyond the classes.
         """
-        observation, why = self._open(view)
-        if observation is None:
+        passing = self.memory_budget == 0 and view.name not in self.views
+        why = self._vote(view, 1) if passing else self._replace(view)
+        if why:
             self.rejected[view.name] = why
             return False
-        if view.name in self.views:
-            self.retract(view.name)
         self.rejected.pop(view.name, None)
-        self._count(observation, 1)
         self.views[view.name] = view
-        self._keep(view.name, observation)
         return True
 
     def observe_all(self, views: Sequence[View], progress: Progress = silent) -> None:
@@ -129,7 +129,10 @@ class Learner(ABC):
         """
         if name not in self.views:
             raise SettingsError(f"view {name!r} was not observed; there are {len(self.views)} others")
-        self._count(self.observation(name), -1)
+        if name in self._prepared:
+            self._prepared[name].vote(self._votes, UNITS, -1)
+        else:
+            self._vote(self.views[name], -1)
         del self.views[name]
         self._prepared.pop(name, None)
 
@@ -212,15 +215,37 @@ class Learner(ABC):
         """Count the rejected views by reason."""
         return dict(Counter(self.rejected.values()))
 
+    def _replace(self, view: View) -> str:
+        """Prepare a view and add its votes, in place of those of its name; returns why not, or nothing."""
+        observation, why = self._open(view)
+        if observation is not None:
+            if view.name in self.views:
+                self.retract(view.name)
+            observation.vote(self._votes, UNITS)
+            self._keep(view.name, observation)
+        return why
+
+    def _vote(self, view: View, sign: int) -> str:
+        """Add a view's votes, or take them away, and keep nothing of it; returns why not, or nothing."""
+        seen, why = self._read(view)
+        if seen is None:
+            return why
+        operator = make_operator(self.scene, view.camera, self.device)
+        return "" if operator.vote(*seen, self._votes, UNITS, sign) else SEES_NOTHING
+
     def _open(self, view: View) -> tuple[Observation | None, str]:
+        seen, why = self._read(view)
+        if seen is None:
+            return None, why
+        observation = make_operator(self.scene, view.camera, self.device).observe(*seen)
+        return (observation, "") if len(observation.ids) else (None, SEES_NOTHING)
+
+    def _read(self, view: View) -> tuple[SeenLabels | None, str]:
         if not view.has_mask:
             return None, NO_MASK
         seen = view.read_seen()
         self._check_labels(view, seen)
-        if not (seen.labels >= 0).any():
-            return None, ALL_UNKNOWN
-        observation = make_operator(self.scene, view.camera, self.device).observe(*seen)
-        return (observation, "") if len(observation.ids) else (None, SEES_NOTHING)
+        return (seen, "") if (seen.labels >= 0).any() else (None, ALL_UNKNOWN)
 
     def _check_labels(self, view: View, seen: SeenLabels) -> None:
         largest = int(seen.labels.max()) if seen.meaning is None else seen.meaning.largest
@@ -229,9 +254,6 @@ class Learner(ABC):
                 f"{view.mask_path or view.name}: mask holds the label {largest}; expected at most "
                 f"{self.num_classes - 1}, since there are {self.num_classes} classes"
             )
-
-    def _count(self, observation: Observation, sign: int) -> None:
-        count_votes(self._votes, observation, sign)
 
     def _keep(self, name: str, observation: Observation) -> None:
         used = sum(kept.nbytes for kept in self._prepared.values())
@@ -274,13 +296,3 @@ class Learner(ABC):
         for ids in names.values() or (None,):
             possible[[k for k in ids if k < self.num_classes] if ids is not None else slice(None)] = True
         return possible
-
-
-def count_votes(
-    total: np.ndarray,  # (N, K) int64, added to
-    observation: Observation,
-    sign: int = 1,
-) -> None:
-    """Add a view's votes, or take them away, in units of `VOTE_UNIT`."""
-    seen = observation.ids, observation.start, observation.labels
-    add_votes(total, *seen, *observation.meaning.votes, observation.votes(), 1 / VOTE_UNIT, sign)

@@ -11,6 +11,7 @@ import numpy as np
 from gsseg_core.cameras import Camera
 from gsseg_core.devices import checked_device
 from gsseg_core.errors import MaskSizeError, SceneValueError, SettingsError
+from gsseg_core.gaussian_kernels import add_votes
 from gsseg_core.meaning import Meaning
 from gsseg_core.rows import Rows
 from gsseg_core.scene import GaussianScene
@@ -129,6 +130,15 @@ class Observation(ABC):
     @abstractmethod
     def votes(self) -> np.ndarray:
         """Sum of weights of each sighting, the entries of W^T onehot(y) that are not zero: (P,) float32, in px."""
+
+    def vote(
+        self,
+        total: np.ndarray,  # (N, K) int64, added to
+        units: float,
+        sign: int = 1,
+    ) -> None:
+        """Add the votes to those of other views, or take them away, in whole units."""
+        add_votes(total, self.ids, self.start, self.labels, *self.meaning.votes, self.votes(), units, sign)
 
     @abstractmethod
     def shares(
@@ -266,6 +276,40 @@ class ViewOperator(ABC):
             observation.meaning = meaning
         return observation
 
+    def vote(
+        self,
+        labels: np.ndarray,  # (H, W) int32
+        meaning: Meaning | None,
+        total: np.ndarray,  # (N, K) int64, added to
+        units: float,
+        sign: int = 1,
+    ) -> bool:
+        """Add the view's votes to those of others, W^T onehot(y): what `observe` would say, with nothing kept of it.
+
+        Parameters
+        ----------
+        labels, meaning
+            The mask, as for `observe`.
+        total : (N, K) int64
+            Votes in units, of K classes, among them all that the mask speaks of.
+        units : float
+            Units per px of weight; a power of 2.
+        sign : int
+            1 to add, -1 to take back; what was added is taken back exactly.
+
+        Returns
+        -------
+        bool
+            Whether a labelled pixel sees any Gaussian.
+
+        Raises
+        ------
+        MaskSizeError
+            The labels are not of the camera's size.
+        """
+        self._check_size(labels, 2)
+        return self._vote(labels, meaning, total, units, sign)
+
     def visibility(self) -> np.ndarray:
         """Sum of each Gaussian's weights over the image: W^T 1, (N,) float32, in px."""
         return self.adjoint(np.ones((self.camera.height, self.camera.width, 1), np.float32))[:, 0]
@@ -308,6 +352,11 @@ class ViewOperator(ABC):
 
     @abstractmethod
     def _observe(self, labels: np.ndarray) -> Observation: ...
+
+    def _vote(self, labels: np.ndarray, meaning: Meaning | None, total: np.ndarray, units: float, sign: int) -> bool:
+        observation = self.observe(labels, meaning)
+        observation.vote(total, units, sign)
+        return len(observation.ids) > 0
 
     def _check_size(self, image: np.ndarray, dimensions: int) -> None:
         height, width = self.camera.height, self.camera.width

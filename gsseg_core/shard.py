@@ -20,7 +20,7 @@ import numpy as np
 from gsseg_core.dataset import View
 from gsseg_core.em import EMLearner, EMSettings, ErrorModel
 from gsseg_core.errors import GssegError
-from gsseg_core.learner import count_votes
+from gsseg_core.learner import UNITS
 from gsseg_core.rows import Rows
 from gsseg_core.scene import GaussianScene
 
@@ -99,7 +99,7 @@ def sum_votes(shard: Shard, wanted: dict[str, Any]) -> Part:
     votes = np.zeros((len(shard.scene), shard.num_classes), np.int64)
     with _all_threads():
         for _, observation in shard._observations(name for name in wanted if name in shard.views):
-            count_votes(votes, observation)
+            observation.vote(votes, UNITS)
     return votes, {name: shard.rejected.get(name, "") for name in wanted}
 
 

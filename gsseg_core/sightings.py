@@ -88,7 +88,10 @@ def number_sightings(
         for g in range(first, (chunk + 1) * many // CHUNKS):
             begin, is_seen = n, False
             for i in range(gaussian_start[g], gaussian_start[g + 1]):
-                prefetch(kept, gaussian_entries[min(i + AHEAD, last)])
+                prefetch(kept, gaussian_entries[min(i + 2 * AHEAD, last)])
+                later = gaussian_entries[min(i + AHEAD, last)]
+                facts = tiles[kept[later, 1]]
+                prefetch(sums, facts[1] + (later - facts[0]) * facts[5])
                 e = gaussian_entries[i]
                 target, tile = kept[e, 0], kept[e, 1]
                 if target < 0:

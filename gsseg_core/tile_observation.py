@@ -7,7 +7,7 @@ import numpy as np
 from gsseg_core import sightings
 from gsseg_core.cameras import Camera
 from gsseg_core.errors import SceneValueError
-from gsseg_core.lift import Labels, cut_labels, lift
+from gsseg_core.lifted_mask import LiftedMask
 from gsseg_core.operator import Observation, Shares
 from gsseg_core.rows import starts
 from gsseg_core.tiles import Tiles
@@ -25,29 +25,19 @@ class TileObservation(Observation):
         ids: np.ndarray,  # (M,)
         table: np.ndarray,  # (M, 8)
         tiles: Tiles,
-        labels: np.ndarray,  # (H, W)
+        lifted: LiftedMask,
     ) -> None:
-        self._camera = camera
-        areas = np.bincount(np.maximum(labels, -1).ravel() + 1, minlength=1)[1:]
-        self.classes = np.flatnonzero(areas).astype(np.int32)
-        self.num_pixels = int(areas.sum())
-        self._columns, self._labels = tiles.columns, _cut(labels, self.classes, tiles)
-        self._lift(ids, table, tiles)
+        self._camera, self._columns = camera, tiles.columns
+        self.classes, self.num_pixels, self._labels = lifted.classes, lifted.num_pixels, lifted.labels
+        self._number(ids, table, tiles, lifted)
 
-    def _lift(self, ids: np.ndarray, table: np.ndarray, tiles: Tiles) -> None:
-        mask, camera = self._labels, self._camera
+    def _number(self, ids: np.ndarray, table: np.ndarray, tiles: Tiles, lifted: LiftedMask) -> None:
+        mask, slot_start, counts = lifted.labels, lifted.slot_start, lifted.counts
         many = np.diff(mask.start)
-        slot_start = starts(np.diff(tiles.start) * many)
-        reached, sums = np.empty(len(tiles.entries), np.uint16), np.empty(slot_start[-1], np.float32)
-        counts = np.empty((len(many), 3), np.int64)
-        lift(
-            tiles.columns, camera.width, camera.height, table, tiles.start, tiles.entries,
-            mask.start, mask.span_start, mask.slots, mask.lanes, slot_start, reached, sums, counts,
-        )  # fmt: skip
         self._start, self._slot_start = starts(counts[:, 0]), starts(counts[:, 0] * many)
         self._records = counts[:, 1].copy()
-        kept, self._rows = np.empty((len(reached), 2), np.int32), np.empty(self._start[-1], np.uint16)
-        sightings.keep_entries(tiles.start, reached, self._start, kept, self._rows)
+        kept, self._rows = np.empty((len(lifted.reached), 2), np.int32), np.empty(self._start[-1], np.uint16)
+        sightings.keep_entries(tiles.start, lifted.reached, self._start, kept, self._rows)
 
         # A Gaussian has at most as many labels as sums, and each entry one sum, but for so many in all:
         extra = counts[:, 2].sum() - counts[:, 0].sum()
@@ -60,7 +50,7 @@ class TileObservation(Observation):
         begins = (tiles.start, slot_start, self._start, self._slot_start, mask.start)
         sightings.number_sightings(
             tiles.gaussian_start, tiles.gaussian_entries, kept,
-            np.stack([*(begin[:-1] for begin in begins), many], axis=1), sums, mask.present, len(self.classes),
+            np.stack([*(begin[:-1] for begin in begins), many], axis=1), lifted.sums, mask.present, len(self.classes),
             room, found, gaussians, label_counts, labels, votes, self._entries, self._sighting,
         )  # fmt: skip
         before = np.cumsum(found, axis=0) - found
@@ -107,18 +97,6 @@ class TileObservation(Observation):
         sightings.add_up(self._slot_start, self._sighting, sums, parts)
         total = np.bincount(mask.present, weights=left_over, minlength=len(rest))
         return Shares(parts.sum(axis=0), total, float(logs.sum()))
-
-
-def _cut(
-    labels: np.ndarray,  # (H, W)
-    classes: np.ndarray,  # (L,)
-    tiles: Tiles,
-) -> Labels:
-    """Cut a mask into tiles, its labels numbered as in `classes`."""
-    position = np.full(max(classes.max(initial=0) + 1, 1), -1, np.int32)
-    position[classes] = np.arange(len(classes))
-    local = np.where(labels >= 0, position[np.maximum(labels, 0)], -1).astype(np.int32)
-    return Labels(*cut_labels(local, tiles.columns, tiles.rows, len(classes)))
 
 
 def _joined(

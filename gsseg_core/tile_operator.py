@@ -6,6 +6,8 @@ import numpy as np
 
 from gsseg_core import products
 from gsseg_core.cameras import Camera
+from gsseg_core.lifted_mask import LiftedMask
+from gsseg_core.meaning import Meaning
 from gsseg_core.operator import Blended, Observation, ViewOperator, Weights
 from gsseg_core.projection import project
 from gsseg_core.rows import Rows
@@ -79,4 +81,10 @@ class TileOperator(ViewOperator):
         return Weights(pixels[order], self.ids[rows[order]], weights[order])
 
     def _observe(self, labels: np.ndarray) -> Observation:
-        return TileObservation(self.camera, self.ids, self._table, self._tiles, labels)
+        lifted = LiftedMask(self.camera, self._table, self._tiles, labels)
+        return TileObservation(self.camera, self.ids, self._table, self._tiles, lifted)
+
+    def _vote(self, labels: np.ndarray, meaning: Meaning | None, total: np.ndarray, units: float, sign: int) -> bool:
+        lifted = LiftedMask(self.camera, self._table, self._tiles, labels)
+        lifted.vote(self.ids, self._tiles, meaning or Meaning(lifted.classes), total, units, sign)
+        return lifted.sees

@@ -101,8 +101,9 @@ def test_views_taken_back_leave_no_trace_whatever_the_order(order: list[int], ta
         np.testing.assert_array_equal(learner.fit().codes_, fresh.fit().codes_)
 
 
-def test_a_view_of_the_same_name_replaces_the_earlier_one() -> None:
-    learner = taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS)
+@pytest.mark.parametrize("budget", [0, 1 << 30])
+def test_a_view_of_the_same_name_replaces_the_earlier_one(budget: int) -> None:
+    learner = taught(VoteLearner(SCENE, NUM_CLASSES, memory_budget=budget), VIEWS)
     other = View.from_arrays(VIEWS[1].camera, np.full_like(VIEWS[1].read_labels(), 3))
     taught(learner, [other])
     fresh = taught(VoteLearner(SCENE, NUM_CLASSES), [VIEWS[0], other, *VIEWS[2:]])
@@ -110,9 +111,10 @@ def test_a_view_of_the_same_name_replaces_the_earlier_one() -> None:
     assert len(learner.views) == 5
 
 
+@pytest.mark.parametrize("budget", [0, 1 << 30])
 @every_learner
-def test_views_that_cannot_be_used_are_counted_by_reason_and_change_nothing(kind: type[Learner]) -> None:
-    learner = taught(kind(SCENE, NUM_CLASSES), VIEWS[:2])
+def test_views_that_cannot_be_used_are_counted_by_reason_and_change_nothing(kind: type[Learner], budget: int) -> None:
+    learner = taught(kind(SCENE, NUM_CLASSES, memory_budget=budget), VIEWS[:2])
     before = learner._votes.copy()
     unknown = np.full((48, 64), -1, np.int32)
     away = look_at("away", np.array([0.0, 500.0, 300.0]))

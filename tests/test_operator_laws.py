@@ -11,6 +11,8 @@ from operator_backends import CPU
 from operator_cases import dense, make_camera, make_scene, moved, random_mask, random_view, rigid, spread
 
 from gsseg_core.cameras import Camera
+from gsseg_core.learner import UNITS
+from gsseg_core.meaning import Meaning
 
 views = st.fixed_dictionaries(
     {
@@ -193,6 +195,26 @@ def test_votes_are_the_adjoint_of_the_one_hot_mask(backend, view):
     np.testing.assert_allclose(
         spread(operator, seen, seen.votes(), 9), operator.adjoint(one_hot), rtol=5 * backend.sum, atol=backend.sum
     )
+
+
+@few
+@given(views, st.booleans())
+def test_votes_that_keep_nothing_of_a_view_are_those_of_its_observation_to_the_last_bit(backend, view, soft):
+    scene, camera = random_view(**view)
+    operator = backend.make(scene, camera)
+    mask, meaning = random_mask(view["seed"], camera.width, camera.height, ids=(0, 2, 3, 8)), None
+    if soft:  # Prototypes, which speak for several classes and against others.
+        present, places = np.unique(mask, return_inverse=True)
+        mask = places.reshape(mask.shape).astype(np.int32) - (present[0] < 0)
+        mass = np.random.default_rng(view["seed"]).dirichlet(np.ones(3), mask.max() + 1)[:, :2]
+        meaning = Meaning(np.array([1, 5], np.int32), mass.astype(np.float32), np.array([1, 4, 5], np.int32))
+    observation = operator.observe(mask, meaning)
+    expected, found = np.zeros((2, len(scene), 9), np.int64)
+    observation.vote(expected, UNITS)
+    assert operator.vote(mask, meaning, found, UNITS) == (len(observation.ids) > 0)
+    np.testing.assert_array_equal(found, expected)
+    operator.vote(mask, meaning, found, UNITS, -1)
+    assert not found.any()
 
 
 @few
