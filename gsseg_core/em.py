@@ -29,7 +29,7 @@ without the summand of v, and with B_v taken at q^-v
 
 with the left-over transmittance as one more Gaussian of class 0. a_v[k] counts pseudo-pixels in which the segmenter was
 right, a share of those that class k fills in view v by the votes of the others. At first q^-v are these votes' codes;
-once the codes have converged the models are learnt anew in this way, and then the codes once more.
+once the codes have all but converged the models are learnt anew in this way, and then the codes once more.
 
 Soft and partial masks. There the segmenter's words y are classes, and "none of those that I looked for", which is right
 for all others. A pixel's label m is a mixture of words with shares s_m[y] (see `gsseg_core.meaning`): wherever
@@ -46,13 +46,16 @@ from functools import partial
 import numpy as np
 
 from gsseg_core.errors import SettingsError
-from gsseg_core.gaussian_kernels import collect, improve, mix, take_votes, tally
-from gsseg_core.learner import MEMORY_BUDGET, VOTE_UNIT, Learner, Progress, silent
+from gsseg_core.gaussian_kernels import collect, improve, improve_without, mix, take_votes, tally
+from gsseg_core.learner import MEMORY_BUDGET, UNITS, VOTE_UNIT, Learner, Progress, silent
 from gsseg_core.meaning import Meaning, standing
 from gsseg_core.neighbours import neighbours_of
 from gsseg_core.operator import Observation
-from gsseg_core.rows import Rows
+from gsseg_core.rows import Rows, starts
 from gsseg_core.scene import GaussianScene
+
+ROUGH = 4
+"""Codes that error models are learnt anew from may be so many times less settled than those that are handed out."""
 
 
 @dataclass(frozen=True)
@@ -64,11 +67,11 @@ class EMSettings:
     max_steps : int
         Steps at most.
     tolerance : float
-        Stop when a step gains less than this, in nats per labelled pixel.
+        Stop when a step gains less than this, in nats per labelled pixel; `ROUGH` times this before a refit.
     errors : bool
         Learn what the segmenter got wrong in each view; without, every mask is taken at its word.
     refits : int
-        How often error models are learnt anew once the codes have converged, and the codes then once more.
+        How often error models are learnt anew once the codes have all but converged, and the codes then once more.
     error_prior : float
         Pseudo-pixels in which a class was labelled right, as a share of the pixels that it fills in the view.
     outliers : float
@@ -234,8 +237,10 @@ class EMLearner(Learner):
             gains, told = self._gains(codes, models, tell)
             history.append((_log_prior(codes.values, prior.values) + sum(told[name] for name in self.views)) / pixels)
             rounds[-1] += 1
-            self.converged_ = rounds[-1] > 1 and history[-1] - history[-2] < settings.tolerance
-            if self.converged_ and (len(rounds) > settings.refits or not settings.errors):
+            last = len(rounds) > settings.refits or not settings.errors
+            enough = settings.tolerance * (1 if last else ROUGH)
+            self.converged_ = rounds[-1] > 1 and history[-1] - history[-2] < enough
+            if self.converged_ and last:
                 improve(codes.start, codes.values, gains, prior.values)
                 break
             if self.converged_:
@@ -273,7 +278,7 @@ class EMLearner(Learner):
         seen = order, observation.start, observation.labels
         places = votes.places(observation.ids[order])
         others = places.with_values(votes.values[places.values])
-        take_votes(*others, *seen, *observation.meaning.votes, own, 1 / VOTE_UNIT)
+        take_votes(*others, *seen, *observation.meaning.votes, own, UNITS)
         others = standing(others, self._possible())
         codes = others.with_values(others.values.astype(np.float32)).normalised()
         return tally(*codes, *seen, own, self.num_classes, len(observation.classes))
@@ -315,7 +320,7 @@ class EMLearner(Learner):
         for name, observation in self._observations(models):
             tell()
             model, order = models[name], observation.order
-            without, _ = codes_without(observation, model, codes, gains, prior)
+            without = codes_without(observation, model, codes, gains, prior)
             likelihood = np.ascontiguousarray(model.likelihood.T)
             said = mix(*without, order, _inverse(order), observation.start, observation.labels, likelihood)
             shares = observation.shares(said, likelihood[:, 0])
@@ -340,26 +345,16 @@ def codes_without(
     model: ErrorModel,
     codes: Rows,
     gains: np.ndarray,  # (Z,) int64, of a step at these codes and models
-    prior: np.ndarray | None = None,  # (Z,) px
-) -> tuple[Rows, np.ndarray]:
-    """Take a step of EM that leaves a view's own summand out.
-
-    Returns
-    -------
-    without : Rows
-        Codes of the M Gaussians that the view sees, in the order of the scene.
-    places : (Z',) int64
-        Where in the codes of all they stand.
-    """
-    order = observation.order
-    start, classes, places = codes.places(observation.ids[order])
+    prior: np.ndarray,  # (Z,) float32, px
+) -> Rows:
+    """Take a step of EM that leaves a view's own summand out: codes of the M Gaussians that it sees, by `order`."""
     likelihood = np.ascontiguousarray(model.likelihood.T)
-    seen = order, _inverse(order), observation.start, observation.labels, likelihood
-    without, own = codes.values[places], np.zeros(len(places), np.int64)
-    shares = observation.shares(mix(start, classes, without, *seen), likelihood[:, 0])
-    collect(start, classes, own, *seen, shares.sightings)  # Exactly what the view has given to the gains.
-    improve(start, without, gains[places] - own, np.zeros_like(without) if prior is None else prior[places])
-    return Rows(start, classes, without), places
+    seen = observation.order, observation.ids, observation.start, observation.labels, likelihood
+    shares = observation.shares(mix(*codes, *seen), likelihood[:, 0])
+    start = starts(np.diff(codes.start)[observation.ids[observation.order]])
+    without = Rows(start, np.empty(start[-1], np.uint32), np.empty(start[-1], np.float32))
+    improve_without(*codes, gains, prior, *seen, shares.sightings, *without)
+    return without
 
 
 def _inverse(

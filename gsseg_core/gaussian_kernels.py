@@ -112,6 +112,40 @@ def improve(
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
+def improve_without(
+    rows: np.ndarray,  # (N + 1,) all three that follow, as `Rows`
+    classes: np.ndarray,  # (Z,)
+    codes: np.ndarray,  # (Z,) float32
+    gains: np.ndarray,  # (Z,) int64, in units of GAIN_UNIT
+    prior: np.ndarray,  # (Z,) float32, px
+    order: np.ndarray,  # (M,) int32: in which to go through the Gaussians
+    ids: np.ndarray,  # (M,) int32
+    start: np.ndarray,  # (M + 1,)
+    labels: np.ndarray,  # (P,) int32
+    likelihood: np.ndarray,  # (L, K) float32
+    shares: np.ndarray,  # (P,) float32
+    out_rows: np.ndarray,  # (M + 1,) the result, as `Rows` in that order
+    out_classes: np.ndarray,  # (Z',) out
+    out: np.ndarray,  # (Z',) float32 out
+) -> None:
+    """Improve the codes of the Gaussians that a view sees by the gains less what `collect` added for this view."""
+    for i in nb.prange(order.shape[0]):
+        m = order[i]
+        first, total = rows[ids[m]], np.float32(0.0)
+        for j in range(out_rows[i + 1] - out_rows[i]):
+            z, k = out_rows[i] + j, classes[first + j]
+            others = gains[first + j]
+            for s in range(start[m], start[m + 1]):
+                others -= in_units(shares[s] * likelihood[labels[s], k])
+            out_classes[z] = k
+            out[z] = codes[first + j] * (np.float32(others) * _GAIN_UNIT) + prior[first + j]
+            total += out[z]
+        if total > 0:
+            for z in range(out_rows[i], out_rows[i + 1]):
+                out[z] /= total
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
 def tally(
     rows: np.ndarray,  # (M + 1,) codes, as `Rows`
     classes: np.ndarray,  # (Z,)

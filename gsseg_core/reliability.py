@@ -115,6 +115,8 @@ class OtherViews:
         self._sampled = {view.name for view in spread(list(learner.views.values()), VIEWS)}
         self._samples: dict[str, Sample] = {}
         self._codes = Rows.of(learner.codes_)
+        # Where no other view has seen anything, nothing is to be said.
+        self._prior = np.zeros_like(self._codes.values)
         self._shows_background = bool((self._codes.classes == 0).any())
         total = len(learner.views)
         done = itertools.count()
@@ -136,11 +138,10 @@ class OtherViews:
     def blend(self, view: View) -> np.ndarray:
         """Blend what all the others say into a view, (H, W, K) float32; rows sum to less where they are silent."""
         learner = self.learner
-        # No prior: where no other view has seen anything, nothing is to be said.
         model = learner.error_models_[view.name]
-        without, places = codes_without(learner.observation(view.name), model, self._codes, self._gains)
-        codes = self._codes.values.copy()
-        codes[places] = without.values
+        observation, codes = learner.observation(view.name), self._codes.values.copy()
+        places = self._codes.places(observation.ids[observation.order]).values
+        codes[places] = codes_without(observation, model, self._codes, self._gains, self._prior).values
         operator = make_operator(learner.scene, view.camera, learner.device)
         image, left_over = operator.blend_rows(self._codes.with_values(codes), learner.num_classes)
         if self._shows_background:

@@ -23,7 +23,7 @@ from small_scenes import (
 from threadpoolctl import threadpool_limits
 
 from gsseg_core.dataset import View
-from gsseg_core.em import EMLearner, EMSettings
+from gsseg_core.em import EMLearner, EMSettings, codes_without
 from gsseg_core.errors import SettingsError
 from gsseg_core.gaussian_kernels import GAIN_UNIT, collect, improve
 from gsseg_core.operator import make_operator
@@ -202,6 +202,24 @@ def test_sums_over_views_do_not_depend_on_order_or_grouping(groups: list[int], o
         parts += gains
         assert part_told == {name: told[name] for name in chosen}
     np.testing.assert_array_equal(parts, whole)
+
+
+def test_codes_without_a_view_are_a_step_with_the_gains_of_all_the_others() -> None:
+    learner = taught(EMLearner(SCENE, NUM_CLASSES), wrong_views(4))
+    codes = Rows.of(learner.vote_codes() + np.float32(0.01))
+    prior = np.random.default_rng(0).uniform(0, 3, len(codes.values)).astype(np.float32)
+    models = learner._first_models(Rows.of(learner._votes), lambda: None)
+    gains, _ = learner._gains(codes, models, lambda: None)
+    for name in learner.views:
+        observation = learner.observation(name)
+        others, _ = learner._gains(codes, {other: models[other] for other in models if other != name}, lambda: None)
+        expected = codes.with_values(codes.values.copy())
+        improve(expected.start, expected.values, others, prior)
+        seen = expected.places(observation.ids[observation.order])
+        found = codes_without(observation, models[name], codes, gains, prior)
+        np.testing.assert_array_equal(found.start, seen.start)
+        np.testing.assert_array_equal(found.classes, seen.classes)
+        np.testing.assert_array_equal(found.values, expected.values[seen.values])
 
 
 def test_what_was_all_but_ruled_out_does_not_overflow_the_sums() -> None:
