@@ -20,16 +20,16 @@ so a scene in millimetres, or one whose far half is sparser, is treated the same
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import numba as nb
 import numpy as np
 
 from gsseg_core.errors import SceneValueError, SettingsError
-from gsseg_core.kd_tree import Tree, scaled
+from gsseg_core.kd_tree import Tree, scaled, tree_of
 from gsseg_core.nearest import CHUNK, nearest
+from gsseg_core.per_scene import PerScene
+from gsseg_core.rows import starts
 from gsseg_core.scene import GaussianScene
 
 BLOCK = 16
@@ -106,41 +106,35 @@ class Graph:
         means: np.ndarray,  # (N, 3) float32, finite
         colors: np.ndarray,  # (N, 3) float32
         k: int = GraphSettings.k,
+        tree: Tree | None = None,
     ) -> Graph:
-        """Link every point with its k nearest others, or with all there are."""
+        """Link every point with its k nearest others, or with all there are; `tree` is that of the scaled points."""
         if len(means) < 2:
             return cls(k, np.arange(len(means), dtype=np.int32), np.zeros(len(means) + 1, np.int64),
                        np.empty(0, np.int32), np.empty(0, np.float32))  # fmt: skip
-        tree = Tree.build(scaled(means))
+        tree = tree or Tree.build(scaled(means))
         places = np.arange(len(means), dtype=np.int32)
         radii, _ = nearest(tree.points, tree.boxes, tree.blocks, places, min(k, len(means) - 1))
-        start = np.zeros(len(means) + 1, np.int64)
-        # A thousand points in one place are all tied: without a limit, each would have a thousand neighbours.
-        _list_near(tree.points, tree.boxes, radii, 2 * k, start[1:], np.empty(0, np.int64), np.empty(0, np.int32))
-        np.cumsum(start, out=start)
-        near = np.empty(start[-1], np.int32)
-        _list_near(tree.points, tree.boxes, radii, 2 * k, np.empty(0, np.int64), start, near)
-        of = np.repeat(places, np.diff(start))
+        start, near = _near(tree, radii, k)
         ordered = np.ascontiguousarray(colors[tree.order], np.float32)
-        contrast = np.linalg.norm(ordered[of] - ordered[near], axis=1)
-        shares = np.empty(len(near), np.float32)
+        contrast, shares = np.empty(len(near), np.float32), np.empty(len(near), np.float32)
+        _compare(ordered, start, near, contrast)
         # Painted scenes have areas of one colour; where there is only one, it tells nothing.
         typical = float(np.median(contrast)) or float(contrast.mean()) or 1.0
         _weigh(tree.points, radii, contrast, typical, start, near, shares)
         return cls(k, tree.order, start, near, shares)
 
 
-_KNOWN: WeakKeyDictionary[GaussianScene, Graph] = WeakKeyDictionary()
-_BUILDING = threading.Lock()
+_KNOWN: PerScene[Graph] = PerScene()
 
 
 def graph_of(scene: GaussianScene, k: int = GraphSettings.k) -> Graph:
     """Build the graph of a scene, once: it is kept with it."""
-    with _BUILDING:
-        known = _KNOWN.get(scene)
-        if known is None or known.k != k:
-            known = _KNOWN[scene] = Graph.build(scene.means, scene.colors(), k)
-        return known
+
+    def build() -> Graph:
+        return Graph.build(scene.means, scene.colors(), k, tree_of(scene) if len(scene) else None)
+
+    return _KNOWN.of(scene, build, lambda known: known.k == k)
 
 
 def is_scarce(
@@ -332,23 +326,69 @@ def _steps_to_reach(start: np.ndarray, places: np.ndarray, known: np.ndarray, st
     return reached
 
 
+def _near(
+    tree: Tree,
+    radii: np.ndarray,  # (n,) squared
+    k: int,
+) -> tuple[np.ndarray, np.ndarray]:
+    """List the others within each point's radius: where each list begins, (n + 1,) int64, and places, (E,) int32."""
+    n = len(radii)
+    k = min(k, n - 1)
+    # A thousand points in one place are all tied: without a limit, each would have a thousand neighbours.
+    most, counts = 2 * k, np.empty(n, np.int64)
+    near = np.empty(n * k, np.int32)
+    _list_near(tree.points, tree.boxes, radii, most, np.arange(n, dtype=np.int32), np.arange(n + 1) * k, counts, near)
+    start, tied = starts(counts), np.flatnonzero(counts > k).astype(np.int32)
+    if len(tied):
+        first, near = near.reshape(n, k), np.empty(start[-1], np.int32)
+        _move(first, start, near)
+        _list_near(tree.points, tree.boxes, radii, most, tied, start, counts, near)
+    return start, near
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _move(
+    lists: np.ndarray,  # (n, k)
+    start: np.ndarray,  # (n + 1,)
+    near: np.ndarray,  # (E,) out
+) -> None:
+    for i in nb.prange(lists.shape[0]):
+        for j in range(lists.shape[1]):
+            near[start[i] + j] = lists[i, j]
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _compare(
+    colors: np.ndarray,  # (n, 3)
+    start: np.ndarray,  # (n + 1,)
+    near: np.ndarray,  # (E,)
+    contrast: np.ndarray,  # (E,) out
+) -> None:
+    for i in nb.prange(colors.shape[0]):
+        for e in range(start[i], start[i + 1]):
+            j = near[e]
+            r, g, b = colors[i, 0] - colors[j, 0], colors[i, 1] - colors[j, 1], colors[i, 2] - colors[j, 2]
+            contrast[e] = np.sqrt(r * r + g * g + b * b)
+
+
 @nb.njit(parallel=True, nogil=True, cache=True)
 def _list_near(
     points: np.ndarray,  # (3, n)
     boxes: np.ndarray,  # (2 L, 6)
     radii: np.ndarray,  # (n,) squared
     most: int,  # for one point
-    counts: np.ndarray,  # (n,) out, if not empty
-    start: np.ndarray,  # (n + 1,) where to write, if not empty
+    wanted: np.ndarray,  # (M,) int32: of which points
+    start: np.ndarray,  # (n + 1,) room for the list of each point
+    counts: np.ndarray,  # (n,) out: how many there are, though there may be room for fewer
     near: np.ndarray,  # (E,) out
 ) -> None:
-    """Count the others within each point's radius, or list them where a first call's counts say."""
+    """List the others within the radius of points."""
     leaves, n = boxes.shape[0] // 2, points.shape[1]
-    for chunk in nb.prange((n + CHUNK - 1) // CHUNK):
+    for chunk in nb.prange((wanted.shape[0] + CHUNK - 1) // CHUNK):
         nodes = np.empty(64, np.int64)
-        for own in range(chunk * CHUNK, min((chunk + 1) * CHUNK, n)):
+        for own in wanted[chunk * CHUNK : (chunk + 1) * CHUNK]:
             x, y, z, radius = points[0, own], points[1, own], points[2, own], radii[own]
-            found, first = 0, start[own] if start.shape[0] else 0
+            found, first, room = 0, start[own], start[own + 1] - start[own]
             nodes[0], waiting = 1, 1
             while waiting:
                 waiting -= 1
@@ -365,11 +405,10 @@ def _list_near(
                 for i in range((node - leaves) * n // leaves, (node - leaves + 1) * n // leaves):
                     dx, dy, dz = points[0, i] - x, points[1, i] - y, points[2, i] - z
                     if i != own and found < most and dx * dx + dy * dy + dz * dz <= radius:
-                        if start.shape[0]:
+                        if found < room:
                             near[first + found] = i
                         found += 1
-            if counts.shape[0]:
-                counts[own] = found
+            counts[own] = found
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)

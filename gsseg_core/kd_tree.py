@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
+from gsseg_core.per_scene import PerScene
+from gsseg_core.scene import GaussianScene
+
 LEAF = 16
 """Most points in a leaf of the tree."""
 
@@ -69,6 +72,14 @@ def scaled(means: np.ndarray) -> np.ndarray:
     largest = max(points.max(initial=0), -points.min(initial=0))
     scaled: np.ndarray = np.ldexp(points, -np.frexp(largest)[1])
     return scaled
+
+
+_KNOWN: PerScene[Tree] = PerScene()
+
+
+def tree_of(scene: GaussianScene) -> Tree:
+    """Build the tree of a scene's centres, scaled, once: it is kept with it. There must be one."""
+    return _KNOWN.of(scene, lambda: Tree.build(scaled(scene.means)))
 
 
 def _depth(count: int) -> int:

@@ -9,17 +9,16 @@ among the k nearest share it equally, and sums are taken over whole numbers, whe
 
 from __future__ import annotations
 
-import threading
 from dataclasses import dataclass
 from itertools import pairwise
-from weakref import WeakKeyDictionary
 
 import numba as nb
 import numpy as np
 
-from gsseg_core.kd_tree import LEAF, Tree, enclose, leaf_range, scaled
+from gsseg_core.kd_tree import LEAF, Tree, enclose, leaf_range, scaled, tree_of
 from gsseg_core.lanes import at_most, first_bit, load_row
 from gsseg_core.nearest import CHUNK, NO_SKIP, middle_of, nearest
+from gsseg_core.per_scene import PerScene
 from gsseg_core.rows import Rows
 from gsseg_core.scene import GaussianScene
 from gsseg_core.surroundings import Surroundings, end_of_group, look_around, measure, room_for
@@ -58,9 +57,10 @@ class Neighbours:
         cls,
         means: np.ndarray,  # (N, 3) float32, finite
         k: int,
+        tree: Tree | None = None,
     ) -> Neighbours:
-        """Find them, for N > 1."""
-        tree, k = Tree.build(scaled(means)), min(k, len(means) - 1)
+        """Find them, for N > 1; the tree, if there is one, is that of the scaled points."""
+        tree, k = tree or Tree.build(scaled(means)), min(k, len(means) - 1)
         radii, distances = nearest(tree.points, tree.boxes, tree.blocks, np.arange(len(means), dtype=np.int32), k)
         return cls(k, tree, radii, distances)
 
@@ -128,20 +128,15 @@ class Neighbours:
         return out
 
 
-_KNOWN: WeakKeyDictionary[GaussianScene, Neighbours] = WeakKeyDictionary()
-_FINDING = threading.Lock()
+_KNOWN: PerScene[Neighbours] = PerScene()
 
 
 def neighbours_of(scene: GaussianScene, k: int) -> Neighbours | None:
     """Find the neighbours of a scene's Gaussians, once: they are kept with it. None if it has a single Gaussian."""
     if len(scene) < 2:
         return None
-    # Whoever asks while another thread looks waits for that one.
-    with _FINDING:
-        known = _KNOWN.get(scene)
-        if known is None or known.k != min(k, len(scene) - 1):
-            known = _KNOWN[scene] = Neighbours.find(scene.means, k)
-        return known
+    k = min(k, len(scene) - 1)
+    return _KNOWN.of(scene, lambda: Neighbours.find(scene.means, k, tree_of(scene)), lambda known: known.k == k)
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
