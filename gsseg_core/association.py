@@ -50,6 +50,8 @@ class AssociationSettings:
         Views, in full sight of both clusters, that it takes at least to merge two.
     full_sight : float
         Share of a cluster, as far as any view sees it, that a view must see to count in full.
+    plenty : float
+        Px of a cluster that a view must see to count in full, however large the cluster is.
     full_sight_px : float
         What a view sees of a cluster counts by x / (x + this), x in px.
     least_share : float
@@ -65,6 +67,7 @@ class AssociationSettings:
     doubt: float = 0.3
     evidence: float = 0.3
     full_sight: float = 0.5
+    plenty: float = 2000.0
     full_sight_px: float = 10.0
     least_share: float = 0.05
     unseen: float = 0.3
@@ -78,8 +81,10 @@ class AssociationSettings:
             )
         if min(self.doubt, self.evidence, self.full_sight_px, self.least_share, self.unseen, self.rounds) < 0:
             raise SettingsError("association: a setting is negative; expected 0 or more")
-        if self.full_sight <= 0:
-            raise SettingsError(f"association: full_sight is {self.full_sight}; expected a share above 0")
+        if min(self.full_sight, self.plenty) <= 0:
+            raise SettingsError(
+                f"association: full_sight is {self.full_sight}, plenty {self.plenty}; expected more than 0"
+            )
 
 
 def associate(views: Mapping[str, Lifted], settings: AssociationSettings | None = None) -> dict[str, np.ndarray]:
@@ -181,7 +186,8 @@ def _votes(
     Who calls a cluster background says nothing of which object it is.
     """
     told = np.maximum(seen - hidden, 0)
-    counts: np.ndarray = np.minimum(told / np.maximum(settings.full_sight * seen.max(axis=1, keepdims=True), 1e-9), 1)
+    full = np.minimum(settings.full_sight * seen.max(axis=1, keepdims=True), settings.plenty)
+    counts: np.ndarray = np.minimum(told / np.maximum(full, 1e-9), 1)
     counts *= told / (told + settings.full_sight_px)
     entries = overlap.tocoo()
     share = entries.data / np.maximum(told[entries.row, view[entries.col]], 1e-9)

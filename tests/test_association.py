@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import sparse
 from small_scenes import (
     NAMES,
     NUM_CLASSES,
@@ -310,8 +311,26 @@ def test_ari_and_matchings_are_those_of_the_definition() -> None:
     assert renamed(np.array([5, 7, UNKNOWN]), {5: 0}).tolist() == [0, UNKNOWN, UNKNOWN]
 
 
+def test_views_of_a_corner_of_something_large_say_that_what_is_beside_it_is_another_thing() -> None:
+    """A view from afar calls both one; five from close by, which see little of the large one, tell them apart."""
+
+    def lifted(rows: list[list[float]]) -> Lifted:
+        weights = sparse.csr_matrix(np.array(rows, np.float32))
+        seen = np.flatnonzero(weights.toarray().any(axis=0)).astype(np.int32)
+        return Lifted(np.arange(1, len(rows) + 1, dtype=np.int32), seen, weights[:, seen])
+
+    views = {"afar": lifted([[9e4] * 9 + [150.0]])}
+    views |= {f"close {i}": lifted([[0.0] * 8 + [3e3, 0.0], [0.0] * 9 + [300.0]]) for i in range(5)}
+    objects = associate(views)
+    large, small = objects["close 0"]
+    assert large != small and objects["afar"].tolist() == [large]
+    assert all(objects[name].tolist() == [large, small] for name in views if name != "afar")
+    one = associate(views, AssociationSettings(plenty=np.inf))
+    assert len(set(np.concatenate(list(one.values())).tolist())) == 1
+
+
 def test_settings_that_make_no_sense_are_refused() -> None:
-    for wrong in ({"kept": 0.0}, {"agreement": 1.0}, {"doubt": -1.0}, {"full_sight": 0.0}):
+    for wrong in ({"kept": 0.0}, {"agreement": 1.0}, {"doubt": -1.0}, {"full_sight": 0.0}, {"plenty": 0.0}):
         with pytest.raises(SettingsError, match="association"):
             AssociationSettings(**wrong)
 
