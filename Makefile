@@ -12,10 +12,14 @@ COLCON_READY := $(COLCON_VENV)/.ready
 INSTALLED := setup.py package.xml $(wildcard config/* foxglove/* launch/* resource/* rviz/* scripts/* sros2/*)
 MSGS := $(wildcard msg_defs/*.* msg_defs/action/* msg_defs/msg/* msg_defs/srv/*)
 
+# All that start nodes. They wait more than they work, so all others have time beside them; two of them would meet in one
+# ROS domain.
+ROS_TESTS := $(wildcard tests/test_ros_*.py) tests/test_docs.py
+
 # Both builders of the messages obey it; without it one of them compiles file after file.
 export CMAKE_BUILD_PARALLEL_LEVEL ?= $(shell nproc 2>/dev/null || echo 1)
 
-.PHONY: help demo demo-local view test docs colcon results robustness bench clean
+.PHONY: help demo demo-local view test test-ros test-core docs colcon results robustness bench clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{ printf "%-16s %s\n", $$1, $$2 }'
@@ -35,7 +39,15 @@ test: $(READY) $(ROS_READY) $(MSGS_READY)  ## lint, check the types and run the 
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -m pytest -W error
+	$(BIN)/python -c 'from gsseg_core.warm_up import warm_up; warm_up(say=print)'
+	@echo 'tests with ROS and all others run beside each other; either prints once it has ended'
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync --keep-going test-ros test-core
+
+test-ros:
+	$(BIN)/python -m pytest -W error -o cache_dir=.pytest_cache/ros $(ROS_TESTS)
+
+test-core:
+	$(BIN)/python -m pytest -W error -o cache_dir=.pytest_cache/core $(addprefix --ignore=,$(ROS_TESTS))
 
 docs: $(READY)  ## build the documentation into site/index.html, and refuse links that lead nowhere
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
