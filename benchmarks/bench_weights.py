@@ -39,6 +39,7 @@ from gsseg_core.lanes import (
     load_row,
     store_row,
 )
+from gsseg_core.lifted_mask import LiftedMask
 from gsseg_core.operator import Shares, ViewOperator, make_operator
 from gsseg_core.scene import GaussianScene
 from gsseg_core.tile_observation import TileObservation
@@ -102,7 +103,8 @@ class StoredWeights(TileObservation):
     """An observation that keeps the weights of all its records."""
 
     def __init__(self, operator: ViewOperator, labels: np.ndarray) -> None:
-        super().__init__(operator.camera, operator.ids, operator._table, operator._tiles, labels)
+        lifted = LiftedMask(operator.camera, operator._table, operator._tiles, labels)
+        super().__init__(operator.camera, operator.ids, operator._table, operator._tiles, lifted)
         self._first = np.concatenate([[0], np.cumsum(self._records)])
         self._kept = np.empty((self._first[-1], LANES), np.uint16)
         self._left_over = np.empty((len(self._records), TILE, TILE), np.float32)
