@@ -66,6 +66,11 @@ class JobSlot:
                 self._job = None
                 self._free.set()
 
+    @property
+    def busy(self) -> bool:
+        """Whether a job runs."""
+        return not self._free.is_set()
+
     def cancel(self, timeout_s: float) -> bool:
         """Ask the running job to stop, and wait for that; return whether the slot is free."""
         with self._lock:

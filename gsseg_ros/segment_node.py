@@ -37,8 +37,8 @@ THREADS = 6
 STOP_SECONDS = 3.0
 """How long a job gets to stop when the node is deactivated or shut down."""
 
-ANSWER_SECONDS = 0.3
-"""For the answer to a job that the end of the node has canceled."""
+ANSWER_SECONDS, CANCEL_SECONDS = 0.3, 2.0
+"""At the end of the node, for answers under way, and for that to a job that it has canceled."""
 
 
 class SegmentNode(LifecycleNode):
@@ -219,9 +219,10 @@ def main(args: list[str] | None = None) -> int:
         while not stop.is_set():
             _spin_once(executor, node)
     finally:
-        node.stop()
         # A canceled job is still answered: rclpy sends that from the executor.
-        answered = time.monotonic() + ANSWER_SECONDS
+        seconds = CANCEL_SECONDS if node.workspace.slot.busy else ANSWER_SECONDS
+        node.stop()
+        answered = time.monotonic() + seconds
         while time.monotonic() < answered:
             executor.spin_once(timeout_sec=0.05)
         node.close()
