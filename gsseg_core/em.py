@@ -276,8 +276,7 @@ class EMLearner(Learner):
         """Count the pixels (K, L) of each class under each label of a view, by the votes of all the others."""
         order, own = observation.order, observation.votes()
         seen = order, observation.start, observation.labels
-        places = votes.places(observation.ids[order])
-        others = places.with_values(votes.values[places.values])
+        others = votes.take(observation.ids[order])
         take_votes(*others, *seen, *observation.meaning.votes, own, UNITS)
         others = standing(others, self._possible())
         codes = others.with_values(others.values.astype(np.float32)).normalised()

@@ -111,7 +111,9 @@ class Observation(ABC):
     @cached_property
     def order(self) -> np.ndarray:
         """Places in `ids` in the order of the scene, (M,) int32: whoever goes by it goes through memory once."""
-        return np.argsort(self.ids, kind="stable").astype(np.int32)
+        place = np.full(int(self.ids.max(initial=-1)) + 1, -1, np.int32)
+        place[self.ids] = np.arange(len(self.ids), dtype=np.int32)
+        return place[place >= 0]
 
     @property
     def rows(self) -> np.ndarray:

@@ -101,6 +101,16 @@ class Rows(NamedTuple):
         _normalise(self.start, self.values)
         return self
 
+    def take(
+        self,
+        ids: np.ndarray,  # (M,)
+    ) -> Rows:
+        """Copy some rows: M of them."""
+        start = starts((self.start[1:] - self.start[:-1])[ids])
+        rows = Rows(start, np.empty(start[-1], np.uint32), np.empty(start[-1], self.values.dtype))
+        _take(*self, ids, *rows)
+        return rows
+
     def places(
         self,
         ids: np.ndarray,  # (M,)
@@ -174,6 +184,22 @@ def _normalise(start: np.ndarray, values: np.ndarray) -> None:
         if total > 0:
             for z in range(start[i], start[i + 1]):
                 values[z] /= total
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _take(
+    start: np.ndarray,
+    classes: np.ndarray,
+    values: np.ndarray,
+    ids: np.ndarray,
+    taken_start: np.ndarray,
+    taken_classes: np.ndarray,
+    taken: np.ndarray,
+) -> None:
+    for m in nb.prange(ids.shape[0]):
+        first = start[ids[m]]
+        for j in range(taken_start[m + 1] - taken_start[m]):
+            taken_classes[taken_start[m] + j], taken[taken_start[m] + j] = classes[first + j], values[first + j]
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)

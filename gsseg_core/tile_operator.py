@@ -38,8 +38,7 @@ class TileOperator(ViewOperator):
 
     def blend_rows(self, codes: Rows, num_classes: int) -> Blended:
         """Blend codes without their zeros."""
-        visible = codes.places(self.ids)
-        return self._blend_visible(visible.with_values(codes.values[visible.values]), num_classes)
+        return self._blend_visible(codes.take(self.ids), num_classes)
 
     def _blend_visible(self, codes: Rows, num_classes: int) -> Blended:
         image = np.empty((self.camera.height, self.camera.width, num_classes), np.float32)
