@@ -11,6 +11,7 @@ from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.operator import make_operator
+from gsseg_core.reliability import OtherViews
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.votes import VoteLearner
@@ -53,6 +54,7 @@ def _segment_something(device: str) -> None:
     learner = EMLearner(scene, 2, EMSettings(max_steps=2), device=device)
     learner.observe(view)
     result = Segmentation.from_codes(scene, learner.fit().codes_, {0: "left", 1: "right"})
+    OtherViews(learner).blend(view)
     operator = make_operator(scene, camera, device)
     result.render(operator)
     operator.render(scene.colors(camera.center))
