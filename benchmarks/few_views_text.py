@@ -4,7 +4,7 @@ from __future__ import annotations
 
 HEADER = """# Few views, few labels
 
-Made by `python benchmarks/few_views.py`, which measures everything here again, in {minutes} minutes on a busy machine.
+Made by `python benchmarks/few_views.py`, which measures everything here again, in {minutes} minutes.
 Machine: {machine}.
 """
 
