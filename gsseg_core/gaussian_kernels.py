@@ -10,10 +10,7 @@ import numpy as np
 from llvmlite import ir
 from numba.core import types
 
-from gsseg_core.lanes import intrinsic, prefetch
-
-AHEAD = 16
-"""How many rows ahead memory is asked for."""
+from gsseg_core.lanes import intrinsic
 
 BLOCKS = 16
 """Counts are summed in this many parts, then together, so that they do not depend on the number of threads."""
@@ -222,25 +219,3 @@ def take_votes(
                 for z in range(rows[i], rows[i + 1]):
                     if classes[z] == said_classes[j]:
                         total[z] -= np.int64(np.rint(np.float64(votes[s]) * said[j] * units))
-
-
-@nb.njit(parallel=True, nogil=True, cache=True)
-def add_votes(
-    total: np.ndarray,  # (N, K) int64, added to
-    ids: np.ndarray,  # (M,) int32, distinct
-    start: np.ndarray,  # (M + 1,)
-    labels: np.ndarray,  # (P,) int32: label of each sighting
-    said_start: np.ndarray,  # (L + 1,) what a pixel of each label votes, as `Rows`
-    said_classes: np.ndarray,
-    said: np.ndarray,  # float64
-    votes: np.ndarray,  # (P,) float32
-    units: float,  # per vote; a power of 2
-    sign: int,
-) -> None:
-    """Add a view's votes, or take them away, in whole units."""
-    for m in nb.prange(ids.shape[0]):
-        prefetch(total, ids[min(m + AHEAD, ids.shape[0] - 1)])
-        row = total[ids[m]]
-        for s in range(start[m], start[m + 1]):
-            for j in range(said_start[labels[s]], said_start[labels[s] + 1]):
-                row[said_classes[j]] += sign * np.int64(np.rint(np.float64(votes[s]) * said[j] * units))

@@ -78,7 +78,7 @@ class LiftedMask:
         units: float,
         sign: int,
     ) -> None:
-        """Add the votes to those of other views, bit for bit as `gaussian_kernels.add_votes` does with sightings."""
+        """Add the votes to those of other views, bit for bit as `sightings.add_votes` does with sightings."""
         where, mask = np.empty(len(self.reached), np.int32), self.labels
         _locate(tiles.start, self.reached, where)
         many = np.diff(mask.start)

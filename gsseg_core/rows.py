@@ -93,8 +93,8 @@ class Rows(NamedTuple):
         start = np.zeros(count + 1, np.int64)
         start[1:][ids] = np.diff(self.start)
         np.cumsum(start, out=start)
-        places = self.places(source[source >= 0]).values
-        return Rows(start, self.classes[places], self.values[places])
+        _, classes, values = self.take(source[source >= 0])
+        return Rows(start, classes, values)
 
     def normalised(self) -> Rows:
         """Scale each row of float32 to sum 1, in place; rows of zeros stay zero."""

@@ -24,9 +24,9 @@ SLOW = 1.5
 
 
 def warm_up(device: str = "cpu", say: Callable[[str], object] = lambda text: None) -> None:
-    """Take a few Gaussians through everything that segmenting does, so that all its kernels are there.
+    """Take some thousand Gaussians through everything that segmenting does, so that all its kernels are there.
 
-    That takes a fifth of a second when they are in the cache, and up to a minute at the first time after an
+    That takes a third of a second when they are in the cache, and up to a minute at the first time after an
     installation; then `say` is told.
     """
     slow = threading.Timer(SLOW, say, ["compiling kernels, a minute; only the first run after installing does this"])
