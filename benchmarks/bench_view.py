@@ -34,6 +34,7 @@ from playwright.sync_api import Page
 from gsseg_core.dataset import View
 from gsseg_core.operator import make_operator
 from gsseg_core.view_model import Labelling, ViewModel
+from gsseg_core.view_screens import BROWSER, SERVER
 from gsseg_core.viewer import Viewer
 
 LIMIT = 200
@@ -42,9 +43,10 @@ LIMIT = 200
 PORT, PATIENCE, SETTLED = 18200, 60.0, 1.5
 WIDTH, HEIGHT = 960, 640
 
-# After each draw of splats, compares a grid of pixels with those of the time when `watch` was called.
+# After each draw of splats, or of an image in their place, compares a grid of pixels with those when `watch` was
+# called.
 PROBE = """
-(() => {
+((images) => {
   const draw = WebGL2RenderingContext.prototype.drawElementsInstanced;
   const probe = { changed: null, base: null, last: null, waiting: false, answered: null, frames: 0, pictures: 0,
     skip: false, sent: false };
@@ -52,12 +54,16 @@ PROBE = """
   const answer = new MutationObserver(() => { probe.answered ??= performance.now(); });
   document.addEventListener('DOMContentLoaded', () =>
     answer.observe(document.body, { subtree: true, attributes: true, attributeFilter: ['style'] }));
+  // All at once: each call of readPixels waits for the drawing. Then every 26th row, which is enough to look at.
   const read = (gl) => {
-    const rows = 24, width = gl.drawingBufferWidth, all = new Uint8Array(rows * width * 4);
-    for (let i = 0; i < rows; i++)
-      gl.readPixels(0, Math.floor((i + 0.5) * gl.drawingBufferHeight / rows), width, 1, gl.RGBA, gl.UNSIGNED_BYTE,
-                    all.subarray(i * width * 4, (i + 1) * width * 4));
-    return all;
+    const width = gl.drawingBufferWidth, height = gl.drawingBufferHeight, all = new Uint8Array(height * width * 4);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, all);
+    const rows = 24, some = new Uint8Array(rows * width * 4);
+    for (let i = 0; i < rows; i++) {
+      const from = Math.floor((i + 0.5) * height / rows) * width * 4;
+      some.set(all.subarray(from, from + width * 4), i * width * 4);
+    }
+    return some;
   };
   const differing = (a, b) => {
     let count = 0;
@@ -69,6 +75,13 @@ PROBE = """
     upload.apply(this, args);
     probe.sent = true;
   };
+  const look = (gl) => {
+    const seen = read(gl);
+    if (probe.last === null || differing(seen, probe.last) > 0) probe.pictures++;
+    if (!probe.waiting) probe.base = seen;
+    else if (differing(seen, probe.base) > 60) { probe.changed = performance.now(); probe.waiting = false; }
+    probe.last = seen;
+  };
   WebGL2RenderingContext.prototype.drawElementsInstanced = function (...args) {
     probe.frames++;
     if (probe.skip) {
@@ -76,13 +89,16 @@ PROBE = """
       return;
     }
     draw.apply(this, args);
-    const seen = read(this);
-    if (probe.last === null || differing(seen, probe.last) > 0) probe.pictures++;
-    if (!probe.waiting) probe.base = seen;
-    else if (differing(seen, probe.base) > 60) { probe.changed = performance.now(); probe.waiting = false; }
-    probe.last = seen;
+    look(this);
   };
-})();
+  const plain = WebGL2RenderingContext.prototype.drawElements;
+  WebGL2RenderingContext.prototype.drawElements = function (...args) {
+    plain.apply(this, args);
+    if (!images) return;
+    look(this);
+    if (probe.pictures > 1) probe.frames++;
+  };
+})(IMAGES);
 """
 
 
@@ -123,6 +139,7 @@ class Counter:
             sink.close()
 
     def close(self) -> None:
+        self._server.shutdown(socket.SHUT_RDWR)  # Which also ends a thread that waits in `accept`.
         self._server.close()
 
 
@@ -197,13 +214,19 @@ def main() -> None:
     model, views = room_model(options.gaussians, options.classes)
     print(", ".join(f"{key} {value}" for key, value in describe().items()))
     print(f"{options.gaussians:,} Gaussians, {options.classes} classes, page of {WIDTH} x {HEIGHT}, WebGL by software")
+    for draw in (SERVER, BROWSER):
+        measure_page(model, views, draw, options.toggles)
+
+
+def measure_page(model: ViewModel, views: list[View], draw: str, toggles: int) -> None:
     started = time.monotonic()
-    viewer = Viewer(model, views, port=PORT)
+    model.show_all()
+    viewer = Viewer(model, views, port=PORT, draw=draw)
     counter = Counter(PORT + 500, viewer.server.get_port())
     with closing(viewer), closing(counter), started_chromium() as browser:
-        print(f"server ready after {time.monotonic() - started:.1f} s, {viewer.splats.bytes_sent:,} bytes of Gaussians")
+        print(f"\ndrawn by the {draw}: ready after {time.monotonic() - started:.1f} s")
         with opened_page(browser, WIDTH, HEIGHT, tolerated="computeBoundingSphere") as page:
-            page.add_init_script(PROBE)
+            page.add_init_script(PROBE.replace("IMAGES", "true" if draw == SERVER else "false"))
             started = time.monotonic()
             page.goto(f"http://127.0.0.1:{PORT + 500}")
             page.wait_for_function("probe.frames > 0", timeout=1000 * PATIENCE)
@@ -211,19 +234,21 @@ def main() -> None:
             watched = Watched(page, counter)
             watched.settle()
             print(f"first picture {first:.1f} s after the page was asked for, {counter.received:,} bytes on the wire")
-            measure_all(watched, page, viewer, options.toggles)
+            measure_all(watched, page, viewer, draw, toggles)
 
 
-def measure_all(watched: Watched, page: Page, viewer: Viewer, toggles: int) -> None:
+def measure_all(watched: Watched, page: Page, viewer: Viewer, draw: str, toggles: int) -> None:
     print(f"\n{'medians':<38}{'widget, ms':>12}{'picture, ms':>12}{'longest':>12}{'bytes':>12}")
     names = seen(viewer.model, viewer.views[0])
     presses = [press(names[i // 2 % len(names)]) for i in range(toggles)]
     drawn = [watched.measure(script) for script in presses]
     row("toggle of a class", drawn)
-    page.evaluate("probe.skip = true")
-    alone = [watched.measure(script) for script in presses]
-    row("the same, nothing drawn", alone)
-    page.evaluate("probe.skip = false")
+    alone = []
+    if draw == BROWSER:
+        page.evaluate("probe.skip = true")
+        alone = [watched.measure(script) for script in presses]
+        row("the same, nothing drawn", alone)
+        page.evaluate("probe.skip = false")
     page.get_by_role("button", name="show all").click()
     for what, values in {"at a mark of the slider": (0.9, 0.95, 0.8), "between two marks": (0.93, 0.87)}.items():
         row(f"confidence, {what}", [by_server(watched, viewer, "min_confidence", value) for value in values])
@@ -231,6 +256,8 @@ def measure_all(watched: Watched, page: Page, viewer: Viewer, toggles: int) -> N
     row("colours of another mode", [by_server(watched, viewer, "mode", mode) for mode in ("true colours", "class")])
     print()
     for what, results in {"": drawn, ", nothing drawn": alone}.items():
+        if not results:
+            continue
         median = statistics.median(max(result.drawn, result.answered) for result in results)
         held = "holds" if median <= LIMIT else "does not hold"
         print(f"a toggle within {LIMIT} ms{what}: {held} ({median:,.0f} ms)")

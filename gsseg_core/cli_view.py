@@ -34,6 +34,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--ros", action="store_true", help="follow the ROS 2 node `gsseg` while it learns")
     parser.add_argument("--host", default="127.0.0.1", help="0.0.0.0 lets other machines look (default: %(default)s)")
     parser.add_argument("--port", type=int, default=8080, help="default: %(default)s, or the next one that is free")
+    parser.add_argument(
+        "--draw",
+        choices=("auto", "browser", "server"),
+        default="auto",
+        help="who draws: the browser; the server, which sends it images; or (default) the browser if it is fast",
+    )
     parser.add_argument("--open", action="store_true", help="open the page, too")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="default: cpu")
     add_quiet(parser)
@@ -65,7 +71,14 @@ def run(options: argparse.Namespace) -> int:
     source = open_source("ros", scene) if options.ros else None
     model = ViewModel(scene, labelling, mode=BY_CLASS if options.segmentation or options.ros else TRUE_COLOURS)
     viewer = viewer_module.Viewer(
-        model, views, reliability, source, host=options.host, port=options.port, device=options.device
+        model,
+        views,
+        reliability,
+        source,
+        host=options.host,
+        port=options.port,
+        draw=options.draw,
+        device=options.device,
     )
     with closing(viewer):
         print(f"gsseg: {len(scene):,} Gaussians at {viewer.url} (Ctrl-C ends it)", flush=True)

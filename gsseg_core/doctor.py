@@ -154,7 +154,7 @@ def _kernels(say: Callable[[str], object]) -> Iterator[Finding]:
     start = time.perf_counter()
     try:
         from gsseg_core.sightings import add_votes
-        from gsseg_core.warm_up import warm_up
+        from gsseg_core.warm_up import SIDE, warm_up
 
         warm_up(say=say)
     except (ImportError, OSError, RuntimeError, GssegError) as error:
@@ -164,7 +164,9 @@ def _kernels(say: Callable[[str], object]) -> Iterator[Finding]:
         return
     folder = Path(add_votes.stats.cache_path or "")
     compiled = "from the cache" if add_votes.stats.cache_hits else "compiled just now"
-    yield Finding("kernels", "run", f"segmented 16 Gaussians in {time.perf_counter() - start:.1f} s, {compiled}")
+    yield Finding(
+        "kernels", "run", f"segmented {SIDE**2:,} Gaussians in {time.perf_counter() - start:.1f} s, {compiled}"
+    )
     if os.access(folder, os.W_OK):
         yield Finding("kernels", "cache", str(folder))
     else:

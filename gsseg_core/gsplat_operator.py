@@ -7,6 +7,7 @@ an adjoint that and its backward pass with respect to the colours.
 
 from __future__ import annotations
 
+import copy
 import functools
 import importlib
 import threading
@@ -191,6 +192,12 @@ class GsplatOperator(ViewOperator):
             self._means2d, self._conics, codes[None], self._opacities, width, height, TILE, self._offsets, self._entries
         )
         return image[0], 1 - opacity.detach()[0, :, :, 0]
+
+    def _without(self, hidden: np.ndarray) -> GsplatOperator:
+        other = copy.copy(self)
+        away = torch.tensor(hidden, device=self.device)
+        other._opacities = self._opacities.masked_fill(away, 0)
+        return other
 
     def _blend(self, codes: np.ndarray) -> Blended:
         codes = codes[self.ids]

@@ -180,7 +180,7 @@ class ViewOperator(ABC):
     num_gaussians : int
         N, the size of the scene.
     ids : (M,) int32
-        Gaussians that reach the image, nearest first. All others have a column of zeros.
+        Gaussians that can reach the image, nearest first. All others have a column of zeros.
     """
 
     camera: Camera
@@ -312,6 +312,21 @@ class ViewOperator(ABC):
         self._check_size(labels, 2)
         return self._vote(labels, meaning, total, units, sign)
 
+    def without(
+        self,
+        hidden: np.ndarray,  # (N,) bool
+    ) -> ViewOperator:
+        """Make the same view of the scene without some of its Gaussians; indices stay, and nothing is projected again.
+
+        Raises
+        ------
+        SceneValueError
+            There is not one entry per Gaussian.
+        """
+        if hidden.shape != (self.num_gaussians,):
+            raise SceneValueError(f"hidden has shape {hidden.shape}; expected ({self.num_gaussians},)")
+        return self._without(hidden[self.ids])
+
     def visibility(self) -> np.ndarray:
         """Sum of each Gaussian's weights over the image: W^T 1, (N,) float32, in px."""
         return self.adjoint(np.ones((self.camera.height, self.camera.width, 1), np.float32))[:, 0]
@@ -342,6 +357,12 @@ class ViewOperator(ABC):
                 f"expected a row from 0 to {height - 1} and a column from 0 to {width - 1}"
             )
         return self._weights((row, column))
+
+    @abstractmethod
+    def _without(
+        self,
+        hidden: np.ndarray,  # (M,) bool
+    ) -> ViewOperator: ...
 
     @abstractmethod
     def _blend(self, codes: np.ndarray) -> Blended: ...

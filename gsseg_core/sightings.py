@@ -155,10 +155,10 @@ def add_votes(
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def take(
-    table: np.ndarray,  # (M, 8)
+    table: np.ndarray,  # (M, K)
     chosen: np.ndarray,  # (M',)
 ) -> np.ndarray:
-    """Copy some rows of the table, (M', 8)."""
+    """Copy some rows of a table, (M', K); several times as fast as numpy."""
     out = np.empty((chosen.shape[0], table.shape[1]), table.dtype)
     for m in nb.prange(chosen.shape[0]):
         for j in range(table.shape[1]):

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 
 from gsseg_core import products
 from gsseg_core.cameras import Camera
+from gsseg_core.lanes import LOG_OPACITY
 from gsseg_core.lifted_mask import LiftedMask
 from gsseg_core.meaning import Meaning
 from gsseg_core.operator import Blended, Observation, ViewOperator, Weights
 from gsseg_core.projection import project
 from gsseg_core.rows import Rows
 from gsseg_core.scene import GaussianScene
+from gsseg_core.sightings import take
 from gsseg_core.tile_observation import TileObservation
 from gsseg_core.tiles import TILE, assign
 
@@ -32,9 +36,16 @@ class TileOperator(ViewOperator):
         self._table = projected.table
         self._tiles = assign(projected, camera.width, camera.height)
 
+    def _without(self, hidden: np.ndarray) -> TileOperator:
+        other = copy.copy(self)
+        other._table = self._table.copy()
+        other._table[hidden, LOG_OPACITY] = -np.inf
+        return other
+
     def _blend(self, codes: np.ndarray) -> Blended:
         # A Gaussian speaks for few classes; the others cost nothing.
-        return self._blend_visible(Rows.of(codes[self.ids].astype(np.float32, order="C")), codes.shape[1])
+        visible = take(np.ascontiguousarray(codes, np.float32), self.ids)
+        return self._blend_visible(Rows.of(visible), codes.shape[1])
 
     def blend_rows(self, codes: Rows, num_classes: int) -> Blended:
         """Blend codes without their zeros."""

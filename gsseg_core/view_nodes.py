@@ -8,6 +8,7 @@ its Gaussians transparent; only how much is sent depends on it.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -92,7 +93,7 @@ def cut(
 
 
 def paint(
-    parts: dict[Key, np.ndarray],
+    parts: Mapping[Key, np.ndarray],
     shown: np.ndarray,  # (N,) bool
     colors: np.ndarray,  # (N, 3) uint8
     opacities: np.ndarray,  # (N,) uint8

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -71,22 +70,14 @@ def pick(
     pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
     pose[:3, 3] = -pose[:3, :3] @ np.asarray(origin, np.float64)
     K = np.array([[focal, 0, _WINDOW / 2], [0, focal, _WINDOW / 2], [0, 0, 1]])
-    seen = scene if shown is None else without(scene, ~shown)
-    weights = make_operator(seen, Camera("click", _WINDOW, _WINDOW, K, pose), device).weights(
-        _WINDOW // 2, _WINDOW // 2
-    )
+    operator = make_operator(scene, Camera("click", _WINDOW, _WINDOW, K, pose), device)
+    if shown is not None:
+        operator = operator.without(~shown)
+    weights = operator.weights(_WINDOW // 2, _WINDOW // 2)
     if not len(weights.weights):
         return None
     best = int(weights.weights.argmax())
     return Picked(int(weights.gaussians[best]), float(weights.weights[best]))
-
-
-def without(
-    scene: GaussianScene,
-    hidden: np.ndarray,  # (N,) bool
-) -> GaussianScene:
-    """Make some Gaussians of a scene invisible; its indices stay what they were."""
-    return replace(scene, opacities=np.where(hidden, np.float32(0), scene.opacities))
 
 
 def scene_camera(

@@ -1,6 +1,8 @@
-"""The scene in the browser: sends what has changed, and counts it."""
+"""The scene in a browser: sends what has changed, and counts it."""
 
 from __future__ import annotations
+
+from functools import cached_property
 
 import numpy as np
 import viser
@@ -13,14 +15,46 @@ _LARGEST = 200.0
 """The largest standard deviation is sent as this many units: its square fits a 16-bit float, and so do small ones."""
 
 
-class SplatNodes:
-    """The nodes of a scene in a viser server.
+class Splats:
+    """A scene as browsers want it, made once for all of them.
+
+    viser sends covariances as 16-bit floats, which know nothing below 6e-8: a millimetre squared, in metres, is hardly
+    there. So the scene is sent in units of its own, and scaled back by each node.
 
     Parameters
     ----------
-    server : viser.ViserServer
-        Shows them to all its clients.
     scene : GaussianScene
+        N Gaussians.
+
+    Attributes
+    ----------
+    unit : float
+        In units of the scene.
+    """
+
+    def __init__(self, scene: GaussianScene) -> None:
+        self._scene = scene
+        self.unit = float(scene.scales.max()) / _LARGEST
+
+    @cached_property
+    def centers(self) -> np.ndarray:
+        """Means in units of `unit`, (N, 3) float32."""
+        return self._scene.means / np.float32(self.unit)
+
+    @cached_property
+    def covariances(self) -> np.ndarray:
+        """Covariances in units of `unit`, (N, 3, 3) float32."""
+        return covariances(self._scene.quats, self._scene.scales / np.float32(self.unit))
+
+
+class SplatNodes:
+    """The nodes of a scene in a browser.
+
+    Parameters
+    ----------
+    client : viser.ClientHandle
+        The browser.
+    splats : Splats
         N Gaussians.
 
     Attributes
@@ -29,13 +63,8 @@ class SplatNodes:
         Of Gaussians, before compression, since the start.
     """
 
-    def __init__(self, server: viser.ViserServer, scene: GaussianScene) -> None:
-        self._server = server
-        # viser sends covariances as 16-bit floats, which know nothing below 6e-8: a millimetre squared, in metres, is
-        # hardly there. So the scene is sent in units of its own, and scaled back by the node.
-        self._unit = float(scene.scales.max()) / _LARGEST
-        self._centers = scene.means / np.float32(self._unit)
-        self._covariances = covariances(scene.quats, scene.scales / np.float32(self._unit))
+    def __init__(self, client: viser.ClientHandle, splats: Splats) -> None:
+        self._client, self._splats = client, splats
         self._handles: dict[Key, viser.GaussianSplatHandle] = {}
         self._sent: dict[Key, Node] = {}
         self.bytes_sent = 0
@@ -43,20 +72,20 @@ class SplatNodes:
     def show(self, wanted: dict[Key, Node]) -> None:
         """Make the picture look like this; what is there already is not sent again."""
         todo = changes(self._sent, wanted)
-        with self._server.atomic():
+        with self._client.atomic():
             for key in todo.drop:
                 self._handles.pop(key).remove()
             for key in todo.put:
                 self._put(key, wanted[key])
             for key, visible in todo.switch.items():
                 self._handles[key].visible = visible
-        self._server.flush()
+        self._client.flush()
         self._sent = after(self._sent, wanted, todo)
 
     def _put(self, key: Key, node: Node) -> None:
         gaussians = {
-            "centers": self._centers[node.members],
-            "covariances": self._covariances[node.members],
+            "centers": self._splats.centers[node.members],
+            "covariances": self._splats.covariances[node.members],
             "rgbs": node.rgba[:, :3],
             "opacities": node.rgba[:, 3:],
         }
@@ -65,7 +94,7 @@ class SplatNodes:
             self._handles[key].set_gaussians(**gaussians)
         else:
             name = f"/splats/{key[0]}/{key[1]}"
-            self._handles[key] = self._server.scene.add_gaussian_splats(name, **gaussians, scale=self._unit)
+            self._handles[key] = self._client.scene.add_gaussian_splats(name, **gaussians, scale=self._splats.unit)
 
 
 def covariances(

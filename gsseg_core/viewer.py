@@ -24,10 +24,11 @@ from gsseg_core.segmentation import Segmentation
 from gsseg_core.view_corrections import Corrections
 from gsseg_core.view_live import LiveSource
 from gsseg_core.view_model import BY_RELIABILITY, ViewModel
-from gsseg_core.view_nodes import cut, paint
+from gsseg_core.view_nodes import cut
 from gsseg_core.view_panel import Panel
-from gsseg_core.view_picking import Evidence, pick, scene_camera, without
-from gsseg_core.view_splats import SplatNodes
+from gsseg_core.view_picking import Evidence, pick, scene_camera
+from gsseg_core.view_picture import Picture
+from gsseg_core.view_screens import AUTO, Screens
 
 DRAWING_HEIGHT = 480
 """Most rows of the image in which a correction is drawn; finer than the Gaussians is of no use."""
@@ -51,8 +52,10 @@ class Viewer:
         Codes that change while the viewer runs.
     host, port : str, int
         Where to listen; if the port is taken, at the next one that is free.
+    draw : str
+        Who draws: 'browser'; 'server', this program, which sends images; or 'auto', the browser if it is fast.
     device : str
-        Where clicks and corrections are rendered.
+        Where clicks and corrections are rendered, and what the server draws.
 
     Attributes
     ----------
@@ -71,6 +74,7 @@ class Viewer:
         *,
         host: str = "127.0.0.1",
         port: int = 8080,
+        draw: str = AUTO,
         device: str = "cpu",
     ) -> None:
         self.model, self.views, self.reliability, self.device = model, tuple(views), dict(reliability or {}), device
@@ -82,11 +86,10 @@ class Viewer:
         self.lock = threading.RLock()
         self._stale, self._closing = threading.Event(), threading.Event()
         self._source = source
-        self._opacities = np.rint(model.scene.opacities * 255).astype(np.uint8)
         with contextlib.redirect_stdout(io.StringIO()):  # viser draws a box with its address whatever `verbose` says.
             self.server = viser.ViserServer(host=host, port=port, label="gsseg", verbose=False)
         self.url = f"http://{'localhost' if host in ('127.0.0.1', '0.0.0.0') else host}:{self.server.get_port()}"
-        self.splats = SplatNodes(self.server, model.scene)
+        self.screens = Screens(self.server, model.scene, self._seen_by, draw, device)
         self._set_up_camera()
         self.panel = Panel(self)
         self.server.scene.on_click()(self._on_click)
@@ -108,6 +111,7 @@ class Viewer:
             thread.join()
         if self._source is not None:
             self._source.close()
+        self.screens.close()
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
@@ -235,10 +239,9 @@ class Viewer:
         """Labels (H, W) of what is shown, -1 where nothing is."""
         with self.lock:
             labelling, shown = self.model.labelling, self.model.shown()
-        seen = without(self.model.scene, ~shown)
         # The last channel is for what has no class, so that it is a region as well.
         codes = np.eye(labelling.probabilities.shape[1] + 1, dtype=np.float32)[np.maximum(labelling.labels, -1)]
-        image = make_operator(seen, camera, self.device).render(codes)
+        image = make_operator(self.model.scene, camera, self.device).without(~shown).render(codes)
         labels = np.where(image.max(axis=2) > 0, image.argmax(axis=2), -1)
         labels[labels == codes.shape[1] - 1] = -1
         return labels
@@ -252,6 +255,9 @@ class Viewer:
         pose[:3, 3] = camera.position
         return scene_camera("viewer", max(round(height * camera.aspect), 1), height, camera.fov, pose)
 
+    def _seen_by(self, client: viser.ClientHandle, rows: int) -> Camera:
+        return self.camera_of(client, min(client.camera.image_height, rows))
+
     # What follows from a change.
 
     def _relabel(self) -> None:
@@ -264,8 +270,8 @@ class Viewer:
 
     def _show(self) -> None:
         with self.lock:
-            wanted = paint(self._parts, self.model.shown(), self.model.colors(), self._opacities)
-        self.splats.show(wanted)
+            picture = Picture(self.model.scene, self._parts, self.model.shown(), self.model.colors())
+        self.screens.show(picture)
         self.panel.refresh()
 
     def _keep_showing(self) -> None:

@@ -123,7 +123,7 @@ def named(findings: list[Finding], name: str) -> Finding:
 def test_doctor_finds_that_the_core_works(findings: list[Finding], capsys: pytest.CaptureFixture[str]) -> None:
     assert works(findings)
     assert named(findings, "numpy").state == metadata.version("numpy")
-    assert "segmented 16 Gaussians" in named(findings, "run").state
+    assert "segmented 5,184 Gaussians" in named(findings, "run").state
     assert Path(named(findings, "cache").state.removesuffix(" cannot be written to")).is_dir()
     assert main(["doctor"]) == 0
     text = capsys.readouterr().out

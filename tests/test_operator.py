@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from operator_backends import CPU
@@ -66,6 +68,23 @@ def test_visibility_agrees_with_the_naive_rasteriser(backend, seed):
     expected = naive.weights.sum(axis=0)
     doubt = naive.slack.sum()
     assert (np.abs(operator.visibility() - expected) <= backend.sum * (1 + expected) + doubt).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_view_without_some_gaussians_is_the_view_of_a_scene_where_they_are_invisible(backend, seed):
+    scene, camera = random_view(seed)
+    hidden = np.random.default_rng(seed).random(len(scene)) < 0.5
+    operator = backend.make(scene, camera)
+    before = operator.transmittance()
+    alone = backend.make(replace(scene, opacities=np.where(hidden, np.float32(0), scene.opacities)), camera)
+    other = operator.without(hidden)
+    assert np.abs(dense(other) - dense(alone)).max() <= backend.weight
+    codes = np.random.default_rng(seed).uniform(-1, 1, (len(scene), 3))
+    assert np.abs(other.render(codes) - alone.render(codes)).max() <= 2 * backend.weight
+    assert not other.visibility()[hidden].any()
+    np.testing.assert_array_equal(operator.transmittance(), before)
+    with pytest.raises(SceneValueError, match=r"hidden has shape \(3,\); expected"):
+        operator.without(np.zeros(3, bool))
 
 
 def assert_sightings_are_what_labelled_pixels_see(seen, mask, weights, ids):

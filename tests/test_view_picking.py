@@ -14,7 +14,7 @@ from gsseg_core.operator import make_operator
 from gsseg_core.segmentation import REMOVED, UNOBSERVED
 from gsseg_core.view_corrections import Corrections, box, disc, region, share_seen
 from gsseg_core.view_model import Labelling
-from gsseg_core.view_picking import Evidence, pick, scene_camera, without
+from gsseg_core.view_picking import Evidence, pick, scene_camera
 
 SCENE, TRUTH = balls_on_a_table()
 CAMERA = ring(5)[0]
@@ -56,7 +56,7 @@ def test_what_is_hidden_is_looked_through_and_a_ray_into_nothing_hits_nothing() 
 
 
 def test_a_scene_without_some_gaussians_is_drawn_without_them() -> None:
-    image = make_operator(without(SCENE, TRUTH == 1), CAMERA).render(np.eye(4, dtype=np.float32)[TRUTH])
+    image = make_operator(SCENE, CAMERA).without(TRUTH == 1).render(np.eye(4, dtype=np.float32)[TRUTH])
     assert not image[..., 1].any() and image[..., 2].any()
 
 
@@ -108,7 +108,7 @@ def test_the_share_seen_is_one_for_what_lies_open_and_nearly_nothing_for_what_li
     share = share_seen(SCENE, drawn)
     seen = make_operator(SCENE, CAMERA).visibility()
     for i in np.flatnonzero(seen > 0.5)[::25]:
-        alone = make_operator(without(SCENE, np.arange(len(SCENE)) != i), CAMERA).visibility()[i]
+        alone = make_operator(SCENE, CAMERA).without(np.arange(len(SCENE)) != i).visibility()[i]
         assert share[i] == pytest.approx(seen[i] / alone, abs=0.08)  # alphas below 1/255 count as nothing
     assert share.max() <= 1 and not share[-1]
 

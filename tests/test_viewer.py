@@ -25,6 +25,8 @@ from gsseg_core.view_model import BY_RELIABILITY, TRUE_COLOURS, Labelling, ViewM
 
 pytest.importorskip("viser")
 
+from gsseg_core import view_screens
+from gsseg_core.view_screens import AUTO, BROWSER, SERVER
 from gsseg_core.viewer import Viewer
 
 if TYPE_CHECKING:
@@ -76,12 +78,12 @@ class Shown:
         self.page.get_by_text(text).first.wait_for(timeout=PATIENCE * 1000)
 
 
-@pytest.fixture(scope="module")
-def opened(chromium: Browser) -> Iterator[Shown]:
+@pytest.fixture(scope="module", params=[BROWSER, SERVER])
+def opened(chromium: Browser, request: pytest.FixtureRequest) -> Iterator[Shown]:
     views = clean_views(3)
     reliability = {view.name: 0.2 + 0.3 * i for i, view in enumerate(views)}
     # three.js complains of the splats' own geometry, which is flat, wherever one points at it.
-    viewer = Viewer(ViewModel(SCENE, LEARNT), views, reliability, port=18080)
+    viewer = Viewer(ViewModel(SCENE, LEARNT), views, reliability, port=18080, draw=request.param)
     with closing(viewer), opened_page(chromium, 960, 640, tolerated="computeBoundingSphere") as page:
         page.goto(viewer.url)
         shown = Shown(viewer, page)
@@ -109,14 +111,14 @@ def test_the_page_loads_and_splats_are_drawn(shown: Shown) -> None:
 
 
 def test_a_class_toggle_changes_the_picture_and_sends_no_gaussian(shown: Shown) -> None:
-    before, sent = shown.picture(), shown.viewer.splats.bytes_sent
+    before, sent = shown.picture(), shown.viewer.screens.bytes_sent
     shown.press("red ball 60")
     shown.wait(lambda: not shown.looks_like(1), "the red ball to go")
     assert shown.looks_like(2)
     shown.press("red ball 60")
     shown.wait(lambda: shown.looks_like(1), "the red ball to come back")
     shown.wait(lambda: np.abs(shown.picture() - before).max(axis=2).mean() < 2, "the picture as it was")
-    assert shown.viewer.splats.bytes_sent == sent
+    assert shown.viewer.screens.bytes_sent == sent
 
 
 def test_a_class_is_isolated_and_another_is_removed(shown: Shown) -> None:
@@ -246,7 +248,7 @@ def test_codes_of_a_live_source_refresh_the_picture(chromium: Browser) -> None:
             pass
 
     source = Source()
-    viewer = Viewer(ViewModel(SCENE, Labelling.unknown(len(SCENE))), source=source, port=18080)
+    viewer = Viewer(ViewModel(SCENE, Labelling.unknown(len(SCENE))), source=source, port=18080, draw=SERVER)
     with closing(viewer), opened_page(chromium, 960, 640, tolerated="computeBoundingSphere") as page:
         page.goto(viewer.url)
         shown = Shown(viewer, page)
@@ -256,6 +258,28 @@ def test_codes_of_a_live_source_refresh_the_picture(chromium: Browser) -> None:
         shown.wait(lambda: shown.looks_like(1) and shown.looks_like(2), "the classes")
         shown.tab("Save")
         shown.says("live: 7 views so far")
+
+
+@pytest.mark.parametrize(("limit", "draws"), [(-1.0, False), (np.inf, True)])
+def test_a_browser_gets_images_until_it_has_shown_that_it_draws_fast(
+    chromium: Browser, monkeypatch: pytest.MonkeyPatch, limit: float, draws: bool
+) -> None:
+    monkeypatch.setattr(view_screens, "SLOW", limit)
+    taken: list[bool] = []
+    stop = view_screens.Screen.stop_images
+    monkeypatch.setattr(view_screens.Screen, "stop_images", lambda screen: (stop(screen), taken.append(True)))
+    viewer = Viewer(ViewModel(SCENE, LEARNT), clean_views(1), port=18080, draw=AUTO)
+    with closing(viewer), opened_page(chromium, 960, 640, tolerated="computeBoundingSphere") as page:
+        page.goto(viewer.url)
+        shown = Shown(viewer, page)
+        shown.wait(lambda: shown.looks_like(1), "the first picture")
+        if draws:
+            shown.wait(lambda: taken, "the browser to draw")
+        else:
+            shown.says("This browser draws slowly")
+        assert viewer.screens.drawing == draws and bool(viewer.screens.bytes_sent) == draws
+        viewer.change(lambda model: model.isolate(2))
+        shown.wait(lambda: shown.looks_like(2) and not shown.looks_like(1), "the mug alone")
 
 
 def test_the_command_serves_the_page_until_it_is_interrupted(tmp_path: Path) -> None:

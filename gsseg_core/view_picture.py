@@ -1,0 +1,55 @@
+"""What is shown now: as splats that a browser draws, or as an image that is drawn here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from gsseg_core.operator import ViewOperator
+from gsseg_core.scene import GaussianScene
+from gsseg_core.view_nodes import Key, Node, paint
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A scene, and how it should look.
+
+    Attributes
+    ----------
+    scene : GaussianScene
+        N Gaussians.
+    parts : mapping of Key to (M,) int64
+        How the scene is cut into nodes.
+    shown : (N,) bool
+        Which of them are to be seen.
+    colors : (N, 3) uint8
+        In which colours.
+    """
+
+    scene: GaussianScene
+    parts: Mapping[Key, np.ndarray]
+    shown: np.ndarray
+    colors: np.ndarray
+
+    @cached_property
+    def nodes(self) -> dict[Key, Node]:
+        """The pieces that a browser draws."""
+        opacities = np.rint(self.scene.opacities * 255).astype(np.uint8)
+        return paint(self.parts, self.shown, self.colors, opacities)
+
+    def draw(
+        self,
+        operator: ViewOperator,  # of the scene
+    ) -> np.ndarray:
+        """Draw it as a view sees it, before black: (H, W, 3) uint8."""
+        image = operator.without(~self.shown).render(self._codes)
+        drawn: np.ndarray = (image * 255 + 0.5).clip(0, 255).astype(np.uint8)
+        return drawn
+
+    @cached_property
+    def _codes(self) -> np.ndarray:
+        codes: np.ndarray = self.colors.astype(np.float32) / 255
+        return codes

@@ -1,0 +1,237 @@
+"""The browsers that look: which of them draws splats itself, and for which they are drawn here."""
+
+from __future__ import annotations
+
+import threading
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import viser
+import viser.transforms as vtf
+
+from gsseg_core.scene import GaussianScene
+from gsseg_core.view_frames import CameraOf, Frames
+from gsseg_core.view_picture import Picture
+from gsseg_core.view_splats import SplatNodes, Splats
+
+AUTO, BROWSER, SERVER = "auto", "browser", "server"
+DRAWN_BY = (AUTO, BROWSER, SERVER)
+"""Who draws: each browser, this program, or whoever is faster."""
+
+SLOW = 0.3
+"""Seconds more that splats may take a browser than a picture without them."""
+
+_TRIAL, _TRIAL_SIZE = 2500, 0.1
+"""Splats of the trial, and their standard deviation as a part of half the picture's height."""
+
+_FAINT = 2
+"""Opacity of the trial, of 255: it is drawn like all others, and hardly seen."""
+
+# A browser may leave while its picture is made. That is no news.
+warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
+
+_PATIENCE = 60.0
+_SMALL = (48, 64)
+
+
+class Screen:
+    """One browser, and what draws for it.
+
+    Parameters
+    ----------
+    client : viser.ClientHandle
+        The browser.
+    splats : Splats
+        What it may draw.
+    camera_of : CameraOf
+        Where it looks from.
+    drawn_by : str
+        One of `DRAWN_BY`.
+    device : str
+        Where images are drawn.
+    """
+
+    def __init__(
+        self, client: viser.ClientHandle, splats: Splats, camera_of: CameraOf, drawn_by: str, device: str
+    ) -> None:
+        self._client, self._splats = client, splats
+        self._lock = threading.Lock()
+        self._picture: Picture | None = None
+        self._nodes = SplatNodes(client, splats) if drawn_by == BROWSER else None
+        self._frames = Frames(client, camera_of, device) if drawn_by != BROWSER else None
+
+    @property
+    def bytes_sent(self) -> int:
+        """Of Gaussians, before compression."""
+        return self._nodes.bytes_sent if self._nodes else 0
+
+    @property
+    def draws(self) -> bool:
+        """Whether the browser draws by itself."""
+        return self._nodes is not None
+
+    def show(self, picture: Picture) -> None:
+        """Have this seen from now on."""
+        with self._lock:
+            self._picture = picture
+            if self._nodes:
+                self._nodes.show(picture.nodes)
+            if self._frames:
+                self._frames.show(picture)
+
+    def send_splats(self) -> None:
+        """Have the browser draw by itself, before the images that it gets."""
+        with self._lock:
+            self._nodes = SplatNodes(self._client, self._splats)
+            if self._picture:
+                self._nodes.show(self._picture.nodes)
+
+    def take_splats_back(self) -> None:
+        """Leave the browser with images alone."""
+        with self._lock:
+            if self._nodes:
+                self._nodes.show({})
+            self._nodes = None
+
+    def stop_images(self) -> None:
+        """Leave the browser with what it draws by itself."""
+        self.close()
+        self._client.scene.set_background_image(None)
+        self._client.flush()
+
+    def close(self) -> None:
+        """Send no more images."""
+        with self._lock:
+            frames, self._frames = self._frames, None
+        if frames:
+            frames.close()
+
+
+class Screens:
+    """All browsers that look.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+        To which they connect.
+    scene : GaussianScene
+        What they look at.
+    camera_of : CameraOf
+        Where one looks from.
+    drawn_by : str
+        One of `DRAWN_BY`. In `AUTO`, a browser gets images until it has shown that it draws fast.
+    device : str
+        Where images are drawn.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        scene: GaussianScene,
+        camera_of: CameraOf,
+        drawn_by: str = AUTO,
+        device: str = "cpu",
+    ) -> None:
+        self._splats, self._camera_of, self._drawn_by, self._device = Splats(scene), camera_of, drawn_by, device
+        self._lock = threading.Lock()
+        self._screens: dict[int, Screen] = {}
+        self._picture: Picture | None = None
+        server.on_client_connect(self._join)
+        server.on_client_disconnect(self._leave)
+
+    @property
+    def bytes_sent(self) -> int:
+        """Of Gaussians, before compression, to those that look now."""
+        return sum(screen.bytes_sent for screen in self._all())
+
+    @property
+    def drawing(self) -> int:
+        """Count the browsers that draw by themselves."""
+        return sum(screen.draws for screen in self._all())
+
+    def show(self, picture: Picture) -> None:
+        """Have this seen from now on."""
+        with self._lock:
+            self._picture = picture
+            for screen in self._screens.values():
+                screen.show(picture)
+
+    def close(self) -> None:
+        """Send nothing more."""
+        for screen in self._all():
+            screen.close()
+
+    def _all(self) -> list[Screen]:
+        with self._lock:
+            return list(self._screens.values())
+
+    def _join(self, client: viser.ClientHandle) -> None:
+        screen = Screen(client, self._splats, self._camera_of, self._drawn_by, self._device)
+        with self._lock:
+            self._screens[client.client_id] = screen
+            if self._picture:
+                screen.show(self._picture)
+        if self._drawn_by == AUTO:
+            try:
+                self._decide(client, screen)
+            except (RuntimeError, TimeoutError):  # It has left, or it cannot even draw the trial.
+                return
+
+    def _leave(self, client: viser.ClientHandle) -> None:
+        with self._lock:
+            screen = self._screens.pop(client.client_id, None)
+        if screen:
+            screen.close()
+
+    @staticmethod
+    def _decide(client: viser.ClientHandle, screen: Screen) -> None:
+        alone = time_of_picture(client)
+        with trial(client):
+            slow = time_of_picture(client) - alone > SLOW
+        if not slow:
+            screen.send_splats()
+            slow = time_of_picture(client) - alone > SLOW
+            screen.take_splats_back() if slow else screen.stop_images()
+        if slow:
+            client.add_notification(
+                "The server draws",
+                "This browser draws slowly, as without a GPU, so it gets images. `--draw browser` leaves it to itself.",
+                auto_close_seconds=8.0,
+            )
+
+
+def time_of_picture(client: viser.ClientHandle) -> float:
+    """Seconds that a browser takes to draw what it has now, and to send a small image of that.
+
+    Raises
+    ------
+    RuntimeError, TimeoutError
+        The browser has left, or does not answer.
+    """
+    for _ in range(2):  # The first may be without what has just been sent: splats are sorted beside the drawing.
+        start = time.monotonic()
+        client.get_render(*_SMALL, timeout=_PATIENCE)
+    return time.monotonic() - start
+
+
+@contextmanager
+def trial(client: viser.ClientHandle) -> Iterator[None]:
+    """Put some splats before a browser, so faint that nobody sees them, and take them away again."""
+    camera, rng = client.camera, np.random.default_rng(0)
+    half = np.tan(camera.fov / 2)
+    there = np.column_stack([rng.uniform(-half, half, (_TRIAL, 2)) * (camera.aspect, 1), np.ones(_TRIAL)])
+    node = client.scene.add_gaussian_splats(
+        "/trial",
+        centers=(camera.position + there @ vtf.SO3(camera.wxyz).as_matrix().T).astype(np.float32),
+        covariances=np.tile(np.eye(3, dtype=np.float32) * (_TRIAL_SIZE * half) ** 2, (_TRIAL, 1, 1)),
+        rgbs=np.zeros((_TRIAL, 3), np.uint8),
+        opacities=np.full((_TRIAL, 1), _FAINT, np.uint8),
+    )
+    try:
+        yield
+    finally:
+        node.remove()
+        client.flush()

@@ -1,0 +1,94 @@
+"""Images for browsers that draw slowly: what is in them, and when they come."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_scenes import NAMES, balls_on_a_table, clean_views
+
+pytest.importorskip("viser")
+
+from gsseg_core.cameras import Camera
+from gsseg_core.operator import make_operator
+from gsseg_core.view_frames import FINE_ROWS, QUICK_ROWS, RESTS, Frames
+from gsseg_core.view_model import Labelling, ViewModel
+from gsseg_core.view_nodes import cut
+from gsseg_core.view_picture import Picture
+
+PATIENCE = 30.0
+SCENE, TRUTH = balls_on_a_table()
+MODEL = ViewModel(SCENE, Labelling(TRUTH.astype(np.int32), np.eye(4, dtype=np.float32)[TRUTH], dict(NAMES)))
+CAMERA = clean_views(1)[0].camera
+
+
+def picture(shown: np.ndarray) -> Picture:
+    return Picture(SCENE, cut(MODEL.labelling.labels, MODEL.confidence), shown, MODEL.colors())
+
+
+def camera_of(_: object, rows: int) -> Camera:
+    scale = rows / CAMERA.height
+    return replace(CAMERA, width=round(CAMERA.width * scale), height=rows, K=CAMERA.K * [[scale], [scale], [1]])
+
+
+class Client:
+    """A browser that keeps the images which it gets, and says where it looks when it is told to."""
+
+    def __init__(self) -> None:
+        self.camera, self.scene = self, self
+        self.images: list[np.ndarray] = []
+        self.move: Callable[[object], object] = print
+
+    def on_update(self, callback: Callable[[object], object]) -> None:
+        self.move = callback
+
+    def set_background_image(self, image: np.ndarray, **_: object) -> None:
+        self.images.append(image)
+
+    def flush(self) -> None:
+        pass
+
+    def wait_for(self, count: int) -> None:
+        deadline = time.monotonic() + PATIENCE
+        while len(self.images) < count:
+            assert time.monotonic() < deadline, f"{len(self.images)} images came; expected {count}"
+            time.sleep(0.01)
+
+
+def test_an_image_has_the_colours_of_what_is_shown_and_nothing_else() -> None:
+    shown = TRUTH == 2
+    image = picture(shown).draw(make_operator(SCENE, CAMERA))
+    codes = MODEL.colors().astype(np.float32) / 255
+    alone = make_operator(SCENE.subset(shown), CAMERA).render(codes[shown])
+    assert np.abs(image - 255 * alone).max() <= 0.5001
+    assert image.any()
+    assert not picture(np.zeros(len(SCENE), bool)).draw(make_operator(SCENE, CAMERA)).any()
+
+
+def test_a_change_is_answered_by_a_quick_image_and_then_by_a_fine_one() -> None:
+    client = Client()
+    with closing(Frames(client, camera_of)) as frames:  # type: ignore[arg-type]
+        frames.show(picture(TRUTH >= 0))
+        client.wait_for(2)
+        client.move(None)
+        client.wait_for(4)
+        time.sleep(2 * RESTS)
+    assert [len(image) for image in client.images] == [QUICK_ROWS, FINE_ROWS] * 2
+    assert np.array_equal(client.images[1], client.images[3])
+
+
+def test_after_the_end_no_image_comes() -> None:
+    client = Client()
+    frames = Frames(client, camera_of)  # type: ignore[arg-type]
+    frames.show(picture(TRUTH >= 0))
+    client.wait_for(1)
+    frames.close()
+    count = len(client.images)
+    client.move(None)
+    frames.show(picture(TRUTH == 1))
+    time.sleep(2 * RESTS)
+    assert len(client.images) == count
