@@ -1,12 +1,13 @@
 """Measure `gsseg view` in a real headless Chromium: first picture, class toggles, thresholds, and bytes on the wire.
 
-The page runs in WebGL by software where there is no GPU, so every picture costs processor time that a GPU would save.
-One time ends when the button that was pressed changes, which the server asks for after the picture; the other when the
-first picture that differs has been drawn, which is read back from the canvas in that frame. Bytes are counted between
-the server and the browser, as compressed. Toggles are then measured once more with the drawing itself left out, as if a
-GPU took no time at all for it: what is left is what this program, the connection and the page's own work take.
+Twice: once the server draws, and once the browser. The page runs in WebGL by software where there is no GPU, so every
+picture that the browser draws costs processor time that a GPU would save. One time ends when the button that was
+pressed changes, which the server asks for after the picture; the other when the first picture that differs has been
+drawn, which is read back from the canvas in that frame. Bytes are counted between the server and the browser, as
+compressed. Toggles of a browser that draws are measured once more with the drawing itself left out, as if a GPU took no
+time at all for it: what is left is what this program, the connection and the page's own work take.
 
-Usage: python benchmarks/bench_view.py [--gaussians 300000] [--classes 40] [--toggles 15]
+Usage: python benchmarks/bench_view.py [--gaussians 300000] [--classes 40] [--toggles 15] [--draw server]
 """
 
 from __future__ import annotations
@@ -207,6 +208,7 @@ def main() -> None:
     parser.add_argument("--gaussians", type=int, default=300_000)
     parser.add_argument("--classes", type=int, default=40)
     parser.add_argument("--toggles", type=int, default=15)
+    parser.add_argument("--draw", nargs="+", choices=(SERVER, BROWSER), default=(SERVER, BROWSER), help="who draws")
     options = parser.parse_args()
     why = why_missing()
     if why:
@@ -214,7 +216,7 @@ def main() -> None:
     model, views = room_model(options.gaussians, options.classes)
     print(", ".join(f"{key} {value}" for key, value in describe().items()))
     print(f"{options.gaussians:,} Gaussians, {options.classes} classes, page of {WIDTH} x {HEIGHT}, WebGL by software")
-    for draw in (SERVER, BROWSER):
+    for draw in options.draw:
         measure_page(model, views, draw, options.toggles)
 
 
