@@ -88,7 +88,7 @@ def without_wrong(bench: Bench, views: Sequence[View], least: float) -> list[Vie
 def regions_of(
     labels: np.ndarray,  # (H, W)
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Number the regions of a mask, (H, W), UNKNOWN where it is unknown; and give the label of each, (R,)."""
+    """Give the regions of a mask numbers, (H, W), UNKNOWN where it is; and give the label of each, (R,)."""
     regions, classes = np.full(labels.shape, UNKNOWN, np.int32), []
     for label in np.unique(labels[labels >= 0]).tolist():
         parts, count = ndimage.label(labels == label)
