@@ -5,11 +5,13 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 import viser
 
 from gsseg_core.cameras import Camera
+from gsseg_core.errors import GssegError
 from gsseg_core.operator import ViewOperator, make_operator
 from gsseg_core.scene import GaussianScene
 from gsseg_core.view_picture import Picture
@@ -73,7 +75,8 @@ class Frames:
             if self._picture is None:
                 continue
             changing = time.monotonic() - self._changed < RESTS
-            self._send(self._picture, QUICK_ROWS if changing else FINE_ROWS)
+            with suppress(GssegError):  # A window may be so small that nothing can be seen in it.
+                self._send(self._picture, QUICK_ROWS if changing else FINE_ROWS)
             if changing and not self._stale.wait(RESTS):
                 self._stale.set()
 

@@ -41,6 +41,8 @@ def test_the_quality_of_service_of_an_input_can_be_overridden(
     robot = Robot(ros)
     override = {} if reliability is None else {"qos_overrides./mask.subscription.reliability": reliability}
     robot.started({**parameters, **override}, lossless=False)
+    for topic in ("/mask", "/pose"):  # That the node is active says nothing of what has been discovered here.
+        ros.wait_until(lambda topic=topic: ros.node.get_subscriptions_info_by_topic(topic), topic)
     (found,) = ros.node.get_subscriptions_info_by_topic("/mask")
     wanted = ReliabilityPolicy.BEST_EFFORT if reliability is None else ReliabilityPolicy.RELIABLE
     assert found.qos_profile.reliability == wanted

@@ -81,6 +81,19 @@ def test_a_change_is_answered_by_a_quick_image_and_then_by_a_fine_one() -> None:
     assert np.array_equal(client.images[1], client.images[3])
 
 
+def test_a_window_that_is_too_small_for_a_picture_gets_one_once_it_is_larger() -> None:
+    client, asked = Client(), []
+
+    def small_at_first(browser: object, rows: int) -> Camera:
+        asked.append(rows)
+        return camera_of(browser, rows if len(asked) > 1 else 0)
+
+    with closing(Frames(client, small_at_first)) as frames:  # type: ignore[arg-type]
+        frames.show(picture(TRUTH >= 0))
+        client.wait_for(1)
+    assert asked[:2] == [QUICK_ROWS, FINE_ROWS] and len(client.images[0]) == FINE_ROWS
+
+
 def test_after_the_end_no_image_comes() -> None:
     client = Client()
     frames = Frames(client, camera_of)  # type: ignore[arg-type]
