@@ -21,8 +21,7 @@ from robustness import EM, Bench, learn, open_benches
 from scipy import ndimage
 
 from gsseg_core.dataset import View, spread
-from gsseg_core.gaussian_kernels import take_votes, tally
-from gsseg_core.learner import UNITS
+from gsseg_core.em import counted_by_others
 from gsseg_core.masks import UNKNOWN
 from gsseg_core.meaning import Meaning
 from gsseg_core.operator import make_operator
@@ -100,12 +99,7 @@ def regions_of(
 def agreement(bench: Bench, votes: Rows, view: View, regions: np.ndarray, classes: np.ndarray) -> np.ndarray:
     """Find which share of each region is of its label by the votes of the others, (R,); 1 where nobody else votes."""
     observation = make_operator(bench.scene, view.camera).observe(regions, Meaning(classes))
-    own, order = observation.votes(), observation.order
-    seen = order, observation.start, observation.labels
-    others = votes.take(observation.ids[order])
-    take_votes(*others, *seen, *Meaning(classes).votes, own, UNITS)
-    codes = others.with_values(others.values.astype(np.float32)).normalised()
-    counts = tally(*codes, *seen, own, bench.data.num_classes, len(classes))
+    counts = counted_by_others(votes, observation, np.ones(bench.data.num_classes, bool))
     total = counts.sum(axis=0)
     return np.divide(counts[classes, np.arange(len(classes))], total, out=np.ones(len(classes)), where=total > 0)
 

@@ -269,18 +269,8 @@ class EMLearner(Learner):
         settings, meaning, pixels = self.settings, observation.meaning, observation.num_pixels
         if not settings.errors:
             return ErrorModel.trusting(meaning, self.num_classes, settings.outliers, pixels)
-        counts = self._counted(votes, observation)
+        counts = counted_by_others(votes, observation, self._possible())
         return ErrorModel.from_counts(meaning, counts, settings.error_prior, settings.outliers, pixels)
-
-    def _counted(self, votes: Rows, observation: Observation) -> np.ndarray:
-        """Count the pixels (K, L) of each class under each label of a view, by the votes of all the others."""
-        order, own = observation.order, observation.votes()
-        seen = order, observation.start, observation.labels
-        others = votes.take(observation.ids[order])
-        take_votes(*others, *seen, *observation.meaning.votes, own, UNITS)
-        others = standing(others, self._possible())
-        codes = others.with_values(others.values.astype(np.float32)).normalised()
-        return tally(*codes, *seen, own, self.num_classes, len(observation.classes))
 
     def _gains(
         self,
@@ -337,6 +327,21 @@ class EMLearner(Learner):
         codes = votes.with_values(votes.values.astype(np.float32) * np.float32(VOTE_UNIT)).normalised()
         smooth = neighbours.mean_codes(codes, self.observed_, self.num_classes).normalised()
         return smooth.with_values(np.float32(self.settings.prior_weight) * smooth.values)
+
+
+def counted_by_others(
+    votes: Rows,  # int64, of all views
+    observation: Observation,
+    possible: np.ndarray,  # (K,) bool: ids that are classes
+) -> np.ndarray:
+    """Count the pixels (K, L) of each class under each label of a view, by the votes of all the others."""
+    order, own = observation.order, observation.votes()
+    seen = order, observation.start, observation.labels
+    others = votes.take(observation.ids[order])
+    take_votes(*others, *seen, *observation.meaning.votes, own, UNITS)
+    others = standing(others, possible)
+    codes = others.with_values(others.values.astype(np.float32)).normalised()
+    return tally(*codes, *seen, own, len(possible), len(observation.classes))
 
 
 def codes_without(
