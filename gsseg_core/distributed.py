@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from gsseg_core.dataset import View
-from gsseg_core.em import EMLearner, ErrorModel
+from gsseg_core.em import EMLearner
+from gsseg_core.error_model import ErrorModel
 from gsseg_core.errors import GssegError, SchedulerError
 from gsseg_core.learner import Learner, Progress, silent
 from gsseg_core.rows import Rows
@@ -36,6 +37,7 @@ from gsseg_core.shard import (
     prepare,
     refit_models,
     start_models,
+    sum_doubted,
     sum_gains,
     sum_votes,
 )
@@ -97,7 +99,7 @@ class _OnWorkers(Learner):
         task: Callable[..., Part],
         views: Mapping[str, View],
         tell: Callable[[int], None],
-        models: Mapping[str, ErrorModel] | None = None,
+        by_view: Mapping[str, Any] | None = None,
         *values: Any,
     ) -> Part:
         """Sum up what a task makes of these views; `tell` is called with how many of them are done, time and again.
@@ -112,7 +114,7 @@ class _OnWorkers(Learner):
         for _ in range(ATTEMPTS):
             used: list[Future] = []
             try:
-                return self._try_to_sum(used, task, views, tell, models or {}, values)
+                return self._try_to_sum(used, task, views, tell, by_view or {}, values)
             except (_LostError, CancelledError):
                 self._shares = []
             finally:
@@ -127,7 +129,7 @@ class _OnWorkers(Learner):
         task: Callable[..., Part],
         views: Mapping[str, View],
         tell: Callable[[int], None],
-        models: Mapping[str, ErrorModel],
+        by_view: Mapping[str, Any],
         values: Sequence[Any],
     ) -> Part:
         shares = self._deal(views, tell)
@@ -135,7 +137,7 @@ class _OnWorkers(Learner):
         used += [future for copy in copies for future in copy.values()]
         parts = []
         for share in shares:
-            wanted = {name: models.get(name) for name in share.views if name in views}
+            wanted = {name: by_view.get(name) for name in share.views if name in views}
             parts.append(self._submit(share.worker, task, share.shard, wanted, *(c[share.worker] for c in copies)))
         used += parts
         sums = parts
@@ -247,13 +249,22 @@ class DistributedEM(_OnWorkers, EMLearner):
     `memory_budget` is that of each worker. Views are best added together, by `observe_all`.
     """
 
-    def _first_models(
+    def _judge(
         self,
         votes: Rows,  # int64
         tell: Callable[[], None],
         names: Iterable[str] | None = None,
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        return self._sum(sum_doubted, self.views, lambda done: tell(), None, votes)
+
+    def _first_models(
+        self,
+        votes: Rows,  # int64
+        doubts: Mapping[str, np.ndarray],  # (L,) bool
+        tell: Callable[[], None],
+        names: Iterable[str] | None = None,
     ) -> dict[str, ErrorModel]:
-        models = self._sum(start_models, self.views, lambda done: tell(), None, votes)[1]
+        models = self._sum(start_models, self.views, lambda done: tell(), doubts, votes)[1]
         return {name: models[name] for name in self.views}
 
     def _gains(

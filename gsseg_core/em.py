@@ -39,20 +39,24 @@ to the summands.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
+from gsseg_core.dataset import View
+from gsseg_core.error_model import ErrorModel
 from gsseg_core.errors import SettingsError
-from gsseg_core.gaussian_kernels import collect, improve, improve_without, mix, take_votes, tally
-from gsseg_core.learner import MEMORY_BUDGET, UNITS, VOTE_UNIT, Learner, Progress, silent
-from gsseg_core.meaning import Meaning, standing
+from gsseg_core.gaussian_kernels import collect, improve, improve_without, mix, tally
+from gsseg_core.learner import MEMORY_BUDGET, VOTE_UNIT, Learner, Progress, silent
+from gsseg_core.meaning import standing
 from gsseg_core.neighbours import neighbours_of
 from gsseg_core.operator import Observation
+from gsseg_core.regions import by_region, counted_by_others, in_doubt, votes_of
 from gsseg_core.rows import Rows, starts
 from gsseg_core.scene import GaussianScene
+from gsseg_core.soft_masks import SeenLabels
 
 ROUGH = 4
 """Codes that error models are learnt anew from may be so many times less settled than those that are handed out."""
@@ -72,6 +76,9 @@ class EMSettings:
         Learn what the segmenter got wrong in each view; without, every mask is taken at its word.
     refits : int
         How often error models are learnt anew once the codes have all but converged, and the codes then once more.
+    least_agreement : float
+        A region of a mask is not heard if a smaller share of it is of its label by the votes of the other views; see
+        `gsseg_core.regions`. 0 hears all.
     error_prior : float
         Pseudo-pixels in which a class was labelled right, as a share of the pixels that it fills in the view.
     outliers : float
@@ -86,6 +93,7 @@ class EMSettings:
     tolerance: float = 0.005
     errors: bool = True
     refits: int = 1
+    least_agreement: float = 0.05
     error_prior: float = 0.3
     outliers: float = 1e-3
     prior_weight: float = 3.0
@@ -97,90 +105,10 @@ class EMSettings:
             raise SettingsError(f"em: max_steps is {self.max_steps}, prior_k {self.prior_k}; expected at least 1")
         if not 0 < self.outliers < 1:
             raise SettingsError(f"em: outliers is {self.outliers}; expected a share in (0, 1)")
+        if not 0 <= self.least_agreement <= 1:
+            raise SettingsError(f"em: least_agreement is {self.least_agreement}; expected a share in [0, 1]")
         if min(self.tolerance, self.error_prior, self.prior_weight, self.refits) < 0:
             raise SettingsError("em: tolerance, error_prior, prior_weight or refits is negative; expected 0 or more")
-
-
-@dataclass
-class ErrorModel:
-    """What one view's segmenter calls each class.
-
-    Attributes
-    ----------
-    meaning : Meaning
-        Of the L labels that occur in the view's mask; they are made of W words.
-    confusion : (K, W) float32
-        R_v: rows are true classes, columns the words seen; rows sum to 1.
-    right : (T,) float64
-        a_v of the classes that have a right word, in px.
-    outliers : float
-        Share of pixels labelled by chance.
-    num_pixels : int
-        Pixels with a label.
-    """
-
-    meaning: Meaning
-    confusion: np.ndarray
-    right: np.ndarray
-    outliers: float
-    num_pixels: int
-
-    @classmethod
-    def trusting(cls, meaning: Meaning, num_classes: int, outliers: float, num_pixels: int) -> ErrorModel:
-        """Believe that every label is right."""
-        confusion, right = np.zeros((num_classes, len(meaning.words)), np.float32), meaning.right(num_classes)
-        confusion[right] = 1.0
-        return cls(meaning, confusion, np.zeros(len(right[0])), outliers, num_pixels)
-
-    @classmethod
-    def from_counts(
-        cls,
-        meaning: Meaning,
-        counts: np.ndarray,  # (K, L) px of each class under each label
-        prior: float,
-        outliers: float,
-        num_pixels: int,
-    ) -> ErrorModel:
-        """Start from what the codes so far say of the mask."""
-        if meaning.shares is not None:
-            counts = counts @ (meaning.shares / meaning.shares.sum(axis=1, keepdims=True))
-        right = prior * counts[meaning.right(len(counts))[0]].sum(axis=1)
-        uniform = np.full(counts.shape, 1.0 / len(meaning.words), np.float32)
-        model = cls(meaning, uniform, right, outliers, num_pixels)
-        model.maximise(counts)
-        return model
-
-    @property
-    def classes(self) -> np.ndarray:
-        """The words seen, (W,) int32: classes, and then `UNKNOWN` (-1) for "none of these", if it occurs."""
-        return self.meaning.words
-
-    @property
-    def likelihood(self) -> np.ndarray:
-        """C_v: probability of each label given the class, (K, L) float32."""
-        words: np.ndarray = (1 - self.outliers) * self.confusion + np.float32(self.outliers / len(self.classes))
-        return words if self.meaning.shares is None else np.asarray(words @ self.meaning.shares.T)
-
-    def expected(
-        self,
-        counts: np.ndarray,  # (K, L) sum of the shares of each class under each label
-    ) -> np.ndarray:
-        """Count the pixels (K, W) in which each class was there and each word was meant."""
-        if self.meaning.shares is not None:
-            counts = counts @ self.meaning.shares
-        expected: np.ndarray = counts * (1 - self.outliers) * self.confusion
-        return expected
-
-    def maximise(
-        self,
-        counts: np.ndarray,  # (K, W) expected px
-    ) -> None:
-        """Set R_v to its best for expected counts; classes that the view does not show keep their row."""
-        counts = counts.astype(np.float64)
-        counts[self.meaning.right(len(counts))] += self.right
-        total = counts.sum(axis=1, keepdims=True)
-        shown = total[:, 0] > 0
-        self.confusion[shown] = counts[shown] / total[shown]
 
 
 class EMLearner(Learner):
@@ -218,8 +146,13 @@ class EMLearner(Learner):
         """Step until a step gains less than the tolerance."""
         settings = self.settings
         self._begin()
-        votes = Rows.of(self._votes)
+        votes, tell = Rows.of(self._votes), partial(progress, "em", 0, settings.max_steps)
+        doubts: dict[str, np.ndarray] = {}
+        if settings.errors and settings.least_agreement:
+            doubted, doubts = self._judge(votes, tell)
+            votes = votes.with_values(votes.values - doubted).nonzero()
         stands = standing(votes, self._possible())
+        self.observed_ = np.diff(stands.start) > 0
         counted, prior = stands.united(self._smooth(stands))
         # Votes are the first step; with the prior counted in, the objective is finite from the start. What is zero now
         # is zero after every step, so the codes keep these places.
@@ -228,8 +161,7 @@ class EMLearner(Learner):
         ).normalised()
         history: list[float] = []
         self.history_ = history
-        tell = partial(progress, "em", 0, settings.max_steps)
-        models = self._first_models(votes, tell)
+        models = self._first_models(votes, doubts, tell)
         pixels = sum(model.num_pixels for model in models.values())
         self.rounds_ = rounds = [0]
         while len(history) < settings.max_steps:
@@ -252,9 +184,40 @@ class EMLearner(Learner):
         self._finish()
         return self
 
+    def _seen(self, view: View) -> SeenLabels:
+        """Read a mask; regions are told apart if they may be in doubt."""
+        seen = super()._seen(view)
+        return by_region(seen) if self.settings.errors and self.settings.least_agreement else seen
+
+    def _judge(
+        self,
+        votes: Rows,  # int64
+        tell: Callable[[], None],
+        names: Iterable[str] | None = None,
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Find the labels of each view, or of some, that the other views speak against.
+
+        Returns
+        -------
+        doubted : (Z,) int64
+            Their part of each entry of the votes.
+        doubts : dict of str to (L,) bool
+            Which they are; views without any are left out.
+        """
+        doubted, doubts = np.zeros_like(votes.values), {}
+        for name, observation in self._observations(names):
+            tell()
+            doubtful = in_doubt(votes, observation, self._possible(), self.settings.least_agreement)
+            if doubtful.any():
+                doubts[name] = doubtful
+                places, voted = votes_of(doubtful, votes, observation)
+                doubted[places] += voted
+        return doubted, doubts
+
     def _first_models(
         self,
         votes: Rows,  # int64
+        doubts: Mapping[str, np.ndarray],  # (L,) bool
         tell: Callable[[], None],
         names: Iterable[str] | None = None,
     ) -> dict[str, ErrorModel]:
@@ -262,14 +225,17 @@ class EMLearner(Learner):
         models = {}
         for name, observation in self._observations(names):
             tell()
-            models[name] = self._first_model(votes, observation)
+            models[name] = self._first_model(votes, observation, doubts.get(name))
         return models
 
-    def _first_model(self, votes: Rows, observation: Observation) -> ErrorModel:
-        settings, meaning, pixels = self.settings, observation.meaning, observation.num_pixels
+    def _first_model(self, votes: Rows, observation: Observation, doubtful: np.ndarray | None) -> ErrorModel:
+        settings, meaning = self.settings, observation.meaning
         if not settings.errors:
-            return ErrorModel.trusting(meaning, self.num_classes, settings.outliers, pixels)
-        counts = counted_by_others(votes, observation, self._possible())
+            return ErrorModel.trusting(meaning, self.num_classes, settings.outliers, observation.num_pixels)
+        if doubtful is not None:
+            meaning = meaning.without(doubtful)
+        pixels = int(observation.areas[meaning.says].sum())
+        counts = counted_by_others(votes, observation, self._possible(), meaning)
         return ErrorModel.from_counts(meaning, counts, settings.error_prior, settings.outliers, pixels)
 
     def _gains(
@@ -290,11 +256,11 @@ class EMLearner(Learner):
         gains, told = np.zeros(len(codes.values), np.int64), {}
         for name, observation in self._observations(models):
             tell()  # after each view, so that whoever listens can stop the work at once
-            likelihood = np.ascontiguousarray(models[name].likelihood.T)
-            seen = observation.order, observation.ids, observation.start, observation.labels, likelihood
-            shares = observation.shares(mix(*codes, *seen), likelihood[:, 0])
+            likelihood, taught = models[name].told
+            seen = observation.order, observation.ids, observation.start, observation.labels
+            shares = observation.shares(mix(*codes, *seen, likelihood), likelihood[:, 0])
             told[name] = shares.log_likelihood
-            collect(codes.start, codes.classes, gains, *seen, shares.sightings)
+            collect(codes.start, codes.classes, gains, *seen, taught, shares.sightings)
         return gains, told
 
     def _refit(
@@ -310,7 +276,7 @@ class EMLearner(Learner):
             tell()
             model, order = models[name], observation.order
             without = codes_without(observation, model, codes, gains, prior)
-            likelihood = np.ascontiguousarray(model.likelihood.T)
+            likelihood, _ = model.told
             said = mix(*without, order, _inverse(order), observation.start, observation.labels, likelihood)
             shares = observation.shares(said, likelihood[:, 0])
             seen = order, observation.start, observation.labels
@@ -329,21 +295,6 @@ class EMLearner(Learner):
         return smooth.with_values(np.float32(self.settings.prior_weight) * smooth.values)
 
 
-def counted_by_others(
-    votes: Rows,  # int64, of all views
-    observation: Observation,
-    possible: np.ndarray,  # (K,) bool: ids that are classes
-) -> np.ndarray:
-    """Count the pixels (K, L) of each class under each label of a view, by the votes of all the others."""
-    order, own = observation.order, observation.votes()
-    seen = order, observation.start, observation.labels
-    others = votes.take(observation.ids[order])
-    take_votes(*others, *seen, *observation.meaning.votes, own, UNITS)
-    others = standing(others, possible)
-    codes = others.with_values(others.values.astype(np.float32)).normalised()
-    return tally(*codes, *seen, own, len(possible), len(observation.classes))
-
-
 def codes_without(
     observation: Observation,
     model: ErrorModel,
@@ -352,12 +303,12 @@ def codes_without(
     prior: np.ndarray,  # (Z,) float32, px
 ) -> Rows:
     """Take a step of EM that leaves a view's own summand out: codes of the M Gaussians that it sees, by `order`."""
-    likelihood = np.ascontiguousarray(model.likelihood.T)
-    seen = observation.order, observation.ids, observation.start, observation.labels, likelihood
-    shares = observation.shares(mix(*codes, *seen), likelihood[:, 0])
+    likelihood, taught = model.told
+    seen = observation.order, observation.ids, observation.start, observation.labels
+    shares = observation.shares(mix(*codes, *seen, likelihood), likelihood[:, 0])
     start = starts(np.diff(codes.start)[observation.ids[observation.order]])
     without = Rows(start, np.empty(start[-1], np.uint32), np.empty(start[-1], np.float32))
-    improve_without(*codes, gains, prior, *seen, shares.sightings, *without)
+    improve_without(*codes, gains, prior, *seen, taught, shares.sightings, *without)
     return without
 
 

@@ -281,8 +281,8 @@ class GsplatObservation(Observation):
     ) -> None:
         self._operator = operator
         known = labels >= 0
-        self.classes = np.unique(labels[known]).astype(np.int32)
-        self.num_pixels = int(known.sum())
+        classes, self.areas = np.unique(labels[known], return_counts=True)
+        self.classes = classes.astype(np.int32)
         local = np.where(known, np.searchsorted(self.classes, labels), -1)
         self._labels = torch.tensor(local, dtype=torch.int32, device=operator.device)
         votes = self._lift()

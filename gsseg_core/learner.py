@@ -243,9 +243,13 @@ class Learner(ABC):
     def _read(self, view: View) -> tuple[SeenLabels | None, str]:
         if not view.has_mask:
             return None, NO_MASK
-        seen = view.read_seen()
+        seen = self._seen(view)
         self._check_labels(view, seen)
         return (seen, "") if (seen.labels >= 0).any() else (None, ALL_UNKNOWN)
+
+    def _seen(self, view: View) -> SeenLabels:
+        """Read what is learnt from a mask."""
+        return view.read_seen()
 
     def _check_labels(self, view: View, seen: SeenLabels) -> None:
         largest = int(seen.labels.max()) if seen.meaning is None else seen.meaning.largest
@@ -264,7 +268,7 @@ class Learner(ABC):
         """Return a view with its mask, prepared; it is kept as far as the memory budget goes."""
         if name not in self._prepared:
             view = self.views[name]
-            observation = make_operator(self.scene, view.camera, self.device).observe(*view.read_seen())
+            observation = make_operator(self.scene, view.camera, self.device).observe(*self._seen(view))
             self._keep(name, observation)
             return observation
         return self._prepared[name]
@@ -283,7 +287,7 @@ class Learner(ABC):
     def _finish(self) -> None:
         """Leave codes only where something was seen that they can be told by."""
         unsure = np.flatnonzero(~self.observed_)
-        seen = self._votes[unsure].any(axis=1)
+        seen = (self._votes[unsure] < 0).any(axis=1)
         self.codes_[unsure[~seen]] = 0.0
         if seen.any():
             guess(self.codes_, self._votes, self._possible(), unsure[seen])

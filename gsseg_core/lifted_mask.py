@@ -31,8 +31,8 @@ class LiftedMask:
     ----------
     classes : (L,) int32
         Labels that occur in the mask, ascending.
-    num_pixels : int
-        Pixels with a label.
+    areas : (L,) int64
+        Pixels of each label.
     labels : Labels
         The mask cut into tiles; labels are positions in `classes`.
     slot_start : (T + 1,) int64
@@ -54,7 +54,7 @@ class LiftedMask:
     ) -> None:
         areas = np.bincount(np.maximum(labels, -1).ravel() + 1, minlength=1)[1:]
         self.classes = np.flatnonzero(areas).astype(np.int32)
-        self.num_pixels = int(areas.sum())
+        self.areas = areas[self.classes]
         self.labels = mask = _cut(labels, self.classes, tiles)
         self.slot_start = starts(np.diff(tiles.start) * np.diff(mask.start))
         self.reached = np.empty(len(tiles.entries), np.uint16)

@@ -58,6 +58,28 @@ class Meaning:
         """Whether some label says "none of those that were looked for"."""
         return self.supervised is not None and bool((self.rest > 0).any())
 
+    @cached_property
+    def is_certain(self) -> bool:
+        """Whether every label names one class, for certain, and all classes were looked for."""
+        if self.mass is None or self.supervised is not None:
+            return self.supervised is None
+        return bool((self.mass.max(axis=1, initial=0) == 1).all())
+
+    @cached_property
+    def says(self) -> np.ndarray:
+        """Whether a label says anything at all, (L,) bool."""
+        if self.mass is None or self.supervised is not None:
+            return np.ones(len(self.rest), bool)
+        return np.asarray(self.mass.any(axis=1))
+
+    def without(
+        self,
+        labels: np.ndarray,  # (L,) bool
+    ) -> Meaning:
+        """Have these labels say nothing, in a mask in which all classes were looked for."""
+        mass = np.eye(len(self.classes), dtype=np.float32) if self.mass is None else self.mass
+        return Meaning(self.classes, np.where(labels[:, None], np.float32(0), mass))
+
     @property
     def words(self) -> np.ndarray:
         """The segmenter's words, (W,) int32: classes, and then `UNKNOWN` (-1) for "none of these" if it is said."""

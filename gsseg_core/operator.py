@@ -86,8 +86,8 @@ class Observation(ABC):
         Label of each sighting, as its position in `classes`.
     classes : (L,) int32
         Labels that occur in the mask, ascending.
-    num_pixels : int
-        Pixels with a label.
+    areas : (L,) int64
+        Pixels of each label.
     meaning : Meaning
         What the labels say of the classes; of a plain mask, that they are classes.
     """
@@ -96,12 +96,17 @@ class Observation(ABC):
     start: np.ndarray
     labels: np.ndarray
     classes: np.ndarray
-    num_pixels: int
+    areas: np.ndarray
 
     @property
     @abstractmethod
     def nbytes(self) -> int:
         """Memory that it holds, in bytes."""
+
+    @property
+    def num_pixels(self) -> int:
+        """Pixels with a label."""
+        return int(self.areas.sum())
 
     @cached_property
     def meaning(self) -> Meaning:

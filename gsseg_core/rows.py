@@ -101,6 +101,11 @@ class Rows(NamedTuple):
         _normalise(self.start, self.values)
         return self
 
+    def nonzero(self) -> Rows:
+        """Leave out entries that have become zero."""
+        kept = self.values != 0
+        return Rows(starts(kept)[self.start], self.classes[kept], self.values[kept])
+
     def take(
         self,
         ids: np.ndarray,  # (M,)

@@ -18,7 +18,8 @@ import numba
 import numpy as np
 
 from gsseg_core.dataset import View
-from gsseg_core.em import EMLearner, EMSettings, ErrorModel
+from gsseg_core.em import EMLearner, EMSettings
+from gsseg_core.error_model import ErrorModel
 from gsseg_core.errors import GssegError
 from gsseg_core.learner import UNITS
 from gsseg_core.rows import Rows
@@ -26,6 +27,9 @@ from gsseg_core.scene import GaussianScene
 
 Part = tuple[Any, dict[str, Any]]
 """A sum over some views, of int64, or None, and by view what else came out."""
+
+ONLY_VOTES = EMSettings(errors=False)
+"""What is wrong with a mask does not matter to votes."""
 
 _BUSY = threading.Lock()
 
@@ -79,7 +83,7 @@ def prepare(
     memory_budget: int,
 ) -> Shard:
     """Prepare views; `NotHereError` where a mask's file is not the one with the digest beside the view."""
-    shard = Shard(scene, num_classes, settings, device=device, memory_budget=memory_budget)
+    shard = Shard(scene, num_classes, settings or ONLY_VOTES, device=device, memory_budget=memory_budget)
     shard._votes = shard._votes[:0].copy()
     with _all_threads():
         for view, digest in views:
@@ -103,14 +107,25 @@ def sum_votes(shard: Shard, wanted: dict[str, Any]) -> Part:
     return votes, {name: shard.rejected.get(name, "") for name in wanted}
 
 
-def start_models(
+def sum_doubted(
     shard: Shard,
     wanted: dict[str, Any],
     votes: Rows,  # int64
 ) -> Part:
+    """Count the votes that are in doubt; beside them, what they have been given to."""
+    with _all_threads():
+        return shard._judge(_as_compiled_for(votes), _go_on, wanted)
+
+
+def start_models(
+    shard: Shard,
+    doubts: dict[str, np.ndarray | None],
+    votes: Rows,  # int64
+) -> Part:
     """Make the first error model of each view."""
     with _all_threads():
-        return None, shard._first_models(_as_compiled_for(votes), _go_on, wanted)
+        known = {name: doubtful for name, doubtful in doubts.items() if doubtful is not None}
+        return None, shard._first_models(_as_compiled_for(votes), known, _go_on, doubts)
 
 
 def sum_gains(

@@ -28,7 +28,7 @@ class TileObservation(Observation):
         lifted: LiftedMask,
     ) -> None:
         self._camera, self._columns = camera, tiles.columns
-        self.classes, self.num_pixels, self._labels = lifted.classes, lifted.num_pixels, lifted.labels
+        self.classes, self.areas, self._labels = lifted.classes, lifted.areas, lifted.labels
         self._number(ids, table, tiles, lifted)
 
     def _number(self, ids: np.ndarray, table: np.ndarray, tiles: Tiles, lifted: LiftedMask) -> None:

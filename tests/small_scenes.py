@@ -98,6 +98,13 @@ def wrong_views(count: int = 8, *, seed: int = 0, missed: float = 0.2, swapped: 
     return views
 
 
+def with_clutter(view: View, label: int = 3) -> View:
+    """Put a blob into a corner, where the table is."""
+    labels = view.read_labels()
+    labels[-16:, :12] = label
+    return View.from_arrays(view.camera, labels)
+
+
 def taught(learner: Learner, views: list[View]) -> Learner:
     for view in views:
         assert learner.observe(view)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from small_scenes import NUM_CLASSES, balls_on_a_table, taught, write_dataset, wrong_views
+from small_scenes import NUM_CLASSES, balls_on_a_table, taught, with_clutter, write_dataset, wrong_views
 
 from gsseg_core import scheduler
 from gsseg_core.cli import main
@@ -33,6 +33,7 @@ from gsseg_core.distributed import DistributedEM, DistributedVotes  # noqa: E402
 
 SCENE, _ = balls_on_a_table()
 VIEWS = wrong_views(7)
+VIEWS[4] = with_clutter(VIEWS[4])
 SETTINGS = EMSettings(max_steps=6, tolerance=0.0)
 
 Told = tuple[str, int, int]
@@ -66,6 +67,7 @@ def assert_same(one: Learner, other: Learner) -> None:
         assert list(one.error_models_) == list(other.error_models_)
         for name, model in one.error_models_.items():
             np.testing.assert_array_equal(model.confusion, other.error_models_[name].confusion)
+            np.testing.assert_array_equal(model.meaning.says, other.error_models_[name].meaning.says)
 
 
 @pytest.mark.parametrize("kind", ["em", "votes"])
@@ -95,6 +97,7 @@ def test_em_on_workers_equals_em_here_bit_for_bit(client: Any, errors: bool) -> 
     here.observe_all(with_a_useless_one())
     assert_same(there, here)
     assert there.reject_summary() == {"all pixels unknown": 1}
+    assert there.error_models_[VIEWS[4].name].meaning.says.all() != errors  # the clutter is not heard
 
 
 def test_votes_on_workers_equal_votes_here_as_views_come_and_go(client: Any) -> None:

@@ -106,6 +106,7 @@ def test_votes_and_shares_agree_with_the_naive_rasteriser(backend, seed, n, widt
     seen = operator.observe(mask)
     assert seen.classes.tolist() == sorted(set(mask[mask >= 0]))
     assert seen.num_pixels == (mask >= 0).sum()
+    np.testing.assert_array_equal(seen.areas, [(mask == label).sum() for label in seen.classes])
     assert seen.nbytes > 0
     assert_sightings_are_what_labelled_pixels_see(seen, mask, dense(operator), operator.ids)
 

@@ -1,0 +1,102 @@
+"""What a view's segmenter calls each class: the error model of `gsseg_core.em`, of one view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsseg_core.meaning import Meaning
+
+
+@dataclass
+class ErrorModel:
+    """What one view's segmenter calls each class.
+
+    Attributes
+    ----------
+    meaning : Meaning
+        Of the L labels that occur in the view's mask; they are made of W words.
+    confusion : (K, W) float32
+        R_v: rows are true classes, columns the words seen; rows sum to 1.
+    right : (T,) float64
+        a_v of the classes that have a right word, in px.
+    outliers : float
+        Share of pixels labelled by chance.
+    num_pixels : int
+        Pixels with a label that says something.
+    """
+
+    meaning: Meaning
+    confusion: np.ndarray
+    right: np.ndarray
+    outliers: float
+    num_pixels: int
+
+    @classmethod
+    def trusting(cls, meaning: Meaning, num_classes: int, outliers: float, num_pixels: int) -> ErrorModel:
+        """Believe that every label is right."""
+        confusion, right = np.zeros((num_classes, len(meaning.words)), np.float32), meaning.right(num_classes)
+        confusion[right] = 1.0
+        return cls(meaning, confusion, np.zeros(len(right[0])), outliers, num_pixels)
+
+    @classmethod
+    def from_counts(
+        cls,
+        meaning: Meaning,
+        counts: np.ndarray,  # (K, L) px of each class under each label
+        prior: float,
+        outliers: float,
+        num_pixels: int,
+    ) -> ErrorModel:
+        """Start from what the codes so far say of the mask."""
+        if meaning.shares is not None:
+            counts = (
+                counts[:, meaning.says] @ (meaning.shares / meaning.shares.sum(axis=1, keepdims=True))[meaning.says]
+            )
+        right = prior * counts[meaning.right(len(counts))[0]].sum(axis=1)
+        uniform = np.full(counts.shape, 1.0 / len(meaning.words), np.float32)
+        model = cls(meaning, uniform, right, outliers, num_pixels)
+        model.maximise(counts)
+        return model
+
+    @property
+    def classes(self) -> np.ndarray:
+        """The words seen, (W,) int32: classes, and then `UNKNOWN` (-1) for "none of these", if it occurs."""
+        return self.meaning.words
+
+    @property
+    def likelihood(self) -> np.ndarray:
+        """C_v: probability of each label given the class, (K, L) float32."""
+        words: np.ndarray = (1 - self.outliers) * self.confusion + np.float32(self.outliers / len(self.classes))
+        return words if self.meaning.shares is None else np.asarray(words @ self.meaning.shares.T)
+
+    @property
+    def told(self) -> tuple[np.ndarray, np.ndarray]:
+        """The same by label, (L, K) float32; and then with zeros where a label says nothing: its pixels teach nothing.
+
+        All classes are as plausible there, so they would not change where the steps end, only how soon they do.
+        """
+        likelihood = np.ascontiguousarray(self.likelihood.T)
+        return likelihood, np.where(self.meaning.says[:, None], likelihood, np.float32(0))
+
+    def expected(
+        self,
+        counts: np.ndarray,  # (K, L) sum of the shares of each class under each label
+    ) -> np.ndarray:
+        """Count the pixels (K, W) in which each class was there and each word was meant."""
+        if self.meaning.shares is not None:
+            counts = counts[:, self.meaning.says] @ self.meaning.shares[self.meaning.says]
+        expected: np.ndarray = counts * (1 - self.outliers) * self.confusion
+        return expected
+
+    def maximise(
+        self,
+        counts: np.ndarray,  # (K, W) expected px
+    ) -> None:
+        """Set R_v to its best for expected counts; classes that the view does not show keep their row."""
+        counts = counts.astype(np.float64)
+        counts[self.meaning.right(len(counts))] += self.right
+        total = counts.sum(axis=1, keepdims=True)
+        shown = total[:, 0] > 0
+        self.confusion[shown] = counts[shown] / total[shown]

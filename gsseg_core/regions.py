@@ -1,0 +1,177 @@
+"""Regions of a mask, and which of them the other views speak against.
+
+Most errors of a segmenter sit in one place: a blob of clutter, one object under the id of another, a frame in which
+everything is wrong. An error model of the whole view, which says how often each class is called what, does not explain
+them. A *region* is a set of connected pixels of one label. It is held against the votes of all other views: where next
+to nothing of it is of its label to them, it is in doubt, and what it says is not heard at all. That costs little if it
+was right, since others say the same, and much is won if it was wrong, above all where few others look.
+"""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+
+from gsseg_core.gaussian_kernels import take_votes, tally
+from gsseg_core.learner import UNITS
+from gsseg_core.masks import UNKNOWN
+from gsseg_core.meaning import Meaning, standing
+from gsseg_core.operator import Observation
+from gsseg_core.rows import Rows
+from gsseg_core.soft_masks import SeenLabels
+
+SMALLEST = 64
+"""Regions of fewer px are not told apart: all of one label are judged as one."""
+
+MOST = 500
+"""Regions of a mask that are told apart at most, the largest; what is left of each label is judged as one."""
+
+
+def by_region(seen: SeenLabels) -> SeenLabels:
+    """Give every region of a mask a label of its own, which means the class that it had; a soft mask stays as it is."""
+    if seen.meaning is not None or not (seen.labels >= 0).any():
+        return seen
+    connected, area = connected_pixels(seen.labels)
+    known = connected >= 0
+    first = np.zeros(len(area), np.int64)
+    first[connected[known]] = np.flatnonzero(known.ravel())  # any pixel of it does
+    label = seen.labels.ravel()[first]
+    alone = np.zeros(len(area), bool)
+    alone[np.argsort(-area, kind="stable")[:MOST]] = True
+    alone &= area >= SMALLEST
+    classes, position = np.unique(label, return_inverse=True)
+    # Those that stand alone keep a number each; the others have that of their class.
+    regions = np.unique(np.where(alone, len(classes) + np.arange(len(area)), position), return_inverse=True)[1]
+    mass = np.zeros((int(regions.max()) + 1, len(classes)), np.float32)
+    mass[regions, position] = 1
+    labels = np.append(regions, UNKNOWN).astype(np.int32)[connected]
+    return SeenLabels(labels, Meaning(classes.astype(np.int32), mass))
+
+
+def connected_pixels(
+    labels: np.ndarray,  # (H, W) int32
+) -> tuple[np.ndarray, np.ndarray]:
+    """Give sets of pixels of one label that are connected over sides numbers, in the order of their first pixels.
+
+    Returns
+    -------
+    connected : (H, W) int32
+        `UNKNOWN` (-1) where the label is negative.
+    area : (R,) int64
+        Pixels of each set.
+    """
+    connected = np.empty(labels.shape, np.int32)
+    many = _connect(np.ascontiguousarray(labels), connected)
+    return connected, np.bincount(connected.ravel() + 1, minlength=many + 1)[1:]
+
+
+def counted_by_others(
+    votes: Rows,  # int64, of all views
+    observation: Observation,
+    possible: np.ndarray,  # (K,) bool: ids that are classes
+    meaning: Meaning | None = None,
+) -> np.ndarray:
+    """Count the pixels (K, L) of each class under each label of a view, by the votes of all the others.
+
+    Parameters
+    ----------
+    votes : Rows
+        Of all views, this one among them.
+    observation : Observation
+        The view.
+    possible : (K,) bool
+        Ids that are classes.
+    meaning : Meaning, optional
+        What the view has voted with; that of the observation by default.
+    """
+    order, own = observation.order, observation.votes()
+    seen = order, observation.start, observation.labels
+    others = votes.take(observation.ids[order])
+    take_votes(*others, *seen, *(meaning or observation.meaning).votes, own, UNITS)
+    others = standing(others, possible)
+    codes = others.with_values(others.values.astype(np.float32)).normalised()
+    return tally(*codes, *seen, own, len(possible), len(observation.classes))
+
+
+def in_doubt(
+    votes: Rows,  # int64, of all views
+    observation: Observation,
+    possible: np.ndarray,  # (K,) bool: ids that are classes
+    least: float,
+) -> np.ndarray:
+    """Tell which labels of a view the others speak against, (L,) bool; none where a label may mean several classes.
+
+    Parameters
+    ----------
+    votes, observation, possible
+        As in `counted_by_others`.
+    least : float
+        Share of what lies under a label, by weight, that has to be of its class by the votes of the others.
+    """
+    meaning = observation.meaning
+    if not meaning.is_certain:
+        return np.zeros(len(observation.classes), bool)
+    counts, label = counted_by_others(votes, observation, possible), np.arange(len(observation.classes))
+    doubtful: np.ndarray = counts[meaning.named(), label] < least * counts.sum(axis=0)
+    return doubtful
+
+
+def votes_of(
+    doubtful: np.ndarray,  # (L,) bool
+    votes: Rows,  # int64, of all views
+    observation: Observation,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find what a view has voted with some of its labels: places in `votes.values`, and how much, int64."""
+    order = observation.order
+    places = votes.places(observation.ids[order])
+    voted = places.with_values(np.zeros_like(places.values))
+    said = observation.meaning.without(~doubtful).votes
+    take_votes(*voted, order, observation.start, observation.labels, *said, observation.votes(), UNITS)
+    return places.values, -voted.values
+
+
+@nb.njit(nogil=True, cache=True)
+def _root(parent: np.ndarray, i: int) -> int:
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i
+
+
+@nb.njit(nogil=True, cache=True)
+def _connect(
+    labels: np.ndarray,  # (H, W)
+    connected: np.ndarray,  # (H, W) int32 out
+) -> int:
+    """Write the numbers, and return how many there are. Runs of equal pixels are joined to those of the row above."""
+    height, width = labels.shape
+    parent = np.empty(height * width, np.int32)  # of runs; there are at most as many as pixels
+    runs = 0
+    for y in range(height):
+        for x in range(width):
+            if labels[y, x] < 0:
+                connected[y, x] = -1
+                continue
+            joined = x > 0 and labels[y, x] == labels[y, x - 1]
+            if not joined:
+                parent[runs] = runs
+                runs += 1
+            connected[y, x] = run = runs - 1
+            # Once for each stretch in which the two rows go along with each other.
+            if y > 0 and labels[y, x] == labels[y - 1, x] and not (joined and labels[y - 1, x - 1] == labels[y, x]):
+                one, two = _root(parent, run), _root(parent, connected[y - 1, x])
+                parent[max(one, two)] = min(one, two)
+    many = 0
+    number = np.empty(runs, np.int32)
+    for run in range(runs):
+        root = _root(parent, run)
+        if root == run:
+            number[run] = many
+            many += 1
+        else:
+            number[run] = number[root]
+    for y in range(height):
+        for x in range(width):
+            if connected[y, x] >= 0:
+                connected[y, x] = number[connected[y, x]]
+    return many

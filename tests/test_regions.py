@@ -1,0 +1,138 @@
+"""Regions of masks: what is connected, and what is not heard since the other views speak against it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from scipy import ndimage
+from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, mean_iou, taught, with_clutter
+
+from gsseg_core.dataset import View
+from gsseg_core.em import EMLearner, EMSettings
+from gsseg_core.errors import SettingsError
+from gsseg_core.masks import UNKNOWN
+from gsseg_core.regions import MOST, SMALLEST, by_region, connected_pixels
+from gsseg_core.soft_masks import SeenLabels
+from gsseg_core.votes import VoteLearner
+
+SCENE, _ = balls_on_a_table()
+SHAPES = st.tuples(st.integers(1, 12), st.integers(1, 12))
+
+
+@settings(deadline=None)
+@given(arrays.arrays(np.int32, SHAPES, elements=st.integers(-1, 2)))
+def test_connected_pixels_are_those_of_scipy(labels: np.ndarray) -> None:
+    connected, area = connected_pixels(labels)
+    np.testing.assert_array_equal(connected < 0, labels < 0)
+    np.testing.assert_array_equal(np.bincount(connected[connected >= 0], minlength=len(area)), area)
+    firsts = np.unique(connected[connected >= 0], return_index=True)[1]
+    assert (np.diff(firsts) > 0).all()
+    many = 0
+    for k in range(3):
+        parts, count = ndimage.label(labels == k)
+        many += count
+        for part in range(1, count + 1):
+            assert len(np.unique(connected[parts == part])) == 1
+    assert len(area) == many
+
+
+@settings(deadline=None, max_examples=30)
+@given(arrays.arrays(np.int32, st.just((40, 30)), elements=st.integers(-1, 2), fill=st.integers(0, 2)))
+def test_regions_mean_what_the_labels_were_and_only_large_ones_stand_alone(labels: np.ndarray) -> None:
+    seen = by_region(SeenLabels(labels))
+    np.testing.assert_array_equal(seen.named(), np.maximum(labels, UNKNOWN))
+    if seen.meaning is None:
+        assert (labels < 0).all()
+        return
+    assert seen.meaning.is_certain and seen.meaning.says.all()
+    np.testing.assert_array_equal(np.unique(seen.labels[seen.labels >= 0]), np.arange(len(seen.meaning.says)))
+    connected, area = connected_pixels(labels)
+    large = np.flatnonzero(area >= SMALLEST)
+    alone = [np.unique(seen.labels[connected == part]) for part in large]
+    assert all(len(region) == 1 for region in alone)
+    assert len(np.unique(alone)) == len(large)
+    assert len(seen.meaning.says) <= len(large) + 3
+
+
+def test_of_very_many_regions_the_largest_stand_alone() -> None:
+    y, x = np.indices((30 * 8, 40 * 8)) // 8
+    labels = ((y + x) % 2).astype(np.int32)
+    labels[:8, :24] = 2
+    seen = by_region(SeenLabels(labels))
+    assert seen.meaning is not None and len(seen.meaning.says) == MOST + 2
+    assert (seen.labels == seen.labels[0, 0]).sum() == 8 * 24
+
+
+def test_what_one_view_alone_claims_against_all_others_is_not_heard() -> None:
+    views = clean_views(8)
+    clean = taught(EMLearner(SCENE, NUM_CLASSES), views).fit()
+    assert all(model.meaning.says.all() for model in clean.error_models_.values())
+    cluttered = [with_clutter(view, 1 + i % 3) for i, view in enumerate(views)]
+    heard, unheard = (
+        taught(EMLearner(SCENE, NUM_CLASSES, EMSettings(least_agreement=least)), cluttered).fit()
+        for least in (0.0, EMSettings.least_agreement)
+    )
+    for view in cluttered:
+        meaning = unheard.error_models_[view.name].meaning
+        labels = by_region(view.read_seen()).labels
+        assert not meaning.says[labels[-1, 0]]
+        assert (~meaning.says).sum() == 1
+    assert mean_iou(unheard) > mean_iou(heard)
+    assert mean_iou(unheard) > mean_iou(clean) - 0.01
+
+
+def test_gaussians_of_which_only_doubtful_regions_speak_have_no_code() -> None:
+    first, *others = clean_views(4)
+    # A blob over all of the table in one view; the others leave open what is near one of the balls.
+    views = [View.from_arrays(first.camera, np.where(first.read_labels() < 2, 3, 2))]
+    for view in others:
+        near = ndimage.binary_dilation(view.read_labels() == 1, iterations=9)
+        views.append(View.from_arrays(view.camera, np.where(near, UNKNOWN, view.read_labels())))
+    learner = taught(EMLearner(SCENE, NUM_CLASSES), views).fit()
+    voted = learner._votes.any(axis=1)
+    assert (voted & ~learner.observed_).any()
+    np.testing.assert_array_equal(learner.codes_.any(axis=1), learner.observed_)
+    assert (learner.observed_ <= voted).all()
+
+
+def test_a_single_view_is_heard_whatever_it_says() -> None:
+    learner = taught(EMLearner(SCENE, NUM_CLASSES), [with_clutter(clean_views(1)[0])]).fit()
+    assert all(model.meaning.says.all() for model in learner.error_models_.values())
+    assert learner.observed_.any()
+
+
+def test_soft_and_partial_masks_are_heard_whatever_they_say() -> None:
+    views = clean_views(5)
+    odd = with_clutter(views[0]).read_labels()
+    chances = np.stack([np.where(odd == k, 0.8, 0.2 / 3) for k in range(NUM_CLASSES)])
+    views[0] = View.from_probabilities(views[0].camera, chances)
+    odd = with_clutter(views[1]).read_labels()
+    views[1] = View.from_arrays(views[1].camera, np.where(odd == 3, 3, 0), supervised=[3])
+    models = taught(EMLearner(SCENE, NUM_CLASSES), views).fit().error_models_
+    assert all(model.meaning.says.all() for model in models.values())
+
+
+def test_views_come_and_go_exactly_with_regions_too() -> None:
+    views = [with_clutter(view) for view in clean_views(4)]
+    for budget in (0, 1 << 30):
+        learner = taught(EMLearner(SCENE, NUM_CLASSES, memory_budget=budget), views)
+        learner.fit()
+        for view in views[1:]:
+            learner.retract(view.name)
+        np.testing.assert_array_equal(learner._votes, taught(EMLearner(SCENE, NUM_CLASSES), views[:1])._votes)
+        learner.retract(views[0].name)
+        assert not learner._votes.any()
+
+
+def test_votes_by_region_are_the_votes() -> None:
+    views = [with_clutter(view) for view in clean_views(4)]
+    em, votes = (taught(make(SCENE, NUM_CLASSES), views)._votes for make in (EMLearner, VoteLearner))
+    np.testing.assert_allclose(em, votes, rtol=1e-6, atol=2 * len(views))  # each sighting is rounded once
+
+
+def test_a_share_beyond_one_is_refused() -> None:
+    with pytest.raises(SettingsError, match=r"least_agreement is 1.5; expected a share in \[0, 1\]"):
+        EMSettings(least_agreement=1.5)
