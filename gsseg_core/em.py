@@ -9,6 +9,10 @@ probability (Dawid & Skene 1979, who had examiners in place of views)
 A view in which a chair was missed or taken for a table has that in R_v, and so its pixels are no evidence against the
 chair.
 
+Regions in doubt. An error model says what a view calls each class, wherever in the image. What is wrong in one place,
+say a blob of clutter, it does not explain. So regions of a mask that the votes of all other views speak against are
+left out of all that follows; see `gsseg_core.regions`.
+
 The objective. With the error models fixed, the log of the posterior of the codes, in nats:
 
     J(q) = sum_v sum_p log p_v(y_p | p) + prior_weight sum_i sum_k m_i[k] log q_i[k].

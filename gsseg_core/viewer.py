@@ -28,7 +28,7 @@ from gsseg_core.view_nodes import cut
 from gsseg_core.view_panel import Panel
 from gsseg_core.view_picking import Evidence, pick, scene_camera
 from gsseg_core.view_picture import Picture
-from gsseg_core.view_screens import AUTO, Screens
+from gsseg_core.view_screens import AUTO, DRAWN_BY, Screens
 
 DRAWING_HEIGHT = 480
 """Most rows of the image in which a correction is drawn; finer than the Gaussians is of no use."""
@@ -63,6 +63,11 @@ class Viewer:
         What is shown.
     url : str
         Where to look.
+
+    Raises
+    ------
+    SettingsError
+        `draw` is none of these.
     """
 
     def __init__(
@@ -77,6 +82,8 @@ class Viewer:
         draw: str = AUTO,
         device: str = "cpu",
     ) -> None:
+        if draw not in DRAWN_BY:
+            raise SettingsError(f"draw is {draw!r}; expected one of {', '.join(DRAWN_BY)}")
         self.model, self.views, self.reliability, self.device = model, tuple(views), dict(reliability or {}), device
         self.corrections = Corrections(model.scene, device=device)
         self.added_names: dict[int, str] = {}

@@ -18,6 +18,7 @@ from browser import opened_page, screenshot
 from small_scenes import NAMES, balls_on_a_table, clean_views, write_dataset
 
 from gsseg_core.cli import main
+from gsseg_core.errors import SettingsError
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.view_live import LiveUpdate
@@ -258,6 +259,11 @@ def test_codes_of_a_live_source_refresh_the_picture(chromium: Browser) -> None:
         shown.wait(lambda: shown.looks_like(1) and shown.looks_like(2), "the classes")
         shown.tab("Save")
         shown.says("live: 7 views so far")
+
+
+def test_who_is_to_draw_must_be_known() -> None:
+    with pytest.raises(SettingsError, match="draw is 'gpu'; expected one of auto, browser, server"):
+        Viewer(ViewModel(SCENE, LEARNT), port=18080, draw="gpu")
 
 
 @pytest.mark.parametrize(("limit", "draws"), [(-1.0, False), (np.inf, True)])
