@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -54,6 +54,9 @@ class ViewCheck:
         What the other views predict, (H, W), for pictures.
     meaning : Meaning, optional
         Of a soft or partial mask; `classes` are its words.
+    unheard : float
+        Share of the pixels with a label from which nothing was learnt, since they lie in regions in doubt; see
+        `gsseg_core.regions`.
     """
 
     name: str
@@ -62,6 +65,7 @@ class ViewCheck:
     counts: np.ndarray
     predicted: PackedLabels | None = None
     meaning: Meaning | None = None
+    unheard: float = 0.0
 
     @property
     def checked(self) -> int:
@@ -153,7 +157,9 @@ class OtherViews:
         image = self.blend(view)
         if view.name in self._sampled:
             self._samples[view.name] = sample_pixels(image, view.read_labels())
-        return hold_against(view, _strongest(image), self.learner.num_classes)
+        check = hold_against(view, _strongest(image), self.learner.num_classes)
+        says, areas = self.learner.error_models_[view.name].meaning.says, self.learner.observation(view.name).areas
+        return replace(check, unheard=float(areas[~says].sum() / areas.sum()))
 
     def sample(self, view: View) -> Sample:
         """Take pixels of a view's mask with what the others predict of them, to fit the temperature to."""
@@ -208,7 +214,8 @@ def reliability_report(checks: Iterable[ViewCheck], class_names: Mapping[int, st
     Returns
     -------
     list of dict
-        `name`; `reliability` in [0, 1], None where the other views say nothing; `num_pixels` with a label;
+        `name`; `reliability` in [0, 1], None where the other views say nothing; `num_pixels` with a label; `unheard`,
+        the share of them from which nothing was learnt;
         `confusions`, largest first: `true`, the class that the others predict, `seen` as, and the `share` of the
         view's checked pixels.
     """
@@ -217,6 +224,7 @@ def reliability_report(checks: Iterable[ViewCheck], class_names: Mapping[int, st
             "name": check.name,
             "reliability": round(check.reliability, 4) if check.checked else None,
             "num_pixels": check.num_pixels,
+            "unheard": round(check.unheard, 4),
             "confusions": [
                 {"true": _name(class_names, k), "seen": _name(class_names, y), "share": round(share, 4)}
                 for k, y, share in check.confusions()

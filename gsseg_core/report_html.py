@@ -183,11 +183,12 @@ def views_section(reliability: Sequence[Mapping[str, Any]]) -> str:
     """Draw the views by reliability, and list them, the worst first."""
     titles = [f"{view['name']}: {percent(view['reliability'])}" for view in reliability]
     drawn = charts.columns([view["reliability"] for view in reliability], titles, TRUSTED)
-    header = ["view", "reliability", "most often taken for something else"]
+    header = ["view", "reliability", "not learnt from", "most often taken for something else"]
     rows = [
         [
             _bdi(view["name"]),
             _share(view["reliability"], "fill" if (view["reliability"] or 0) >= TRUSTED else "bad"),
+            percent(view["unheard"]) if view["unheard"] else "-",
             "; ".join(map(_taken, view["confusions"])) or "-",
         ]
         for view in reliability

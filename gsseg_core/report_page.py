@@ -255,7 +255,8 @@ def _reliability(report: Mapping[str, Any]) -> str:
     if not views:
         return ""
     return (
-        '<p class="faint">The share of a mask\'s pixels whose label is what all other views predict there.</p>'
+        '<p class="faint">The share of a mask\'s pixels whose label is what all other views predict there. '
+        "Not learnt from: pixels in regions of the mask that the votes of all other views speak against.</p>"
         + html.views_section(views)
     )
 
