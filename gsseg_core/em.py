@@ -32,8 +32,10 @@ without the summand of v, and with B_v taken at q^-v
     R_v[k, y]  <- normalise( (1 - outliers) R_v[k, y] sum_i q^-v_i[k] B_v[i, y] + a_v[k] [y = k] )
 
 with the left-over transmittance as one more Gaussian of class 0. a_v[k] counts pseudo-pixels in which the segmenter was
-right, a share of those that class k fills in view v by the votes of the others. At first q^-v are these votes' codes;
-once the codes have all but converged the models are learnt anew in this way, and then the codes once more.
+right, a share of those that class k fills in view v by the votes of the others. At first q^-v are these votes' codes,
+raised to a power: where a third of the views is wrong, each in its own way, the majority still is right, and to count
+the minorities along with it would smear every large class over the rows of the small ones. Once the codes have all but
+converged the models are learnt anew in this way, and then the codes once more.
 
 Soft and partial masks. There the segmenter's words y are classes, and "none of those that I looked for", which is right
 for all others. A pixel's label m is a mixture of words with shares s_m[y] (see `gsseg_core.meaning`): wherever
@@ -83,6 +85,8 @@ class EMSettings:
     least_agreement : float
         A region of a mask is not heard if a smaller share of it is of its label by the votes of the other views; see
         `gsseg_core.regions`. 0 hears all.
+    majority : float
+        The first error models are counted from the votes' codes to this power: above 1, majorities stand out.
     error_prior : float
         Pseudo-pixels in which a class was labelled right, as a share of the pixels that it fills in the view.
     outliers : float
@@ -98,6 +102,7 @@ class EMSettings:
     errors: bool = True
     refits: int = 1
     least_agreement: float = 0.05
+    majority: float = 4.0
     error_prior: float = 0.3
     outliers: float = 1e-3
     prior_weight: float = 3.0
@@ -111,6 +116,8 @@ class EMSettings:
             raise SettingsError(f"em: outliers is {self.outliers}; expected a share in (0, 1)")
         if not 0 <= self.least_agreement <= 1:
             raise SettingsError(f"em: least_agreement is {self.least_agreement}; expected a share in [0, 1]")
+        if self.majority < 1:
+            raise SettingsError(f"em: majority is {self.majority}; expected at least 1")
         if min(self.tolerance, self.error_prior, self.prior_weight, self.refits) < 0:
             raise SettingsError("em: tolerance, error_prior, prior_weight or refits is negative; expected 0 or more")
 
@@ -239,7 +246,7 @@ class EMLearner(Learner):
         if doubtful is not None:
             meaning = meaning.without(doubtful)
         pixels = int(observation.areas[meaning.says].sum())
-        counts = counted_by_others(votes, observation, self._possible(), meaning)
+        counts = counted_by_others(votes, observation, self._possible(), meaning, settings.majority)
         return ErrorModel.from_counts(meaning, counts, settings.error_prior, settings.outliers, pixels)
 
     def _gains(

@@ -70,6 +70,7 @@ def counted_by_others(
     observation: Observation,
     possible: np.ndarray,  # (K,) bool: ids that are classes
     meaning: Meaning | None = None,
+    power: float = 1.0,
 ) -> np.ndarray:
     """Count the pixels (K, L) of each class under each label of a view, by the votes of all the others.
 
@@ -83,6 +84,8 @@ def counted_by_others(
         Ids that are classes.
     meaning : Meaning, optional
         What the view has voted with; that of the observation by default.
+    power : float
+        Codes are raised to it, and scaled to sum 1 again, before they are counted: above 1, majorities stand out.
     """
     order, own = observation.order, observation.votes()
     seen = order, observation.start, observation.labels
@@ -90,6 +93,8 @@ def counted_by_others(
     take_votes(*others, *seen, *(meaning or observation.meaning).votes, own, UNITS)
     others = standing(others, possible)
     codes = others.with_values(others.values.astype(np.float32)).normalised()
+    if power != 1:
+        codes = codes.with_values(codes.values ** np.float32(power)).normalised()
     return tally(*codes, *seen, own, len(possible), len(observation.classes))
 
 

@@ -69,7 +69,7 @@ def slow_em(
         diagonal, own = np.eye(K)[:, classes], W.T @ onehot
         others = votes.copy()
         others[:, classes] -= own
-        counts = scaled(np.maximum(others, 0)).T @ own
+        counts = scaled(scaled(np.maximum(others, 0)) ** settings.majority).T @ own
         right = settings.error_prior * counts[classes].sum(axis=1)
         flat = np.full((K, len(classes)), 1 / len(classes))
         confusions.append(scaled(counts + diagonal * right, flat) if settings.errors else diagonal)
@@ -159,6 +159,7 @@ def scaled(rows: np.ndarray, otherwise: np.ndarray | float = 0.0) -> np.ndarray:
         ({"max_steps": 9, "tolerance": 1e9}, [2, 2]),
         ({"max_steps": 9, "tolerance": 1e9, "refits": 2}, [2, 2, 2]),
         ({"max_steps": 9, "tolerance": 1e9, "least_agreement": 0.0}, [2, 2]),
+        ({"max_steps": 9, "tolerance": 1e9, "majority": 1.0}, [2, 2]),
     ],
 )
 def test_steps_agree_with_a_slow_twin_written_from_the_equations(changes: dict[str, Any], rounds: list[int]) -> None:

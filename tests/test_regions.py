@@ -133,6 +133,8 @@ def test_votes_by_region_are_the_votes() -> None:
     np.testing.assert_allclose(em, votes, rtol=1e-6, atol=2 * len(views))  # each sighting is rounded once
 
 
-def test_a_share_beyond_one_is_refused() -> None:
+def test_settings_out_of_range_are_refused() -> None:
     with pytest.raises(SettingsError, match=r"least_agreement is 1.5; expected a share in \[0, 1\]"):
         EMSettings(least_agreement=1.5)
+    with pytest.raises(SettingsError, match=r"majority is 0.5; expected at least 1"):
+        EMSettings(majority=0.5)
