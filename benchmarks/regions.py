@@ -1,10 +1,10 @@
 """Tell what it brings that regions of a mask are not heard if the other views speak against them, and from which share.
 
-    python benchmarks/segments.py        # on $GSSEG_DATA, default ../shared/data, and on the demo scene
+    python benchmarks/regions.py        # on $GSSEG_DATA, default ../shared/data, and on the demo scene
 
 Printed are mIoU in the test views and the seconds that `fit` takes, for several values of `EMSettings.least_agreement`;
-with 0 all regions are heard. On the real scene wrong masks are drawn from several seeds: what becomes of a few small
-objects is a matter of luck, and one draw tells little.
+with 0 all regions are heard. Wrong masks are drawn from several seeds: what becomes of a few small objects is a matter
+of luck, and one draw tells little.
 """
 
 from __future__ import annotations
@@ -54,9 +54,8 @@ def main() -> None:
                 print(f"{what:>26}" + "".join(f"{miou:>10.4f} ({seconds:.1f} s)" for miou, seconds in runs), flush=True)
                 if what.startswith("a quarter wrong"):
                     drawn.append([miou for miou, _ in runs])
-            print(
-                f"{'mean of a quarter wrong':>26}" + "".join(f"{mean:>10.4f}{'':8}" for mean in np.mean(drawn, axis=0))
-            )
+            means = "".join(f"{mean:>10.4f}{'':8}" for mean in np.mean(drawn, axis=0))
+            print(f"{'mean of a quarter wrong':>26}{means}", flush=True)
 
 
 def masks(bench: Bench) -> Iterator[tuple[str, Sequence[View]]]:

@@ -121,6 +121,11 @@ class EMSettings:
         if min(self.tolerance, self.error_prior, self.prior_weight, self.refits) < 0:
             raise SettingsError("em: tolerance, error_prior, prior_weight or refits is negative; expected 0 or more")
 
+    @property
+    def judges(self) -> bool:
+        """Whether regions of masks may be in doubt."""
+        return self.errors and self.least_agreement > 0
+
 
 class EMLearner(Learner):
     """The default: the paper's loss with an error model, maximised by multiplicative steps that need no rate.
@@ -159,7 +164,7 @@ class EMLearner(Learner):
         self._begin()
         votes, tell = Rows.of(self._votes), partial(progress, "em", 0, settings.max_steps)
         doubts: dict[str, np.ndarray] = {}
-        if settings.errors and settings.least_agreement:
+        if settings.judges:
             doubted, doubts = self._judge(votes, tell)
             votes = votes.with_values(votes.values - doubted).nonzero()
         stands = standing(votes, self._possible())
@@ -198,7 +203,7 @@ class EMLearner(Learner):
     def _seen(self, view: View) -> SeenLabels:
         """Read a mask; regions are told apart if they may be in doubt."""
         seen = super()._seen(view)
-        return by_region(seen) if self.settings.errors and self.settings.least_agreement else seen
+        return by_region(seen) if self.settings.judges else seen
 
     def _judge(
         self,

@@ -51,9 +51,8 @@ class ErrorModel:
     ) -> ErrorModel:
         """Start from what the codes so far say of the mask."""
         if meaning.shares is not None:
-            counts = (
-                counts[:, meaning.says] @ (meaning.shares / meaning.shares.sum(axis=1, keepdims=True))[meaning.says]
-            )
+            shares = meaning.shares[meaning.says]
+            counts = counts[:, meaning.says] @ (shares / shares.sum(axis=1, keepdims=True))
         right = prior * counts[meaning.right(len(counts))[0]].sum(axis=1)
         uniform = np.full(counts.shape, 1.0 / len(meaning.words), np.float32)
         model = cls(meaning, uniform, right, outliers, num_pixels)

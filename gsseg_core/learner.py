@@ -287,6 +287,7 @@ class Learner(ABC):
     def _finish(self) -> None:
         """Leave codes only where something was seen that they can be told by."""
         unsure = np.flatnonzero(~self.observed_)
+        # Votes for a class without a code to go with them are votes that the learner does not believe.
         seen = (self._votes[unsure] < 0).any(axis=1)
         self.codes_[unsure[~seen]] = 0.0
         if seen.any():
