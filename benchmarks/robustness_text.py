@@ -24,7 +24,8 @@ learning, with the reading and preparing of the views.
 {table}
 
 What each error costs alone; swapped pairs, in which two objects of a view have exchanged ids, are not among those
-above. The last two columns are the mIoU of the other learners.
+above. The last three columns are the mIoU of other learners; `em` moves outlines to edges of the scene
+(`gsseg_core/outlines.py`), the first of the three does not.
 
 {parts}
 """

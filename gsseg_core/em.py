@@ -9,6 +9,9 @@ probability (Dawid & Skene 1979, who had examiners in place of views)
 A view in which a chair was missed or taken for a table has that in R_v, and so its pixels are no evidence against the
 chair.
 
+Outlines. What a segmenter draws too wide in one view and too narrow in the next is moved to where the scene has edges
+before anything is learnt from it; see `gsseg_core.outlines`.
+
 Regions in doubt. An error model says what a view calls each class, wherever in the image. What is wrong in one place,
 say a blob of clutter, it does not explain. So regions of a mask that the votes of all other views speak against are
 left out of all that follows; see `gsseg_core.regions`.
@@ -51,14 +54,14 @@ from functools import partial
 
 import numpy as np
 
-from gsseg_core.dataset import View
 from gsseg_core.error_model import ErrorModel
 from gsseg_core.errors import SettingsError
 from gsseg_core.gaussian_kernels import collect, improve, improve_without, mix, tally
 from gsseg_core.learner import MEMORY_BUDGET, VOTE_UNIT, Learner, Progress, silent
 from gsseg_core.meaning import standing
 from gsseg_core.neighbours import neighbours_of
-from gsseg_core.operator import Observation
+from gsseg_core.operator import Observation, ViewOperator
+from gsseg_core.outlines import scene_edges, settle_outlines
 from gsseg_core.regions import by_region, counted_by_others, in_doubt, votes_of
 from gsseg_core.rows import Rows, starts
 from gsseg_core.scene import GaussianScene
@@ -82,6 +85,9 @@ class EMSettings:
         Learn what the segmenter got wrong in each view; without, every mask is taken at its word.
     refits : int
         How often error models are learnt anew once the codes have all but converged, and the codes then once more.
+    edge_px : int
+        Outlines of a mask may lie so many px too far in or out, and are moved to edges of the scene; see
+        `gsseg_core.outlines`. 0 leaves them where they are, and so do soft and partial masks.
     least_agreement : float
         A region of a mask is not heard if a smaller share of it is of its label by the votes of the other views; see
         `gsseg_core.regions`. 0 hears all.
@@ -101,6 +107,7 @@ class EMSettings:
     tolerance: float = 0.005
     errors: bool = True
     refits: int = 1
+    edge_px: int = 3
     least_agreement: float = 0.05
     majority: float = 4.0
     error_prior: float = 0.3
@@ -118,8 +125,10 @@ class EMSettings:
             raise SettingsError(f"em: least_agreement is {self.least_agreement}; expected a share in [0, 1]")
         if self.majority < 1:
             raise SettingsError(f"em: majority is {self.majority}; expected at least 1")
-        if min(self.tolerance, self.error_prior, self.prior_weight, self.refits) < 0:
-            raise SettingsError("em: tolerance, error_prior, prior_weight or refits is negative; expected 0 or more")
+        if min(self.tolerance, self.error_prior, self.prior_weight, self.refits, self.edge_px) < 0:
+            raise SettingsError(
+                "em: tolerance, error_prior, prior_weight, refits or edge_px is negative; expected 0 or more"
+            )
 
     @property
     def judges(self) -> bool:
@@ -200,10 +209,12 @@ class EMLearner(Learner):
         self._finish()
         return self
 
-    def _seen(self, view: View) -> SeenLabels:
-        """Read a mask; regions are told apart if they may be in doubt."""
-        seen = super()._seen(view)
-        return by_region(seen) if self.settings.judges else seen
+    def _heard(self, seen: SeenLabels, operator: ViewOperator) -> SeenLabels:
+        """Move outlines to edges, if the mask has any; tell regions apart, if they may be in doubt."""
+        settings = self.settings
+        if settings.errors and settings.edge_px and seen.meaning is None:
+            seen = SeenLabels(settle_outlines(seen.labels, scene_edges(operator, self.scene), settings.edge_px))
+        return by_region(seen) if settings.judges else seen
 
     def _judge(
         self,

@@ -14,7 +14,7 @@ from gsseg_core.dataset import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
 from gsseg_core.gaussian_kernels import share_votes
 from gsseg_core.meaning import decided, guess
-from gsseg_core.operator import Observation, make_operator
+from gsseg_core.operator import Observation, ViewOperator, make_operator
 from gsseg_core.scene import GaussianScene
 from gsseg_core.soft_masks import SeenLabels
 from gsseg_core.state_file import State
@@ -231,25 +231,29 @@ class Learner(ABC):
         if seen is None:
             return why
         operator = make_operator(self.scene, view.camera, self.device)
-        return "" if operator.vote(*seen, self._votes, UNITS, sign) else SEES_NOTHING
+        return "" if operator.vote(*self._heard(seen, operator), self._votes, UNITS, sign) else SEES_NOTHING
 
     def _open(self, view: View) -> tuple[Observation | None, str]:
         seen, why = self._read(view)
         if seen is None:
             return None, why
-        observation = make_operator(self.scene, view.camera, self.device).observe(*seen)
+        observation = self._prepare(view, seen)
         return (observation, "") if len(observation.ids) else (None, SEES_NOTHING)
+
+    def _prepare(self, view: View, seen: SeenLabels) -> Observation:
+        operator = make_operator(self.scene, view.camera, self.device)
+        return operator.observe(*self._heard(seen, operator))
 
     def _read(self, view: View) -> tuple[SeenLabels | None, str]:
         if not view.has_mask:
             return None, NO_MASK
-        seen = self._seen(view)
+        seen = view.read_seen()
         self._check_labels(view, seen)
         return (seen, "") if (seen.labels >= 0).any() else (None, ALL_UNKNOWN)
 
-    def _seen(self, view: View) -> SeenLabels:
-        """Read what is learnt from a mask."""
-        return view.read_seen()
+    def _heard(self, seen: SeenLabels, operator: ViewOperator) -> SeenLabels:
+        """Make of a mask what is learnt from it."""
+        return seen
 
     def _check_labels(self, view: View, seen: SeenLabels) -> None:
         largest = int(seen.labels.max()) if seen.meaning is None else seen.meaning.largest
@@ -268,7 +272,7 @@ class Learner(ABC):
         """Return a view with its mask, prepared; it is kept as far as the memory budget goes."""
         if name not in self._prepared:
             view = self.views[name]
-            observation = make_operator(self.scene, view.camera, self.device).observe(*self._seen(view))
+            observation = self._prepare(view, view.read_seen())
             self._keep(name, observation)
             return observation
         return self._prepared[name]

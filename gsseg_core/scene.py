@@ -18,7 +18,7 @@ from gsseg_core.errors import EmptySceneError, ScenePropertyError, SceneValueErr
 from gsseg_core.ply import read_vertices, write_vertices
 
 _MEANS = ("x", "y", "z")
-_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _OPACITY = ("opacity",)
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -145,7 +145,7 @@ class GaussianScene:
         columns = {
             _MEANS: arrays["means"],
             ("nx", "ny", "nz"): np.zeros((n, 3)),
-            _DC: dc,
+            DC: dc,
             _rest(rest.shape[1]): rest,
             _OPACITY: np.log(opacity / (1 - opacity))[:, None],
             _SCALES: np.log(arrays["scales"]),
@@ -224,7 +224,7 @@ class GaussianScene:
     @cached_property
     def sh(self) -> npt.NDArray[np.float32]:
         """Coefficients of spherical harmonics, (N, (d + 1)^2, 3) float32, band after band, RGB last."""
-        sh = _columns(self.vertices, _DC)[:, None, :]
+        sh = _columns(self.vertices, DC)[:, None, :]
         count = _count_rest(self.vertices)
         if count:
             # In the PLY all of red comes first, then green, then blue; f_dc is one of each.
@@ -250,7 +250,7 @@ class GaussianScene:
     ) -> npt.NDArray[np.float32]:
         """Evaluate the colours (N, 3), RGB float32 in [0, 1], seen from `camera_center`; of degree 0 only if None."""
         if camera_center is None:
-            return spherical_harmonics.to_rgb(_columns(self.vertices, _DC)[:, None, :], self.means)
+            return spherical_harmonics.to_rgb(_columns(self.vertices, DC)[:, None, :], self.means)
         offsets = self.means - np.asarray(camera_center, np.float32)
         lengths = np.linalg.norm(offsets, axis=1, keepdims=True)
         return spherical_harmonics.to_rgb(self.sh, offsets / np.maximum(lengths, np.finfo(np.float32).tiny))
@@ -263,7 +263,7 @@ def _count_rest(vertices: npt.NDArray[np.void]) -> int:
 def _check_properties(vertices: npt.NDArray[np.void], source: str) -> tuple[str, ...]:
     """Names of the SH properties, after making sure that all properties of 3DGS are there."""
     names = set(vertices.dtype.names or ())
-    missing = [name for name in _MEANS + _DC + _OPACITY + _SCALES + _QUATS if name not in names]
+    missing = [name for name in _MEANS + DC + _OPACITY + _SCALES + _QUATS if name not in names]
     if missing:
         raise ScenePropertyError(f"{source}: not a 3DGS scene, lacks the vertex properties {', '.join(missing)}")
     count = _count_rest(vertices)
@@ -273,7 +273,7 @@ def _check_properties(vertices: npt.NDArray[np.void], source: str) -> tuple[str,
         raise ScenePropertyError(
             f"{source}: has {count} properties f_rest_*; expected {expected} (SH degree 0, 1, 2, 3), numbered from 0"
         )
-    return _DC + rest
+    return DC + rest
 
 
 def _check_finite(

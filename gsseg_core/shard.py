@@ -16,6 +16,7 @@ from typing import Any
 
 import numba
 import numpy as np
+from numpy.lib.recfunctions import repack_fields
 
 from gsseg_core.dataset import View
 from gsseg_core.em import EMLearner, EMSettings
@@ -23,7 +24,7 @@ from gsseg_core.error_model import ErrorModel
 from gsseg_core.errors import GssegError
 from gsseg_core.learner import UNITS
 from gsseg_core.rows import Rows
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene import DC, GaussianScene
 
 Part = tuple[Any, dict[str, Any]]
 """A sum over some views, of int64, or None, and by view what else came out."""
@@ -62,8 +63,8 @@ def load(path: str, digest: str) -> GaussianScene:
 
 
 def geometry(scene: GaussianScene) -> GaussianScene:
-    """Leave out the vertices, which hold colours and all else that no learner needs."""
-    return replace(scene, vertices=scene.vertices[:0])
+    """Leave out of the vertices what no learner needs: all but the colours of degree 0."""
+    return replace(scene, vertices=repack_fields(scene.vertices[list(DC)]))
 
 
 def digest_of(path: Path) -> str | None:

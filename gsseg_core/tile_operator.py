@@ -43,8 +43,12 @@ class TileOperator(ViewOperator):
         return other
 
     def _blend(self, codes: np.ndarray) -> Blended:
-        # A Gaussian speaks for few classes; the others cost nothing.
         visible = take(np.ascontiguousarray(codes, np.float32), self.ids)
+        if 0 < codes.shape[1] <= products.FEW:
+            blended, tiles = self._blank(codes.shape[1]), self._tiles
+            products.render_few(tiles.columns, self._table, tiles.start, tiles.entries, visible, *blended)
+            return blended
+        # A Gaussian speaks for few classes; the others cost nothing.
         return self._blend_visible(Rows.of(visible), codes.shape[1])
 
     def blend_rows(self, codes: Rows, num_classes: int) -> Blended:
@@ -52,11 +56,13 @@ class TileOperator(ViewOperator):
         return self._blend_visible(codes.take(self.ids), num_classes)
 
     def _blend_visible(self, codes: Rows, num_classes: int) -> Blended:
-        image = np.empty((self.camera.height, self.camera.width, num_classes), np.float32)
-        left_over = np.empty(image.shape[:2], np.float32)
-        tiles = self._tiles
-        products.render(tiles.columns, self._table, tiles.start, tiles.entries, *codes, image, left_over)
-        return Blended(image, left_over)
+        blended, tiles = self._blank(num_classes), self._tiles
+        products.render(tiles.columns, self._table, tiles.start, tiles.entries, *codes, *blended)
+        return blended
+
+    def _blank(self, channels: int) -> Blended:
+        size = self.camera.height, self.camera.width
+        return Blended(np.empty((*size, channels), np.float32), np.empty(size, np.float32))
 
     def _adjoint(self, residual: np.ndarray) -> np.ndarray:
         tiles = self._tiles

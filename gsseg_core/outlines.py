@@ -1,0 +1,345 @@
+"""Outlines of a mask, moved to where the scene itself has edges.
+
+Segmenters draw an object too wide in one view and too narrow in the next. Other views cannot tell where the outline
+really is any better than the mean over all of them, and there are not many; but the trained scene can, for most objects
+end where its colour or its depth does.
+
+Each region A of a mask, connected pixels of one label, is taken to have been drawn s_A px too wide, all around, with
+s_A a whole number from -S to S. Where two regions touch, their outline then lies s_A - s_B px too far inside B. With E
+the strength of the scene's edges, f_AB(b) its mean over the pixels along the outline of A and B moved b px into A, and
+n_AB the length of that outline, the log of the posterior of all shifts of a view is, but for a constant,
+
+    sum_AB SHARPNESS sqrt(n_AB / LENGTH) f_AB(s_A - s_B) + sum_A log p(s_A).
+
+Shifts of regions that touch depend on each other, so the posterior is approached by one factor per region (mean
+field), each in turn made the best one given the others. The prior p is the view's own: it is learnt along with the
+shifts, the same for s and -s. In a mask with true outlines most shifts are found to be 0, p says so, and the rest, too,
+stays where it is unless the edges are clear.
+
+E is the gradient of the luminance plus the second differences of the inverse depth, each in units of its 95th
+percentile over the view. On a plane, inverse depth is linear in the image, so that only creases and steps are left.
+"""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+
+from gsseg_core.operator import ViewOperator
+from gsseg_core.per_scene import PerScene
+from gsseg_core.regions import connected_pixels
+from gsseg_core.rows import starts
+from gsseg_core.scene import GaussianScene
+
+SHARPNESS = 3.0
+"""How much a mean edge of one unit says, in nats, along an outline of `LENGTH`."""
+
+LENGTH = 30.0
+"""Of an outline, in px."""
+
+LONGEST = 400
+"""Longer outlines say no more, in px: what holds for all of a region holds only roughly."""
+
+SHORTEST = 3
+"""Along fewer px nothing is asked."""
+
+BAND = 64
+"""Rows of the image that are gone through at once."""
+
+ROUNDS = 6
+"""Of the mean field, each with a better prior."""
+
+STRONGEST = 2.0
+"""Edges count at most so much, in units of the view's 95th percentile."""
+
+_LIGHT: PerScene[np.ndarray] = PerScene()
+
+
+def scene_edges(
+    operator: ViewOperator,
+    scene: GaussianScene,
+) -> np.ndarray:
+    """Draw how strong the edges of colour and depth are in a view, (H, W) float32, at least 0; see above for units."""
+    camera = operator.camera
+    depth = scene.means @ camera.world_to_camera[2, :3].astype(np.float32) + np.float32(camera.world_to_camera[2, 3])
+    near = 1 / np.maximum(depth, np.float32(1e-6))  # what is behind the camera is not drawn
+    # Where a ray leaves the scene, the background is dark and far away.
+    image = operator.render(np.stack([_LIGHT.of(scene, lambda: _light(scene)), near], axis=1))
+    light_edges, depth_edges = np.empty(image.shape[:2], np.float32), np.empty(image.shape[:2], np.float32)
+    _differences(image, light_edges, depth_edges)
+    edges: np.ndarray = _in_units(light_edges) + _in_units(depth_edges)
+    return edges
+
+
+def settle_outlines(
+    labels: np.ndarray,  # (H, W) int32
+    edges: np.ndarray,  # (H, W) float32
+    farthest: int,
+) -> np.ndarray:
+    """Move the outlines of a mask to edges.
+
+    Parameters
+    ----------
+    labels : (H, W) int32
+        The mask; negative where it says nothing.
+    edges : (H, W) float32
+        How strong they are, as of `scene_edges`.
+    farthest : int
+        S, in px: regions are drawn too wide or too narrow by so much at most.
+
+    Returns
+    -------
+    (H, W) int32
+        A new mask.
+    """
+    region, area = connected_pixels(labels)
+    other, ring = np.full(labels.shape, -1, np.int32), np.zeros(labels.shape, np.int32)
+    _reach_across(region, 2 * farthest, other, ring)
+    pairs, pair, lengths, strengths = _along_outlines(region, other, ring, edges, len(area), 2 * farthest)
+    shifts = _shifts(pairs, lengths, strengths, len(area), farthest)
+    moved = shifts[pairs[:, 0]] - shifts[pairs[:, 1]]
+    moved[~_asked(lengths)] = 0
+    settled: np.ndarray = labels.copy()
+    label = np.zeros(len(area), np.int32)
+    label[region[region >= 0]] = labels[region >= 0]
+    _move(region, other, ring, pair, pairs[:, 0], moved, label, settled)
+    return settled
+
+
+def _light(scene: GaussianScene) -> np.ndarray:
+    light: np.ndarray = scene.colors().mean(axis=1)
+    return light
+
+
+def _in_units(edges: np.ndarray) -> np.ndarray:
+    unit = np.float32(np.percentile(edges[::2, ::2], 95))  # every fourth pixel tells it as well
+    return np.minimum(edges / unit, np.float32(STRONGEST)) if unit > 0 else np.zeros_like(edges)
+
+
+def _asked(
+    lengths: np.ndarray,  # (P, 4 S)
+) -> np.ndarray:
+    """Tell which outlines are long enough, (P,) bool."""
+    middle = lengths.shape[1] // 2
+    asked: np.ndarray = lengths[:, middle - 1 : middle + 1].min(axis=1) >= SHORTEST
+    return asked
+
+
+def _shifts(
+    pairs: np.ndarray,  # (P, 2) regions that touch
+    lengths: np.ndarray,  # (P, 4 S) pixels in each ring, from the farthest inside the second to that inside the first
+    strengths: np.ndarray,  # (P, 4 S) sum of their edges
+    many: int,
+    farthest: int,
+) -> np.ndarray:
+    """Find by how much each region was drawn too wide, (R,) int64, in px."""
+    asked = _asked(lengths)
+    touching, told = pairs[asked], _told(lengths[asked], strengths[asked])
+    prior = np.full(2 * farthest + 1, 0.25 / farthest)
+    prior[farthest] = 0.5
+    belief, touches = np.tile(prior, (many, 1)), np.zeros(many, bool)
+    touches[touching] = True
+    begin = starts(np.bincount(touching.ravel(), minlength=many))
+    ends = np.argsort(
+        touching.ravel(), kind="stable"
+    )  # of pairs, by region: pair i ends in its regions as 2 i, 2 i + 1
+    for _ in range(ROUNDS):
+        _believe(touching, told, begin, ends, np.log(prior), belief)
+        counts = belief[touches].sum(axis=0)
+        prior = (counts + counts[::-1]) / 2 + 1
+        prior /= prior.sum()
+    found: np.ndarray = np.where(touches, belief.argmax(axis=1) - farthest, 0)
+    return found
+
+
+def _told(
+    lengths: np.ndarray,  # (P, 4 S)
+    strengths: np.ndarray,  # (P, 4 S)
+) -> np.ndarray:
+    """Tell what edges say of outlines moved by -(2 S - 1) to 2 S - 1 px, (P, 4 S - 1), in nats."""
+    there = np.minimum(lengths[:, 1:], lengths[:, :-1]) >= SHORTEST
+    mean = (strengths[:, 1:] + strengths[:, :-1]) / np.maximum(lengths[:, 1:] + lengths[:, :-1], 1)
+    # What there is no room for says no more than the weakest of the others.
+    mean = np.where(there, mean, np.where(there, mean, np.inf).min(axis=1, keepdims=True))
+    middle = lengths.shape[1] // 2
+    length = np.minimum(lengths[:, middle - 1] + lengths[:, middle], LONGEST)
+    told: np.ndarray = SHARPNESS * np.sqrt(length / LENGTH)[:, None] * mean
+    return told
+
+
+@nb.njit(nogil=True, cache=True)
+def _believe(
+    pairs: np.ndarray,  # (P, 2) regions
+    told: np.ndarray,  # (P, 4 S - 1)
+    begin: np.ndarray,  # (R + 1,) where the ends of each region begin
+    ends: np.ndarray,  # (2 P,)
+    log_prior: np.ndarray,  # (2 S + 1,)
+    belief: np.ndarray,  # (R, 2 S + 1) changed in place: probability of each shift
+) -> None:
+    """Tell each region's shifts from those of the regions that it touches, one after the other."""
+    many, middle = log_prior.shape[0], told.shape[1] // 2
+    for region in range(belief.shape[0]):
+        field = log_prior.copy()
+        for end in ends[begin[region] : begin[region + 1]]:
+            pair, sign = end // 2, 1 - 2 * (end % 2)
+            other = belief[pairs[pair, (end + 1) % 2]]
+            for i in range(many):
+                for j in range(many):
+                    field[i] += other[j] * told[pair, min(max(sign * (i - j), -middle), middle) + middle]
+        field = np.exp(field - field.max())
+        belief[region] = field / field.sum()
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _differences(
+    image: np.ndarray,  # (H, W, 2) luminance, inverse depth
+    light_edges: np.ndarray,  # (H, W) out: length of the gradient of the one
+    depth_edges: np.ndarray,  # (H, W) out: second differences of the other
+) -> None:
+    height, width = light_edges.shape
+    for y in nb.prange(height):
+        up, down = max(y - 1, 0), min(y + 1, height - 1)
+        for x in range(width):
+            left, right = max(x - 1, 0), min(x + 1, width - 1)
+            dy, dx = image[down, x, 0] - image[up, x, 0], image[y, right, 0] - image[y, left, 0]
+            light_edges[y, x] = np.sqrt(dx * dx + dy * dy)
+            here = 2 * image[y, x, 1]
+            across = image[y, left, 1] + image[y, right, 1] - here if left < x < right else np.float32(0)
+            along = image[up, x, 1] + image[down, x, 1] - here if up < y < down else np.float32(0)
+            depth_edges[y, x] = abs(across) + abs(along)
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _reach_across(
+    region: np.ndarray,  # (H, W) int32
+    farthest: int,
+    other: np.ndarray,  # (H, W) int32 out: the region nearest to each pixel, but its own; -1 if that is farther
+    ring: np.ndarray,  # (H, W) int32 out: how far it is in px, rounded up; 0 if it is farther
+) -> None:
+    """Find what is near, band by band; nothing farther above or below matters to a band."""
+    height, width = region.shape
+    for band in nb.prange(-(-height // BAND)):
+        first, last = band * BAND, min(band * BAND + BAND, height)
+        top = max(first - farthest, 0)
+        seen = region[top : min(last + farthest, height)]
+        rows, columns = np.full(seen.shape, -1, np.int32), np.full(seen.shape, -1, np.int32)
+        _hand_on(seen, rows, columns)
+        for y in range(first, last):
+            for x in range(width):
+                row, column = rows[y - top, x], columns[y - top, x]
+                other[y, x], ring[y, x] = -1, 0
+                away = (row + top - y) ** 2 + (column - x) ** 2
+                if row >= 0 and away <= farthest * farthest:
+                    other[y, x], ring[y, x] = seen[row, column], int(np.ceil(np.sqrt(away)))
+
+
+@nb.njit
+def _hand_on(
+    region: np.ndarray,  # (h, W)
+    rows: np.ndarray,  # (h, W) in: -1; out: row of the nearest pixel of another region
+    columns: np.ndarray,  # (h, W) the same for its column
+) -> None:
+    """Hand the nearest pixel of another region on from neighbour to neighbour (Danielsson 1980), there and back."""
+    height, width = region.shape
+    for step in (1, -1):
+        for i in range(height):
+            y = i if step > 0 else height - 1 - i
+            for j in range(width):
+                x = j if step > 0 else width - 1 - j
+                if region[y, x] >= 0:
+                    for dx in (-1, 0, 1):
+                        _hear(region, y, x, y - step, x + dx, rows, columns)
+                    _hear(region, y, x, y, x - step, rows, columns)
+            for j in range(width):
+                x = width - 1 - j if step > 0 else j
+                if region[y, x] >= 0:
+                    _hear(region, y, x, y, x + step, rows, columns)
+
+
+@nb.njit(inline="always")
+def _hear(region: np.ndarray, y: int, x: int, ny: int, nx: int, rows: np.ndarray, columns: np.ndarray) -> None:
+    """Take over what a neighbour knows, if that is nearer."""
+    if 0 <= ny < region.shape[0] and 0 <= nx < region.shape[1] and region[ny, nx] >= 0:
+        same = region[ny, nx] == region[y, x]
+        row, column = (rows[ny, nx], columns[ny, nx]) if same else (ny, nx)
+        if row >= 0 and _nearer(y, x, row, column, rows[y, x], columns[y, x]):
+            rows[y, x], columns[y, x] = row, column
+
+
+@nb.njit(inline="always")
+def _nearer(y: int, x: int, row: int, column: int, other_row: int, other_column: int) -> bool:
+    away = (row - y) ** 2 + (column - x) ** 2
+    return bool(other_row < 0 or away < (other_row - y) ** 2 + (other_column - x) ** 2)
+
+
+@nb.njit(nogil=True, cache=True)
+def _along_outlines(
+    region: np.ndarray,  # (H, W)
+    other: np.ndarray,  # (H, W)
+    ring: np.ndarray,  # (H, W)
+    edges: np.ndarray,  # (H, W)
+    many: int,  # regions
+    farthest: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Give pairs of regions that touch numbers, and sum up edges by pair and ring.
+
+    Returns
+    -------
+    pairs : (P, 2) int64
+        The lower number first.
+    pair : (H W,) int32
+        Which pair each pixel is near, -1 for none.
+    lengths, strengths : (P, 2 farthest) float64
+        Pixels, and sum of their edges, from the farthest ring inside the second region to that inside the first.
+    """
+    of_pixel, of_other, rings = region.ravel(), other.ravel(), ring.ravel()
+    strength = edges.ravel()
+    pixels = of_pixel.shape[0]
+    begin = np.zeros(many + 1, np.int64)
+    for p in range(pixels):
+        if of_other[p] >= 0:
+            begin[min(of_pixel[p], of_other[p]) + 1] += 1
+    begin = np.cumsum(begin)
+    place, order = begin[:-1].copy(), np.empty(begin[-1], np.int32)
+    for p in range(pixels):
+        if of_other[p] >= 0:
+            low = min(of_pixel[p], of_other[p])
+            order[place[low]] = p
+            place[low] += 1
+    pair, met = np.full(pixels, -1, np.int32), np.full(many, -1, np.int64)
+    pairs, n = np.empty((order.shape[0], 2), np.int64), 0
+    for low in range(many):
+        first = n
+        for p in order[begin[low] : begin[low + 1]]:
+            high = max(of_pixel[p], of_other[p])
+            if met[high] < first:
+                met[high], pairs[n, 0], pairs[n, 1] = n, low, high
+                n += 1
+            pair[p] = met[high]
+    lengths, strengths = np.zeros((n, 2 * farthest)), np.zeros((n, 2 * farthest))
+    for p in order:
+        k = farthest + rings[p] - 1 if of_pixel[p] == pairs[pair[p], 0] else farthest - rings[p]
+        lengths[pair[p], k] += 1
+        strengths[pair[p], k] += strength[p]
+    return pairs[:n].copy(), pair, lengths, strengths
+
+
+@nb.njit(nogil=True, cache=True)
+def _move(
+    region: np.ndarray,  # (H, W)
+    other: np.ndarray,  # (H, W)
+    ring: np.ndarray,  # (H, W)
+    pair: np.ndarray,  # (H W,)
+    first: np.ndarray,  # (P,) region of each pair into which outlines move if `moved` is above 0
+    moved: np.ndarray,  # (P,) px
+    label: np.ndarray,  # (R,) of each region
+    labels: np.ndarray,  # (H, W) changed in place
+) -> None:
+    height, width = region.shape
+    for y in range(height):
+        for x in range(width):
+            k = pair[y * width + x]
+            if k >= 0:
+                depth = moved[k] if region[y, x] == first[k] else -moved[k]
+                if ring[y, x] <= depth:
+                    labels[y, x] = label[other[y, x]]

@@ -1,0 +1,180 @@
+"""Outlines of masks: moved to where the scene has edges, and left alone where they are right."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from scipy import ndimage
+from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, mean_iou
+
+from gsseg_core.dataset import View
+from gsseg_core.em import EMLearner, EMSettings
+from gsseg_core.errors import SettingsError
+from gsseg_core.operator import make_operator
+from gsseg_core.outlines import _along_outlines, _reach_across, scene_edges, settle_outlines
+from gsseg_core.regions import connected_pixels
+
+SCENE, _ = balls_on_a_table()
+FARTHEST = 3
+SMALL_MASKS = arrays.arrays(np.int32, st.tuples(st.integers(1, 20), st.integers(1, 20)), elements=st.integers(-1, 2))
+
+
+def discs(rows: int = 96, columns: int = 128) -> np.ndarray:
+    """Four discs, two of which touch, on a background of two halves."""
+    y, x = np.indices((rows, columns))
+    labels = (x > columns // 2).astype(np.int32)
+    for k, (row, column, radius) in enumerate(((26, 28, 15), (62, 34, 17), (62, 66, 15), (28, 100, 13))):
+        labels[np.hypot(y - row, x - column) <= radius] = k + 2
+    return labels
+
+
+def edges_of(labels: np.ndarray) -> np.ndarray:
+    """Edges where labels change, as a picture has them: two px wide, and some noise."""
+    steps = sum(np.abs(np.gradient((labels == k).astype(np.float32), axis=axis)) for k in range(6) for axis in (0, 1))
+    noise = np.random.default_rng(0).uniform(0, 0.3, labels.shape)
+    edges: np.ndarray = (np.minimum(2 * steps, 2) + noise).astype(np.float32)
+    return edges
+
+
+def drawn_too_wide(labels: np.ndarray, shifts: dict[int, int]) -> np.ndarray:
+    """Grow objects by so many px all around, or shrink them."""
+    wrong = labels.copy()
+    for k, shift in shifts.items():
+        own = wrong == k
+        if shift > 0:
+            wrong[ndimage.distance_transform_edt(~own) <= shift] = k
+        else:
+            depth, (rows, columns) = ndimage.distance_transform_edt(own, return_indices=True)
+            lost = own & (depth <= -shift)
+            wrong[lost] = wrong[rows[lost], columns[lost]]
+    return wrong
+
+
+@pytest.mark.parametrize(
+    "shifts", [{2: 3}, {2: -3}, {3: 2, 4: -2}, {2: 1, 3: -1, 4: 2, 5: -3}, {2: 3, 3: 3, 4: 3, 5: 3}]
+)
+def test_objects_drawn_too_wide_or_too_narrow_get_their_outlines_back(shifts: dict[int, int]) -> None:
+    labels = discs()
+    wrong = drawn_too_wide(labels, shifts)
+    settled = settle_outlines(wrong, edges_of(labels), FARTHEST)
+    assert (settled != labels).sum() < 0.25 * (wrong != labels).sum()
+
+
+def test_right_outlines_stay_where_they_are() -> None:
+    labels = discs()
+    np.testing.assert_array_equal(settle_outlines(labels, edges_of(labels), FARTHEST), labels)
+
+
+def test_without_edges_nothing_moves() -> None:
+    labels = discs()
+    np.testing.assert_array_equal(settle_outlines(labels, np.zeros(labels.shape, np.float32), FARTHEST), labels)
+
+
+@settings(deadline=None, max_examples=60)
+@given(SMALL_MASKS, st.integers(1, 3), st.integers(0, 2**32 - 1))
+def test_pixels_move_to_regions_near_by_and_the_unknown_stays_unknown(
+    labels: np.ndarray, farthest: int, seed: int
+) -> None:
+    edges = np.random.default_rng(seed).random(labels.shape, np.float32)
+    before = labels.copy()
+    settled = settle_outlines(labels, edges, farthest)
+    np.testing.assert_array_equal(labels, before)
+    np.testing.assert_array_equal(settled < 0, labels < 0)
+    for row, column in np.argwhere(settled != labels):
+        y, x = np.indices(labels.shape)
+        near = (y - row) ** 2 + (x - column) ** 2 <= (2 * farthest) ** 2
+        assert settled[row, column] in labels[near]
+
+
+@settings(deadline=None, max_examples=60)
+@given(SMALL_MASKS, st.integers(1, 3))
+def test_a_view_turned_around_settles_turned_around(labels: np.ndarray, farthest: int) -> None:
+    # Where two regions are equally near, either may be named; edges everywhere the same leave that without effect.
+    edges = np.ones(labels.shape, np.float32)
+    settled = settle_outlines(labels, edges, farthest)
+    turned = settle_outlines(labels[::-1, ::-1].copy(), edges, farthest)[::-1, ::-1]
+    np.testing.assert_array_equal(settled, turned)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    arrays.arrays(np.int32, st.tuples(st.integers(1, 90), st.integers(1, 20)), elements=st.integers(0, 1)),
+    st.integers(1, 6),
+)
+def test_the_nearest_region_is_as_far_as_by_looking_at_all_pixels(labels: np.ndarray, farthest: int) -> None:
+    region, _ = connected_pixels(labels)
+    other, ring = np.full(labels.shape, -1, np.int32), np.zeros(labels.shape, np.int32)
+    _reach_across(region, farthest, other, ring)
+    pixels = np.stack(np.indices(labels.shape), axis=-1).reshape(-1, 2)
+    away = np.sqrt(((pixels[:, None] - pixels) ** 2).sum(axis=2))
+    away[region.ravel()[:, None] == region.ravel()] = np.inf
+    nearest = away.min(axis=1)
+    found = other.ravel() >= 0
+    # What is handed on by neighbours may miss the nearest pixel by a fraction of one (Danielsson 1980).
+    assert found[nearest <= farthest - 0.5].all() and not found[nearest > farthest].any()
+    assert (np.abs(ring.ravel()[found] - np.ceil(nearest[found])) <= 1).all()
+    assert (other.ravel()[found] != region.ravel()[found]).all()
+
+
+def test_edges_are_summed_by_pair_and_ring_as_by_looking_at_all_pixels() -> None:
+    labels, farthest = discs(), 6
+    region, area = connected_pixels(labels)
+    edges = np.random.default_rng(1).random(labels.shape, np.float32)
+    other, ring = np.full(labels.shape, -1, np.int32), np.zeros(labels.shape, np.int32)
+    _reach_across(region, farthest, other, ring)
+    pairs, pair, lengths, strengths = _along_outlines(region, other, ring, edges, len(area), farthest)
+    assert {tuple(sorted(p)) for p in np.stack([region, other], axis=-1)[other >= 0].tolist()} == set(
+        map(tuple, pairs.tolist())
+    )
+    np.testing.assert_array_equal(pair.reshape(labels.shape) >= 0, other >= 0)
+    for k, (low, high) in enumerate(pairs):
+        for d in range(1, farthest + 1):
+            for mine, theirs, column in ((low, high, farthest + d - 1), (high, low, farthest - d)):
+                there = (region == mine) & (other == theirs) & (ring == d)
+                assert lengths[k, column] == there.sum()
+                assert strengths[k, column] == pytest.approx(edges[there].sum(dtype=np.float64))
+
+
+def test_edges_of_a_scene_lie_along_its_objects() -> None:
+    view = clean_views(1)[0]
+    edges = scene_edges(make_operator(SCENE, view.camera), SCENE)
+    labels = view.read_labels()
+    outline = ndimage.morphological_gradient(labels, size=3) > 0
+    assert edges.shape == labels.shape and edges.dtype == np.float32 and edges.min() >= 0
+    assert edges[outline].mean() > 2 * edges[~ndimage.binary_dilation(outline, iterations=2)].mean()
+
+
+def test_em_learns_more_from_masks_that_are_off_since_it_moves_them() -> None:
+    rng = np.random.default_rng(3)
+    wrong = [
+        View.from_arrays(
+            view.camera,
+            drawn_too_wide(view.read_labels(), {k: int(rng.integers(-2, 3)) for k in range(1, NUM_CLASSES)}),
+        )
+        for view in clean_views(4)
+    ]
+
+    def learnt(edge_px: int) -> float:
+        learner = EMLearner(SCENE, NUM_CLASSES, EMSettings(edge_px=edge_px))
+        learner.observe_all(wrong)
+        return mean_iou(learner.fit())
+
+    assert learnt(3) > learnt(0)
+
+
+def test_a_view_is_taken_back_as_exactly_as_it_was_added() -> None:
+    learner = EMLearner(SCENE, NUM_CLASSES, EMSettings())
+    views = clean_views(3)
+    learner.observe_all(views[:2])
+    before = learner._votes.copy()
+    learner.observe(views[2])
+    learner.retract(views[2].name)
+    np.testing.assert_array_equal(learner._votes, before)
+
+
+def test_a_negative_width_is_refused() -> None:
+    with pytest.raises(SettingsError, match="edge_px"):
+        EMSettings(edge_px=-1)
