@@ -102,7 +102,7 @@ def settle_outlines(
     settled: np.ndarray = labels.copy()
     label = np.zeros(len(area), np.int32)
     label[region[region >= 0]] = labels[region >= 0]
-    _move(region, other, ring, pair, pairs[:, 0], moved, label, settled)
+    _move(region, other, ring, pair, pairs[:, 0].copy(), moved, label, settled)
     return settled
 
 

@@ -62,6 +62,16 @@ def test_render_and_adjoint_agree_with_the_naive_rasteriser(backend, width, heig
 
 
 @pytest.mark.parametrize("seed", range(4))
+def test_few_channels_are_rendered_as_they_are_among_many(backend, seed):
+    scene, camera = random_view(seed)
+    operator = backend.make(scene, camera)
+    codes = np.random.default_rng(seed).normal(size=(len(scene), 12)).astype(np.float32)
+    many = operator.render(codes)
+    for few in (1, 2, 3, 4, 5):
+        assert np.abs(operator.render(codes[:, :few]) - many[..., :few]).max() <= backend.weight * (backend is not CPU)
+
+
+@pytest.mark.parametrize("seed", range(4))
 def test_visibility_agrees_with_the_naive_rasteriser(backend, seed):
     scene, camera = random_view(seed)
     operator, naive = backend.make(scene, camera), backend.naive(scene, camera)
@@ -211,6 +221,20 @@ def test_a_mask_with_all_pixels_unknown_gives_no_evidence(backend):
     assert share.sightings.shape == (0,)
     assert share.rest.shape == (0,)
     assert share.log_likelihood == 0
+
+
+def test_shares_asked_again_are_the_same_and_those_of_other_codes_are_others(backend):
+    scene, camera = random_view(3)
+    labels = np.random.default_rng(3).integers(-1, 3, (21, 37)).astype(np.int32)
+    seen = backend.make(scene, camera).observe(labels)
+    said, rest = np.full(len(seen.labels), 0.5, np.float32), np.full(len(seen.classes), 0.5, np.float32)
+    once = seen.shares(said, rest)
+    np.testing.assert_array_equal(seen.shares(said, rest).sightings, once.sightings)
+    said[: len(said) // 2] = 0.25
+    other = seen.shares(said, rest)
+    expected = backend.make(scene, camera).observe(labels).shares(said, rest)
+    np.testing.assert_array_equal(other.sightings, expected.sightings)
+    assert other.log_likelihood == expected.log_likelihood != once.log_likelihood
 
 
 def test_a_pixel_that_nothing_explains_gives_no_share_and_a_finite_likelihood(backend):
