@@ -6,8 +6,8 @@ end where its colour or its depth does.
 
 Each region A of a mask, connected pixels of one label, is taken to have been drawn s_A px too wide, all around, with
 s_A a whole number from -S to S. Where two regions touch, their outline then lies s_A - s_B px too far inside B. With E
-the strength of the scene's edges, f_AB(b) its mean over the pixels along the outline of A and B moved b px into A, and
-n_AB the length of that outline, the log of the posterior of all shifts of a view is, but for a constant,
+the strength of the scene's edges, f_AB(b) its mean over the pixels on both sides of the outline of A and B, moved b px
+into A, and n_AB how many these are at b = 0, the log of the posterior of all shifts of a view is, but for a constant,
 
     sum_AB SHARPNESS sqrt(n_AB / LENGTH) f_AB(s_A - s_B) + sum_A log p(s_A).
 
@@ -32,16 +32,19 @@ from gsseg_core.rows import starts
 from gsseg_core.scene import GaussianScene
 
 SHARPNESS = 3.0
-"""How much a mean edge of one unit says, in nats, along an outline of `LENGTH`."""
+"""How much edges of one unit in the mean say, in nats, where `LENGTH` pixels lie along the outline."""
 
 LENGTH = 30.0
-"""Of an outline, in px."""
+"""In px, of both sides."""
 
 LONGEST = 400
-"""Longer outlines say no more, in px: what holds for all of a region holds only roughly."""
+"""More pixels than these say no more: that a region is too wide by the same all around holds only roughly."""
 
 SHORTEST = 3
-"""Along fewer px nothing is asked."""
+"""Along fewer px of either side nothing is asked."""
+
+NO_ROOM = -20.0
+"""What speaks against an outline so far inside a region that hardly anything of it would be left, in nats."""
 
 BAND = 64
 """Rows of the image that are gone through at once."""
@@ -63,8 +66,9 @@ def scene_edges(
     camera = operator.camera
     depth = scene.means @ camera.world_to_camera[2, :3].astype(np.float32) + np.float32(camera.world_to_camera[2, 3])
     near = 1 / np.maximum(depth, np.float32(1e-6))  # what is behind the camera is not drawn
-    # Where a ray leaves the scene, the background is dark and far away.
-    image = operator.render(np.stack([_LIGHT.of(scene, lambda: _light(scene)), near], axis=1))
+    image, left_over = operator.blend(np.stack([_LIGHT.of(scene, lambda: _light(scene)), near], axis=1))
+    # Means over what is seen; where that is little, the background is dark and far away.
+    image /= np.maximum(1 - left_over, np.float32(0.5))[..., None]
     light_edges, depth_edges = np.empty(image.shape[:2], np.float32), np.empty(image.shape[:2], np.float32)
     _differences(image, light_edges, depth_edges)
     edges: np.ndarray = _in_units(light_edges) + _in_units(depth_edges)
@@ -97,7 +101,8 @@ def settle_outlines(
     _reach_across(region, 2 * farthest, other, ring)
     pairs, pair, lengths, strengths = _along_outlines(region, other, ring, edges, len(area), 2 * farthest)
     shifts = _shifts(pairs, lengths, strengths, len(area), farthest)
-    moved = shifts[pairs[:, 0]] - shifts[pairs[:, 1]]
+    most = 2 * farthest - 1
+    moved = np.clip(shifts[pairs[:, 0]] - shifts[pairs[:, 1]], -most, most)
     moved[~_asked(lengths)] = 0
     settled: np.ndarray = labels.copy()
     label = np.zeros(len(area), np.int32)
@@ -140,9 +145,8 @@ def _shifts(
     belief, touches = np.tile(prior, (many, 1)), np.zeros(many, bool)
     touches[touching] = True
     begin = starts(np.bincount(touching.ravel(), minlength=many))
-    ends = np.argsort(
-        touching.ravel(), kind="stable"
-    )  # of pairs, by region: pair i ends in its regions as 2 i, 2 i + 1
+    # Pair i ends in its two regions, as 2 i and as 2 i + 1; these are the ends, region by region.
+    ends = np.argsort(touching.ravel(), kind="stable")
     for _ in range(ROUNDS):
         _believe(touching, told, begin, ends, np.log(prior), belief)
         counts = belief[touches].sum(axis=0)
@@ -159,12 +163,10 @@ def _told(
     """Tell what edges say of outlines moved by -(2 S - 1) to 2 S - 1 px, (P, 4 S - 1), in nats."""
     there = np.minimum(lengths[:, 1:], lengths[:, :-1]) >= SHORTEST
     mean = (strengths[:, 1:] + strengths[:, :-1]) / np.maximum(lengths[:, 1:] + lengths[:, :-1], 1)
-    # What there is no room for says no more than the weakest of the others.
-    mean = np.where(there, mean, np.where(there, mean, np.inf).min(axis=1, keepdims=True))
     middle = lengths.shape[1] // 2
     length = np.minimum(lengths[:, middle - 1] + lengths[:, middle], LONGEST)
-    told: np.ndarray = SHARPNESS * np.sqrt(length / LENGTH)[:, None] * mean
-    return told
+    told = SHARPNESS * np.sqrt(length / LENGTH)[:, None] * mean
+    return np.where(there, told, NO_ROOM)
 
 
 @nb.njit(nogil=True, cache=True)

@@ -203,9 +203,14 @@ def main(args: list[str] | None = None) -> int:
     except Exception as error:  # arguments that ROS cannot parse; its class for that is not public
         print(f"replay_node: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
+    early: list[int] = []  # signals that come while the node is made
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda which, _: early.append(which))
     node = ReplayNode()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: node.stop())
+    if early:
+        node.stop()
     try:
         return _run(node)
     finally:
