@@ -60,12 +60,13 @@ from gsseg_core.gaussian_kernels import collect, improve, improve_without, mix, 
 from gsseg_core.learner import MEMORY_BUDGET, VOTE_UNIT, Learner, Progress, silent
 from gsseg_core.meaning import standing
 from gsseg_core.neighbours import neighbours_of
-from gsseg_core.operator import Observation, ViewOperator
+from gsseg_core.operator import Observation, ViewOperator, make_operator
 from gsseg_core.outlines import scene_edges, settle_outlines
 from gsseg_core.regions import by_region, counted_by_others, in_doubt, votes_of
 from gsseg_core.rows import Rows, starts
 from gsseg_core.scene import GaussianScene
 from gsseg_core.soft_masks import SeenLabels
+from gsseg_core.tile_operator import TileOperator
 
 ROUGH = 4
 """Codes that error models are learnt anew from may be so many times less settled than those that are handed out."""
@@ -213,7 +214,9 @@ class EMLearner(Learner):
         """Move outlines to edges, if the mask has any; tell regions apart, if they may be in doubt."""
         settings = self.settings
         if settings.errors and settings.edge_px and seen.meaning is None:
-            seen = SeenLabels(settle_outlines(seen.labels, scene_edges(operator, self.scene), settings.edge_px))
+            # Where outlines go is decided, not computed to a precision: all devices have to see the very same edges.
+            drawn = operator if isinstance(operator, TileOperator) else make_operator(self.scene, operator.camera)
+            seen = SeenLabels(settle_outlines(seen.labels, scene_edges(drawn, self.scene), settings.edge_px))
         return by_region(seen) if settings.judges else seen
 
     def _judge(
