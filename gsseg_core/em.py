@@ -66,7 +66,6 @@ from gsseg_core.regions import by_region, counted_by_others, in_doubt, votes_of
 from gsseg_core.rows import Rows, starts
 from gsseg_core.scene import GaussianScene
 from gsseg_core.soft_masks import SeenLabels
-from gsseg_core.tile_operator import TileOperator
 
 ROUGH = 4
 """Codes that error models are learnt anew from may be so many times less settled than those that are handed out."""
@@ -215,8 +214,8 @@ class EMLearner(Learner):
         settings = self.settings
         if settings.errors and settings.edge_px and seen.meaning is None:
             # Where outlines go is decided, not computed to a precision: all devices have to see the very same edges.
-            drawn = operator if isinstance(operator, TileOperator) else make_operator(self.scene, operator.camera)
-            seen = SeenLabels(settle_outlines(seen.labels, scene_edges(drawn, self.scene), settings.edge_px))
+            drawing = operator if self.device == "cpu" else make_operator(self.scene, operator.camera)
+            seen = SeenLabels(settle_outlines(seen.labels, scene_edges(drawing, self.scene), settings.edge_px))
         return by_region(seen) if settings.judges else seen
 
     def _judge(

@@ -18,6 +18,7 @@ stays where it is unless the edges are clear.
 
 E is the gradient of the luminance plus the second differences of the inverse depth, each in units of its 95th
 percentile over the view. On a plane, inverse depth is linear in the image, so that only creases and steps are left.
+Depth alone is too soft to tell outlines by: a scene of one colour has no edges.
 """
 
 from __future__ import annotations
@@ -63,10 +64,12 @@ def scene_edges(
     scene: GaussianScene,
 ) -> np.ndarray:
     """Draw how strong the edges of colour and depth are in a view, (H, W) float32, at least 0; see above for units."""
-    camera = operator.camera
+    camera, light = operator.camera, _LIGHT.of(scene, lambda: _light(scene))
+    if light.min() == light.max():
+        return np.zeros((camera.height, camera.width), np.float32)
     depth = scene.means @ camera.world_to_camera[2, :3].astype(np.float32) + np.float32(camera.world_to_camera[2, 3])
     near = 1 / np.maximum(depth, np.float32(1e-6))  # what is behind the camera is not drawn
-    image, left_over = operator.blend(np.stack([_LIGHT.of(scene, lambda: _light(scene)), near], axis=1))
+    image, left_over = operator.blend(np.stack([light, near], axis=1))
     # Means over what is seen; where that is little, the background is dark and far away.
     image /= np.maximum(1 - left_over, np.float32(0.5))[..., None]
     light_edges, depth_edges = np.empty(image.shape[:2], np.float32), np.empty(image.shape[:2], np.float32)

@@ -29,6 +29,7 @@ from gsseg_core.errors import SettingsError
 from gsseg_core.gradient import GradientLearner, GradientSettings
 from gsseg_core.gsplat_operator import GsplatOperator, _tensors_of, chunks, load_gsplat
 from gsseg_core.operator import make_operator
+from gsseg_core.scene import GaussianScene
 from gsseg_core.votes import VoteLearner
 
 FUNCTIONS = ("fully_fused_projection", "isect_tiles", "isect_offset_encode", "rasterize_to_pixels")
@@ -54,7 +55,7 @@ def solid_and_thin():
     scene, truth = balls_on_a_table()
     rng = np.random.default_rng(1)
     opacities = np.where(rng.random(len(scene)) < 0.3, rng.uniform(0.98, 0.9999, len(scene)), rng.uniform(0.2, 1))
-    return make_scene(scene.means, scene.quats, scene.scales, opacities), truth
+    return GaussianScene.from_arrays(scene.means, scene.quats, scene.scales, opacities, scene.sh), truth
 
 
 @pytest.mark.parametrize("backend", ["plain", "cuda"], indirect=True)
@@ -63,14 +64,13 @@ def test_labels_are_those_of_the_cpu(backend, monkeypatch, which):
     scene, truth = solid_and_thin()
     views = [View.from_arrays(camera, true_labels(scene, truth, camera)) for camera in ring(4)]
     learners = {
-        # Outlines apart, which are drawn on the CPU for all devices.
-        "em": lambda: EMLearner(scene, NUM_CLASSES, EMSettings(max_steps=6, edge_px=0)),
-        "votes": lambda: VoteLearner(scene, NUM_CLASSES),
-        "gradient": lambda: GradientLearner(scene, NUM_CLASSES, GradientSettings(epochs=1)),
+        "em": lambda device: EMLearner(scene, NUM_CLASSES, EMSettings(max_steps=6), device=device),
+        "votes": lambda device: VoteLearner(scene, NUM_CLASSES, device=device),
+        "gradient": lambda device: GradientLearner(scene, NUM_CLASSES, GradientSettings(epochs=1), device=device),
     }
-    expected = taught(learners[which](), views).fit()
+    expected = taught(learners[which]("cpu"), views).fit()
     monkeypatch.setattr("gsseg_core.learner.make_operator", lambda scene, camera, device: backend.make(scene, camera))
-    got = taught(learners[which](), views).fit()
+    got = taught(learners[which](backend.name), views).fit()
     both = expected.observed_ & got.observed_
     assert both.sum() >= 0.999 * expected.observed_.sum() > 300
     same = expected.codes_.argmax(axis=1) == got.codes_.argmax(axis=1)

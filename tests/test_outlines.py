@@ -16,6 +16,7 @@ from gsseg_core.errors import SettingsError
 from gsseg_core.operator import make_operator
 from gsseg_core.outlines import _along_outlines, _reach_across, scene_edges, settle_outlines
 from gsseg_core.regions import connected_pixels
+from gsseg_core.scene import GaussianScene
 
 SCENE, _ = balls_on_a_table()
 FARTHEST = 3
@@ -145,6 +146,11 @@ def test_edges_of_a_scene_lie_along_its_objects() -> None:
     outline = ndimage.morphological_gradient(labels, size=3) > 0
     assert edges.shape == labels.shape and edges.dtype == np.float32 and edges.min() >= 0
     assert edges[outline].mean() > 2 * edges[~ndimage.binary_dilation(outline, iterations=2)].mean()
+
+
+def test_a_scene_without_colour_has_no_edges() -> None:
+    grey = GaussianScene.from_arrays(SCENE.means, SCENE.quats, SCENE.scales, SCENE.opacities, np.zeros_like(SCENE.sh))
+    assert not scene_edges(make_operator(grey, clean_views(1)[0].camera), grey).any()
 
 
 def test_em_learns_more_from_masks_that_are_off_since_it_moves_them() -> None:
