@@ -40,9 +40,13 @@ def warm_up(device: str = "cpu", say: Callable[[str], object] = lambda text: Non
 
 def _segment_something(device: str) -> None:
     x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-1.5, 1.5, SIDE), np.linspace(-1.5, 1.5, SIDE)))
-    means, ones = np.stack([x, y, 4 + 0.1 * x], axis=1), np.ones(len(x))
+    means, ones, light = np.stack([x, y, 4 + 0.1 * x], axis=1), np.ones(len(x)), np.where(x < 0, -1.0, 1.0)
     scene = GaussianScene.from_arrays(
-        means, np.tile([1.0, 0, 0, 0], (len(x), 1)), np.full((len(x), 3), 0.05), 0.9 * ones, np.zeros((len(x), 1, 3))
+        means,
+        np.tile([1.0, 0, 0, 0], (len(x), 1)),
+        np.full((len(x), 3), 0.05),
+        0.9 * ones,
+        np.tile(light[:, None, None], (1, 1, 3)),
     )
     K = np.array([[16.0, 0, 16], [0, 16, 16], [0, 0, 1]])
     camera = Camera("warm_up", 32, 32, K, np.eye(4))
