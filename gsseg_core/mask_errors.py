@@ -120,19 +120,27 @@ def _move_edges(labels: np.ndarray, rng: np.random.Generator, settings: MaskErro
     objects = _objects(labels)
     shifts = rng.integers(-settings.edge_px, settings.edge_px, len(objects), endpoint=True)
     for k in rng.permutation(len(objects)):
-        label, shift = objects[k], shifts[k]
-        mask = labels == label
-        if not shift or not mask.any():  # a neighbour may have grown over it
-            continue
-        window = _window(mask, max(shift, 1))
-        own = mask[window]
-        if shift > 0:
-            labels[window][ndimage.distance_transform_edt(~own) <= shift] = label
-        elif not own.all():
-            depth, (rows, columns) = ndimage.distance_transform_edt(own, return_indices=True)
-            lost = own & (depth <= -shift)
-            labels[window][lost] = labels[window][rows[lost], columns[lost]]
+        resize(labels, int(objects[k]), int(shifts[k]))
     return labels
+
+
+def resize(
+    labels: np.ndarray,  # (H, W) changed in place
+    label: int,
+    shift: int,
+) -> None:
+    """Grow an object by so many px all around, or shrink it if `shift` is negative, down to nothing."""
+    mask = labels == label
+    if not shift or not mask.any():  # another object may have grown over it
+        return
+    window = _window(mask, max(shift, 1))
+    own = mask[window]
+    if shift > 0:
+        labels[window][ndimage.distance_transform_edt(~own) <= shift] = label
+    elif not own.all():
+        depth, (rows, columns) = ndimage.distance_transform_edt(own, return_indices=True)
+        lost = own & (depth <= -shift)
+        labels[window][lost] = labels[window][rows[lost], columns[lost]]
 
 
 def _punch_holes(labels: np.ndarray, rng: np.random.Generator, settings: MaskErrors) -> np.ndarray:

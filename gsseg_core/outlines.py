@@ -64,7 +64,7 @@ def scene_edges(
     scene: GaussianScene,
 ) -> np.ndarray:
     """Draw how strong the edges of colour and depth are in a view, (H, W) float32, at least 0; see above for units."""
-    camera, light = operator.camera, _LIGHT.of(scene, lambda: _light(scene))
+    camera, light = operator.camera, _LIGHT.of(scene, lambda: scene.colors().mean(axis=1))
     if light.min() == light.max():
         return np.zeros((camera.height, camera.width), np.float32)
     depth = scene.means @ camera.world_to_camera[2, :3].astype(np.float32) + np.float32(camera.world_to_camera[2, 3])
@@ -100,23 +100,17 @@ def settle_outlines(
         A new mask.
     """
     region, area = connected_pixels(labels)
-    other, ring = np.full(labels.shape, -1, np.int32), np.zeros(labels.shape, np.int32)
-    _reach_across(region, 2 * farthest, other, ring)
+    other, ring = _reach_across(region, 2 * farthest)
     pairs, pair, lengths, strengths = _along_outlines(region, other, ring, edges, len(area), 2 * farthest)
-    shifts = _shifts(pairs, lengths, strengths, len(area), farthest)
+    asked = lengths[:, 2 * farthest - 1 : 2 * farthest + 1].min(axis=1) >= SHORTEST
+    shifts = _shifts(pairs[asked], _told(lengths[asked], strengths[asked]), len(area), farthest)
     most = 2 * farthest - 1
-    moved = np.clip(shifts[pairs[:, 0]] - shifts[pairs[:, 1]], -most, most)
-    moved[~_asked(lengths)] = 0
+    moved = np.where(asked, np.clip(shifts[pairs[:, 0]] - shifts[pairs[:, 1]], -most, most), 0)
     settled: np.ndarray = labels.copy()
     label = np.zeros(len(area), np.int32)
     label[region[region >= 0]] = labels[region >= 0]
-    _move(region, other, ring, pair, pairs[:, 0].copy(), moved, label, settled)
+    _move(region, other, ring, pair, pairs, moved, label, settled)
     return settled
-
-
-def _light(scene: GaussianScene) -> np.ndarray:
-    light: np.ndarray = scene.colors().mean(axis=1)
-    return light
 
 
 def _in_units(edges: np.ndarray) -> np.ndarray:
@@ -124,25 +118,13 @@ def _in_units(edges: np.ndarray) -> np.ndarray:
     return np.minimum(edges / unit, np.float32(STRONGEST)) if unit > 0 else np.zeros_like(edges)
 
 
-def _asked(
-    lengths: np.ndarray,  # (P, 4 S)
-) -> np.ndarray:
-    """Tell which outlines are long enough, (P,) bool."""
-    middle = lengths.shape[1] // 2
-    asked: np.ndarray = lengths[:, middle - 1 : middle + 1].min(axis=1) >= SHORTEST
-    return asked
-
-
 def _shifts(
-    pairs: np.ndarray,  # (P, 2) regions that touch
-    lengths: np.ndarray,  # (P, 4 S) pixels in each ring, from the farthest inside the second to that inside the first
-    strengths: np.ndarray,  # (P, 4 S) sum of their edges
+    touching: np.ndarray,  # (P, 2) regions
+    told: np.ndarray,  # (P, 4 S - 1)
     many: int,
     farthest: int,
 ) -> np.ndarray:
     """Find by how much each region was drawn too wide, (R,) int64, in px."""
-    asked = _asked(lengths)
-    touching, told = pairs[asked], _told(lengths[asked], strengths[asked])
     prior = np.full(2 * farthest + 1, 0.25 / farthest)
     prior[farthest] = 0.5
     belief, touches = np.tile(prior, (many, 1)), np.zeros(many, bool)
@@ -160,8 +142,8 @@ def _shifts(
 
 
 def _told(
-    lengths: np.ndarray,  # (P, 4 S)
-    strengths: np.ndarray,  # (P, 4 S)
+    lengths: np.ndarray,  # (P, 4 S) pixels in each ring, from the farthest inside the second to that inside the first
+    strengths: np.ndarray,  # (P, 4 S) sum of their edges
 ) -> np.ndarray:
     """Tell what edges say of outlines moved by -(2 S - 1) to 2 S - 1 px, (P, 4 S - 1), in nats."""
     there = np.minimum(lengths[:, 1:], lengths[:, :-1]) >= SHORTEST
@@ -218,11 +200,18 @@ def _differences(
 def _reach_across(
     region: np.ndarray,  # (H, W) int32
     farthest: int,
-    other: np.ndarray,  # (H, W) int32 out: the region nearest to each pixel, but its own; -1 if that is farther
-    ring: np.ndarray,  # (H, W) int32 out: how far it is in px, rounded up; 0 if it is farther
-) -> None:
-    """Find what is near, band by band; nothing farther above or below matters to a band."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find what is near, band by band; nothing farther above or below matters to a band.
+
+    Returns
+    -------
+    other : (H, W) int32
+        The region nearest to each pixel, but its own; -1 if that is farther.
+    ring : (H, W) int32
+        How far it is in px, rounded up; 0 if it is farther.
+    """
     height, width = region.shape
+    other, ring = np.empty((height, width), np.int32), np.empty((height, width), np.int32)
     for band in nb.prange(-(-height // BAND)):
         first, last = band * BAND, min(band * BAND + BAND, height)
         top = max(first - farthest, 0)
@@ -236,6 +225,7 @@ def _reach_across(
                 away = (row + top - y) ** 2 + (column - x) ** 2
                 if row >= 0 and away <= farthest * farthest:
                     other[y, x], ring[y, x] = seen[row, column], int(np.ceil(np.sqrt(away)))
+    return other, ring
 
 
 @nb.njit
@@ -297,21 +287,9 @@ def _along_outlines(
     lengths, strengths : (P, 2 farthest) float64
         Pixels, and sum of their edges, from the farthest ring inside the second region to that inside the first.
     """
-    of_pixel, of_other, rings = region.ravel(), other.ravel(), ring.ravel()
-    strength = edges.ravel()
-    pixels = of_pixel.shape[0]
-    begin = np.zeros(many + 1, np.int64)
-    for p in range(pixels):
-        if of_other[p] >= 0:
-            begin[min(of_pixel[p], of_other[p]) + 1] += 1
-    begin = np.cumsum(begin)
-    place, order = begin[:-1].copy(), np.empty(begin[-1], np.int32)
-    for p in range(pixels):
-        if of_other[p] >= 0:
-            low = min(of_pixel[p], of_other[p])
-            order[place[low]] = p
-            place[low] += 1
-    pair, met = np.full(pixels, -1, np.int32), np.full(many, -1, np.int64)
+    of_pixel, of_other, rings, strength = region.ravel(), other.ravel(), ring.ravel(), edges.ravel()
+    begin, order = _by_lower(of_pixel, of_other, many)
+    pair, met = np.full(of_pixel.shape[0], -1, np.int32), np.full(many, -1, np.int64)
     pairs, n = np.empty((order.shape[0], 2), np.int64), 0
     for low in range(many):
         first = n
@@ -329,14 +307,35 @@ def _along_outlines(
     return pairs[:n].copy(), pair, lengths, strengths
 
 
+@nb.njit
+def _by_lower(
+    of_pixel: np.ndarray,  # (H W,) region
+    of_other: np.ndarray,  # (H W,) the one near by, -1 for none
+    many: int,  # regions
+) -> tuple[np.ndarray, np.ndarray]:
+    """Sort the pixels near another region by the lower number of the two: where each begins, and the pixels."""
+    begin = np.zeros(many + 1, np.int64)
+    for p in range(of_pixel.shape[0]):
+        if of_other[p] >= 0:
+            begin[min(of_pixel[p], of_other[p]) + 1] += 1
+    begin = np.cumsum(begin)
+    place, order = begin[:-1].copy(), np.empty(begin[-1], np.int32)
+    for p in range(of_pixel.shape[0]):
+        if of_other[p] >= 0:
+            low = min(of_pixel[p], of_other[p])
+            order[place[low]] = p
+            place[low] += 1
+    return begin, order
+
+
 @nb.njit(nogil=True, cache=True)
 def _move(
     region: np.ndarray,  # (H, W)
     other: np.ndarray,  # (H, W)
     ring: np.ndarray,  # (H, W)
     pair: np.ndarray,  # (H W,)
-    first: np.ndarray,  # (P,) region of each pair into which outlines move if `moved` is above 0
-    moved: np.ndarray,  # (P,) px
+    pairs: np.ndarray,  # (P, 2)
+    moved: np.ndarray,  # (P,) px, into the first region of each pair
     label: np.ndarray,  # (R,) of each region
     labels: np.ndarray,  # (H, W) changed in place
 ) -> None:
@@ -345,6 +344,6 @@ def _move(
         for x in range(width):
             k = pair[y * width + x]
             if k >= 0:
-                depth = moved[k] if region[y, x] == first[k] else -moved[k]
+                depth = moved[k] if region[y, x] == pairs[k, 0] else -moved[k]
                 if ring[y, x] <= depth:
                     labels[y, x] = label[other[y, x]]

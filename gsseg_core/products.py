@@ -44,6 +44,25 @@ def _scratch(entries: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarr
     )
 
 
+@nb.njit(inline="always")
+def _put(
+    tile: int,
+    columns: int,
+    block: np.ndarray,  # (16, K, 16)
+    rays: np.ndarray,  # (16, 16)
+    out: np.ndarray,  # (H, W, K) out
+    left_over: np.ndarray,  # (H, W) out
+) -> None:
+    """Write a tile into the image."""
+    height, width, channels = out.shape
+    left, top = (tile % columns) * TILE, (tile // columns) * TILE
+    for r in range(min(TILE, height - top)):
+        for c in range(min(TILE, width - left)):
+            left_over[top + r, left + c] = rays[r, c]
+            for k in range(channels):
+                out[top + r, left + c, k] = block[r, k, c]
+
+
 @nb.njit(parallel=True, nogil=True, cache=True)
 def render(
     columns: int,
@@ -72,12 +91,7 @@ def render(
                     k = row + np.int64(classes[z])
                     store_row(block, k, add_scaled(load_row(block, k), weight, codes[z]))
             n = ends[e]
-        left, top = (tile % columns) * TILE, (tile // columns) * TILE
-        for r in range(min(TILE, height - top)):
-            for c in range(min(TILE, width - left)):
-                left_over[top + r, left + c] = rays[r, c]
-                for k in range(channels):
-                    out[top + r, left + c, k] = block[r, k, c]
+        _put(tile, columns, block, rays, out, left_over)
 
 
 @nb.njit(parallel=True, nogil=True, cache=True, fastmath={"contract"}, error_model="numpy")
@@ -114,12 +128,7 @@ def render_few(
                     live &= ~(1 << r)
             if not live:
                 break
-        x, y = (tile % columns) * TILE, (tile // columns) * TILE
-        for r in range(min(TILE, height - y)):
-            for c in range(min(TILE, width - x)):
-                left_over[y + r, x + c] = rays[r, c]
-                for k in range(channels):
-                    out[y + r, x + c, k] = block[r, k, c]
+        _put(tile, columns, block, rays, out, left_over)
 
 
 @nb.njit(parallel=True, nogil=True, cache=True, fastmath=FAST)

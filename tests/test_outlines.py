@@ -13,6 +13,7 @@ from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, mean_iou
 from gsseg_core.dataset import View
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import SettingsError
+from gsseg_core.mask_errors import resize
 from gsseg_core.operator import make_operator
 from gsseg_core.outlines import _along_outlines, _reach_across, scene_edges, settle_outlines
 from gsseg_core.regions import connected_pixels
@@ -44,13 +45,7 @@ def drawn_too_wide(labels: np.ndarray, shifts: dict[int, int]) -> np.ndarray:
     """Grow objects by so many px all around, or shrink them."""
     wrong = labels.copy()
     for k, shift in shifts.items():
-        own = wrong == k
-        if shift > 0:
-            wrong[ndimage.distance_transform_edt(~own) <= shift] = k
-        else:
-            depth, (rows, columns) = ndimage.distance_transform_edt(own, return_indices=True)
-            lost = own & (depth <= -shift)
-            wrong[lost] = wrong[rows[lost], columns[lost]]
+        resize(wrong, k, shift)
     return wrong
 
 
@@ -107,8 +102,7 @@ def test_a_view_turned_around_settles_turned_around(labels: np.ndarray, farthest
 )
 def test_the_nearest_region_is_as_far_as_by_looking_at_all_pixels(labels: np.ndarray, farthest: int) -> None:
     region, _ = connected_pixels(labels)
-    other, ring = np.full(labels.shape, -1, np.int32), np.zeros(labels.shape, np.int32)
-    _reach_across(region, farthest, other, ring)
+    other, ring = _reach_across(region, farthest)
     pixels = np.stack(np.indices(labels.shape), axis=-1).reshape(-1, 2)
     away = np.sqrt(((pixels[:, None] - pixels) ** 2).sum(axis=2))
     away[region.ravel()[:, None] == region.ravel()] = np.inf
@@ -124,8 +118,7 @@ def test_edges_are_summed_by_pair_and_ring_as_by_looking_at_all_pixels() -> None
     labels, farthest = discs(), 6
     region, area = connected_pixels(labels)
     edges = np.random.default_rng(1).random(labels.shape, np.float32)
-    other, ring = np.full(labels.shape, -1, np.int32), np.zeros(labels.shape, np.int32)
-    _reach_across(region, farthest, other, ring)
+    other, ring = _reach_across(region, farthest)
     pairs, pair, lengths, strengths = _along_outlines(region, other, ring, edges, len(area), farthest)
     assert {tuple(sorted(p)) for p in np.stack([region, other], axis=-1)[other >= 0].tolist()} == set(
         map(tuple, pairs.tolist())
