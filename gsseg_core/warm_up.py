@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 
 import numpy as np
+from numba.core import event
 
 from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
@@ -19,8 +19,19 @@ from gsseg_core.votes import VoteLearner
 SIDE = 72
 """Gaussians on a side of the square that is segmented; trees of fewer than 4,096 in all are built by other kernels."""
 
-SLOW = 1.5
-"""Seconds after which it is plain that kernels are compiled and not just loaded."""
+
+class _FirstCompilation(event.Listener):
+    def __init__(self, say: Callable[[str], object]) -> None:
+        self._say = say
+        self._said = False
+
+    def on_start(self, begun: event.Event) -> None:
+        if not self._said:
+            self._said = True
+            self._say("compiling kernels, a minute; only the first run after installing does this")
+
+    def on_end(self, ended: event.Event) -> None:
+        pass
 
 
 def warm_up(device: str = "cpu", say: Callable[[str], object] = lambda text: None) -> None:
@@ -29,13 +40,8 @@ def warm_up(device: str = "cpu", say: Callable[[str], object] = lambda text: Non
     That takes a third of a second when they are in the cache, and up to a minute at the first time after an
     installation; then `say` is told.
     """
-    slow = threading.Timer(SLOW, say, ["compiling kernels, a minute; only the first run after installing does this"])
-    slow.daemon = True
-    slow.start()
-    try:
+    with event.install_listener("numba:compile", _FirstCompilation(say)):
         _segment_something(device)
-    finally:
-        slow.cancel()
 
 
 def _segment_something(device: str) -> None:
