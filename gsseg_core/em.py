@@ -62,7 +62,7 @@ from gsseg_core.meaning import standing
 from gsseg_core.neighbours import neighbours_of
 from gsseg_core.operator import Observation, ViewOperator, make_operator
 from gsseg_core.outlines import scene_edges, settle_outlines
-from gsseg_core.regions import by_region, counted_by_others, in_doubt, votes_of
+from gsseg_core.regions import by_region, counted_by_others, in_doubt, take_back
 from gsseg_core.rows import Rows, starts
 from gsseg_core.scene import GaussianScene
 from gsseg_core.soft_masks import SeenLabels
@@ -233,15 +233,14 @@ class EMLearner(Learner):
         doubts : dict of str to (L,) bool
             Which they are; views without any are left out.
         """
-        doubted, doubts = np.zeros_like(votes.values), {}
+        left, doubts = np.zeros_like(votes.values), {}
         for name, observation in self._observations(names):
             tell()
             doubtful = in_doubt(votes, observation, self._possible(), self.settings.least_agreement)
             if doubtful.any():
                 doubts[name] = doubtful
-                places, voted = votes_of(doubtful, votes, observation)
-                doubted[places] += voted
-        return doubted, doubts
+                take_back(doubtful, votes, observation, left)
+        return -left, doubts
 
     def _first_models(
         self,

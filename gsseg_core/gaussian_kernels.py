@@ -199,7 +199,8 @@ def share_votes(
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def take_votes(
-    rows: np.ndarray,  # (M + 1,) votes, as `Rows`
+    first: np.ndarray,  # (M,) where the row of each Gaussian begins
+    last: np.ndarray,  # (M,) one past its end
     classes: np.ndarray,  # (Z,)
     total: np.ndarray,  # (Z,) int64, taken from
     order: np.ndarray,  # (M,) int32: whose rows these are
@@ -216,6 +217,6 @@ def take_votes(
         m = order[i]
         for s in range(start[m], start[m + 1]):
             for j in range(said_start[labels[s]], said_start[labels[s] + 1]):
-                for z in range(rows[i], rows[i + 1]):
+                for z in range(first[i], last[i]):
                     if classes[z] == said_classes[j]:
                         total[z] -= np.int64(np.rint(np.float64(votes[s]) * said[j] * units))

@@ -67,9 +67,9 @@ def scene_edges(
     camera, light = operator.camera, _LIGHT.of(scene, lambda: scene.colors().mean(axis=1))
     if light.min() == light.max():
         return np.zeros((camera.height, camera.width), np.float32)
-    depth = scene.means @ camera.world_to_camera[2, :3].astype(np.float32) + np.float32(camera.world_to_camera[2, 3])
-    near = 1 / np.maximum(depth, np.float32(1e-6))  # what is behind the camera is not drawn
-    image, left_over = operator.blend(np.stack([light, near], axis=1))
+    looks = np.empty((len(scene), 2), np.float32)
+    _looks(scene.means, light, camera.world_to_camera[2].astype(np.float32), looks)
+    image, left_over = operator.blend(looks)
     # Means over what is seen; where that is little, the background is dark and far away.
     image /= np.maximum(1 - left_over, np.float32(0.5))[..., None]
     light_edges, depth_edges = np.empty(image.shape[:2], np.float32), np.empty(image.shape[:2], np.float32)
@@ -175,6 +175,19 @@ def _believe(
                     field[i] += other[j] * told[pair, min(max(sign * (i - j), -middle), middle) + middle]
         field = np.exp(field - field.max())
         belief[region] = field / field.sum()
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _looks(
+    means: np.ndarray,  # (N, 3) float32
+    light: np.ndarray,  # (N,)
+    ahead: np.ndarray,  # (4,) third row of world to camera
+    looks: np.ndarray,  # (N, 2) out: luminance, inverse depth
+) -> None:
+    for i in nb.prange(means.shape[0]):
+        depth = means[i, 0] * ahead[0] + means[i, 1] * ahead[1] + means[i, 2] * ahead[2] + ahead[3]
+        looks[i, 0] = light[i]
+        looks[i, 1] = 1 / max(depth, np.float32(1e-6))  # what is behind the camera is not drawn
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)

@@ -90,7 +90,8 @@ def counted_by_others(
     order, own = observation.order, observation.votes()
     seen = order, observation.start, observation.labels
     others = votes.take(observation.ids[order])
-    take_votes(*others, *seen, *(meaning or observation.meaning).votes, own, UNITS)
+    said = (meaning or observation.meaning).votes
+    take_votes(others.start[:-1], others.start[1:], others.classes, others.values, *seen, *said, own, UNITS)
     others = standing(others, possible)
     codes = others.with_values(others.values.astype(np.float32)).normalised()
     if power != 1:
@@ -121,18 +122,17 @@ def in_doubt(
     return doubtful
 
 
-def votes_of(
+def take_back(
     doubtful: np.ndarray,  # (L,) bool
     votes: Rows,  # int64, of all views
     observation: Observation,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Find what a view has voted with some of its labels: places in `votes.values`, and how much, int64."""
-    order = observation.order
-    places = votes.places(observation.ids[order])
-    voted = places.with_values(np.zeros_like(places.values))
-    said = observation.meaning.without(~doubtful).votes
-    take_votes(*voted, order, observation.start, observation.labels, *said, observation.votes(), UNITS)
-    return places.values, -voted.values
+    total: np.ndarray,  # (Z,) int64, changed in place
+) -> None:
+    """Take what a view has voted with some of its labels away from a total of the same rows as the votes."""
+    order, said = observation.order, observation.meaning.without(~doubtful).votes
+    ids = observation.ids[order]
+    seen = order, observation.start, observation.labels
+    take_votes(votes.start[ids], votes.start[ids + 1], votes.classes, total, *seen, *said, observation.votes(), UNITS)
 
 
 @nb.njit(nogil=True, cache=True)
