@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from machine import DATA, once, processor, timed, version
+from machine import DATA, asked_anew, once, processor, timed, version
 from room import build_room
 
 from gsseg_core.dataset import Dataset, View, spread
@@ -96,7 +96,7 @@ def _products(scene: GaussianScene, views: list[View], num_classes: int, device:
             lambda use=operator: use.render(codes),
             lambda use=operator, image=image: use.adjoint(image),
             seen.votes,
-            lambda use=seen, own=own, rest=rest: use.shares(own, rest),
+            asked_anew(seen, own, rest),
         )
         for what, job in zip(total, jobs, strict=True):
             total[what] += float(np.median(timed(job, 3))) / len(chosen)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import itertools
 import os
 import platform
 import resource
@@ -11,7 +12,12 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from gsseg_core.operator import Observation, Shares
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("GSSEG_DATA") or REPOSITORY.parent / "shared" / "data")
@@ -37,6 +43,16 @@ def timed(job: Callable[[], object], runs: int, *, warm: bool = True) -> list[fl
     if warm:
         job()
     return [once(job) for _ in range(runs)]
+
+
+def asked_anew(
+    observation: Observation,
+    said: np.ndarray,  # (P,)
+    rest: np.ndarray,  # (L,)
+) -> Callable[[], Shares]:
+    """Ask for shares, each time a little differently: an observation remembers what it was asked last."""
+    times = itertools.count(1)
+    return lambda: observation.shares(said * np.float32(1 + 1e-3 * next(times)), rest)
 
 
 def once(job: Callable[[], object]) -> float:

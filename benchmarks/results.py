@@ -19,10 +19,10 @@ import tempfile
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jobs import hard_votes
+from machine import processor
 
 from gsseg_core.dataset import Dataset, View
 from gsseg_core.em import EMLearner, EMSettings
@@ -225,12 +225,7 @@ def markdown(header: list[str], rows: list[list[str]]) -> str:
 
 def machine() -> str:
     """Name the processor, its cores and the versions."""
-    model: Any = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        names = [line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
-        model = names[0] if names else model
-    return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}, NumPy {np.__version__}"
+    return f"{processor()}, {os.cpu_count()} cores, Python {platform.python_version()}, NumPy {np.__version__}"
 
 
 HEADER = """# Results
@@ -243,7 +238,8 @@ The scene is one floor of a real scanned apartment (Replica `apartment_0`): 126,
 view, and edges off by up to 3 px. Scores are of the test views against the true masks; no learner saw either.
 [What is measured](#what-is-measured) stands at the end. The settings of `em` were chosen on 15 of the train views, held
 out from learning for that purpose; but `least_agreement` and `majority` on the test views here and on those of the demo
-scene, with masks drawn wrong in many ways ([robustness.md](robustness.md)).
+scene, with masks drawn wrong in many ways ([robustness.md](robustness.md)); and so were `SHARPNESS` and `SHORTEST` of
+`gsseg_core/outlines.py`.
 """
 
 LEARNERS = """## Learners

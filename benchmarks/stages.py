@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from machine import drop_from_page_cache, once, timed
+from machine import asked_anew, drop_from_page_cache, once, timed
 
 from gsseg_core.cameras import Camera
 from gsseg_core.dataset import Dataset, View, spread
@@ -78,7 +78,7 @@ def _view_stages(scene: GaussianScene, views: list[View], num_classes: int, runs
         add("blend", operator.transmittance)
         add(f"render {num_classes} classes", lambda o=operator: o.render(codes))
         add("lift", lambda o=operator, m=mask: o.observe(m))
-        add("shares", lambda o=observation, q=mine, r=rest: o.shares(q, r))
+        add("shares", asked_anew(observation, mine, rest))
         add("adjoint, 3 channels", lambda o=operator, m=mask: o.adjoint(np.repeat(m[..., None], 3, axis=2)))
     return {name: _averaged(jobs, runs) for name, jobs in stages.items()}
 
