@@ -2,9 +2,9 @@
 
 Most errors of a segmenter sit in one place: a blob of clutter, one object under the id of another, a frame in which
 everything is wrong. An error model of the whole view, which says how often each class is called what, does not explain
-them. A *region* is a set of connected pixels of one label. It is held against the votes of all other views: where next
-to nothing of it is of its label to them, it is in doubt, and what it says is not heard at all. That costs little if it
-was right, since others say the same, and much is won if it was wrong, above all where few others look.
+them. A *region* is a set of connected pixels of one label. It is held against the votes of all other views: where they
+saw enough of it, and next to nothing of that is of its label to them, it is in doubt, and what it says is not heard at
+all. That costs little if it was right, since others say the same, and much is won if it was wrong.
 """
 
 from __future__ import annotations
@@ -22,6 +22,9 @@ from gsseg_core.soft_masks import SeenLabels
 
 SMALLEST = 64
 """Regions of fewer px are not told apart: all of one label are judged as one."""
+
+COVERED = 0.25
+"""Share of a region, by weight, that the other views must have seen as well as this one for it to be in doubt."""
 
 MOST = 500
 """Regions of a mask that are told apart at most, the largest; what is left of each label is judged as one."""
@@ -65,6 +68,20 @@ def connected_pixels(
     return connected, np.bincount(connected.ravel() + 1, minlength=many + 1)[1:]
 
 
+def _votes_of_others(
+    votes: Rows,  # int64, of all views
+    observation: Observation,
+    possible: np.ndarray,  # (K,) bool
+    meaning: Meaning,
+) -> Rows:
+    """Take a view's votes away from those of all, for the Gaussians that it sees, in its order; none is negative."""
+    others = votes.take(observation.ids[observation.order])
+    seen = observation.order, observation.start, observation.labels
+    own = observation.votes()
+    take_votes(others.start[:-1], others.start[1:], others.classes, others.values, *seen, *meaning.votes, own, UNITS)
+    return standing(others, possible)
+
+
 def counted_by_others(
     votes: Rows,  # int64, of all views
     observation: Observation,
@@ -87,16 +104,16 @@ def counted_by_others(
     power : float
         Codes are raised to it, and scaled to sum 1 again, before they are counted: above 1, majorities stand out.
     """
-    order, own = observation.order, observation.votes()
-    seen = order, observation.start, observation.labels
-    others = votes.take(observation.ids[order])
-    said = (meaning or observation.meaning).votes
-    take_votes(others.start[:-1], others.start[1:], others.classes, others.values, *seen, *said, own, UNITS)
-    others = standing(others, possible)
+    others = _votes_of_others(votes, observation, possible, meaning or observation.meaning)
     codes = others.with_values(others.values.astype(np.float32)).normalised()
     if power != 1:
         codes = codes.with_values(codes.values ** np.float32(power)).normalised()
-    return tally(*codes, *seen, own, len(possible), len(observation.classes))
+    return _counted(codes, observation, len(possible))
+
+
+def _counted(codes: Rows, observation: Observation, num_classes: int) -> np.ndarray:
+    seen = observation.order, observation.start, observation.labels
+    return tally(*codes, *seen, observation.votes(), num_classes, len(observation.classes))
 
 
 def in_doubt(
@@ -106,6 +123,9 @@ def in_doubt(
     least: float,
 ) -> np.ndarray:
     """Tell which labels of a view the others speak against, (L,) bool; none where a label may mean several classes.
+
+    A Gaussian that this view saw better than all others together, says as much for a class as they saw of it, and no
+    more: what shows through a gap somewhere else is no witness. Where they saw too little of a region, it is heard.
 
     Parameters
     ----------
@@ -117,8 +137,14 @@ def in_doubt(
     meaning = observation.meaning
     if not meaning.is_certain:
         return np.zeros(len(observation.classes), bool)
-    counts, label = counted_by_others(votes, observation, possible), np.arange(len(observation.classes))
-    doubtful: np.ndarray = counts[meaning.named(), label] < least * counts.sum(axis=0)
+    others = _votes_of_others(votes, observation, possible, meaning)
+    own = observation.votes()
+    said = others.with_values(np.empty(len(others.values), np.float32))
+    _weigh(others.start, others.values, observation.order, observation.start, own, said.values)
+    counts, label = _counted(said, observation, len(possible)), np.arange(len(observation.classes))
+    covered = counts.sum(axis=0)
+    enough = covered >= COVERED * np.bincount(observation.labels, weights=own, minlength=len(label))
+    doubtful: np.ndarray = enough & (counts[meaning.named(), label] < least * covered)
     return doubtful
 
 
@@ -133,6 +159,26 @@ def take_back(
     ids = observation.ids[order]
     seen = order, observation.start, observation.labels
     take_votes(votes.start[ids], votes.start[ids + 1], votes.classes, total, *seen, *said, observation.votes(), UNITS)
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _weigh(
+    rows: np.ndarray,  # (M + 1,)
+    votes: np.ndarray,  # (Z,) int64, of the others
+    order: np.ndarray,  # (M,) whose rows these are
+    start: np.ndarray,  # (M + 1,)
+    own: np.ndarray,  # (P,) px, of this view
+    said: np.ndarray,  # (Z,) float32 out: votes as shares of their sum, or of this view's weight if that is more
+) -> None:
+    for i in nb.prange(order.shape[0]):
+        total, mine = np.float64(0), np.float64(0)
+        for z in range(rows[i], rows[i + 1]):
+            total += votes[z]
+        for s in range(start[order[i]], start[order[i] + 1]):
+            mine += own[s]
+        most = max(total, mine * UNITS)
+        for z in range(rows[i], rows[i + 1]):
+            said[z] = votes[z] / most if total > 0 else 0
 
 
 @nb.njit(nogil=True, cache=True)

@@ -14,7 +14,8 @@ from gsseg_core.dataset import View
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import SettingsError
 from gsseg_core.masks import UNKNOWN
-from gsseg_core.regions import MOST, SMALLEST, by_region, connected_pixels
+from gsseg_core.regions import MOST, SMALLEST, by_region, connected_pixels, in_doubt
+from gsseg_core.rows import Rows
 from gsseg_core.soft_masks import SeenLabels
 from gsseg_core.votes import VoteLearner
 
@@ -96,6 +97,19 @@ def test_gaussians_of_which_only_doubtful_regions_speak_have_no_code() -> None:
     assert (voted & ~learner.observed_).any()
     np.testing.assert_array_equal(learner.codes_.any(axis=1), learner.observed_)
     assert (learner.observed_ <= voted).all()
+
+
+@pytest.mark.parametrize(("seen", "doubted"), [(1.0, True), (0.5, True), (0.2, False), (0.001, False)])
+def test_a_region_is_in_doubt_only_where_the_others_saw_enough_of_it(seen: float, doubted: bool) -> None:
+    view = clean_views(1)[0]
+    learner = EMLearner(SCENE, NUM_CLASSES + 1)
+    learner.observe(view)
+    votes = learner._votes.copy()
+    votes[:, NUM_CLASSES] = seen * votes.sum(axis=1)  # all is one more class to the others
+    observation, possible = learner._prepared[view.name], np.ones(NUM_CLASSES + 1, bool)
+    doubtful = in_doubt(Rows.of(votes), observation, possible, EMSettings().least_agreement)
+    assert len(doubtful) >= NUM_CLASSES
+    np.testing.assert_array_equal(doubtful, doubted)
 
 
 def test_a_single_view_is_heard_whatever_it_says() -> None:
