@@ -18,7 +18,8 @@ stays where it is unless the edges are clear.
 
 E is the gradient of the luminance plus the second differences of the inverse depth, each in units of its 95th
 percentile over the view. On a plane, inverse depth is linear in the image, so that only creases and steps are left.
-Depth alone is too soft to tell outlines by: a scene of one colour has no edges.
+Depth alone is too soft to tell outlines by: a scene of one colour has no edges. And where edges are no stronger along
+the outlines than elsewhere, as on a wall of posters, they do not tell of outlines, and all stay where they are.
 """
 
 from __future__ import annotations
@@ -46,6 +47,9 @@ SHORTEST = 3
 
 NO_ROOM = -20.0
 """What speaks against an outline so far inside a region that hardly anything of it would be left, in nats."""
+
+TELLING = 1.75
+"""Edges within S px of the outlines must be so many times as strong as those of the whole view, or nothing is moved."""
 
 BAND = 64
 """Rows of the image that are gone through at once."""
@@ -82,6 +86,7 @@ def settle_outlines(
     labels: np.ndarray,  # (H, W) int32
     edges: np.ndarray,  # (H, W) float32
     farthest: int,
+    telling: float = TELLING,
 ) -> np.ndarray:
     """Move the outlines of a mask to edges.
 
@@ -93,6 +98,8 @@ def settle_outlines(
         How strong they are, as of `scene_edges`.
     farthest : int
         S, in px: regions are drawn too wide or too narrow by so much at most.
+    telling : float
+        How many times as strong as in the whole view edges must be within S px of the outlines.
 
     Returns
     -------
@@ -102,6 +109,9 @@ def settle_outlines(
     region, area = connected_pixels(labels)
     other, ring = _reach_across(region, 2 * farthest)
     pairs, pair, lengths, strengths = _along_outlines(region, other, ring, edges, len(area), 2 * farthest)
+    near = slice(farthest, 3 * farthest)  # an outline may lie so far from its edge
+    if strengths[:, near].sum() < telling * edges.mean() * lengths[:, near].sum():
+        return labels.copy()
     asked = lengths[:, 2 * farthest - 1 : 2 * farthest + 1].min(axis=1) >= SHORTEST
     shifts = _shifts(pairs[asked], _told(lengths[asked], strengths[asked]), len(area), farthest)
     most = 2 * farthest - 1

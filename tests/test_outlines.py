@@ -69,6 +69,13 @@ def test_without_edges_nothing_moves() -> None:
     np.testing.assert_array_equal(settle_outlines(labels, np.zeros(labels.shape, np.float32), FARTHEST), labels)
 
 
+def test_where_edges_are_no_stronger_along_outlines_than_elsewhere_nothing_moves() -> None:
+    labels = discs()
+    posters = ndimage.gaussian_filter(np.random.default_rng(2).random(labels.shape, np.float32), 1)
+    assert (settle_outlines(labels, posters, FARTHEST, telling=0) != labels).any()
+    np.testing.assert_array_equal(settle_outlines(labels, posters, FARTHEST), labels)
+
+
 @settings(deadline=None, max_examples=60)
 @given(SMALL_MASKS, st.integers(1, 3), st.integers(0, 2**32 - 1))
 def test_pixels_move_to_regions_near_by_and_the_unknown_stays_unknown(
@@ -76,7 +83,7 @@ def test_pixels_move_to_regions_near_by_and_the_unknown_stays_unknown(
 ) -> None:
     edges = np.random.default_rng(seed).random(labels.shape, np.float32)
     before = labels.copy()
-    settled = settle_outlines(labels, edges, farthest)
+    settled = settle_outlines(labels, edges, farthest, telling=0)
     np.testing.assert_array_equal(labels, before)
     np.testing.assert_array_equal(settled < 0, labels < 0)
     for row, column in np.argwhere(settled != labels):
@@ -90,8 +97,8 @@ def test_pixels_move_to_regions_near_by_and_the_unknown_stays_unknown(
 def test_a_view_turned_around_settles_turned_around(labels: np.ndarray, farthest: int) -> None:
     # Where two regions are equally near, either may be named; edges everywhere the same leave that without effect.
     edges = np.ones(labels.shape, np.float32)
-    settled = settle_outlines(labels, edges, farthest)
-    turned = settle_outlines(labels[::-1, ::-1].copy(), edges, farthest)[::-1, ::-1]
+    settled = settle_outlines(labels, edges, farthest, telling=0)
+    turned = settle_outlines(labels[::-1, ::-1].copy(), edges, farthest, telling=0)[::-1, ::-1]
     np.testing.assert_array_equal(settled, turned)
 
 
