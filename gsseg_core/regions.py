@@ -86,8 +86,8 @@ def counted_by_others(
     votes: Rows,  # int64, of all views
     observation: Observation,
     possible: np.ndarray,  # (K,) bool: ids that are classes
-    meaning: Meaning | None = None,
-    power: float = 1.0,
+    meaning: Meaning,
+    power: float,
 ) -> np.ndarray:
     """Count the pixels (K, L) of each class under each label of a view, by the votes of all the others.
 
@@ -99,12 +99,12 @@ def counted_by_others(
         The view.
     possible : (K,) bool
         Ids that are classes.
-    meaning : Meaning, optional
-        What the view has voted with; that of the observation by default.
+    meaning : Meaning
+        What the view has voted with.
     power : float
         Codes are raised to it, and scaled to sum 1 again, before they are counted: above 1, majorities stand out.
     """
-    others = _votes_of_others(votes, observation, possible, meaning or observation.meaning)
+    others = _votes_of_others(votes, observation, possible, meaning)
     codes = others.with_values(others.values.astype(np.float32)).normalised()
     if power != 1:
         codes = codes.with_values(codes.values ** np.float32(power)).normalised()
