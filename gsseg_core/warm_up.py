@@ -54,7 +54,7 @@ def _segment_something(device: str) -> None:
         0.9 * ones,
         np.tile(light[:, None, None], (1, 1, 3)),
     )
-    # The square is larger than the image, so that nothing has edges but where the classes meet: outlines are moved there.
+    # The square is larger than the image: edges are only where the classes meet, and so the outline is moved there.
     K = np.array([[48.0, 0, 16], [0, 48, 16], [0, 0, 1]])
     camera = Camera("warm_up", 32, 32, K, np.eye(4))
     labels = np.repeat(np.arange(2), 16)[None].repeat(32, axis=0)
