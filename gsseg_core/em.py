@@ -26,7 +26,9 @@ of J at the old values, so J never falls:
 
     q_i[k]     <- normalise( q_i[k] sum_v sum_y C_v[k, y] B_v[i, y] + prior_weight m_i[k] )
 
-Only B_v needs the rasteriser, and its cost does not depend on the number of classes.
+Only B_v needs the rasteriser, and its cost does not depend on the number of classes. J is concave, so a step gains at
+most what its slope along the step promises. That is known before the step is taken, and where it is next to nothing,
+the step is the last: no pass over the views is spent on learning how little it brought.
 
 The error models. Codes that have learnt from a mask agree with its errors, the more so the longer they learn, and find
 nothing wrong with it. So a view's model is learnt from codes that have not seen this view: q^-v is the step above
@@ -56,7 +58,7 @@ import numpy as np
 
 from gsseg_core.error_model import ErrorModel
 from gsseg_core.errors import SettingsError
-from gsseg_core.gaussian_kernels import collect, improve, improve_without, mix, tally
+from gsseg_core.gaussian_kernels import collect, improve, improve_without, mix, promised, tally
 from gsseg_core.learner import MEMORY_BUDGET, VOTE_UNIT, Learner, Progress, silent
 from gsseg_core.meaning import standing
 from gsseg_core.neighbours import neighbours_of
@@ -80,7 +82,7 @@ class EMSettings:
     max_steps : int
         Steps at most.
     tolerance : float
-        Stop when a step gains less than this, in nats per labelled pixel; `ROUGH` times this before a refit.
+        Stop with a step that gains less than this, in nats per labelled pixel; `ROUGH` times this before a refit.
     errors : bool
         Learn what the segmenter got wrong in each view; without, every mask is taken at its word.
     refits : int
@@ -168,7 +170,7 @@ class EMLearner(Learner):
         return -self.history_[-1] if self.history_ else float("nan")
 
     def fit(self, progress: Progress = silent) -> EMLearner:
-        """Step until a step gains less than the tolerance."""
+        """Step until a step can gain no more than the tolerance."""
         settings = self.settings
         self._begin()
         votes, tell = Rows.of(self._votes), partial(progress, "em", 0, settings.max_steps)
@@ -195,15 +197,15 @@ class EMLearner(Learner):
             history.append((_log_prior(codes.values, prior.values) + sum(told[name] for name in self.views)) / pixels)
             rounds[-1] += 1
             last = len(rounds) > settings.refits or not settings.errors
-            enough = settings.tolerance * (1 if last else ROUGH)
-            self.converged_ = rounds[-1] > 1 and history[-1] - history[-2] < enough
-            if self.converged_ and last:
-                improve(codes.start, codes.values, gains, prior.values)
-                break
-            if self.converged_:
+            enough = settings.tolerance * (1 if last else ROUGH) * pixels
+            settled = promised(codes.start, codes.values, gains, prior.values) < enough
+            if settled and not last:
                 self._refit(codes, gains, prior.values, models, tell)
                 rounds.append(0)
             improve(codes.start, codes.values, gains, prior.values)
+            self.converged_ = settled and last
+            if self.converged_:
+                break
         progress("em", settings.max_steps, settings.max_steps)
         self.codes_, self.error_models_ = codes.dense(self.num_classes), models
         self._finish()
