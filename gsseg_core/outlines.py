@@ -74,10 +74,8 @@ def scene_edges(
     looks = np.empty((len(scene), 2), np.float32)
     _looks(scene.means, light, camera.world_to_camera[2].astype(np.float32), looks)
     image, left_over = operator.blend(looks)
-    # Means over what is seen; where that is little, the background is dark and far away.
-    image /= np.maximum(1 - left_over, np.float32(0.5))[..., None]
     light_edges, depth_edges = np.empty(image.shape[:2], np.float32), np.empty(image.shape[:2], np.float32)
-    _differences(image, light_edges, depth_edges)
+    _differences(image, left_over, light_edges, depth_edges)
     edges: np.ndarray = _in_units(light_edges) + _in_units(depth_edges)
     return edges
 
@@ -106,7 +104,7 @@ def settle_outlines(
     (H, W) int32
         A new mask.
     """
-    region, area = connected_pixels(labels)
+    region, first, area = connected_pixels(labels)
     other, ring = _reach_across(region, 2 * farthest)
     pairs, pair, lengths, strengths = _along_outlines(region, other, ring, edges, len(area), 2 * farthest)
     near = slice(farthest, 3 * farthest)  # an outline may lie so far from its edge
@@ -117,14 +115,14 @@ def settle_outlines(
     most = 2 * farthest - 1
     moved = np.where(asked, np.clip(shifts[pairs[:, 0]] - shifts[pairs[:, 1]], -most, most), 0)
     settled: np.ndarray = labels.copy()
-    label = np.zeros(len(area), np.int32)
-    label[region[region >= 0]] = labels[region >= 0]
-    _move(region, other, ring, pair, pairs, moved, label, settled)
+    _move(region, other, ring, pair, pairs, moved, labels.ravel()[first], settled)
     return settled
 
 
 def _in_units(edges: np.ndarray) -> np.ndarray:
-    unit = np.float32(np.percentile(edges[::2, ::2], 95))  # every fourth pixel tells it as well
+    some = edges[::2, ::2].ravel()  # every fourth pixel tells it as well
+    rank = 95 * (some.size - 1) // 100
+    unit = np.partition(some, rank)[rank]
     return np.minimum(edges / unit, np.float32(STRONGEST)) if unit > 0 else np.zeros_like(edges)
 
 
@@ -202,11 +200,18 @@ def _looks(
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def _differences(
-    image: np.ndarray,  # (H, W, 2) luminance, inverse depth
+    image: np.ndarray,  # (H, W, 2) luminance, inverse depth; divided in place by what is seen
+    left_over: np.ndarray,  # (H, W) of each ray
     light_edges: np.ndarray,  # (H, W) out: length of the gradient of the one
     depth_edges: np.ndarray,  # (H, W) out: second differences of the other
 ) -> None:
     height, width = light_edges.shape
+    for y in nb.prange(height):
+        for x in range(width):
+            # Means over what is seen; where that is little, the background is dark and far away.
+            seen = max(1 - left_over[y, x], np.float32(0.5))
+            image[y, x, 0] /= seen
+            image[y, x, 1] /= seen
     for y in nb.prange(height):
         up, down = max(y - 1, 0), min(y + 1, height - 1)
         for x in range(width):
@@ -224,7 +229,7 @@ def _reach_across(
     region: np.ndarray,  # (H, W) int32
     farthest: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find what is near, band by band; nothing farther above or below matters to a band.
+    """Find what is near, band by band: pixels at outlines tell those around them where they are.
 
     Returns
     -------
@@ -234,60 +239,70 @@ def _reach_across(
         How far it is in px, rounded up; 0 if it is farther.
     """
     height, width = region.shape
-    other, ring = np.empty((height, width), np.int32), np.empty((height, width), np.int32)
+    borders = _borders(region)
+    other, ring = np.full((height, width), -1, np.int32), np.zeros((height, width), np.int32)
     for band in nb.prange(-(-height // BAND)):
         first, last = band * BAND, min(band * BAND + BAND, height)
-        top = max(first - farthest, 0)
-        seen = region[top : min(last + farthest, height)]
-        rows, columns = np.full(seen.shape, -1, np.int32), np.full(seen.shape, -1, np.int32)
-        _hand_on(seen, rows, columns)
+        away = np.full((last - first, width), farthest**2 + 1, np.int32)
+        for y in range(max(first - farthest, 0), min(last + farthest, height)):
+            x = 0
+            while x < width:
+                end = x + 1
+                if borders[y, x]:
+                    while end < width and borders[y, end] and region[y, end] == region[y, x]:
+                        end += 1
+                    _tell_around(region, y, x, end, farthest, first, last, other, away)
+                x = end
         for y in range(first, last):
             for x in range(width):
-                row, column = rows[y - top, x], columns[y - top, x]
-                other[y, x], ring[y, x] = -1, 0
-                away = (row + top - y) ** 2 + (column - x) ** 2
-                if row >= 0 and away <= farthest * farthest:
-                    other[y, x], ring[y, x] = seen[row, column], int(np.ceil(np.sqrt(away)))
+                if other[y, x] >= 0:
+                    ring[y, x] = int(np.ceil(np.sqrt(away[y - first, x])))
     return other, ring
 
 
 @nb.njit
-def _hand_on(
-    region: np.ndarray,  # (h, W)
-    rows: np.ndarray,  # (h, W) in: -1; out: row of the nearest pixel of another region
-    columns: np.ndarray,  # (h, W) the same for its column
-) -> None:
-    """Hand the nearest pixel of another region on from neighbour to neighbour (Danielsson 1980), there and back."""
+def _borders(region: np.ndarray) -> np.ndarray:
+    """Tell which pixels touch another region, over sides or corners, (H, W) bool."""
     height, width = region.shape
-    for step in (1, -1):
-        for i in range(height):
-            y = i if step > 0 else height - 1 - i
-            for j in range(width):
-                x = j if step > 0 else width - 1 - j
-                if region[y, x] >= 0:
-                    for dx in (-1, 0, 1):
-                        _hear(region, y, x, y - step, x + dx, rows, columns)
-                    _hear(region, y, x, y, x - step, rows, columns)
-            for j in range(width):
-                x = width - 1 - j if step > 0 else j
-                if region[y, x] >= 0:
-                    _hear(region, y, x, y, x + step, rows, columns)
+    borders = np.zeros((height, width), np.bool_)
+    for y in range(height):
+        here, out = region[y], borders[y]
+        for v in range(max(y - 1, 0), min(y + 2, height)):
+            there = region[v]
+            for x in range(width - 1):
+                out[x] |= (here[x] != there[x + 1]) & (here[x] >= 0) & (there[x + 1] >= 0)
+            for x in range(width):
+                out[x] |= (here[x] != there[x]) & (here[x] >= 0) & (there[x] >= 0)
+            for x in range(1, width):
+                out[x] |= (here[x] != there[x - 1]) & (here[x] >= 0) & (there[x - 1] >= 0)
+    return borders
 
 
-@nb.njit(inline="always")
-def _hear(region: np.ndarray, y: int, x: int, ny: int, nx: int, rows: np.ndarray, columns: np.ndarray) -> None:
-    """Take over what a neighbour knows, if that is nearer."""
-    if 0 <= ny < region.shape[0] and 0 <= nx < region.shape[1] and region[ny, nx] >= 0:
-        same = region[ny, nx] == region[y, x]
-        row, column = (rows[ny, nx], columns[ny, nx]) if same else (ny, nx)
-        if row >= 0 and _nearer(y, x, row, column, rows[y, x], columns[y, x]):
-            rows[y, x], columns[y, x] = row, column
-
-
-@nb.njit(inline="always")
-def _nearer(y: int, x: int, row: int, column: int, other_row: int, other_column: int) -> bool:
-    away = (row - y) ** 2 + (column - x) ** 2
-    return bool(other_row < 0 or away < (other_row - y) ** 2 + (other_column - x) ** 2)
+@nb.njit
+def _tell_around(
+    region: np.ndarray,  # (H, W)
+    y: int,
+    begin: int,
+    end: int,
+    farthest: int,
+    first: int,
+    last: int,
+    other: np.ndarray,  # (H, W) changed in place
+    away: np.ndarray,  # (last - first, W) changed in place: squared distance to it
+) -> None:
+    """Tell the pixels of other regions around a stretch of a row that it is near, in the rows from first to last."""
+    mine = region[y, begin]
+    for v in range(max(y - farthest, first), min(y + farthest + 1, last)):
+        across = int(np.sqrt(farthest**2 - (v - y) ** 2))
+        left, right = max(begin - across, 0), min(end + across, region.shape[1])
+        there, nearest, squares = region[v, left:right], other[v, left:right], away[v - first, left:right]
+        # No branches, so that whole vectors go through it.
+        for j in range(right - left):
+            beside = max(begin - left - j, left + j - end + 1, 0)
+            squared = np.int32((v - y) ** 2 + beside * beside)
+            nearer = (squared < squares[j]) & (there[j] != mine) & (there[j] >= 0)
+            squares[j] = squared if nearer else squares[j]
+            nearest[j] = mine if nearer else nearest[j]
 
 
 @nb.njit(nogil=True, cache=True)

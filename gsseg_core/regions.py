@@ -34,10 +34,7 @@ def by_region(seen: SeenLabels) -> SeenLabels:
     """Give every region of a mask a label of its own, which means the class that it had; a soft mask stays as it is."""
     if seen.meaning is not None or not (seen.labels >= 0).any():
         return seen
-    connected, area = connected_pixels(seen.labels)
-    known = connected >= 0
-    first = np.zeros(len(area), np.int64)
-    first[connected[known]] = np.flatnonzero(known.ravel())  # any pixel of it does
+    connected, first, area = connected_pixels(seen.labels)
     label = seen.labels.ravel()[first]
     alone = np.zeros(len(area), bool)
     alone[np.argsort(-area, kind="stable")[:MOST]] = True
@@ -53,19 +50,21 @@ def by_region(seen: SeenLabels) -> SeenLabels:
 
 def connected_pixels(
     labels: np.ndarray,  # (H, W) int32
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Give sets of pixels of one label that are connected over sides numbers, in the order of their first pixels.
 
     Returns
     -------
     connected : (H, W) int32
         `UNKNOWN` (-1) where the label is negative.
+    first : (R,) int64
+        The first pixel of each set, counted row by row.
     area : (R,) int64
         Pixels of each set.
     """
     connected = np.empty(labels.shape, np.int32)
-    many = _connect(np.ascontiguousarray(labels), connected)
-    return connected, np.bincount(connected.ravel() + 1, minlength=many + 1)[1:]
+    first, area = _connect(np.ascontiguousarray(labels), connected)
+    return connected, first, area
 
 
 def _votes_of_others(
@@ -193,10 +192,11 @@ def _root(parent: np.ndarray, i: int) -> int:
 def _connect(
     labels: np.ndarray,  # (H, W)
     connected: np.ndarray,  # (H, W) int32 out
-) -> int:
-    """Write the numbers, and return how many there are. Runs of equal pixels are joined to those of the row above."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Write the numbers, return first pixels and areas. Runs of equal pixels are joined to those of the row above."""
     height, width = labels.shape
     parent = np.empty(height * width, np.int32)  # of runs; there are at most as many as pixels
+    begin = np.empty(height * width, np.int32)
     runs = 0
     for y in range(height):
         for x in range(width):
@@ -205,7 +205,7 @@ def _connect(
                 continue
             joined = x > 0 and labels[y, x] == labels[y, x - 1]
             if not joined:
-                parent[runs] = runs
+                parent[runs], begin[runs] = runs, y * width + x
                 runs += 1
             connected[y, x] = run = runs - 1
             # Once for each stretch in which the two rows go along with each other.
@@ -213,16 +213,18 @@ def _connect(
                 one, two = _root(parent, run), _root(parent, connected[y - 1, x])
                 parent[max(one, two)] = min(one, two)
     many = 0
-    number = np.empty(runs, np.int32)
+    number, first = np.empty(runs, np.int32), np.empty(runs, np.int64)
     for run in range(runs):
         root = _root(parent, run)
         if root == run:
-            number[run] = many
+            number[run], first[many] = many, begin[run]
             many += 1
         else:
             number[run] = number[root]
+    area = np.zeros(many, np.int64)
     for y in range(height):
         for x in range(width):
             if connected[y, x] >= 0:
                 connected[y, x] = number[connected[y, x]]
-    return many
+                area[connected[y, x]] += 1
+    return first[:many].copy(), area

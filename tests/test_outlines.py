@@ -108,22 +108,23 @@ def test_a_view_turned_around_settles_turned_around(labels: np.ndarray, farthest
     st.integers(1, 6),
 )
 def test_the_nearest_region_is_as_far_as_by_looking_at_all_pixels(labels: np.ndarray, farthest: int) -> None:
-    region, _ = connected_pixels(labels)
+    region, _, _ = connected_pixels(labels)
     other, ring = _reach_across(region, farthest)
     pixels = np.stack(np.indices(labels.shape), axis=-1).reshape(-1, 2)
     away = np.sqrt(((pixels[:, None] - pixels) ** 2).sum(axis=2))
     away[region.ravel()[:, None] == region.ravel()] = np.inf
     nearest = away.min(axis=1)
     found = other.ravel() >= 0
-    # What is handed on by neighbours may miss the nearest pixel by a fraction of one (Danielsson 1980).
-    assert found[nearest <= farthest - 0.5].all() and not found[nearest > farthest].any()
-    assert (np.abs(ring.ravel()[found] - np.ceil(nearest[found])) <= 1).all()
+    np.testing.assert_array_equal(found, nearest <= farthest)
+    np.testing.assert_array_equal(ring.ravel()[found], np.ceil(nearest[found]))
+    back = away == np.where(found, nearest, -1)[:, None]  # those that are nearest
+    assert (back & (region.ravel() == other.ravel()[:, None])).any(axis=1)[found].all()
     assert (other.ravel()[found] != region.ravel()[found]).all()
 
 
 def test_edges_are_summed_by_pair_and_ring_as_by_looking_at_all_pixels() -> None:
     labels, farthest = discs(), 6
-    region, area = connected_pixels(labels)
+    region, _, area = connected_pixels(labels)
     edges = np.random.default_rng(1).random(labels.shape, np.float32)
     other, ring = _reach_across(region, farthest)
     pairs, pair, lengths, strengths = _along_outlines(region, other, ring, edges, len(area), farthest)
