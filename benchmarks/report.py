@@ -109,7 +109,8 @@ class Report:
         parts = [text, "## Machine", table(["", ""], [[key, str(value)] for key, value in self.machine.items()])]
         parts.append(self._compared_with(last, compared))
         if bars:
-            parts += ["## What was asked for", table(["what", "bar", "measured", ""], [self._judge(b) for b in bars])]
+            judged = [[*self._judge(bar), _found(compared, bar)] for bar in bars]
+            parts += ["## What was asked for", table(["what", "bar", "measured", "", "last time"], judged)]
         for section, sentences in self.said.items():
             parts += [f"## {section[:1].upper()}{section[1:]}", *sentences]
             rows = [self._line(row, compared) for row in self.rows if row.section == section]
@@ -140,6 +141,11 @@ class Report:
             return [bar.what, limit, "not measured", ""]
         met = value >= bar.limit if bar.at_least else value <= bar.limit
         return [bar.what, limit, short(value), "met" if met else "**not met**"]
+
+
+def _found(report: Report | None, bar: Bar) -> str:
+    value = report.value(bar.section, bar.name) if report is not None else None
+    return "" if value is None else short(value)
 
 
 def short(value: float) -> str:

@@ -150,10 +150,11 @@ def test_bars_are_judged_from_the_numbers() -> None:
         Bar("slow", "stages", "bin", 3.0, at_least=True),
         Bar("absent", "stages", "other", 1.0),
     ]
-    text = report(1.0).markdown("", None, bars)
-    assert "| fast | at most 3.00 | 2.00 | met |" in text
-    assert "| slow | at least 3.00 | 2.00 | **not met** |" in text
-    assert "| absent | at most 1.00 | not measured |  |" in text
+    text = report(1.0).markdown("", report(2.0), bars)
+    assert "| fast | at most 3.00 | 2.00 | met | 4.00 |" in text
+    assert "| slow | at least 3.00 | 2.00 | **not met** | 4.00 |" in text
+    assert "| absent | at most 1.00 | not measured |  |  |" in text
+    assert "| fast | at most 3.00 | 2.00 | met |  |" in report(1.0).markdown("", None, bars)
 
 
 def test_numbers_have_three_digits_that_count() -> None:
