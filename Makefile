@@ -81,12 +81,14 @@ define check-ros
 	{ echo 'compiling the ROS messages needs gcc, g++ and cmake' >&2; exit 1; }
 endef
 
-# setuptools first, so that the build uses the pinned one too.
+# setuptools first, so that the build uses the pinned one too. Kernels are compiled here, so that the first picture does
+# not wait for them.
 $(READY): $(INSTALLED) pyproject.toml constraints.txt
 	$(check-python)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt setuptools
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable '.[dev]'
+	$(BIN)/python -c 'from gsseg_core.warm_up import warm_up; warm_up(say=print)'
 	touch $@
 
 $(ROS_READY): setup.py constraints.txt | $(READY)

@@ -196,7 +196,7 @@ def measure_bar(benches: Sequence[Bench]) -> str:
             rows += [
                 [
                     f"{bench.name}, {title}", name, points(clean[name].miou), points(run.miou),
-                    f"{100 * (clean[name].miou - run.miou):.1f}", f"{clean[name].seconds:.1f}", f"{run.seconds:.1f}",
+                    f"{lost(clean[name], run):.1f}", f"{clean[name].seconds:.1f}", f"{run.seconds:.1f}",
                 ]
                 for name, run in wrong.items()
             ]  # fmt: skip
@@ -204,6 +204,11 @@ def measure_bar(benches: Sequence[Bench]) -> str:
     header = ["masks", "learner", "true masks: mIoU", "wrong masks: mIoU", "points lost", "true: s", "wrong: s"]
     parts = ["scene", "error", "right pixels", EM, "points lost", STILL, PLAIN, VOTES]
     return BAR.format(table=markdown(header, rows), parts=markdown(parts, alone))
+
+
+def lost(clean: Run, wrong: Run) -> float:
+    """Tell how many points of mIoU wrong masks cost; no -0.0."""
+    return round(100 * (clean.miou - wrong.miou), 1) + 0.0
 
 
 def measure_parts(bench: Bench, clean: Mapping[str, Run]) -> Iterator[list[str]]:
@@ -222,13 +227,12 @@ def measure_parts(bench: Bench, clean: Mapping[str, Run]) -> Iterator[list[str]]
         views = corrupt_views(bench.train, 0, errors)
         runs = learn(bench, views, (EM, STILL, PLAIN, VOTES))
         tell(bench, title, runs)
-        lost = 100 * (clean[EM].miou - runs[EM].miou)
         share = np.mean(right_share(views, bench.train))
         yield [
             title,
             points(share),
             points(runs[EM].miou),
-            f"{lost:.1f}",
+            f"{lost(clean[EM], runs[EM]):.1f}",
             *(points(runs[name].miou) for name in (STILL, PLAIN, VOTES)),
         ]
 

@@ -106,7 +106,7 @@ class EMSettings:
     """
 
     max_steps: int = 30
-    tolerance: float = 0.005
+    tolerance: float = 0.0025
     errors: bool = True
     refits: int = 1
     edge_px: int = 3
