@@ -80,13 +80,12 @@ def run(options: argparse.Namespace) -> int:
         draw=options.draw,
         device=options.device,
     )
-    with closing(viewer):
+    with closing(viewer), suppress(KeyboardInterrupt):  # How it is meant to end.
         print(f"gsseg: {len(scene):,} Gaussians at {viewer.url} (Ctrl-C ends it)", flush=True)
         # Without a screen, that would start a browser of text in this very terminal.
         if options.open and any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
             webbrowser.open(viewer.url)
-        with suppress(KeyboardInterrupt):  # How it is meant to end.
-            threading.Event().wait()
+        threading.Event().wait()
     return 0
 
 
