@@ -93,12 +93,13 @@ def test_pixels_move_to_regions_near_by_and_the_unknown_stays_unknown(
 
 
 @settings(deadline=None, max_examples=60)
-@given(SMALL_MASKS, st.integers(1, 3))
-def test_a_view_turned_around_settles_turned_around(labels: np.ndarray, farthest: int) -> None:
-    # Where two regions are equally near, either may be named; edges everywhere the same leave that without effect.
-    edges = np.ones(labels.shape, np.float32)
+@given(st.lists(st.integers(1, 19), min_size=1, max_size=30), st.integers(1, 3), st.integers(0, 2**32 - 1))
+def test_a_view_turned_around_settles_turned_around(widths: list[int], farthest: int, seed: int) -> None:
+    # Two regions, side by side: where there are more, some pixels are equally near to two, and either may be named.
+    labels = (np.arange(20) < np.array(widths)[:, None]).astype(np.int32)
+    edges = np.random.default_rng(seed).random(labels.shape, np.float32)
     settled = settle_outlines(labels, edges, farthest, telling=0)
-    turned = settle_outlines(labels[::-1, ::-1].copy(), edges, farthest, telling=0)[::-1, ::-1]
+    turned = settle_outlines(labels[::-1, ::-1].copy(), edges[::-1, ::-1].copy(), farthest, telling=0)[::-1, ::-1]
     np.testing.assert_array_equal(settled, turned)
 
 
