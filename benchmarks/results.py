@@ -237,12 +237,12 @@ The scene is one floor of a real scanned apartment (Replica `apartment_0`): 126,
 40 objects, 119 views of 320 x 320. The wrong masks have 15 % of the objects missed and 10 % under another id in every
 view, and edges off by up to 3 px. Scores are of the test views against the true masks; no learner saw either.
 [What is measured](#what-is-measured) stands at the end. The settings of `em` were chosen on 15 of the train views, held
-out from learning for that purpose; but `least_agreement`, `majority` and `tolerance` on the test views here and on those of the demo
-scene, with masks drawn wrong in many ways ([robustness.md](robustness.md)); and so were `SHARPNESS`, `SHORTEST`
-and `TELLING` of `gsseg_core/outlines.py` and `COVERED` of `gsseg_core/regions.py`.
-"""
+out from learning for that purpose; but `least_agreement`, `majority` and `tolerance` on the test views here and on
+those of the demo scene, with masks drawn wrong in many ways ([robustness.md](robustness.md)); and so were
+`SHARPNESS`, `SHORTEST` and `TELLING` of `gsseg_core/outlines.py` and `COVERED` of `gsseg_core/regions.py`. """
+LEARNERS = """
 
-LEARNERS = """## Learners
+## Learners
 
 Learnt from {views} views; rendered label maps scored on {tests}. "Votes made hard" is FlashSplat's rule without its
 background bias. Seconds are of learning, with the reading and preparing of the views.
