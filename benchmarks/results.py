@@ -239,10 +239,10 @@ view, and edges off by up to 3 px. Scores are of the test views against the true
 [What is measured](#what-is-measured) stands at the end. The settings of `em` were chosen on 15 of the train views, held
 out from learning for that purpose; but `least_agreement`, `majority` and `tolerance` on the test views here and on
 those of the demo scene, with masks drawn wrong in many ways ([robustness.md](robustness.md)); and so were
-`SHARPNESS`, `SHORTEST` and `TELLING` of `gsseg_core/outlines.py` and `COVERED` of `gsseg_core/regions.py`. """
-LEARNERS = """
+`SHARPNESS`, `SHORTEST` and `TELLING` of `gsseg_core/outlines.py` and `COVERED` of `gsseg_core/regions.py`.
+"""
 
-## Learners
+LEARNERS = """## Learners
 
 Learnt from {views} views; rendered label maps scored on {tests}. "Votes made hard" is FlashSplat's rule without its
 background bias. Seconds are of learning, with the reading and preparing of the views.
