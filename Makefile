@@ -9,6 +9,8 @@ MSGS_READY := $(VENV)/.ready-msgs
 COLCON_VENV := .venv-colcon
 COLCON_READY := $(COLCON_VENV)/.ready
 
+WARM_UP := $(BIN)/python -c 'from gsseg_core.warm_up import warm_up; warm_up(say=print)'
+
 INSTALLED := setup.py package.xml $(wildcard config/* foxglove/* launch/* resource/* rviz/* scripts/* sros2/*)
 MSGS := $(wildcard msg_defs/*.* msg_defs/action/* msg_defs/msg/* msg_defs/srv/*)
 
@@ -39,7 +41,7 @@ test: $(READY) $(ROS_READY) $(MSGS_READY)  ## lint, check the types and run the 
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/python -c 'from gsseg_core.warm_up import warm_up; warm_up(say=print)'
+	$(WARM_UP)
 	@echo 'tests with ROS and all others run beside each other; either prints once it has ended'
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync --keep-going test-ros test-core
 
@@ -88,7 +90,7 @@ $(READY): $(INSTALLED) pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt setuptools
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable '.[dev]'
-	$(BIN)/python -c 'from gsseg_core.warm_up import warm_up; warm_up(say=print)'
+	$(WARM_UP)
 	touch $@
 
 $(ROS_READY): setup.py constraints.txt | $(READY)

@@ -28,7 +28,7 @@ class _FirstCompilation(event.Listener):
     def on_start(self, begun: event.Event) -> None:
         if not self._said:
             self._said = True
-            self._say("compiling kernels, a minute; only the first run after installing does this")
+            self._say("compiling kernels, a minute or two; only the first run after installing does this")
 
     def on_end(self, ended: event.Event) -> None:
         pass
@@ -37,7 +37,7 @@ class _FirstCompilation(event.Listener):
 def warm_up(device: str = "cpu", say: Callable[[str], object] = lambda text: None) -> None:
     """Take some thousand Gaussians through everything that segmenting does, so that all its kernels are there.
 
-    That takes a third of a second when they are in the cache, and up to a minute at the first time after an
+    That takes a third of a second when they are in the cache, and a minute or two at the first time after an
     installation; then `say` is told.
     """
     with event.install_listener("numba:compile", _FirstCompilation(say)):
