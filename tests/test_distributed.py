@@ -174,9 +174,9 @@ def test_the_views_of_killed_workers_are_done_again_elsewhere(
         if done == 2 and 2 not in steps:
             lull.__enter__()  # For good: these workers do not outlive the step.
         steps.append(done)
-        at_work = {int(mark.name) for mark in tmp_path.iterdir()}
-        if at_work == set(victims.values()) and not killed:
-            killed.extend(at_work)
+        # One at work is enough: what was meant for the others may have been handed to it by the scheduler.
+        if any(tmp_path.iterdir()) and not killed:
+            killed.extend(victims.values())
             for process in killed:
                 os.kill(process, signal.SIGKILL)
 
