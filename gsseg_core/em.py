@@ -63,13 +63,14 @@ from gsseg_core.learner import MEMORY_BUDGET, VOTE_UNIT, Learner, Progress, sile
 from gsseg_core.meaning import standing
 from gsseg_core.neighbours import neighbours_of
 from gsseg_core.operator import Observation, ViewOperator, make_operator
+from gsseg_core.others import counted_by_others
 from gsseg_core.outlines import scene_edges, settle_outlines
-from gsseg_core.regions import by_region, counted_by_others, in_doubt, take_back
+from gsseg_core.regions import by_region, in_doubt, take_back
 from gsseg_core.rows import Rows, starts
 from gsseg_core.scene import GaussianScene
 from gsseg_core.soft_masks import SeenLabels
 
-ROUGH = 4
+ROUGH = 8
 """Codes that error models are learnt anew from may be so many times less settled than those that are handed out."""
 
 

@@ -257,6 +257,26 @@ def _remaining(
     return (ids[place] if against and said == ids.shape[0] - 1 else -1), least
 
 
+@nb.njit(nogil=True, cache=True)
+def stand(
+    classes: np.ndarray,  # (n + 1,) of a row of n entries, changed in place
+    votes: np.ndarray,  # (n + 1,) int64, changed in place
+    many: int,  # n
+    ids: np.ndarray,  # of all classes, ascending
+) -> int:
+    """Keep of one row what `standing` would, the class that is left behind the others; return how many they are."""
+    free, least = _remaining(classes[:many], votes[:many], ids)
+    kept = 0
+    for z in range(many):
+        if votes[z] > 0:
+            classes[kept], votes[kept] = classes[z], votes[z]
+            kept += 1
+    if free >= 0:
+        classes[kept], votes[kept] = free, least
+        kept += 1
+    return kept
+
+
 @nb.njit(parallel=True, nogil=True, cache=True)
 def _count_standing(
     start: np.ndarray,  # (N + 1,)

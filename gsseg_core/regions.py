@@ -12,11 +12,12 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from gsseg_core.gaussian_kernels import take_votes, tally
+from gsseg_core.gaussian_kernels import take_votes
 from gsseg_core.learner import UNITS
 from gsseg_core.masks import UNKNOWN
-from gsseg_core.meaning import Meaning, standing
+from gsseg_core.meaning import Meaning
 from gsseg_core.operator import Observation
+from gsseg_core.others import counted_by_others
 from gsseg_core.rows import Rows
 from gsseg_core.soft_masks import SeenLabels
 
@@ -67,54 +68,6 @@ def connected_pixels(
     return connected, first, area
 
 
-def _votes_of_others(
-    votes: Rows,  # int64, of all views
-    observation: Observation,
-    possible: np.ndarray,  # (K,) bool
-    meaning: Meaning,
-) -> Rows:
-    """Take a view's votes away from those of all, for the Gaussians that it sees, in its order; none is negative."""
-    others = votes.take(observation.ids[observation.order])
-    seen = observation.order, observation.start, observation.labels
-    own = observation.votes()
-    take_votes(others.start[:-1], others.start[1:], others.classes, others.values, *seen, *meaning.votes, own, UNITS)
-    return standing(others, possible)
-
-
-def counted_by_others(
-    votes: Rows,  # int64, of all views
-    observation: Observation,
-    possible: np.ndarray,  # (K,) bool: ids that are classes
-    meaning: Meaning,
-    power: float,
-) -> np.ndarray:
-    """Count the pixels (K, L) of each class under each label of a view, by the votes of all the others.
-
-    Parameters
-    ----------
-    votes : Rows
-        Of all views, this one among them.
-    observation : Observation
-        The view.
-    possible : (K,) bool
-        Ids that are classes.
-    meaning : Meaning
-        What the view has voted with.
-    power : float
-        Codes are raised to it, and scaled to sum 1 again, before they are counted: above 1, majorities stand out.
-    """
-    others = _votes_of_others(votes, observation, possible, meaning)
-    codes = others.with_values(others.values.astype(np.float32)).normalised()
-    if power != 1:
-        codes = codes.with_values(codes.values ** np.float32(power)).normalised()
-    return _counted(codes, observation, len(possible))
-
-
-def _counted(codes: Rows, observation: Observation, num_classes: int) -> np.ndarray:
-    seen = observation.order, observation.start, observation.labels
-    return tally(*codes, *seen, observation.votes(), num_classes, len(observation.classes))
-
-
 def in_doubt(
     votes: Rows,  # int64, of all views
     observation: Observation,
@@ -136,13 +89,9 @@ def in_doubt(
     meaning = observation.meaning
     if not meaning.is_certain:
         return np.zeros(len(observation.classes), bool)
-    others = _votes_of_others(votes, observation, possible, meaning)
-    own = observation.votes()
-    said = others.with_values(np.empty(len(others.values), np.float32))
-    _weigh(others.start, others.values, observation.order, observation.start, own, said.values)
-    counts, label = _counted(said, observation, len(possible)), np.arange(len(observation.classes))
+    counts, label = counted_by_others(votes, observation, possible, meaning, most=1), np.arange(len(meaning.says))
     covered = counts.sum(axis=0)
-    enough = covered >= COVERED * np.bincount(observation.labels, weights=own, minlength=len(label))
+    enough = covered >= COVERED * np.bincount(observation.labels, weights=observation.votes(), minlength=len(label))
     doubtful: np.ndarray = enough & (counts[meaning.named(), label] < least * covered)
     return doubtful
 
@@ -158,26 +107,6 @@ def take_back(
     ids = observation.ids[order]
     seen = order, observation.start, observation.labels
     take_votes(votes.start[ids], votes.start[ids + 1], votes.classes, total, *seen, *said, observation.votes(), UNITS)
-
-
-@nb.njit(parallel=True, nogil=True, cache=True)
-def _weigh(
-    rows: np.ndarray,  # (M + 1,)
-    votes: np.ndarray,  # (Z,) int64, of the others
-    order: np.ndarray,  # (M,) whose rows these are
-    start: np.ndarray,  # (M + 1,)
-    own: np.ndarray,  # (P,) px, of this view
-    said: np.ndarray,  # (Z,) float32 out: votes as shares of their sum, or of this view's weight if that is more
-) -> None:
-    for i in nb.prange(order.shape[0]):
-        total, mine = np.float64(0), np.float64(0)
-        for z in range(rows[i], rows[i + 1]):
-            total += votes[z]
-        for s in range(start[order[i]], start[order[i] + 1]):
-            mine += own[s]
-        most = max(total, mine * UNITS)
-        for z in range(rows[i], rows[i + 1]):
-            said[z] = votes[z] / most if total > 0 else 0
 
 
 @nb.njit(nogil=True, cache=True)

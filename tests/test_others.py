@@ -1,0 +1,83 @@
+"""What the other views make of a view: the fast count against the sum as it is written."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views
+
+from gsseg_core.dataset import View
+from gsseg_core.em import EMLearner
+from gsseg_core.learner import UNITS
+from gsseg_core.meaning import Meaning, standing
+from gsseg_core.operator import Observation
+from gsseg_core.others import counted_by_others
+from gsseg_core.rows import Rows
+
+SCENE, _ = balls_on_a_table()
+POSSIBLE = np.ones(NUM_CLASSES, bool)
+
+
+def observed(views: list[View], name: str) -> tuple[EMLearner, Observation]:
+    learner = EMLearner(SCENE, NUM_CLASSES)
+    for view in views:
+        learner.observe(view)
+    return learner, learner._prepared[name]
+
+
+def slow_count(
+    votes: np.ndarray,  # (N, K) int64
+    observation: Observation,
+    meaning: Meaning,
+    power: float,
+    most: float,
+) -> np.ndarray:
+    """Readable twin of `counted_by_others`, Gaussian by Gaussian."""
+    counts = np.zeros((NUM_CLASSES, len(observation.classes)))
+    own, voted = observation.votes().astype(np.float64), meaning.votes.dense(NUM_CLASSES)
+    for m, i in enumerate(observation.ids):
+        mine = slice(observation.start[m], observation.start[m + 1])
+        label, pixels = observation.labels[mine], own[mine]
+        others = votes[i] - np.rint(pixels[:, None] * voted[label] * UNITS).astype(np.int64).sum(axis=0)
+        others = standing(Rows.of(others[None]), POSSIBLE).dense(NUM_CLASSES)[0]
+        if not others.any():
+            continue
+        code = (others / others.sum()) ** power
+        share = min(1.0, most * others.sum() / UNITS / pixels.sum())
+        np.add.at(counts.T, label, share * pixels[:, None] * (code / code.sum()))
+    return counts
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.integers(0, 2**31), st.sampled_from([1.0, 4.0, 2.5, 40.0]), st.sampled_from([np.inf, 1.0, 0.3]))
+def test_counts_by_the_others_are_those_of_a_slow_twin(seed: int, power: float, most: float) -> None:
+    rng = np.random.default_rng(seed)
+    learner, observation = observed(clean_views(3), clean_views(3)[1].name)
+    shape = learner._votes.shape
+    votes = learner._votes + rng.integers(0, int(UNITS), shape) * (rng.random(shape) < 0.2)
+    meaning = observation.meaning.without(rng.random(len(observation.classes)) < 0.3)
+    found = counted_by_others(Rows.of(votes), observation, POSSIBLE, meaning, power, most)
+    np.testing.assert_allclose(found, slow_count(votes, observation, meaning, power, most), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("looked_for", [[1], [1, 2], [2, 3]])
+def test_votes_against_classes_leave_what_can_be_said_with_them(looked_for: list[int]) -> None:
+    views = []
+    for view in clean_views(4):
+        labels = view.read_labels()
+        found = np.where(np.isin(labels, looked_for), labels, 0)
+        views.append(View.from_arrays(view.camera, found, supervised=looked_for))
+    learner, observation = observed(views, views[2].name)
+    assert (learner._votes < 0).any()
+    counts = counted_by_others(Rows.of(learner._votes), observation, POSSIBLE, observation.meaning, 4.0)
+    expected = slow_count(learner._votes, observation, observation.meaning, 4.0, np.inf)
+    np.testing.assert_allclose(counts, expected, rtol=1e-4, atol=1e-4)
+    assert counts.any()
+
+
+def test_a_view_alone_has_nobody_beside_it() -> None:
+    view = clean_views(1)[0]
+    learner, observation = observed([view], view.name)
+    assert not counted_by_others(Rows.of(learner._votes), observation, POSSIBLE, observation.meaning, 4.0).any()
