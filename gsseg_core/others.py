@@ -75,6 +75,7 @@ def _count(
     num_classes: int,
     num_labels: int,
 ) -> np.ndarray:
+    """Count as `counted_by_others`, all of it row by row, so that no array of the others' votes is ever made."""
     parts = np.zeros((BLOCKS, num_classes, num_labels))
     for block in nb.prange(BLOCKS):
         part = parts[block]
