@@ -222,6 +222,25 @@ def share_votes(
     return unsure
 
 
+@nb.njit(nogil=True, cache=True)
+def take_row(
+    classes: np.ndarray,  # (n,) of one Gaussian
+    total: np.ndarray,  # (n,) int64, taken from
+    labels: np.ndarray,  # (s,) label of each of its sightings
+    said_start: np.ndarray,  # (L + 1,) what a pixel of each label votes, as `Rows`
+    said_classes: np.ndarray,
+    said: np.ndarray,  # float64
+    votes: np.ndarray,  # (s,) float32
+    units: float,  # per vote; a power of 2
+) -> None:
+    """Take what a view has voted for one Gaussian away from the votes of all, rounded as when it was added."""
+    for s in range(labels.shape[0]):
+        for j in range(said_start[labels[s]], said_start[labels[s] + 1]):
+            for z in range(classes.shape[0]):
+                if classes[z] == said_classes[j]:
+                    total[z] -= np.int64(np.rint(np.float64(votes[s]) * said[j] * units))
+
+
 @nb.njit(parallel=True, nogil=True, cache=True)
 def take_votes(
     first: np.ndarray,  # (M,) where the row of each Gaussian begins
@@ -239,9 +258,5 @@ def take_votes(
 ) -> None:
     """Take a view's votes away from those of all, row by row."""
     for i in nb.prange(order.shape[0]):
-        m = order[i]
-        for s in range(start[m], start[m + 1]):
-            for j in range(said_start[labels[s]], said_start[labels[s] + 1]):
-                for z in range(first[i], last[i]):
-                    if classes[z] == said_classes[j]:
-                        total[z] -= np.int64(np.rint(np.float64(votes[s]) * said[j] * units))
+        row, seen = slice(first[i], last[i]), slice(start[order[i]], start[order[i] + 1])
+        take_row(classes[row], total[row], labels[seen], said_start, said_classes, said, votes[seen], units)

@@ -259,22 +259,26 @@ def _remaining(
 
 @nb.njit(nogil=True, cache=True)
 def stand(
-    classes: np.ndarray,  # (n + 1,) of a row of n entries, changed in place
-    votes: np.ndarray,  # (n + 1,) int64, changed in place
-    many: int,  # n
+    classes: np.ndarray,  # (n,) of one row
+    votes: np.ndarray,  # (n,) int64, of it
     ids: np.ndarray,  # of all classes, ascending
+    kept_classes: np.ndarray,  # out; there must be room for all that is kept, n + 1 at most
+    kept_votes: np.ndarray,  # out, likewise
 ) -> int:
-    """Keep of one row what `standing` would, the class that is left behind the others; return how many they are."""
-    free, least = _remaining(classes[:many], votes[:many], ids)
-    kept = 0
-    for z in range(many):
+    """Write what `standing` keeps of one row; return how many entries that is."""
+    free, least = _remaining(classes, votes, ids)
+    n = 0
+    for z in range(votes.shape[0]):
+        if 0 <= free < classes[z]:
+            kept_classes[n], kept_votes[n] = free, least
+            n, free = n + 1, -1
         if votes[z] > 0:
-            classes[kept], votes[kept] = classes[z], votes[z]
-            kept += 1
+            kept_classes[n], kept_votes[n] = classes[z], votes[z]
+            n += 1
     if free >= 0:
-        classes[kept], votes[kept] = free, least
-        kept += 1
-    return kept
+        kept_classes[n], kept_votes[n] = free, least
+        n += 1
+    return n
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
@@ -302,14 +306,4 @@ def _keep_standing(
 ) -> None:
     for i in nb.prange(start.shape[0] - 1):
         mine = slice(start[i], start[i + 1])
-        free, least = _remaining(classes[mine], votes[mine], ids)
-        n = kept_start[i]
-        for z in range(start[i], start[i + 1]):
-            if 0 <= free < classes[z]:
-                kept_classes[n], kept_votes[n] = free, least
-                n, free = n + 1, -1
-            if votes[z] > 0:
-                kept_classes[n], kept_votes[n] = classes[z], votes[z]
-                n += 1
-        if free >= 0:
-            kept_classes[n], kept_votes[n] = free, least
+        stand(classes[mine], votes[mine], ids, kept_classes[kept_start[i] :], kept_votes[kept_start[i] :])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from gsseg_core.gaussian_kernels import BLOCKS
+from gsseg_core.gaussian_kernels import BLOCKS, take_row
 from gsseg_core.learner import UNITS
 from gsseg_core.meaning import Meaning, stand
 from gsseg_core.operator import Observation
@@ -80,34 +80,33 @@ def _count(
     for block in nb.prange(BLOCKS):
         part = parts[block]
         which, others = np.empty(num_classes + 1, np.uint32), np.empty(num_classes + 1, np.int64)
+        kept_which, kept_others = np.empty_like(which), np.empty_like(others)
         codes = np.empty(num_classes + 1, np.float32)
         for i in range(order.shape[0] * block // BLOCKS, order.shape[0] * (block + 1) // BLOCKS):
             m = order[i]
             first, many = rows[ids[m]], rows[ids[m] + 1] - rows[ids[m]]
             for z in range(many):
                 which[z], others[z] = classes[first + z], votes[first + z]
-            seen = np.float64(0)
-            for s in range(start[m], start[m + 1]):
-                seen += own[s]
-                for j in range(said_start[labels[s]], said_start[labels[s] + 1]):
-                    for z in range(many):
-                        if which[z] == said_classes[j]:
-                            others[z] -= np.int64(np.rint(np.float64(own[s]) * said[j] * UNITS))
+            mine = slice(start[m], start[m + 1])
+            take_row(which[:many], others[:many], labels[mine], said_start, said_classes, said, own[mine], UNITS)
             least = np.int64(0)
             for z in range(many):
                 least = min(least, others[z])
             if least < 0:
-                many = stand(which, others, many, possible)
+                many = stand(which[:many], others[:many], possible, kept_which, kept_others)
+                which[:many], others[:many] = kept_which[:many], kept_others[:many]
             total, largest = np.int64(0), np.int64(0)
             for z in range(many):
                 total += others[z]
                 largest = max(largest, others[z])
             if total == 0:
                 continue
-            raised = np.float32(0)
+            raised, seen = np.float32(0), np.float64(0)
             for z in range(many):  # As shares of the largest, of which some power is never lost to rounding.
                 codes[z] = _raised(np.float32(others[z]) / np.float32(largest), power)
                 raised += codes[z]
+            for s in range(start[m], start[m + 1]):
+                seen += own[s]
             share = np.float32(min(1.0, most * total / max(seen * UNITS, 1.0))) / raised
             for s in range(start[m], start[m + 1]):
                 for z in range(many):

@@ -54,7 +54,8 @@ def slow_count(
 @given(st.integers(0, 2**31), st.sampled_from([1.0, 4.0, 2.5, 40.0]), st.sampled_from([np.inf, 1.0, 0.3]))
 def test_counts_by_the_others_are_those_of_a_slow_twin(seed: int, power: float, most: float) -> None:
     rng = np.random.default_rng(seed)
-    learner, observation = observed(clean_views(3), clean_views(3)[1].name)
+    views = clean_views(3)
+    learner, observation = observed(views, views[1].name)
     shape = learner._votes.shape
     votes = learner._votes + rng.integers(0, int(UNITS), shape) * (rng.random(shape) < 0.2)
     meaning = observation.meaning.without(rng.random(len(observation.classes)) < 0.3)
