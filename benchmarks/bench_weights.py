@@ -33,7 +33,7 @@ from gsseg_core.lanes import (
     add_scaled,
     add_scaled_where,
     aim,
-    blend_row,
+    blend_block,
     first_bit,
     intrinsic,
     load_row,
@@ -109,8 +109,8 @@ class StoredWeights(TileObservation):
         self._kept = np.empty((self._first[-1], LANES), np.uint16)
         self._left_over = np.empty((len(self._records), TILE, TILE), np.float32)
         store(
-            self._columns, self._camera.width, self._camera.height, self._table, self._start, self._entries, self._rows,
-            self._first, self._kept, self._left_over,
+            self._columns, self._camera.width, self._camera.height, self._table, self._start, self._entries,
+            self._blocks, self._first, self._kept, self._left_over,
         )  # fmt: skip
 
     @property
@@ -125,7 +125,7 @@ class StoredWeights(TileObservation):
         logs, left_over = np.zeros(len(self._records)), np.zeros(len(mask.present))
         sums, parts = np.empty(self._slot_start[-1], np.float32), np.empty((sightings.PARTS, len(said)), np.float32)
         share_stored(
-            self._start, self._rows, self._first, self._kept, self._left_over, mask.start, mask.present,
+            self._start, self._blocks, self._first, self._kept, self._left_over, mask.start, mask.present,
             mask.span_start, mask.slots, mask.lanes, self._slot_start, self._sighting, said, rest, logs, left_over,
             sums,
         )  # fmt: skip
@@ -155,7 +155,7 @@ def load_steps(typing: Any, source: Any, i: Any, target: Any) -> Any:
 
 
 @nb.njit(parallel=True, error_model="numpy")
-def store(columns, width, height, table, start, entries, rows, first, kept, left_over) -> None:  # type: ignore[no-untyped-def]
+def store(columns, width, height, table, start, entries, blocks, first, kept, left_over) -> None:  # type: ignore[no-untyped-def]
     """Make all weights of a view once, and keep them."""
     for tile in nb.prange(start.shape[0] - 1):
         rays, lines, record = left_over[tile], np.empty((2, TILE), np.float32), np.empty((1, TILE), np.float32)
@@ -164,11 +164,11 @@ def store(columns, width, height, table, start, entries, rows, first, kept, left
         for e in range(start[tile], start[tile + 1]):
             g = entries[e]
             aim(table, g, left, top, lines)
-            todo = np.int64(rows[e])
+            todo = np.int64(blocks[e])
             while todo:
-                r = first_bit(todo)
+                b = first_bit(todo)
                 todo &= todo - 1
-                weight, _ = blend_row(rays, r, lines, table[g, WIDTH])
+                weight, _ = blend_block(rays, b, lines, table[g, WIDTH])
                 store_row(record, 0, weight)
                 for c in range(TILE):
                     kept[n, c] = np.uint16(record[0, c] * np.float32(STEPS) + np.float32(0.5))
@@ -177,7 +177,7 @@ def store(columns, width, height, table, start, entries, rows, first, kept, left
 
 @nb.njit(parallel=True, fastmath=FAST, error_model="numpy")
 def share_stored(  # type: ignore[no-untyped-def]
-    start, rows, first, kept, final, label_start, present, span_start, slots, lanes, slot_start, sighting, said, rest,
+    start, blocks, first, kept, final, label_start, present, span_start, slots, lanes, slot_start, sighting, said, rest,
     logs, left_over, sums,
 ) -> None:  # fmt: skip
     """Do what `sightings.share` does."""
@@ -193,25 +193,25 @@ def share_stored(  # type: ignore[no-untyped-def]
         n = 0
         for e in range(start[tile], start[tile + 1]):
             only = said[here[e - start[tile]]] * np.float32(1 / STEPS) if many == 1 else np.float32(0.0)
-            todo = np.int64(rows[e])
+            todo = np.int64(blocks[e])
             while todo:
-                r = first_bit(todo)
+                b = first_bit(todo)
                 todo &= todo - 1
                 load_steps(kept, first[tile] + n, weights[n:])
                 weight = load_row(weights, n)
                 n += 1
-                total = load_row(value, r)
+                total = load_row(value, b)
                 if many == 1:
                     total = add_scaled(total, weight, only)
                 else:
-                    for span in range(spans[r], spans[r + 1]):
+                    for span in range(spans[b], spans[b + 1]):
                         s = max(here[(e - start[tile]) * many + slots[span]], 0)
                         total = add_scaled_where(total, weight, said[s] * np.float32(1 / STEPS), np.int64(lanes[span]))
-                store_row(value, r, total)
+                store_row(value, b, total)
         spare = left_over[label_start[tile] : label_start[tile + 1]]
         logs[tile] = sightings._invert(spans, slots, lanes, rest[labels], final[tile], value, spare)
         mine = sums[slot_start[tile] : slot_start[tile + 1]]
-        sightings._sum_shares(rows[start[tile] : start[tile + 1]], many, spans, slots, lanes, value, weights, mine)
+        sightings._sum_shares(blocks[start[tile] : start[tile + 1]], many, spans, slots, lanes, value, weights, mine)
         mine *= np.float32(1 / STEPS)
 
 

@@ -4,7 +4,7 @@
 
 A step rasterises what each view sees, tile by tile. A tile could be skipped if none of its Gaussians has moved since:
 its sums would be those of the step before. So what counts is not how many Gaussians still move but which part of the
-rows of sixteen pixels that a step makes lies in tiles where one of them does. Told for each step but the last one of
+blocks of sixteen pixels that a step makes lies in tiles where one of them does. Told for each step but the last one of
 the default settings, for several changes of a probability that count as moving.
 """
 

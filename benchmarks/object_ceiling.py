@@ -14,8 +14,9 @@ from collections.abc import Sequence
 import numba as nb
 import numpy as np
 
+from gsseg_core.blend import in_tile, open_rays
 from gsseg_core.dataset import View
-from gsseg_core.lanes import WIDTH, aim, blend_row, first_bit, store_row
+from gsseg_core.lanes import WIDTH, aim, blend_block, first_bit, store_row
 from gsseg_core.operator import make_operator
 from gsseg_core.projection import project
 from gsseg_core.scene import GaussianScene
@@ -83,27 +84,28 @@ def _walk(
     optical: np.ndarray,  # (P,) out
 ) -> int:
     height, width = limit.shape
-    fresh, lines = np.ones((TILE, TILE), np.float32), np.empty((2, TILE), np.float32)
+    fresh, lines = np.empty((TILE, TILE), np.float32), np.empty((2, TILE), np.float32)
     alpha, n = np.empty((1, TILE), np.float32), 0
     for tile in range(start.shape[0] - 1):
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
-        inside, across = (1 << min(TILE, height - top)) - 1, min(TILE, width - left)
+        u, v, inside = open_rays(tile, columns, width, height, fresh)
         for e in range(start[tile], start[tile + 1]):
             g = entries[e]
-            reached = aim(table, g, np.float32(left + 0.5), np.float32(top + 0.5), lines) & inside
+            reached = aim(table, g, u, v, lines) & inside
             while reached:
-                r = first_bit(reached)
+                b = first_bit(reached)
                 reached &= reached - 1
-                fresh[r, :] = 1
-                weight, _ = blend_row(fresh, r, lines, table[g, WIDTH])
+                fresh[b, :] = 1
+                weight, _ = blend_block(fresh, b, lines, table[g, WIDTH])
                 store_row(alpha, 0, weight)
-                for c in range(across):
-                    if alpha[0, c] > 0:
+                for i in range(TILE):
+                    r, c = in_tile(b, i)
+                    if alpha[0, i] > 0 and top + r < height and left + c < width:
                         if len(gaussians):
                             gaussians[n] = g
                             shows = depth[g] <= limit[top + r, left + c]
                             pixels[n] = 2 * (first + (top + r) * width + left + c) + shows
-                            optical[n] = -np.log(1 - alpha[0, c])
+                            optical[n] = -np.log(1 - alpha[0, i])
                         n += 1
     return n
 

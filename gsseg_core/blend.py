@@ -1,8 +1,11 @@
 """The inner loop: blend the Gaussians of one tile, and keep their weights just long enough to use them.
 
 Everything that the system does with a view is a product with its weight matrix W or the transpose. W is never stored:
-the kernels here make the rows of W that belong to one 16 x 16 tile, in the processor's cache, and use them at once. A
-*record* is one Gaussian in one row of a tile: sixteen weights, one vector register.
+the kernels here make the rows of W that belong to one 16 x 16 tile, in the processor's cache, and use them at once.
+
+A tile is cut into sixteen *blocks* of 4 x 4 pixels, numbered row by row, as the pixels of each are. A *record* is one
+Gaussian in one block: sixteen weights, one vector register. Trained Gaussians are small, and squares are met by a third
+fewer of them than rows of sixteen pixels are.
 
 Sums over tiles go through one slot per (Gaussian, tile), added up Gaussian by Gaussian afterwards, in a fixed order.
 So there are no atomic operations, and the result does not depend on the number of threads.
@@ -15,11 +18,23 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from gsseg_core.lanes import OPEN, WIDTH, aim, blend_row, first_bit, prefetch, store_row
+from gsseg_core.lanes import OPEN, SIDE, WIDTH, aim, blend_block, first_bit, prefetch, store_row
 from gsseg_core.tiles import TILE
 
 AHEAD = 12
 """Entries between the one that is blended and the one that is fetched from memory."""
+
+
+@nb.njit(inline="always")
+def in_block(r: int, c: int) -> tuple[int, int]:
+    """Block of the pixel in row r and column c of a tile, and its place there."""
+    return r // SIDE * SIDE + c // SIDE, r % SIDE * SIDE + c % SIDE
+
+
+@nb.njit(inline="always")
+def in_tile(b: int, lane: int) -> tuple[int, int]:
+    """Row and column in the tile of a pixel of block b: the same sum, which is its own inverse."""
+    return in_block(b, lane)
 
 
 @nb.njit(inline="always")
@@ -28,14 +43,38 @@ def open_rays(
     columns: int,  # tiles across
     width: int,  # px
     height: int,  # px
-    transmittance: np.ndarray,  # (16, 16) float32 out
+    transmittance: np.ndarray,  # (16, 16) float32 out, by block
 ) -> tuple[Any, Any, int]:
-    """Begin with a tile: the pixel centre of its corner, and a bit for each of its rows that is in the image."""
-    left, top = (tile % columns) * TILE, (tile // columns) * TILE
+    """Begin with a tile: the pixel centre of its corner, and a bit for each of its blocks that is in the image."""
+    left, top, live = (tile % columns) * TILE, (tile // columns) * TILE, 0
     for r in range(TILE):
         for c in range(TILE):
-            transmittance[r, c] = 1.0 if top + r < height and left + c < width else 0.0
-    return np.float32(left + 0.5), np.float32(top + 0.5), (1 << min(TILE, height - top)) - 1
+            b, lane = in_block(r, c)
+            inside = top + r < height and left + c < width
+            transmittance[b, lane] = 1.0 if inside else 0.0
+            live |= inside << b
+    return np.float32(left + 0.5), np.float32(top + 0.5), live
+
+
+@nb.njit(inline="always")
+def aim_next(
+    table: np.ndarray,  # (M, 8)
+    entries: np.ndarray,  # (E,)
+    e: int,
+    last: int,
+    left: float,
+    top: float,
+    lines: np.ndarray,  # (2, 2, 16) float32 out: those of entry e + 1 go to (e + 1) % 2
+) -> int:
+    """Aim the entry after e, before e is blended.
+
+    How many blocks an entry reaches, no processor guesses; where it is known a whole entry early, a wrong guess costs
+    little. That saves a quarter of the lift.
+    """
+    if e + 1 == last:
+        return 0
+    prefetch(table, entries[min(e + AHEAD, last - 1)])
+    return aim(table, entries[e + 1], left, top, lines[(e + 1) % 2])  # type: ignore[no-any-return]
 
 
 @nb.njit(fastmath={"contract"}, error_model="numpy")
@@ -48,28 +87,27 @@ def blend_tile(
     entries: np.ndarray,  # (E,) rows of the table, by tile, nearest first
     first: int,  # entries of this tile
     last: int,
-    transmittance: np.ndarray,  # (16, 16) float32 out
+    transmittance: np.ndarray,  # (16, 16) float32 out, by block
     weights: np.ndarray,  # (16 * (last - first), 16) float32 out: the records
-    rows: np.ndarray,  # (16 * (last - first),) uint8 out: row in the tile of each record
+    blocks: np.ndarray,  # (16 * (last - first),) uint8 out: block of each record
     ends: np.ndarray,  # (last - first,) int32 out: one past the last record of each entry
 ) -> int:
     """Make the records of one tile; returns how many of its entries were blended before every ray had ended."""
     left, top, live = open_rays(tile, columns, width, height, transmittance)
-    lines = np.empty((2, TILE), np.float32)
-    n = 0
+    lines = np.empty((2, 2, TILE), np.float32)
+    n, ahead = 0, aim_next(table, entries, first - 1, last, left, top, lines)
     for e in range(first, last):
-        prefetch(table, entries[min(e + AHEAD, last - 1)])
-        g = entries[e]
-        reached = aim(table, g, left, top, lines) & live
+        reached, mine, wide = ahead & live, lines[e % 2], table[entries[e], WIDTH]
+        ahead = aim_next(table, entries, e, last, left, top, lines)
         while reached:
-            r = first_bit(reached)
+            b = first_bit(reached)
             reached &= reached - 1
-            weight, bits = blend_row(transmittance, r, lines, table[g, WIDTH])
+            weight, bits = blend_block(transmittance, b, mine, wide)
             store_row(weights, n, weight)
-            rows[n] = r
+            blocks[n] = b
             n += bits > OPEN
             if not bits & OPEN:
-                live &= ~(1 << r)
+                live &= ~(1 << b)
         ends[e - first] = n
         if not live:
             return e - first + 1

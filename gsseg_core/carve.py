@@ -26,9 +26,10 @@ from dataclasses import dataclass, replace
 import numba as nb
 import numpy as np
 
+from gsseg_core.blend import in_block, open_rays
 from gsseg_core.cameras import Camera
 from gsseg_core.errors import MaskSizeError
-from gsseg_core.lanes import WIDTH, aim, blend_row, first_bit, store_row
+from gsseg_core.lanes import WIDTH, aim, blend_block, first_bit, store_row
 from gsseg_core.operator import ViewOperator, make_operator
 from gsseg_core.projection import project
 from gsseg_core.scene import GaussianScene
@@ -225,8 +226,6 @@ def _add_reasons(
 ) -> None:
     height, width = shown.shape
     for tile in nb.prange(start.shape[0] - 1):
-        left, top = (tile % columns) * TILE, (tile // columns) * TILE
-        rows, across = min(TILE, height - top), min(TILE, width - left)
         # Only labels of those who are asked matter here.
         slots, many = np.full(num_labels, -1, np.int64), 0
         for e in range(start[tile], start[tile + 1]):
@@ -236,52 +235,66 @@ def _add_reasons(
                 many += 1
         if not many:
             continue
-        limit = np.zeros((TILE, TILE), np.float32)
-        limit[:rows, :across] = hidden_from[top : top + rows, left : left + across]
+        fresh, lines = np.empty((TILE, TILE), np.float32), np.empty((2, TILE), np.float32)
+        left, top, inside = open_rays(tile, columns, width, height, fresh)
+        limit = _cut(hidden_from, tile, columns)
         through = np.ones((many, TILE, TILE), np.float32)  # T_k
-        fresh, lines = np.ones((TILE, TILE), np.float32), np.empty((2, TILE), np.float32)
         alpha = np.empty((1, TILE), np.float32)
-        corner, inside = (np.float32(left + 0.5), np.float32(top + 0.5)), (1 << rows) - 1
         for e in range(start[tile], start[tile + 1]):
             g = entries[e]
             if labels[g] > 0 and slots[labels[g]] >= 0:
-                reached, mine = aim(table, g, corner[0], corner[1], lines) & inside, through[slots[labels[g]]]
+                reached, mine = aim(table, g, left, top, lines) & inside, through[slots[labels[g]]]
                 while reached:
-                    r = first_bit(reached)
+                    b = first_bit(reached)
                     reached &= reached - 1
-                    _alphas(lines, r, table[g, WIDTH], fresh, alpha)
-                    for c in range(TILE):
-                        mine[r, c] *= np.float32(1) - kept[g] * alpha[0, c]
+                    _alphas(lines, b, table[g, WIDTH], fresh, alpha)
+                    for i in range(TILE):
+                        mine[b, i] *= np.float32(1) - kept[g] * alpha[0, i]
         need, excess = np.zeros_like(through), np.zeros_like(through)
         for label in range(1, num_labels):
             if slots[label] >= 0:
-                _weigh(shown, label, top, left, through[slots[label]], need[slots[label]], excess[slots[label]])
+                _weigh(shown, label, tile, columns, through[slots[label]], need[slots[label]], excess[slots[label]])
         for e in range(start[tile], start[tile + 1]):
             g = entries[e]
             if asked[g]:
-                reached, slot = aim(table, g, corner[0], corner[1], lines) & inside, slots[labels[g]]
+                reached, slot = aim(table, g, left, top, lines) & inside, slots[labels[g]]
                 more, less, z = np.float32(0), np.float32(0), depths[g]
                 while reached:
-                    r = first_bit(reached)
+                    b = first_bit(reached)
                     reached &= reached - 1
-                    _alphas(lines, r, table[g, WIDTH], fresh, alpha)
-                    for c in range(TILE):
-                        more += alpha[0, c] * need[slot, r, c]
-                        less += alpha[0, c] * (excess[slot, r, c] if z <= limit[r, c] else np.float32(0))
+                    _alphas(lines, b, table[g, WIDTH], fresh, alpha)
+                    for i in range(TILE):
+                        more += alpha[0, i] * need[slot, b, i]
+                        less += alpha[0, i] * (excess[slot, b, i] if z <= limit[b, i] else np.float32(0))
                 stay[e], go[e] = more, less
+
+
+@nb.njit
+def _cut(
+    image: np.ndarray,  # (H, W)
+    tile: int,
+    columns: int,
+) -> np.ndarray:
+    """One tile of an image, by block, (16, 16) float32; 0 outside of it."""
+    out = np.zeros((TILE, TILE), np.float32)
+    left, top = (tile % columns) * TILE, (tile // columns) * TILE
+    for r in range(min(TILE, image.shape[0] - top)):
+        for c in range(min(TILE, image.shape[1] - left)):
+            out[in_block(r, c)] = image[top + r, left + c]
+    return out
 
 
 @nb.njit(inline="always")
 def _alphas(
     lines: np.ndarray,  # (2, 16) from `aim`
-    r: int,
+    b: int,
     wide: float,
     fresh: np.ndarray,  # (16, 16) scratch
     alpha: np.ndarray,  # (1, 16) out
 ) -> None:
-    """Alpha of a Gaussian in row r: `blend_row` makes it of rays that nothing has met yet."""
-    fresh[r, :] = 1
-    weight, _ = blend_row(fresh, r, lines, wide)
+    """Alpha of a Gaussian in block b: `blend_block` makes it of rays that nothing has met yet."""
+    fresh[b, :] = 1
+    weight, _ = blend_block(fresh, b, lines, wide)
     store_row(alpha, 0, weight)
 
 
@@ -289,15 +302,17 @@ def _alphas(
 def _weigh(
     shown: np.ndarray,  # (H, W)
     label: int,
-    top: int,
-    left: int,
+    tile: int,
+    columns: int,
     through: np.ndarray,  # (16, 16) T_k
     need: np.ndarray,  # (16, 16) out: T_k / (1 - T_k) where the label is shown
     excess: np.ndarray,  # (16, 16) out: 1 where another one is
 ) -> None:
+    left, top = (tile % columns) * TILE, (tile // columns) * TILE
     for r in range(min(TILE, shown.shape[0] - top)):
         for c in range(min(TILE, shown.shape[1] - left)):
+            b, i = in_block(r, c)
             if shown[top + r, left + c] == label:
-                need[r, c] = through[r, c] / (np.float32(1) - through[r, c] + _ROUNDING)
+                need[b, i] = through[b, i] / (np.float32(1) - through[b, i] + _ROUNDING)
             elif shown[top + r, left + c] >= 0:
-                excess[r, c] = 1
+                excess[b, i] = 1

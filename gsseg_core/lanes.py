@@ -25,6 +25,9 @@ intrinsic: Any = typed_intrinsic
 
 LANES = 16
 
+SIDE = 4
+"""Side of a block in px: its sixteen pixels, row by row, are one vector."""
+
 OPEN = (1 << LANES) - 1
 """Of the bits of `blend_row`, those of the rays that are still open."""
 
@@ -44,6 +47,13 @@ U, V, SHEAR, WIDTH, HEIGHT, LOG_OPACITY, Y_REACH, X_TURN = range(8)
 _F32, _I32, _I64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 _ROW, _BITS = ir.VectorType(_F32, LANES), ir.VectorType(_I32, LANES)
 _COLUMNS = ir.Constant(_ROW, [float(i) for i in range(LANES)])
+
+_FOUR = ir.VectorType(_F32, SIDE)
+_EACH_FOUR_TIMES = ir.Constant(_BITS, [lane // SIDE for lane in range(LANES)])
+_COLUMNS_OF_BLOCKS = ir.Constant(
+    ir.ArrayType(_ROW, SIDE),
+    [ir.Constant(_ROW, [float(SIDE * i + lane % SIDE) for lane in range(LANES)]) for i in range(SIDE)],
+)
 
 # 2^f on [-1/2, 1/2]: the polynomial of degree 5 of least relative error, 7.5e-8; the constant term first.
 _EXP2 = (
@@ -106,10 +116,22 @@ class _Builder:
 
         return column
 
-    def one_of(self, position: int, i: int, number: Any) -> Any:
-        """Entry `number` of row i, sixteen times."""
-        place = self.llvm.add(number, ir.Constant(number.type, i * LANES))
-        return self.spread(self.llvm.load(self.element(position, place), align=4, typ=_F32))
+    def four_of(self, position: int, i: int, block: Any) -> Any:
+        """Entries of row i that belong to the four rows of a block, each four times."""
+        first = self.llvm.and_(block, ir.Constant(block.type, LANES - SIDE))
+        place = self.llvm.add(first, ir.Constant(block.type, i * LANES))
+        address = self.llvm.bitcast(self.element(position, place), ir.PointerType(_FOUR))
+        four = self.llvm.load(address, align=4, typ=_FOUR)
+        return self.llvm.shuffle_vector(four, ir.Constant(_FOUR, ir.Undefined), _EACH_FOUR_TIMES)
+
+    def columns_of(self, position: int) -> Any:
+        """Columns in the tile of the pixels of a block, which is argument `position`."""
+        block = self.arguments[position]
+        constant: Any = cgutils.global_constant
+        table = constant(self.llvm.module, "columns_of_blocks", _COLUMNS_OF_BLOCKS)
+        number = self.llvm.and_(block, ir.Constant(block.type, SIDE - 1))
+        place = self.llvm.gep(table, [ir.Constant(block.type, 0), number], source_etype=_COLUMNS_OF_BLOCKS.type)
+        return self.llvm.load(place, align=4, typ=_ROW)
 
     def load(self, address: Any) -> Any:
         """Read a row; NumPy aligns arrays to 16 bytes only."""
@@ -184,10 +206,10 @@ def _row(value: float) -> Any:
 
 @intrinsic
 def aim(typing: Any, table: Any, g: Any, left: Any, top: Any, lines: Any) -> tuple[Any, Callable[..., Any]]:
-    """Tell which rows of a tile a Gaussian reaches: bit r is set if alpha is at least 1/255 at some pixel of row r.
+    """Tell which blocks of a tile a Gaussian reaches: bit b is set if alpha is at least 1/255 at some pixel of block b.
 
-    The tile's first pixel has its centre at (left, top). For each row, lines[0] gets the column of the largest alpha,
-    and lines[1] what log2 of alpha would be there.
+    The tile's first pixel has its centre at (left, top). For each row of the tile, lines[0] gets the column of the
+    largest alpha, and lines[1] what log2 of alpha would be there.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -195,16 +217,27 @@ def aim(typing: Any, table: Any, g: Any, left: Any, top: Any, lines: Any) -> tup
         column = row.columns(0)
         dy = builder.fsub(_COLUMNS, row.spread(builder.fsub(column(V), arguments[3])))
         x = row.fma(row.spread(column(SHEAR)), dy, row.spread(builder.fsub(column(U), arguments[2])))
-        high = row.spread(builder.fneg(column(HEIGHT)))
+        high, wide = row.spread(builder.fneg(column(HEIGHT))), row.spread(builder.fneg(column(WIDTH)))
         peak = row.fma(high, builder.fmul(dy, dy), row.spread(column(LOG_OPACITY)))
         row.store(x, row.address(4, ir.Constant(_I64, 0)))
         row.store(peak, row.address(4, ir.Constant(_I64, 1)))
-        # No pixel of the row is nearer than this one, and its alpha is computed as `blend_row` does: so the bit says
-        # exactly what will be found there.
-        nearest = row.rint(row.least(row.most(x, _row(0.0)), _row(LANES - 1.0)))
-        offset = builder.fsub(nearest, x)
-        power = row.fma(row.spread(builder.fneg(column(WIDTH))), builder.fmul(offset, offset), peak)
-        return row.bits(builder.fcmp_ordered(">=", power, _row(LOG_ALPHA_MIN)))
+        # In each row, no pixel of a block is nearer to the peak than this one, and its alpha is computed as
+        # `blend_block` does: so the bits say exactly what will be found there.
+        whole, bits = row.rint(x), ir.Constant(_I64, 0)
+        for i in range(SIDE):
+            nearest = row.least(row.most(whole, _row(float(SIDE * i))), _row(SIDE * i + SIDE - 1.0))
+            offset = builder.fsub(nearest, x)
+            power = row.fma(wide, builder.fmul(offset, offset), peak)
+            found = row.bits(builder.fcmp_ordered(">=", power, _row(LOG_ALPHA_MIN)))
+            bits = builder.or_(bits, builder.shl(found, ir.Constant(_I64, LANES * i)))
+        # Bit 16 i + r of these is row r's, in the i-th column of blocks. Rows of four are put together, and columns
+        # of blocks beside each other.
+        for shift in (1, 2):
+            bits = builder.or_(bits, builder.lshr(bits, ir.Constant(_I64, shift)))
+        bits = builder.and_(bits, ir.Constant(_I64, 0x1111111111111111))
+        for shift in (LANES - 1, 2 * LANES - 2):
+            bits = builder.or_(bits, builder.lshr(bits, ir.Constant(_I64, shift)))
+        return builder.and_(bits, ir.Constant(_I64, OPEN))
 
     number = types.float32
     return types.int64(table, types.intp, number, number, lines), generate
@@ -231,18 +264,18 @@ def count_bits(typing: Any, bits: Any) -> tuple[Any, Callable[..., Any]]:
 
 
 @intrinsic
-def blend_row(typing: Any, rays: Any, r: Any, lines: Any, wide: Any) -> tuple[Any, Callable[..., Any]]:
-    """Blend one Gaussian into row r of the rays.
+def blend_block(typing: Any, rays: Any, b: Any, lines: Any, wide: Any) -> tuple[Any, Callable[..., Any]]:
+    """Blend one Gaussian into block b of the rays.
 
-    In column c its log2 of alpha is peak - wide * (c - x)^2, with x and peak from `aim`; below that of 1/255 alpha
-    counts as 0. Returns its weights, and bits: the low sixteen say which rays are still open, the next ones which were
-    hit.
+    In column c of row r its log2 of alpha is peak - wide * (c - x)^2, with x and peak of row r from `aim`; below that
+    of 1/255 alpha counts as 0. Returns its weights, and bits: the low sixteen say which rays are still open, the next
+    ones which were hit.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         row = _Builder(context, builder, signature, arguments)
-        offset = builder.fsub(_COLUMNS, row.one_of(2, 0, arguments[1]))
-        peak = row.one_of(2, 1, arguments[1])
+        offset = builder.fsub(row.columns_of(1), row.four_of(2, 0, arguments[1]))
+        peak = row.four_of(2, 1, arguments[1])
         power = row.fma(row.spread(builder.fneg(arguments[3])), builder.fmul(offset, offset), peak)
         alpha = row.exp2(power)
         alpha = builder.select(builder.fcmp_ordered("<", alpha, _row(ALPHA_MAX)), alpha, _row(ALPHA_MAX))
@@ -259,7 +292,7 @@ def blend_row(typing: Any, rays: Any, r: Any, lines: Any, wide: Any) -> tuple[An
         return context.make_tuple(builder, signature.return_type, [weight, bits])
 
     both: Any = types.Tuple((_row_type, types.int64))  # type: ignore[no-untyped-call]
-    return both(rays, r, lines, types.float32), generate
+    return both(rays, b, lines, types.float32), generate
 
 
 @intrinsic

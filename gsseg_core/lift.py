@@ -1,8 +1,8 @@
 """Lift a mask: sum each Gaussian's weights by the labels of the pixels that it made, in one pass over the view.
 
-The labels of a row of sixteen pixels are kept as *spans*: for each label in the row, one bit per pixel. Most rows hold
-one label, so most records need one sum. The same pass notes which rows of a tile each entry really reached through
-what is in front of it. What reached none is left out of all later passes.
+The labels of a block of sixteen pixels are kept as *spans*: for each label in the block, one bit per pixel. Most blocks
+hold one label, so most records need one sum. The same pass notes which blocks of a tile each entry really reached
+through what is in front of it. What reached none is left out of all later passes.
 """
 
 from __future__ import annotations
@@ -12,19 +12,17 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
-from gsseg_core.blend import AHEAD, open_rays
+from gsseg_core.blend import aim_next, in_tile, open_rays
 from gsseg_core.lanes import (
     FAST,
     LANES,
     OPEN,
     WIDTH,
     add_where,
-    aim,
-    blend_row,
+    blend_block,
     count_bits,
     first_bit,
     nothing,
-    prefetch,
     sum_row,
 )
 from gsseg_core.tiles import TILE
@@ -39,11 +37,11 @@ class Labels:
     start : (T + 1,) int64, present : (start[-1],) int32
         Labels of tile t are present[start[t]:start[t + 1]].
     span_start : (16 T + 1,) int64
-        Spans of row r of tile t are those from span_start[16 t + r] to the next.
+        Spans of block b of tile t are those from span_start[16 t + b] to the next.
     slots : (S,) int32
         Which of its tile's labels a span is.
     lanes : (S,) int32
-        Bit c is set where the span has its label.
+        Bit i is set where pixel i of the block has the label.
     """
 
     start: np.ndarray
@@ -70,10 +68,11 @@ def cut_labels(
     n = spans = 0
     for tile in range(columns * rows):
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
-        for r in range(TILE):
+        for b in range(TILE):
             begin = spans
-            for c in range(min(TILE, width - left) if top + r < height else 0):
-                label = labels[top + r, left + c]
+            for lane in range(LANES):
+                r, c = in_tile(b, lane)
+                label = labels[top + r, left + c] if top + r < height and left + c < width else -1
                 if label < 0:
                     continue
                 if slot_of[label] < 0:
@@ -84,8 +83,8 @@ def cut_labels(
                     span_of[label] = spans
                     slots[spans], lanes[spans] = slot_of[label], 0
                     spans += 1
-                lanes[span_of[label]] |= 1 << c
-            span_start[tile * TILE + r + 1] = spans
+                lanes[span_of[label]] |= 1 << lane
+            span_start[tile * TILE + b + 1] = spans
         for i in range(start[tile], n):
             slot_of[present[i]] = -1
         start[tile + 1] = n
@@ -105,29 +104,50 @@ def lift(
     slots: np.ndarray,  # (S,)
     lanes: np.ndarray,  # (S,)
     slot_start: np.ndarray,  # (T + 1,) where each tile's sums begin: one for each entry and label
-    reached: np.ndarray,  # (E,) uint16 out: rows with a label in which the entry has a weight, one bit each
+    reached: np.ndarray,  # (E,) uint16 out: blocks with a label in which the entry has a weight, one bit each
     sums: np.ndarray,  # (slot_start[-1],) float32 out: sum of weights
-    counts: np.ndarray,  # (T, 3) int64 out: entries with a row, their rows, sums above zero
+    counts: np.ndarray,  # (T, 3) int64 out: entries with a block, their blocks, sums above zero
 ) -> None:
     """Blend the view, and sum weights by entry and label."""
     for tile in nb.prange(start.shape[0] - 1):
         many = label_start[tile + 1] - label_start[tile]
         first, last = start[tile], start[tile + 1]
         reached[first:last] = 0
-        counts[tile] = 0
+        with_block = blocks = positive = 0
         if many:
             mine = sums[slot_start[tile] : slot_start[tile + 1]]
             mine[:] = 0.0
-            _lift_tile(
-                tile, columns, width, height, table, entries, first, last, span_start, slots, lanes, reached, mine, many
-            )
+            if many == 1:  # The compiler makes a shorter loop of this.
+                _lift_tile(
+                    tile,
+                    columns,
+                    width,
+                    height,
+                    table,
+                    entries,
+                    first,
+                    last,
+                    span_start,
+                    slots,
+                    lanes,
+                    reached,
+                    mine,
+                    1,
+                )
+            else:
+                _lift_tile(
+                    tile, columns, width, height, table, entries, first, last, span_start, slots, lanes, reached, mine,
+                    many,
+                )  # fmt: skip
             for e in range(first, last):
-                counts[tile, 0] += reached[e] > 0
-                counts[tile, 1] += count_bits(np.int64(reached[e]))
-            counts[tile, 2] = (mine > 0).sum()
+                with_block += reached[e] > 0
+                blocks += count_bits(np.int64(reached[e]))
+            for i in range(mine.shape[0]):
+                positive += mine[i] > 0
+        counts[tile, 0], counts[tile, 1], counts[tile, 2] = with_block, blocks, positive
 
 
-@nb.njit(fastmath=FAST, error_model="numpy")
+@nb.njit(inline="always")
 def _lift_tile(
     tile: int,
     columns: int,
@@ -144,32 +164,32 @@ def _lift_tile(
     sums: np.ndarray,  # (E_t * many,)
     many: int,
 ) -> None:
-    rays, lines = np.empty((TILE, TILE), np.float32), np.empty((2, TILE), np.float32)
+    rays, lines = np.empty((TILE, TILE), np.float32), np.empty((2, 2, TILE), np.float32)
     left, top, live = open_rays(tile, columns, width, height, rays)
-    labelled = np.zeros(TILE, np.int64)  # one bit per pixel of each row
-    for r in range(TILE):
-        for span in range(span_start[tile * TILE + r], span_start[tile * TILE + r + 1]):
-            labelled[r] |= lanes[span]
-        if not labelled[r]:
-            live &= ~(1 << r)
+    labelled = np.zeros(TILE, np.int64)  # one bit per pixel of each block
+    for b in range(TILE):
+        for span in range(span_start[tile * TILE + b], span_start[tile * TILE + b + 1]):
+            labelled[b] |= lanes[span]
+        if not labelled[b]:
+            live &= ~(1 << b)
+    ahead = aim_next(table, entries, first - 1, last, left, top, lines)
     for e in range(first, last):
-        prefetch(table, entries[min(e + AHEAD, last - 1)])
-        g = entries[e]
-        rows = aim(table, g, left, top, lines) & live
+        blocks, mine, wide = ahead & live, lines[e % 2], table[entries[e], WIDTH]
+        ahead = aim_next(table, entries, e, last, left, top, lines)
         hit = np.int64(0)
-        # Sixteen columns apart, as long as the label stays the same: most rows have one label, most entries too.
+        # Sixteen pixels apart, as long as the label stays the same: most blocks have one label, most entries too.
         current, apart = np.int64(-1), nothing()
-        while rows:
-            r = first_bit(rows)
-            rows &= rows - 1
-            weight, bits = blend_row(rays, r, lines, table[g, WIDTH])
+        while blocks:
+            b = first_bit(blocks)
+            blocks &= blocks - 1
+            weight, bits = blend_block(rays, b, mine, wide)
             if not bits & OPEN:
-                live &= ~(1 << r)
-            hit |= np.int64(bits >> LANES & labelled[r] > 0) << r
+                live &= ~(1 << b)
+            hit |= np.int64(bits >> LANES & labelled[b] > 0) << b
             if many == 1:
-                current, apart = np.int64(0), add_where(apart, weight, labelled[r])
+                current, apart = np.int64(0), add_where(apart, weight, labelled[b])
                 continue
-            for span in range(span_start[tile * TILE + r], span_start[tile * TILE + r + 1]):
+            for span in range(span_start[tile * TILE + b], span_start[tile * TILE + b + 1]):
                 if slots[span] != current:
                     if current >= 0:
                         sums[(e - first) * many + current] += sum_row(apart)

@@ -38,11 +38,11 @@ class LiftedMask:
     slot_start : (T + 1,) int64
         Where the sums of each tile begin: one for each entry and each label of the tile.
     reached : (E,) uint16
-        Rows with a label in which the entry has a weight, one bit each.
+        Blocks with a label in which the entry has a weight, one bit each.
     sums : (slot_start[-1],) float32
         Sum of weights, in px.
     counts : (T, 3) int64
-        Entries with such a row, their rows, sums above zero.
+        Entries with such a block, their blocks, sums above zero.
     """
 
     def __init__(

@@ -8,14 +8,13 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from gsseg_core.blend import AHEAD, blend_tile, open_rays
+from gsseg_core.blend import AHEAD, aim_next, blend_tile, in_block, in_tile, open_rays
 from gsseg_core.lanes import (
     FAST,
     OPEN,
     WIDTH,
     add_scaled,
-    aim,
-    blend_row,
+    blend_block,
     dot,
     first_bit,
     load_row,
@@ -48,8 +47,8 @@ def _scratch(entries: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarr
 def _put(
     tile: int,
     columns: int,
-    block: np.ndarray,  # (16, K, 16)
-    rays: np.ndarray,  # (16, 16)
+    values: np.ndarray,  # (16, K, 16) by block
+    rays: np.ndarray,  # (16, 16) by block
     out: np.ndarray,  # (H, W, K) out
     left_over: np.ndarray,  # (H, W) out
 ) -> None:
@@ -58,9 +57,10 @@ def _put(
     left, top = (tile % columns) * TILE, (tile // columns) * TILE
     for r in range(min(TILE, height - top)):
         for c in range(min(TILE, width - left)):
-            left_over[top + r, left + c] = rays[r, c]
+            b, lane = in_block(r, c)
+            left_over[top + r, left + c] = rays[b, lane]
             for k in range(channels):
-                out[top + r, left + c, k] = block[r, k, c]
+                out[top + r, left + c, k] = values[b, k, lane]
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
@@ -79,19 +79,19 @@ def render(
     height, width, channels = out.shape
     for tile in nb.prange(start.shape[0] - 1):
         first, last = start[tile], start[tile + 1]
-        rays, weights, rows, ends = _scratch(last - first)
-        used = blend_tile(tile, columns, width, height, table, entries, first, last, rays, weights, rows, ends)
-        block = np.zeros((TILE, channels, TILE), np.float32)
+        rays, weights, blocks, ends = _scratch(last - first)
+        used = blend_tile(tile, columns, width, height, table, entries, first, last, rays, weights, blocks, ends)
+        values = np.zeros((TILE, channels, TILE), np.float32)
         n = 0
         for e in range(used):
             g = entries[first + e]
             for i in range(n, ends[e]):
-                weight, row = load_row(weights, i), np.int64(rows[i]) * channels
+                weight, begin = load_row(weights, i), np.int64(blocks[i]) * channels
                 for z in range(rows_of[g], rows_of[g + 1]):
-                    k = row + np.int64(classes[z])
-                    store_row(block, k, add_scaled(load_row(block, k), weight, codes[z]))
+                    k = begin + np.int64(classes[z])
+                    store_row(values, k, add_scaled(load_row(values, k), weight, codes[z]))
             n = ends[e]
-        _put(tile, columns, block, rays, out, left_over)
+        _put(tile, columns, values, rays, out, left_over)
 
 
 @nb.njit(parallel=True, nogil=True, cache=True, fastmath={"contract"}, error_model="numpy")
@@ -108,27 +108,26 @@ def render_few(
     height, width, channels = out.shape
     for tile in nb.prange(start.shape[0] - 1):
         first, last = start[tile], start[tile + 1]
-        rays, lines = np.empty((TILE, TILE), np.float32), np.empty((2, TILE), np.float32)
-        block = np.zeros((TILE, channels, TILE), np.float32)
+        rays, lines = np.empty((TILE, TILE), np.float32), np.empty((2, 2, TILE), np.float32)
+        values = np.zeros((TILE, channels, TILE), np.float32)
         left, top, live = open_rays(tile, columns, width, height, rays)
+        ahead = aim_next(table, entries, first - 1, last, left, top, lines)
         for e in range(first, last):
-            prefetch(table, entries[min(e + AHEAD, last - 1)])
-            prefetch(codes, entries[min(e + AHEAD, last - 1)])
             g = entries[e]
-            reached = aim(table, g, left, top, lines) & live
+            prefetch(codes, entries[min(e + AHEAD, last - 1)])
+            reached, mine, wide = ahead & live, lines[e % 2], table[g, WIDTH]
+            ahead = aim_next(table, entries, e, last, left, top, lines)
             while reached:
-                r = first_bit(reached)
+                b = first_bit(reached)
                 reached &= reached - 1
-                weight, bits = blend_row(rays, r, lines, table[g, WIDTH])
-                for k in range(channels):
-                    store_row(
-                        block, r * channels + k, add_scaled(load_row(block, r * channels + k), weight, codes[g, k])
-                    )
+                weight, bits = blend_block(rays, b, mine, wide)
+                for k in range(b * channels, (b + 1) * channels):
+                    store_row(values, k, add_scaled(load_row(values, k), weight, codes[g, k - b * channels]))
                 if not bits & OPEN:
-                    live &= ~(1 << r)
+                    live &= ~(1 << b)
             if not live:
                 break
-        _put(tile, columns, block, rays, out, left_over)
+        _put(tile, columns, values, rays, out, left_over)
 
 
 @nb.njit(parallel=True, nogil=True, cache=True, fastmath=FAST)
@@ -144,20 +143,21 @@ def adjoint_entries(
     height, width, channels = residual.shape
     for tile in nb.prange(start.shape[0] - 1):
         first, last = start[tile], start[tile + 1]
-        rays, weights, rows, ends = _scratch(last - first)
-        used = blend_tile(tile, columns, width, height, table, entries, first, last, rays, weights, rows, ends)
+        rays, weights, blocks, ends = _scratch(last - first)
+        used = blend_tile(tile, columns, width, height, table, entries, first, last, rays, weights, blocks, ends)
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
-        block = np.zeros((TILE, channels, TILE), np.float32)
+        values = np.zeros((TILE, channels, TILE), np.float32)
         for r in range(min(TILE, height - top)):
             for c in range(min(TILE, width - left)):
+                b, lane = in_block(r, c)
                 for k in range(channels):
-                    block[r, k, c] = residual[top + r, left + c, k]
+                    values[b, k, lane] = residual[top + r, left + c, k]
         sums[first:last] = 0.0
         n = 0
         for e in range(used):
             for i in range(n, ends[e]):
                 for k in range(channels):
-                    sums[first + e, k] += dot(block, rows[i] * channels + k, weights, i)
+                    sums[first + e, k] += dot(values, blocks[i] * channels + k, weights, i)
             n = ends[e]
 
 
@@ -195,19 +195,20 @@ def list_weights(
     for i in nb.prange(wanted.shape[0]):
         tile = wanted[i]
         first, last = start[tile], start[tile + 1]
-        rays, weights, rows, ends = _scratch(last - first)
-        used = blend_tile(tile, columns, width, height, table, entries, first, last, rays, weights, rows, ends)
+        rays, weights, blocks, ends = _scratch(last - first)
+        used = blend_tile(tile, columns, width, height, table, entries, first, last, rays, weights, blocks, ends)
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
         position = place[i] if values.shape[0] else 0
         n = 0
         for e in range(used):
             for record in range(n, ends[e]):
-                for c in range(TILE):
-                    if weights[record, c] > 0:
+                for lane in range(TILE):
+                    if weights[record, lane] > 0:
                         if values.shape[0]:
-                            pixels[position] = (top + rows[record]) * width + left + c
+                            r, c = in_tile(blocks[record], lane)
+                            pixels[position] = (top + r) * width + left + c
                             rows_of[position] = entries[first + e]
-                            values[position] = weights[record, c]
+                            values[position] = weights[record, lane]
                         position += 1
             n = ends[e]
         if not values.shape[0]:

@@ -45,10 +45,14 @@ LARGEST_REACH = np.sqrt(2.0 * np.log(255.0))
 
 ROOT = np.sqrt(DILATION)
 
-BLOCK = 256
+BLOCK = 128
 """Gaussians that are looked at together before those among them that may be visible are projected."""
 
-AHEAD = 16
+# Where numbers of the Gaussians of a block lie: so many times BLOCK.
+MEAN, QUAT, SCALES, OPACITY, OUT, DEPTH = 0, 3, 7, 10, 11, 19
+NUMBERS = 20
+
+AHEAD = 32
 """How many rows ahead memory is asked for."""
 
 SHORT = 32
@@ -162,7 +166,9 @@ def _is_before(one: np.ndarray, other: np.ndarray) -> bool:
 def _gather(rows: np.ndarray, order: np.ndarray, ids: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     sorted_ids, sorted_table = np.empty(order.shape[0], np.int32), np.empty((order.shape[0], 8), np.float32)
     for m in nb.prange(order.shape[0]):
-        prefetch(table, rows[order[min(m + AHEAD, order.shape[0] - 1)]])
+        later = rows[order[min(m + AHEAD, order.shape[0] - 1)]]
+        prefetch(table, later)
+        prefetch(ids, later)
         row = rows[order[m]]
         sorted_ids[m] = ids[row]
         for j in range(8):
@@ -188,17 +194,17 @@ def _project(
     limits = _limits(K, width, height)
     for chunk in nb.prange(CHUNKS):
         first, last = chunk * means.shape[0] // CHUNKS, (chunk + 1) * means.shape[0] // CHUNKS
-        near = np.empty(BLOCK, np.bool_)
+        near, shown, who = np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.int64)
+        lanes = np.empty(NUMBERS * BLOCK, np.float64)
         n = first
         for begin in range(first, last, BLOCK):
             end = min(begin + BLOCK, last)
             _find_near(
                 means[begin:end], scales[begin:end], log_opacities[begin:end], viewmat, K, width, height, limits, near
             )
-            n = _project_near(
-                begin, near[: end - begin], means, quats, scales, log_opacities, viewmat, K, width, height, limits,
-                n, table, depth, ids,
-            )  # fmt: skip
+            many = _collect(begin, near[: end - begin], means, quats, scales, log_opacities, who, lanes)
+            _project_near(many, lanes, shown, viewmat, K, width, height, limits)
+            n = _keep_shown(many, who, lanes, shown, n, table, depth, ids)
         found[chunk] = n - first
 
 
@@ -228,72 +234,89 @@ def _find_near(
 ) -> None:
     """Throw out most of what is off the image before the costly part, by instructions for several Gaussians at once.
 
-    The reach is bounded by the longest axis and opacity 1, with sqrt(a^2 + b^2) <= |a| + |b|, twice.
+    The reach is bounded by the longest axis and opacity 1, with sqrt(a^2 + b^2) <= |a| + |b|, twice, and with the
+    outermost ray at which the camera is linearised. All is multiplied by depth, so nothing is divided.
     """
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     r00, r01, r02, tx = viewmat[0, 0], viewmat[0, 1], viewmat[0, 2], viewmat[0, 3]
     r10, r11, r12, ty = viewmat[1, 0], viewmat[1, 1], viewmat[1, 2], viewmat[1, 3]
     r20, r21, r22, tz = viewmat[2, 0], viewmat[2, 1], viewmat[2, 2], viewmat[2, 3]
     x_low, x_high, y_low, y_high = limits
+    across, down = fx * (1.0 + max(abs(x_low), abs(x_high))), fy * (1.0 + max(abs(y_low), abs(y_high)))
     for i in range(means.shape[0]):
         mx, my, mz = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
         z = r20 * mx + r21 * my + r22 * mz + tz
-        ahead = z >= NEAR
-        inverse = 1.0 / (z if ahead else 1.0)
-        x, y = (r00 * mx + r01 * my + r02 * mz + tx) * inverse, (r10 * mx + r11 * my + r12 * mz + ty) * inverse
-        u, v = fx * x + cx, fy * y + cy
-        longest = np.float64(max(scales[i, 0], max(scales[i, 1], scales[i, 2]))) * inverse
-        bound_x = LARGEST_REACH * (longest * fx * (1.0 + abs(min(max(x, x_low), x_high))) + ROOT)
-        bound_y = LARGEST_REACH * (longest * fy * (1.0 + abs(min(max(y, y_low), y_high))) + ROOT)
-        across = (u + bound_x >= 0.0) & (u - bound_x <= width)
-        near[i] = ahead & (log_opacities[i] >= LOG_ALPHA_MIN) & across & (v + bound_y >= 0.0) & (v - bound_y <= height)
+        u = fx * (r00 * mx + r01 * my + r02 * mz + tx) + cx * z
+        v = fy * (r10 * mx + r11 * my + r12 * mz + ty) + cy * z
+        longest = np.float64(max(scales[i, 0], max(scales[i, 1], scales[i, 2])))
+        bound_u = LARGEST_REACH * (longest * across + ROOT * z)
+        bound_v = LARGEST_REACH * (longest * down + ROOT * z)
+        beside = (u + bound_u >= 0.0) & (u - bound_u <= width * z) & (v + bound_v >= 0.0) & (v - bound_v <= height * z)
+        near[i] = (z >= NEAR) & (log_opacities[i] >= LOG_ALPHA_MIN) & beside
 
 
-@nb.njit(error_model="numpy")
-def _project_near(
+@nb.njit
+def _collect(
     begin: int,
     near: np.ndarray,  # (B,) bool: which of the Gaussians from `begin` on
     means: np.ndarray,  # (N, 3)
     quats: np.ndarray,  # (N, 4)
     scales: np.ndarray,  # (N, 3)
     log_opacities: np.ndarray,  # (N,)
+    who: np.ndarray,  # (BLOCK,) int64 out: which they are
+    lanes: np.ndarray,  # (NUMBERS * BLOCK,) out: what is known of them, number after number
+) -> int:
+    """Put those that may be visible side by side, for instructions on several of them; returns how many there are."""
+    n = 0
+    for j in range(near.shape[0]):
+        who[n] = begin + j
+        n += near[j]
+    for j in range(n):
+        i = who[j]
+        for axis in range(3):
+            lanes[(MEAN + axis) * BLOCK + j] = means[i, axis]
+            lanes[(SCALES + axis) * BLOCK + j] = scales[i, axis]
+        for part in range(4):
+            lanes[(QUAT + part) * BLOCK + j] = quats[i, part]
+        lanes[OPACITY * BLOCK + j] = log_opacities[i]
+    return n
+
+
+@nb.njit(error_model="numpy")
+def _project_near(
+    many: int,
+    lanes: np.ndarray,  # (NUMBERS * BLOCK,) in: what `_collect` put there; out: what the table holds, and depth
+    shown: np.ndarray,  # (BLOCK,) bool out
     viewmat: np.ndarray,  # (4, 4)
     K: np.ndarray,  # (3, 3)
     width: float,
     height: float,
     limits: tuple[float, float, float, float],
-    n: int,
-    table: np.ndarray,  # (N, 8) out, from row n on
-    depth: np.ndarray,  # (N,) out, the same
-    ids: np.ndarray,  # (N,) out, the same
-) -> int:
-    """Project those that may be visible, and keep those that are; returns the row after the last one.
+) -> None:
+    """Project those that may be visible.
 
-    Divisions and roots cost more than all else here, so each is done once.
+    Divisions and roots cost more than all else here, so each is done once. Nothing may be contracted: the last of a
+    block are projected one by one, and must come out as the others do.
     """
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     v00, v01, v02, tx = viewmat[0, 0], viewmat[0, 1], viewmat[0, 2], viewmat[0, 3]
     v10, v11, v12, ty = viewmat[1, 0], viewmat[1, 1], viewmat[1, 2], viewmat[1, 3]
     v20, v21, v22, tz = viewmat[2, 0], viewmat[2, 1], viewmat[2, 2], viewmat[2, 3]
     x_low, x_high, y_low, y_high = limits
-    for j in range(near.shape[0]):
-        if not near[j]:
-            continue
-        i = begin + j
-        mx, my, mz = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
+    for j in range(many):
+        mx, my, mz = lanes[MEAN * BLOCK + j], lanes[(MEAN + 1) * BLOCK + j], lanes[(MEAN + 2) * BLOCK + j]
         z = v20 * mx + v21 * my + v22 * mz + tz
         inverse = 1.0 / z
         x, y = (v00 * mx + v01 * my + v02 * mz + tx) * inverse, (v10 * mx + v11 * my + v12 * mz + ty) * inverse
         u, v = fx * x + cx, fy * y + cy
         xc, yc = min(max(x, x_low), x_high), min(max(y, y_low), y_high)
-        cut = max((np.float64(log_opacities[i]) - LOG_ALPHA_MIN) * (1.0 / HALF_LOG2E), 0.0)
+        cut = max((lanes[OPACITY * BLOCK + j] - LOG_ALPHA_MIN) * (1.0 / HALF_LOG2E), 0.0)
         # Rows of J R_view, with J the Jacobian of the pinhole projection.
         ax, ay, az = fx * inverse * (v00 - xc * v20), fx * inverse * (v01 - xc * v21), fx * inverse * (v02 - xc * v22)
         bx, by, bz = fy * inverse * (v10 - yc * v20), fy * inverse * (v11 - yc * v21), fy * inverse * (v12 - yc * v22)
-        qw, qx, qy, qz = (
-            np.float64(quats[i, 0]), np.float64(quats[i, 1]), np.float64(quats[i, 2]), np.float64(quats[i, 3]),
-        )  # fmt: skip
-        s0, s1, s2 = np.float64(scales[i, 0]), np.float64(scales[i, 1]), np.float64(scales[i, 2])
+        qw, qx = lanes[QUAT * BLOCK + j], lanes[(QUAT + 1) * BLOCK + j]
+        qy, qz = lanes[(QUAT + 2) * BLOCK + j], lanes[(QUAT + 3) * BLOCK + j]
+        s0, s1, s2 = lanes[SCALES * BLOCK + j], lanes[(SCALES + 1) * BLOCK + j], lanes[(SCALES + 2) * BLOCK + j]
         r00, r01, r02 = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy - qw * qz), 2 * (qx * qz + qw * qy)
         r10, r11, r12 = 2 * (qx * qy + qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz - qw * qx)
         r20, r21, r22 = 2 * (qx * qz - qw * qy), 2 * (qy * qz + qw * qx), 1 - 2 * (qx * qx + qy * qy)
@@ -312,18 +335,35 @@ def _project_near(
         syy = b0 * b0 + b1 * b1 + b2 * b2 + DILATION
         reach_x, reach_y = min(np.sqrt(cut * sxx), REACH_MAX), min(np.sqrt(cut * syy), REACH_MAX)
         across = (u + reach_x >= 0.5) & (u - reach_x <= width - 0.5)
-        if not (across & (v + reach_y >= 0.5) & (v - reach_y <= height - 0.5)):
-            continue
+        shown[j] = across & (v + reach_y >= 0.5) & (v - reach_y <= height - 0.5)
         inverse_syy = 1.0 / syy
-        table[n, U] = u
-        table[n, V] = v
-        table[n, SHEAR] = sxy * inverse_syy
+        lanes[(OUT + U) * BLOCK + j] = u
+        lanes[(OUT + V) * BLOCK + j] = v
+        lanes[(OUT + SHEAR) * BLOCK + j] = sxy * inverse_syy
         # var(x|y) = S_xx - S_xy^2 / S_yy is at least the dilation; rounding must not bring it below.
-        table[n, WIDTH] = HALF_LOG2E / max(sxx - sxy * sxy * inverse_syy, DILATION)
-        table[n, HEIGHT] = HALF_LOG2E * inverse_syy
-        table[n, LOG_OPACITY] = log_opacities[i]
-        table[n, Y_REACH] = reach_y
-        table[n, X_TURN] = min(max(sxy * (reach_x / sxx), -REACH_MAX), REACH_MAX)
-        depth[n], ids[n] = z, i
-        n += 1
+        lanes[(OUT + WIDTH) * BLOCK + j] = HALF_LOG2E / max(sxx - sxy * sxy * inverse_syy, DILATION)
+        lanes[(OUT + HEIGHT) * BLOCK + j] = HALF_LOG2E * inverse_syy
+        lanes[(OUT + LOG_OPACITY) * BLOCK + j] = lanes[OPACITY * BLOCK + j]
+        lanes[(OUT + Y_REACH) * BLOCK + j] = reach_y
+        lanes[(OUT + X_TURN) * BLOCK + j] = min(max(sxy * (reach_x / sxx), -REACH_MAX), REACH_MAX)
+        lanes[DEPTH * BLOCK + j] = z
+
+
+@nb.njit
+def _keep_shown(
+    many: int,
+    who: np.ndarray,  # (BLOCK,)
+    lanes: np.ndarray,  # (NUMBERS * BLOCK,)
+    shown: np.ndarray,  # (BLOCK,) bool
+    n: int,
+    table: np.ndarray,  # (N, 8) out, from row n on
+    depth: np.ndarray,  # (N,) out, the same
+    ids: np.ndarray,  # (N,) out, the same
+) -> int:
+    """Write down those that are visible; returns the row after the last one."""
+    for j in range(many):
+        for column in range(8):
+            table[n, column] = lanes[(OUT + column) * BLOCK + j]
+        depth[n], ids[n] = lanes[DEPTH * BLOCK + j], who[j]
+        n += shown[j]
     return n

@@ -2,7 +2,7 @@
 
 A *sighting* is a Gaussian with one of the labels under which a view sees it. There are few: most Gaussians lie inside
 one label. Everything that learning asks of a view is one number per sighting, and `share` makes these numbers, from the
-entries and rows that `lift` found to have a weight. It projects nothing, sorts nothing, and meets no Gaussian that
+entries and blocks that `lift` found to have a weight. It projects nothing, sorts nothing, and meets no Gaussian that
 something else hides.
 """
 
@@ -20,7 +20,7 @@ from gsseg_core.lanes import (
     add_scaled,
     add_scaled_where,
     aim,
-    blend_row,
+    blend_block,
     first_bit,
     load_row,
     nothing,
@@ -45,10 +45,10 @@ PARTS = 4
 @nb.njit(parallel=True, nogil=True, cache=True)
 def keep_entries(
     start: np.ndarray,  # (T + 1,)
-    reached: np.ndarray,  # (E,) uint16: rows of each entry
+    reached: np.ndarray,  # (E,) uint16: blocks of each entry
     kept_start: np.ndarray,  # (T + 1,) where the entries that are kept of each tile go
     kept: np.ndarray,  # (E, 2) int32 out: where each entry goes, -1 if nowhere; its tile
-    rows: np.ndarray,  # (E',) uint16 out: rows of those that are kept
+    blocks: np.ndarray,  # (E',) uint16 out: blocks of those that are kept
 ) -> None:
     """Give a number to every entry that reaches a labelled pixel."""
     for tile in nb.prange(start.shape[0] - 1):
@@ -56,7 +56,7 @@ def keep_entries(
         for e in range(start[tile], start[tile + 1]):
             kept[e, 0], kept[e, 1] = -1, tile
             if reached[e]:
-                kept[e, 0], rows[n] = n, reached[e]
+                kept[e, 0], blocks[n] = n, reached[e]
                 n += 1
 
 
@@ -174,8 +174,8 @@ def share(
     table: np.ndarray,  # (M, 8)
     start: np.ndarray,  # (T + 1,)
     entries: np.ndarray,  # (E,)
-    rows: np.ndarray,  # (E,)
-    records: np.ndarray,  # (T,) rows of all the tile's entries
+    blocks: np.ndarray,  # (E,)
+    records: np.ndarray,  # (T,) blocks of all the tile's entries
     label_start: np.ndarray,  # (T + 1,)
     present: np.ndarray,
     span_start: np.ndarray,  # (16 T + 1,)
@@ -202,13 +202,13 @@ def share(
         weights = np.empty((records[tile], TILE), np.float32)
         left, top, _ = open_rays(tile, columns, width, height, rays)
         _blend_said(
-            left, top, table, entries[mine], rows[mine], labels.shape[0], spans, slots, lanes, here, said, rays, value,
-            weights,
+            left, top, table, entries[mine], blocks[mine], labels.shape[0], spans, slots, lanes, here, said, rays,
+            value, weights,
         )  # fmt: skip
         spare = left_over[label_start[tile] : label_start[tile + 1]]
         logs[tile] = _invert(spans, slots, lanes, rest[labels], rays, value, spare)
         _sum_shares(
-            rows[mine], labels.shape[0], spans, slots, lanes, value, weights,
+            blocks[mine], labels.shape[0], spans, slots, lanes, value, weights,
             sums[slot_start[tile] : slot_start[tile + 1]],
         )  # fmt: skip
 
@@ -219,7 +219,7 @@ def _blend_said(
     top: float,
     table: np.ndarray,  # (M, 8)
     entries: np.ndarray,  # (E_t,) of this tile
-    rows: np.ndarray,  # (E_t,)
+    blocks: np.ndarray,  # (E_t,)
     many: int,
     spans: np.ndarray,  # (17,)
     slots: np.ndarray,
@@ -237,22 +237,22 @@ def _blend_said(
         g = entries[e]
         aim(table, g, left, top, lines)
         only = said[sighting[e * many]] if many == 1 else np.float32(0.0)
-        todo = np.int64(rows[e])
+        todo = np.int64(blocks[e])
         while todo:
-            r = first_bit(todo)
+            b = first_bit(todo)
             todo &= todo - 1
-            weight, _ = blend_row(rays, r, lines, table[g, WIDTH])
+            weight, _ = blend_block(rays, b, lines, table[g, WIDTH])
             store_row(weights, n, weight)
             n += 1
-            total = load_row(value, r)
+            total = load_row(value, b)
             if many == 1:
                 total = add_scaled(total, weight, only)
             else:
-                for span in range(spans[r], spans[r + 1]):
+                for span in range(spans[b], spans[b + 1]):
                     # Where there is no sighting, the weights are zero.
                     s = max(sighting[e * many + slots[span]], 0)
                     total = add_scaled_where(total, weight, said[s], np.int64(lanes[span]))
-            store_row(value, r, total)
+            store_row(value, b, total)
 
 
 @nb.njit(error_model="numpy")
@@ -267,32 +267,32 @@ def _invert(
 ) -> float:
     total = 0.0
     spare[:] = 0.0
-    for r in range(TILE):
+    for b in range(TILE):
         known = np.int64(0)
-        for span in range(spans[r], spans[r + 1]):
+        for span in range(spans[b], spans[b + 1]):
             known |= np.int64(lanes[span])
             # Each likelihood is at least 1e-30 and at most about 1: products of eight stay within a float64.
             product, s = 1.0, slots[span]
-            for c in range(TILE):
-                if lanes[span] >> c & 1:
-                    p = value[r, c] + rest[s] * rays[r, c]
+            for i in range(TILE):
+                if lanes[span] >> i & 1:
+                    p = value[b, i] + rest[s] * rays[b, i]
                     # A pixel that nothing explains has no share to give, at any codes; its term is held at a floor.
                     product *= np.float64(max(p, _TINY))
-                    value[r, c] = 1.0 / p if p > _TINY else 0.0
-                    spare[s] += rays[r, c] * value[r, c]
-                if c == TILE // 2 - 1:
+                    value[b, i] = 1.0 / p if p > _TINY else 0.0
+                    spare[s] += rays[b, i] * value[b, i]
+                if i == TILE // 2 - 1:
                     total += np.log(product)
                     product = 1.0
             total += np.log(product)
-        for c in range(TILE):
-            if not known >> c & 1:
-                value[r, c] = 0.0
+        for i in range(TILE):
+            if not known >> i & 1:
+                value[b, i] = 0.0
     return total
 
 
 @nb.njit(fastmath=FAST)
 def _sum_shares(
-    rows: np.ndarray,  # (E_t,)
+    blocks: np.ndarray,  # (E_t,)
     many: int,
     spans: np.ndarray,  # (17,)
     slots: np.ndarray,
@@ -303,24 +303,24 @@ def _sum_shares(
 ) -> None:
     sums[:] = 0.0
     n = 0
-    for e in range(rows.shape[0]):
-        # Sixteen columns apart, as long as the label stays the same: most rows have one label, most entries too.
+    for e in range(blocks.shape[0]):
+        # Sixteen pixels apart, as long as the label stays the same: most blocks have one label, most entries too.
         current, apart = np.int64(-1), nothing()
-        todo = np.int64(rows[e])
+        todo = np.int64(blocks[e])
         while todo:
-            r = first_bit(todo)
+            b = first_bit(todo)
             todo &= todo - 1
             weight = load_row(weights, n)
             n += 1
             if many == 1:
-                current, apart = np.int64(0), add_product(apart, weight, load_row(inverse, r))
+                current, apart = np.int64(0), add_product(apart, weight, load_row(inverse, b))
                 continue
-            for span in range(spans[r], spans[r + 1]):
+            for span in range(spans[b], spans[b + 1]):
                 if slots[span] != current:
                     if current >= 0:
                         sums[e * many + current] += sum_row(apart)
                     current, apart = np.int64(slots[span]), nothing()
-                apart = add_product_where(apart, weight, load_row(inverse, r), np.int64(lanes[span]))
+                apart = add_product_where(apart, weight, load_row(inverse, b), np.int64(lanes[span]))
         if current >= 0:
             sums[e * many + current] += sum_row(apart)
 

@@ -37,8 +37,8 @@ class TileObservation(Observation):
         many = np.diff(mask.start)
         self._start, self._slot_start = starts(counts[:, 0]), starts(counts[:, 0] * many)
         self._records = counts[:, 1].copy()
-        kept, self._rows = np.empty((len(lifted.reached), 2), np.int32), np.empty(self._start[-1], np.uint16)
-        sightings.keep_entries(tiles.start, lifted.reached, self._start, kept, self._rows)
+        kept, self._blocks = np.empty((len(lifted.reached), 2), np.int32), np.empty(self._start[-1], np.uint16)
+        sightings.keep_entries(tiles.start, lifted.reached, self._start, kept, self._blocks)
 
         # A Gaussian has at most as many labels as sums, and each entry one sum, but for so many in all:
         extra = counts[:, 2].sum() - counts[:, 0].sum()
@@ -66,7 +66,7 @@ class TileObservation(Observation):
     def nbytes(self) -> int:
         """Memory that it holds, in bytes."""
         mask = self._labels
-        held = (self.ids, self.start, self.labels, self._votes, self._table, self._start, self._entries, self._rows,
+        held = (self.ids, self.start, self.labels, self._votes, self._table, self._start, self._entries, self._blocks,
                 self._records, self._slot_start, self._sighting, mask.start, mask.present, mask.span_start, mask.slots,
                 mask.lanes)  # fmt: skip
         # The ids once more for `order`; and what `shares` was asked last, and answered.
@@ -94,7 +94,7 @@ class TileObservation(Observation):
         logs, left_over = np.zeros(len(self._records)), np.zeros(len(mask.present))
         sums, parts = np.empty(self._slot_start[-1], np.float32), np.empty((sightings.PARTS, len(said)), np.float32)
         sightings.share(
-            self._columns, camera.width, camera.height, self._table, self._start, self._entries, self._rows,
+            self._columns, camera.width, camera.height, self._table, self._start, self._entries, self._blocks,
             self._records, mask.start, mask.present, mask.span_start, mask.slots, mask.lanes, self._slot_start,
             self._sighting, said, rest, logs, left_over, sums,
         )  # fmt: skip

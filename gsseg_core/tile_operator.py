@@ -44,7 +44,7 @@ class TileOperator(ViewOperator):
 
     def _blend(self, codes: np.ndarray) -> Blended:
         visible = take(np.ascontiguousarray(codes, np.float32), self.ids)
-        if 0 < codes.shape[1] <= products.FEW:
+        if codes.shape[1] <= products.FEW:
             blended, tiles = self._blank(codes.shape[1]), self._tiles
             products.render_few(tiles.columns, self._table, tiles.start, tiles.entries, visible, *blended)
             return blended
