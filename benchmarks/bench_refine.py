@@ -73,7 +73,7 @@ def neighbour_searches(means: np.ndarray, k: int) -> dict[str, Callable[[], obje
     """Ours and those of the libraries at hand, each from positions to mean distances."""
 
     def ours() -> np.ndarray:
-        return Neighbours.find(means, k).distances
+        return Neighbours.among(means, k).look_for().distances
 
     def scipy() -> np.ndarray:
         return cKDTree(means).query(means, k + 1, workers=-1)[0].sum(axis=1) / k

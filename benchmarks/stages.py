@@ -140,8 +140,8 @@ def _refinement(path: Path, data: Dataset, runs: int) -> Times:
     del fresh
     times["segment, later calls"] = timed(lambda: Segmentation.from_codes(scene, codes, names), runs)
     result = Segmentation.from_codes(scene, codes, names)
-    known = Neighbours.find(scene.means, settings.k)
-    times["neighbours"] = timed(lambda: Neighbours.find(scene.means, settings.k), runs)
+    known = Neighbours.among(scene.means, settings.k).look_for()
+    times["neighbours"] = timed(lambda: Neighbours.among(scene.means, settings.k).look_for(), runs)
     times["KNN"] = timed(lambda: cluster(scene.means, codes, observed, settings.k, settings.beta, known), runs)
     times["filter"] = timed(
         lambda: statistical_filter(

@@ -264,6 +264,21 @@ def count_bits(typing: Any, bits: Any) -> tuple[Any, Callable[..., Any]]:
 
 
 @intrinsic
+def count_at_most(typing: Any, numbers: Any, i: Any, limit: Any) -> tuple[Any, Callable[..., Any]]:
+    """Count which of the sixteen int32 in row i are not above a limit."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        row = _Builder(context, builder, signature, arguments)
+        address = builder.bitcast(row.row(0), ir.PointerType(_BITS))
+        first = builder.insert_element(ir.Constant(_BITS, ir.Undefined), arguments[2], ir.Constant(_I32, 0))
+        most = builder.shuffle_vector(first, first, ir.Constant(_BITS, [0] * LANES))
+        found = builder.icmp_signed("<=", builder.load(address, align=4, typ=_BITS), most)
+        return builder.ctpop(row.bits(found))
+
+    return types.int64(numbers, i, types.int32), generate
+
+
+@intrinsic
 def blend_block(typing: Any, rays: Any, b: Any, lines: Any, wide: Any) -> tuple[Any, Callable[..., Any]]:
     """Blend one Gaussian into block b of the rays.
 

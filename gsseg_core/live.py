@@ -351,7 +351,12 @@ class LiveSession:
 
     def prepare(self, settings: RefineSettings) -> None:
         """Find the neighbours that refinement needs, in a thread of their own, so that the first request has them."""
-        threading.Thread(target=neighbours_of, args=(self.scene, settings.k), name="neighbours").start()
+
+        def find() -> None:
+            if (neighbours := neighbours_of(self.scene, settings.k)) is not None:
+                neighbours.look_for()
+
+        threading.Thread(target=find, name="neighbours").start()
 
     def reset(self) -> int:
         """Forget votes, views and codes; return how many views were forgotten."""

@@ -8,6 +8,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.kd_tree import LEAF, gap_to_point, leaf_of, leaf_range
+from gsseg_core.lanes import count_at_most
 from gsseg_core.surroundings import DEPTH, FAR, Surroundings, end_of_group, look_around, measure, room_for
 
 DIGITS = 24
@@ -35,7 +36,7 @@ def nearest(
     radii, distances = np.empty(m, np.float32), np.empty(m, np.float64)
     bits = radii.view(np.int32)
     for chunk in nb.prange((m + CHUNK - 1) // CHUNK):
-        gaps, close, around = np.empty(DEPTH, np.float32), np.empty(3 * k + LEAF, np.float32), room_for(128)
+        gaps, close, around = np.empty(DEPTH, np.float32), np.empty(3 * k + 2 * LEAF, np.float32), room_for(128)
         box, bounds = np.empty(6, np.float32), np.empty((2, LEAF), np.float32)
         close_bits, bound_bits = close.view(np.int32), bounds.view(np.int32)
         before, first = -1, chunk * CHUNK
@@ -46,25 +47,25 @@ def nearest(
             if before >= 0:
                 bound = _farthest(points, places[before], own, radii[before])
             found = _search(points, boxes, own, k, bound, close, around.nodes, gaps)
-            bits[middle] = _smallest(close_bits, found, k, np.int32(0), _largest(close_bits, found))
+            bits[middle] = _smallest(close_bits, _fill_up(close, found), k, np.int32(0), _largest(close_bits, found))
             reach = _bound(points, places, first, last, middle, radii[middle], bounds)
             around, found = look_around(boxes, box, reach, NO_SKIP, 0, around)
             near = around.near.reshape(-1)
             near_bits = near.view(np.int32)
             for q in range(first, last):
                 own, bound = places[q], bounds[1, q - first]
-                count = LEAF * measure(blocks, points[0, own], points[1, own], points[2, own], bound, found, around)
-                _leave_out(own, leaf_of(own, leaves, n), leaves, n, count, around)
-                bits[q] = _smallest(near_bits, count, k, bound_bits[0, q - first], bound_bits[1, q - first])
-                distances[q] = _mean_root(near, count, k, radii[q])
+                rows = measure(blocks, points[0, own], points[1, own], points[2, own], bound, found, around)
+                _leave_out(own, leaf_of(own, leaves, n), leaves, n, rows, around)
+                bits[q] = _smallest(near_bits, rows, k, bound_bits[0, q - first], bound_bits[1, q - first])
+                distances[q] = _mean_root(near, LEAF * rows, k, radii[q])
             before, first = middle, last
     return radii, distances
 
 
 @nb.njit
-def _leave_out(own: int, leaf: int, leaves: int, n: int, count: int, around: Surroundings) -> None:
+def _leave_out(own: int, leaf: int, leaves: int, n: int, rows: int, around: Surroundings) -> None:
     """Take a point out of what was measured from it."""
-    for h in range(count // LEAF):
+    for h in range(rows):
         if around.leaves[around.reached[h]] == leaf:
             around.near[h, own - leaf_range(leaf, leaves, n)[0]] = FAR
 
@@ -135,7 +136,7 @@ def _search(
     own: int,
     k: int,
     bound: float,  # above the k-th smallest squared distance
-    near: np.ndarray,  # (at least 3 k + LEAF,), filled
+    near: np.ndarray,  # (at least 3 k + 2 LEAF,), filled
     nodes: np.ndarray,  # (DEPTH,), scratch
     gaps: np.ndarray,  # (DEPTH,), scratch
 ) -> int:
@@ -158,7 +159,7 @@ def _search(
         if gap >= bound:
             continue
         first, last = leaf_range(node - leaves, leaves, n)
-        if found + last - first > near.shape[0]:
+        if found + last - first > near.shape[0] - LEAF:
             bound, found = _shorten(near, found, k), k
         for i in range(first, last):
             dx, dy, dz = points[0, i] - x, points[1, i] - y, points[2, i] - z
@@ -172,7 +173,7 @@ def _search(
 def _shorten(near: np.ndarray, found: int, k: int) -> np.float32:
     """Keep the k smallest, of equal ones any; returns the largest of them."""
     bits = near.view(np.int32)
-    limit = _smallest(bits, found, k, np.int32(0), _largest(bits, found))
+    limit = _smallest(bits, _fill_up(near, found), k, np.int32(0), _largest(bits, found))
     kept = 0
     for i in range(found):
         if bits[i] < limit:
@@ -193,29 +194,40 @@ def _largest(bits: np.ndarray, n: int) -> np.int32:
 
 @nb.njit
 def _smallest(
-    bits: np.ndarray,  # (n or more,) int32
-    n: int,
+    bits: np.ndarray,  # (16 rows or more,) int32
+    rows: int,
     k: int,
     low: np.int32,
     high: np.int32,
 ) -> np.int32:
-    """Bits of the k-th smallest of n float32, none negative, which is known to be between two others.
+    """Bits of the k-th smallest of sixteen times so many float32, none negative, known to be between two others.
 
     Such floats sort like their bits, so this bisects the bits: counting what is at most the middle takes a few vector
     instructions, has no branch to mispredict and moves nothing. It ends as soon as k are on one side.
     """
     while low < high:
-        middle = low + ((high - low) >> np.int32(1))
-        count = np.int32(0)
-        for i in range(n):
-            count += np.int32(bits[i] <= middle)
+        middle = np.int32(low + ((high - low) >> np.int32(1)))
+        count = 0
+        for i in range(rows):
+            count += count_at_most(bits, i, middle)
         if count >= k:
             high = middle
             if count == k:
                 break
         else:
-            low = middle + np.int32(1)
+            low = np.int32(middle + 1)
     largest = np.int32(0)
-    for i in range(n):
+    for i in range(LEAF * rows):
         largest = max(largest, bits[i] if bits[i] <= high else np.int32(0))
     return largest
+
+
+@nb.njit
+def _fill_up(
+    near: np.ndarray,  # with room for a row more
+    found: int,
+) -> int:
+    """End the last row of sixteen with distances that nothing has; returns the number of rows."""
+    rows = (found + LEAF - 1) // LEAF
+    near[found : LEAF * rows] = FAR
+    return rows

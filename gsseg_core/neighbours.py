@@ -1,7 +1,8 @@
-"""Distances from every point to its k nearest others, found once per scene, and means over those.
+"""Distances from points to their k nearest others, found once and only where asked for, and means over those.
 
 What is kept is not who the neighbours are but how far the k-th one is: with it, all of them are found again by one look
-around, and a million points take 16 MB instead of 200.
+around, and a million points take 16 MB instead of 200. Background that is sure of itself is never asked for, and it is
+more than half of most scenes.
 
 Results are bit-identical whatever the order of the points and the number of threads: points tied for the last place
 among the k nearest share it equally, and sums are taken over whole numbers, where order is no matter.
@@ -9,7 +10,8 @@ among the k nearest share it equally, and sums are taken over whole numbers, whe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import threading
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numba as nb
@@ -33,7 +35,7 @@ NOBODY = MIXED + 1  # the label of no point
 
 @dataclass(frozen=True, eq=False)
 class Neighbours:
-    """How far the k nearest others of every point are.
+    """How far the k nearest others of points are.
 
     Attributes
     ----------
@@ -42,27 +44,41 @@ class Neighbours:
     tree : Tree
         The points, all arrays here being in its order.
     radii : (N,) float32
-        Squared distance to the k-th nearest other, in units of the scaled points.
+        Squared distance to the k-th nearest other, in units of the scaled points; NaN where nobody has asked for it.
     distances : (N,) float64
-        Mean distance to the k nearest others, in the same units.
+        Mean distance to the k nearest others, in the same units; NaN likewise.
     """
 
     k: int
     tree: Tree
     radii: np.ndarray
     distances: np.ndarray
+    _looking: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     @classmethod
-    def find(
+    def among(
         cls,
         means: np.ndarray,  # (N, 3) float32, finite
         k: int,
         tree: Tree | None = None,
     ) -> Neighbours:
-        """Find them, for N > 1; the tree, if there is one, is that of the scaled points."""
-        tree, k = tree or Tree.build(scaled(means)), min(k, len(means) - 1)
-        radii, distances = nearest(tree.points, tree.boxes, tree.blocks, np.arange(len(means), dtype=np.int32), k)
-        return cls(k, tree, radii, distances)
+        """Begin with N > 1 points, of which none has been asked for; the tree is that of the scaled points."""
+        tree, n = tree or Tree.build(scaled(means)), len(means)
+        return cls(min(k, n - 1), tree, np.full(n, np.nan, np.float32), np.full(n, np.nan))
+
+    def look_for(
+        self,
+        wanted: np.ndarray | None = None,  # (N,) bool, in the order of the tree
+    ) -> Neighbours:
+        """Find what is not known yet of the points that are wanted, or of all; returns the same object."""
+        tree = self.tree
+        with self._looking:
+            missing = np.isnan(self.radii)
+            places = np.flatnonzero(missing if wanted is None else missing & wanted).astype(np.int32)
+            if len(places):
+                found = nearest(tree.points, tree.boxes, tree.blocks, places, self.k)
+                self.radii[places], self.distances[places] = found
+        return self
 
     def mean_codes(
         self,
@@ -82,7 +98,9 @@ class Neighbours:
         read = np.repeat(counted, np.diff(codes.start))
         units = np.rint(codes.values * np.float32(1 / CODE_UNIT), where=read, out=np.zeros_like(codes.values))
         units = units.astype(np.int32)
-        asked = np.arange(len(order)) if wanted is None else np.flatnonzero(wanted[order])
+        mine = np.ones(len(order), bool) if wanted is None else wanted[order]
+        asked = np.flatnonzero(mine)
+        self.look_for(mine)
         # A block at a time is written out in full, so that of all the codes only what is not zero is ever in memory.
         parts = []
         for first in range(0, max(len(asked), 1), BLOCK):
@@ -111,6 +129,7 @@ class Neighbours:
         tree = self.tree
         of_point = labels[tree.order].astype(np.int32)
         of_point[of_point >= num_classes] = 0
+        self.look_for(of_point > 0)
         found = pure_distances(tree.points, tree.boxes, tree.blocks, of_point, self.radii, self.distances)
         by_class = np.argsort(of_point.astype(np.int16) if num_classes < 2**15 else of_point, kind="stable")
         bounds = np.searchsorted(of_point, np.arange(1, num_classes + 1), sorter=by_class).tolist()
@@ -132,11 +151,11 @@ _KNOWN: PerScene[Neighbours] = PerScene()
 
 
 def neighbours_of(scene: GaussianScene, k: int) -> Neighbours | None:
-    """Find the neighbours of a scene's Gaussians, once: they are kept with it. None if it has a single Gaussian."""
+    """Neighbours of a scene's Gaussians: what is found of them is kept with it. None if it has a single Gaussian."""
     if len(scene) < 2:
         return None
     k = min(k, len(scene) - 1)
-    return _KNOWN.of(scene, lambda: Neighbours.find(scene.means, k, tree_of(scene)), lambda known: known.k == k)
+    return _KNOWN.of(scene, lambda: Neighbours.among(scene.means, k, tree_of(scene)), lambda known: known.k == k)
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)

@@ -77,7 +77,7 @@ def cluster(
     wanted = ~observed | (largest(codes)[0] < beta)
     refined, changed = codes.copy(), np.zeros(len(codes), bool)
     if len(means) > 1 and wanted.any() and observed.any():
-        known = neighbours or Neighbours.find(means, k)
+        known = neighbours or Neighbours.among(means, k)
         found = known.mean_codes(Rows.of(codes), observed, codes.shape[1], wanted)
         changed = np.diff(found.start) > 0
         refined[changed] = 0.0
@@ -131,7 +131,7 @@ def statistical_filter(
     limit = int(labels.max(initial=0)) + 1 if num_classes is None else num_classes
     if len(means) < 3:
         return removed
-    known = (neighbours or Neighbours.find(means, k)).class_distances(labels, limit)
+    known = (neighbours or Neighbours.among(means, k)).class_distances(labels, limit)
     # Short numbers are sorted by their digits, in a quarter of the time.
     short = np.clip(labels, -1, limit).astype(np.int16) if limit < 2**15 else labels
     by_class = np.argsort(short, kind="stable")

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from gsseg_core import refine
 from gsseg_core.errors import SettingsError
-from gsseg_core.neighbours import neighbours_of
+from gsseg_core.neighbours import Neighbours, neighbours_of
 from gsseg_core.refine import cluster, statistical_filter
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.scene import GaussianScene
@@ -176,6 +176,29 @@ def test_neighbours_are_found_once_per_scene_and_give_the_same_result():
     removed = statistical_filter(means, labels, 20, neighbours=neighbours)
     np.testing.assert_array_equal(removed, statistical_filter(means, labels, 20))
     assert neighbours_of(given_scene.subset([0]), 20) is None
+
+
+def test_only_what_is_asked_for_is_looked_for_and_it_is_the_same_in_any_portions():
+    means = scene(9, 700)[0]
+    at_once = Neighbours.among(means, 20).look_for()
+    in_portions, rng = Neighbours.among(means, 20), np.random.default_rng(9)
+    asked = np.zeros(700, bool)
+    for share in (0.02, 0.3, 0.3, 1.0):
+        wanted = rng.random(700) < share
+        asked |= wanted
+        assert in_portions.look_for(wanted) is in_portions
+        np.testing.assert_array_equal(np.isnan(in_portions.radii), ~asked)
+        for name in ("radii", "distances"):
+            some, every = getattr(in_portions, name), getattr(at_once, name)
+            np.testing.assert_array_equal(some[asked], every[asked], err_msg=name)
+
+
+def test_background_that_is_sure_of_itself_is_never_looked_for():
+    means, _, _, labels = scene(10, 600)
+    known = Neighbours.among(means, 20)
+    labels = np.where(np.arange(600) < 300, 0, np.maximum(labels, 1))
+    statistical_filter(means, labels, 20, neighbours=known)
+    np.testing.assert_array_equal(np.isnan(known.radii), labels[known.tree.order] == 0)
 
 
 @pytest.mark.parametrize("scale", [1e-25, 1e30])
