@@ -18,6 +18,9 @@ TYPICAL = 4
 
 _LEAST = np.float32(LOG_ALPHA_MIN)
 
+BLOCK = 256
+"""Gaussians that are looked at together."""
+
 CHUNKS = 16
 """Parts into which Gaussians are cut, to be sorted beside each other; fixed, so that threads change nothing."""
 
@@ -72,14 +75,6 @@ def assign(projected: Projected, width: int, height: int) -> Tiles:
 
 
 @nb.njit(inline="always")
-def _rows_of(v: np.float32, reach: np.float32, rows: int) -> tuple[int, int]:
-    """First and last tile row (exclusive) that a Gaussian may touch."""
-    first = np.floor((v - reach - np.float32(0.5)) * np.float32(1 / TILE))
-    last = np.floor((v + reach - np.float32(0.5)) * np.float32(1 / TILE)) + np.float32(1)
-    return int(max(first, np.float32(0))), int(min(max(last, np.float32(0)), np.float32(rows)))
-
-
-@nb.njit(inline="always")
 def _touched(
     u: np.float32,
     v: np.float32,
@@ -88,14 +83,13 @@ def _touched(
     turn: np.float32,
     cut: np.float32,  # LOG_OPACITY less its least
     height: np.float32,
-    narrowness: float,  # 1 / WIDTH
-    row: int,
-    columns: int,
-) -> tuple[int, int]:
-    """First and last tile column (exclusive) that a Gaussian touches in one row of tiles."""
-    top, bottom = np.float32(row * TILE + 0.5) - v, np.float32(row * TILE + TILE - 0.5) - v
-    if bottom < -reach or top > reach:
-        return 0, 0
+    narrowness: np.float32,  # 1 / WIDTH
+    row: np.float32,
+    columns: np.float32,
+) -> tuple[np.int32, np.int32]:
+    """First and last tile column (exclusive) that a Gaussian touches in one row of tiles; without a branch."""
+    top = row * np.float32(TILE) + np.float32(0.5) - v
+    bottom = row * np.float32(TILE) + np.float32(TILE - 0.5) - v
     # The outline x(dy) is concave on the right and convex on the left: its extremes in the band are at the turning
     # points or the ends.
     dy = min(max(turn, top), bottom)
@@ -103,9 +97,51 @@ def _touched(
     dy = min(max(-turn, top), bottom)
     left = shear * dy - np.sqrt(max(cut - height * dy * dy, np.float32(0)) * narrowness)
     # A hundredth of a pixel of slack covers float32 rounding; the blend tests alpha itself.
-    first = np.floor((u + left - np.float32(0.51)) * np.float32(1 / TILE))
-    last = np.floor((u + right - np.float32(0.49)) * np.float32(1 / TILE)) + np.float32(1)
-    return int(max(first, np.float32(0))), int(min(max(last, np.float32(0)), np.float32(columns)))
+    first, last = _tile_of(u + left - np.float32(0.51), columns), _tile_after(u + right - np.float32(0.49), columns)
+    return first, last if (bottom >= -reach) & (top <= reach) else np.int32(0)
+
+
+@nb.njit(inline="always")
+def _tile_of(px: np.float32, limit: np.float32) -> np.int32:
+    """Tile that a pixel is in, between the first one and a limit; `floor` would be a call of a function."""
+    return np.int32(min(max(px * np.float32(1 / TILE), np.float32(0)), limit))
+
+
+@nb.njit(inline="always")
+def _tile_after(px: np.float32, limit: np.float32) -> np.int32:
+    """Tile after that one; the first one if the pixel is before it."""
+    return min(_tile_of(px, limit) + np.int32(px >= 0), np.int32(limit))
+
+
+@nb.njit(error_model="numpy")
+def _touch_two_rows(
+    table: np.ndarray,  # (at most BLOCK, 8)
+    columns: int,
+    rows: int,
+    beside: np.ndarray,  # (8 * BLOCK,) scratch: the table, column after column
+    found: np.ndarray,  # (6 * BLOCK,) int32 out: first and last row (exclusive); tiles in the first one, and the second
+) -> None:
+    """Most Gaussians touch one or two rows of tiles: tell those by instructions for several Gaussians at once."""
+    across = np.float32(columns)
+    for j in range(table.shape[0]):
+        for column in range(8):
+            beside[column * BLOCK + j] = table[j, column]
+    for j in range(table.shape[0]):
+        u, v, shear = beside[U * BLOCK + j], beside[V * BLOCK + j], beside[SHEAR * BLOCK + j]
+        reach, turn = beside[Y_REACH * BLOCK + j], beside[X_TURN * BLOCK + j]
+        cut, height = beside[LOG_OPACITY * BLOCK + j] - _LEAST, beside[HEIGHT * BLOCK + j]
+        narrowness = np.float32(1) / beside[WIDTH * BLOCK + j]
+        low = _tile_of(v - reach - np.float32(0.5), np.float32(rows))
+        high = _tile_after(v + reach - np.float32(0.5), np.float32(rows))
+        row = np.float32(low)
+        one = _touched(u, v, shear, reach, turn, cut, height, narrowness, row, across)
+        two = _touched(u, v, shear, reach, turn, cut, height, narrowness, row + np.float32(1), across)
+        begin = low * np.int32(columns)
+        found[j], found[BLOCK + j] = low, high
+        found[2 * BLOCK + j] = begin + one[0]
+        found[3 * BLOCK + j] = begin + (one[1] if low < high else np.int32(0))
+        found[4 * BLOCK + j] = begin + np.int32(columns) + two[0]
+        found[5 * BLOCK + j] = begin + np.int32(columns) + (two[1] if low + np.int32(1) < high else np.int32(0))
 
 
 @nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
@@ -122,23 +158,56 @@ def _list(
     needed = np.zeros(CHUNKS, np.int64)
     for chunk in nb.prange(CHUNKS):
         counts, mine, n = per_tile[chunk], touched[chunk], 0
+        beside, found = np.empty(8 * BLOCK, np.float32), np.empty(6 * BLOCK, np.int32)
+        last = (chunk + 1) * many // CHUNKS
+        for begin in range(chunk * many // CHUNKS, last, BLOCK):
+            end = min(begin + BLOCK, last)
+            _touch_two_rows(table[begin:end], columns, rows, beside, found)
+            for g in range(begin, end):
+                j, before = g - begin, n
+                one, one_end = found[2 * BLOCK + j], found[3 * BLOCK + j]
+                two, two_end = found[4 * BLOCK + j], found[5 * BLOCK + j]
+                low, high = found[j], found[BLOCK + j]
+                if high - low > 2 or one_end - one > 2 or two_end - two > 2 or n + 4 > room:
+                    n = _list_many(table[g], low, high, columns, mine, n)
+                else:  # without a branch: what is not touched is overwritten
+                    mine[n] = one
+                    n += one < one_end
+                    mine[n] = one + 1
+                    n += one + 1 < one_end
+                    mine[n] = two
+                    n += two < two_end
+                    mine[n] = two + 1
+                    n += two + 1 < two_end
+                per_gaussian[g] = n - before
         counts[:] = 0
-        for g in range(chunk * many // CHUNKS, (chunk + 1) * many // CHUNKS):
-            u, v, shear, reach = table[g, U], table[g, V], table[g, SHEAR], table[g, Y_REACH]
-            turn, cut = table[g, X_TURN], table[g, LOG_OPACITY] - _LEAST
-            height, narrowness = table[g, HEIGHT], np.float32(1) / table[g, WIDTH]
-            before = n
-            low, high = _rows_of(v, reach, rows)
-            for row in range(low, high):
-                first, last = _touched(u, v, shear, reach, turn, cut, height, narrowness, row, columns)
-                for tile in range(row * columns + first, row * columns + last):
-                    counts[tile] += 1
-                    if n < room:
-                        mine[n] = tile
-                    n += 1
-            per_gaussian[g] = n - before
+        for i in range(min(n, room)):
+            counts[mine[i]] += 1
         needed[chunk] = n
     return int(needed.max())
+
+
+@nb.njit(error_model="numpy")
+def _list_many(
+    splat: np.ndarray,  # (8,) a row of the table
+    low: int,  # row of tiles
+    high: int,  # exclusive
+    columns: int,
+    touched: np.ndarray,  # (R,) int32 out, from n on, as far as there is room
+    n: int,
+) -> int:
+    """List the tiles of a Gaussian that may touch many; returns where the next one's begin."""
+    cut, narrowness, across = splat[LOG_OPACITY] - _LEAST, np.float32(1) / splat[WIDTH], np.float32(columns)
+    for row in range(low, high):
+        first, last = _touched(
+            splat[U], splat[V], splat[SHEAR], splat[Y_REACH], splat[X_TURN], cut, splat[HEIGHT], narrowness,
+            np.float32(row), across,
+        )  # fmt: skip
+        for tile in range(row * columns + first, row * columns + last):
+            if n < touched.shape[0]:
+                touched[n] = tile
+            n += 1
+    return n
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
