@@ -20,7 +20,8 @@ from gsseg_core import pipeline
 from gsseg_core.dataset import Dataset, View, spread
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.freed_memory import keep_freed_memory
-from gsseg_core.learner import Learner
+from gsseg_core.learner import UNITS, Learner
+from gsseg_core.lifted_mask import LiftedMask
 from gsseg_core.metrics import Evaluation
 from gsseg_core.operator import make_operator
 from gsseg_core.projection import project
@@ -114,6 +115,7 @@ def _lift_view(scene: GaussianScene, view: View, runs: int) -> dict[str, Any]:
     def first() -> np.ndarray:
         return first_lift(splats, tiles, local, many)
 
+    total = np.zeros((len(scene), int(mask.max()) + 1), np.int64)
     votes = np.zeros((len(operator.ids), many), np.float32)
     votes[np.isin(operator.ids, observation.ids)] = observation.dense(observation.votes())
     return {
@@ -122,8 +124,10 @@ def _lift_view(scene: GaussianScene, view: View, runs: int) -> dict[str, Any]:
         "flops": work.flops,
         "instructions": work.instructions,
         "difference": float(np.abs(first() - votes).sum() / votes.sum()),
-        "lift": timed(lambda: operator.observe(mask), runs),
-        "all": timed(lambda: make_operator(scene, camera).observe(mask), runs),
+        "sums": timed(lambda: LiftedMask(camera, projected.table, tiles, mask), runs),
+        "lift": timed(lambda: operator.vote(mask, None, total, UNITS), runs),
+        "observe": timed(lambda: operator.observe(mask), runs),
+        "all": timed(lambda: make_operator(scene, camera).vote(mask, None, total, UNITS), runs),
         "first": timed(first, runs),
     }
 

@@ -1,26 +1,27 @@
 """Useful pairs per second of the lift, beside what the processor could do at most.
 
 A *pair* is a non-zero weight of W: one Gaussian in one pixel. The lift blends a view and sums its weights by label. Its
-work is counted here in *aims*, one Gaussian in one tile (`lanes.aim`: which rows does it reach?), and *evaluations*,
-one Gaussian over the sixteen pixels of one row that it reaches and in which a ray is open (`lanes.blend_row`).
-Operations, each on sixteen numbers:
+work is counted here in *aims*, one Gaussian in one tile (`lanes.aim`: which blocks of 4 x 4 pixels does it reach?), and
+*evaluations*, one Gaussian over the sixteen pixels of a block that it reaches and in which a ray is open
+(`lanes.blend_block`). Operations, each on sixteen numbers:
 
-| step of an aim                              | fma | add, sub, mul | other                    |
-| ------------------------------------------- | --- | ------------- | ------------------------ |
-| where is the row's peak, and how high?      | 2   | 2             |                          |
-| the pixel next to it: is alpha 1/255 there? | 1   | 2             | min, max, round, compare |
+| step of an aim                                    | fma | add, sub, mul | other                      |
+| ------------------------------------------------- | --- | ------------- | -------------------------- |
+| where is the peak of each row, and how high?      | 2   | 2             | round                      |
+| four times, once for each column of blocks:       |     |               |                            |
+| the pixel next to the peak: is alpha 1/255 there? | 1   | 2             | min, max, compare          |
 
-| step of an evaluation                       | fma | add, sub, mul | other                    |
-| ------------------------------------------- | --- | ------------- | ------------------------ |
-| log2 of alpha: peak - wide * (c-x)^2        | 1   | 2             |                          |
-| alpha = 2^that                              | 5   | 1             | round, convert, shift, + |
-| alpha <= 0.99                               |     |               | min                      |
-| counts it? is the ray open, still?          |     |               | 3 compares               |
-| weight = alpha T, T = T - weight            |     | 2             |                          |
+| step of an evaluation                             | fma | add, sub, mul | other                      |
+| ------------------------------------------------- | --- | ------------- | -------------------------- |
+| log2 of alpha: peak - wide * (c-x)^2              | 1   | 2             | 2 permutations             |
+| alpha = 2^that                                    | 5   | 1             | round, convert, shift, +   |
+| alpha <= 0.99                                     |     |               | min                        |
+| counts it? is the ray open, still?                |     |               | 3 compares                 |
+| weight = alpha T, T = T - weight                  |     | 2             |                            |
 
-That is 3 + 4 + 4 = 11 vector instructions and 3 * 2 + 4 = 10 floating-point operations a row of an aim, 6 + 5 + 8 = 19
-and 6 * 2 + 5 = 17 a pixel of an evaluation. Summing by label adds one addition for each label in the row, and per entry
-and label a sum of sixteen numbers, 15 additions in 4 steps.
+That is 6 + 10 + 13 = 29 vector instructions and 6 * 2 + 10 = 22 floating-point operations a lane of an aim,
+6 + 5 + 10 = 21 and 6 * 2 + 5 = 17 a pixel of an evaluation. Summing by label adds one addition for each label in the
+block, and per entry and label a sum of sixteen numbers, 15 additions in 4 steps.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from machine import once
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
+from gsseg_core.blend import in_tile
 from gsseg_core.lanes import (
     ALPHA_MAX,
     HEIGHT,
@@ -44,15 +46,14 @@ from gsseg_core.lanes import (
     SHEAR,
     T_MIN,
     WIDTH,
-    Y_REACH,
     U,
     V,
 )
 from gsseg_core.projection import Projected
 from gsseg_core.tiles import TILE, Tiles
 
-AIM_FLOPS, AIM_INSTRUCTIONS = 10, 11  # of one aim, per row and per sixteen
-FLOPS, INSTRUCTIONS = 17, 19  # of one evaluation, per pixel and per sixteen
+AIM_FLOPS, AIM_INSTRUCTIONS = 22, 29  # of one aim, per lane and per sixteen
+FLOPS, INSTRUCTIONS = 17, 21  # of one evaluation, per pixel and per sixteen
 SUM_FLOPS, SUM_INSTRUCTIONS = 15, 4  # of one sum of sixteen
 CHAINS = (8, 10, 12)
 
@@ -67,11 +68,11 @@ class Work(NamedTuple):
     aims : int
         Gaussians in tiles, up to where all rays of the tile have ended.
     evaluations : int
-        Rows of sixteen pixels that were blended.
+        Blocks of sixteen pixels that were blended.
     records : int
         Those with a non-zero weight.
     products : int
-        Records times the labels in their row.
+        Records times the labels in their block.
     sums : int
         Gaussians in a tile with at least one record.
     """
@@ -126,47 +127,57 @@ def _count(
     height, width = labels.shape
     for tile in nb.prange(start.shape[0] - 1):
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
-        rays = np.ones((TILE, TILE), np.float32)
-        live, many = np.ones(TILE, np.bool_), np.zeros(TILE, np.int64)
-        for r in range(TILE):
-            live[r] = top + r < height
-            for c in range(TILE):
-                if not live[r] or left + c >= width:
-                    rays[r, c] = 0.0
-                    continue
-                seen = labels[top + r, left + c]
-                new = seen >= 0
-                for before in range(c):
-                    new = new and labels[top + r, left + before] != seen
-                many[r] += new
+        rays, many = np.zeros((TILE, TILE), np.float32), np.zeros(TILE, np.int64)
+        for b in range(TILE):
+            seen = set([np.int32(-1)])
+            for i in range(LANES):
+                r, c = in_tile(b, i)
+                if top + r < height and left + c < width:
+                    rays[r, c] = 1.0
+                    seen.add(labels[top + r, left + c])
+            many[b] = len(seen) - 1
+        live = np.array([_is_open(rays, b) for b in range(TILE)])
         for e in range(start[tile], start[tile + 1]):
             if not live.any():
                 break
             counts[tile, 1] += 1
-            g = entries[e]
-            u, v = table[g, U] - np.float32(left + 0.5), table[g, V] - np.float32(top + 0.5)
-            reach, any_hit = table[g, Y_REACH], False
-            for r in range(max(0, int(np.ceil(v - reach))), min(TILE, int(np.floor(v + reach)) + 1)):
-                if not live[r]:
-                    continue
-                dy = np.float32(r) - v
-                peak = table[g, LOG_OPACITY] - table[g, HEIGHT] * dy * dy
-                x = u + table[g, SHEAR] * dy
-                hits, reached, still = 0, False, False
-                for c in range(TILE):
-                    power = peak - table[g, WIDTH] * (np.float32(c) - x) ** 2
-                    reached = reached or power >= np.float32(LOG_ALPHA_MIN)
-                    if power >= np.float32(LOG_ALPHA_MIN) and rays[r, c] >= np.float32(T_MIN):
-                        hits += 1
-                        rays[r, c] *= 1 - min(np.float32(2.0) ** power, np.float32(ALPHA_MAX))
-                    still = still or rays[r, c] >= np.float32(T_MIN)
-                live[r] = still
-                any_hit = any_hit or hits > 0
-                counts[tile, 0] += hits
-                counts[tile, 2] += reached
-                counts[tile, 3] += hits > 0
-                counts[tile, 4] += many[r] * (hits > 0)
+            g, any_hit = entries[e], False
+            for b in range(TILE):
+                if live[b]:
+                    reached, hits = _blend(table[g], left, top, b, rays)
+                    live[b] = _is_open(rays, b)
+                    any_hit = any_hit or hits > 0
+                    counts[tile, 0] += hits
+                    counts[tile, 2] += reached
+                    counts[tile, 3] += hits > 0
+                    counts[tile, 4] += many[b] * (hits > 0)
             counts[tile, 5] += any_hit
+
+
+@nb.njit
+def _is_open(rays: np.ndarray, b: int) -> bool:
+    """Whether a ray of a block is open."""
+    found = False
+    for i in range(LANES):
+        found = found or rays[in_tile(b, i)] >= np.float32(T_MIN)
+    return found
+
+
+@nb.njit
+def _blend(splat: np.ndarray, left: int, top: int, b: int, rays: np.ndarray) -> tuple[bool, int]:
+    """Whether a Gaussian reaches a block, and how many of its open rays it hits."""
+    reached, hits = False, 0
+    for i in range(LANES):
+        r, c = in_tile(b, i)
+        dy = np.float32(r) - (splat[V] - np.float32(top + 0.5))
+        x = splat[U] - np.float32(left + 0.5) + splat[SHEAR] * dy
+        power = splat[LOG_OPACITY] - splat[HEIGHT] * dy * dy - splat[WIDTH] * (np.float32(c) - x) ** 2
+        if power >= np.float32(LOG_ALPHA_MIN):
+            reached = True
+            if rays[r, c] >= np.float32(T_MIN):
+                hits += 1
+                rays[r, c] *= 1 - min(np.float32(2.0) ** power, np.float32(ALPHA_MAX))
+    return reached, hits
 
 
 def _fma_kernel(chains: int) -> Callable[[int], float]:

@@ -16,6 +16,7 @@ from gsseg_core.dataset import Dataset, View, spread
 from gsseg_core.depth_sort import sort_by_depth
 from gsseg_core.em import EMLearner
 from gsseg_core.export import export_classes
+from gsseg_core.learner import UNITS
 from gsseg_core.live import LiveSession
 from gsseg_core.neighbours import Neighbours
 from gsseg_core.operator import make_operator
@@ -60,6 +61,7 @@ def _unlabelled(view: View) -> View:
 
 def _view_stages(scene: GaussianScene, views: list[View], num_classes: int, runs: int) -> Times:
     """Stages of one view: each run takes all of them, one after the other."""
+    total = np.zeros((len(scene), num_classes), np.int64)
     codes = np.random.default_rng(0).dirichlet(np.ones(num_classes), len(scene)).astype(np.float32)
     stages: dict[str, list[Callable[[], object]]] = {}
 
@@ -77,7 +79,8 @@ def _view_stages(scene: GaussianScene, views: list[View], num_classes: int, runs
         add("bin", lambda p=projected, c=camera: assign(p, c.width, c.height))
         add("blend", operator.transmittance)
         add(f"render {num_classes} classes", lambda o=operator: o.render(codes))
-        add("lift", lambda o=operator, m=mask: o.observe(m))
+        add("lift to votes", lambda o=operator, m=mask: o.vote(m, None, total, UNITS))
+        add("observe", lambda o=operator, m=mask: o.observe(m))
         add("shares", asked_anew(observation, mine, rest))
         add("adjoint, 3 channels", lambda o=operator, m=mask: o.adjoint(np.repeat(m[..., None], 3, axis=2)))
     return {name: _averaged(jobs, runs) for name, jobs in stages.items()}
