@@ -21,6 +21,9 @@ ROS_TESTS := $(wildcard tests/test_ros_*.py) tests/test_docs.py
 # Both builders of the messages obey it; without it one of them compiles file after file.
 export CMAKE_BUILD_PARALLEL_LEVEL ?= $(shell nproc 2>/dev/null || echo 1)
 
+# Targets that `make test` makes as well, while the tests with ROS still wait for their nodes.
+AFTER_CORE ?=
+
 .PHONY: help demo demo-local view test test-ros test-core docs colcon results robustness bench clean
 
 help:  ## list the targets
@@ -43,13 +46,13 @@ test: $(READY) $(ROS_READY) $(MSGS_READY)  ## lint, check the types and run the 
 	$(BIN)/mypy
 	$(WARM_UP)
 	@echo 'tests with ROS and all others run beside each other; either prints once it has ended'
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync --keep-going test-ros test-core
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync --keep-going test-ros test-core $(AFTER_CORE)
 
 test-ros:
-	$(BIN)/python -m pytest -W error -o cache_dir=.pytest_cache/ros $(ROS_TESTS)
+	$(BIN)/python -m pytest -W error --durations=10 -o cache_dir=.pytest_cache/ros $(ROS_TESTS)
 
 test-core:
-	$(BIN)/python -m pytest -W error -o cache_dir=.pytest_cache/core $(addprefix --ignore=,$(ROS_TESTS))
+	$(BIN)/python -m pytest -W error --durations=10 -o cache_dir=.pytest_cache/core $(addprefix --ignore=,$(ROS_TESTS))
 
 docs: $(READY)  ## build the documentation into site/index.html, and refuse links that lead nowhere
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
