@@ -176,7 +176,8 @@ def save_png(path: str | Path, image: np.ndarray) -> None:
         The file cannot be written.
     """
     with write_atomically(path) as temporary:
-        Image.fromarray(image).save(temporary, format="PNG")
+        # Two fifths of the time of Pillow's own level, and files 7 % larger.
+        Image.fromarray(image).save(temporary, format="PNG", compress_level=4)
 
 
 def outline(
