@@ -2,9 +2,9 @@
 
     python benchmarks/bench_weights.py        # on $GSSEG_DATA, default ../shared/data, and on a made-up room
 
-Of a prepared view, gsseg keeps which Gaussians are seen in which rows of which tiles, and makes their weights again in
-every step. Here the same step reads the weights instead, stored as multiples of 1 / 65535. What is told: seconds of a
-step over one view and bytes of the view in either way, and how many labels are other ones after EM.
+Of a prepared view, gsseg keeps which Gaussians are seen in which blocks of which tiles, and makes their weights again
+in every step. Here the same step reads the weights instead, stored as multiples of 1 / 65535. What is told: seconds of
+a step over one view and bytes of the view in either way, and how many labels are other ones after EM.
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ from gsseg_core.lanes import (
 from gsseg_core.lifted_mask import LiftedMask
 from gsseg_core.operator import Shares, ViewOperator, make_operator
 from gsseg_core.scene import GaussianScene
+from gsseg_core.soft_masks import SeenLabels
 from gsseg_core.tile_observation import TileObservation
 from gsseg_core.tiles import TILE
 from gsseg_core.warm_up import warm_up
@@ -88,11 +89,8 @@ def compare(name: str, scene: GaussianScene, views: list[View], num_classes: int
     print(", ".join(f"{statistics.mean(size) / 1e6:.1f} MB" for size in zip(*sizes, strict=True)))
     plain = EMLearner(scene, num_classes)
     plain.observe_all(views)
-    with_stored = EMLearner(scene, num_classes)
+    with_stored = StoringLearner(scene, num_classes)
     with_stored.observe_all(views)
-    with_stored._prepared = {
-        view.name: StoredWeights(make_operator(scene, view.camera), view.read_labels()) for view in views
-    }
     one, other = plain.fit(), with_stored.fit()
     differ = int((one.codes_.argmax(axis=1) != other.codes_.argmax(axis=1))[one.observed_].sum())
     print(f"{name}: {differ} of {int(one.observed_.sum()):,} labels differ, ", end="")
@@ -132,6 +130,18 @@ class StoredWeights(TileObservation):
         sightings.add_up(self._slot_start, self._sighting, sums, parts)
         total = np.bincount(mask.present, weights=left_over, minlength=len(rest))
         return Shares(parts.sum(axis=0), total, float(logs.sum()))
+
+
+class StoringLearner(EMLearner):
+    """EM with views that keep their weights."""
+
+    def _prepare(self, view: View, seen: SeenLabels) -> StoredWeights:
+        operator = make_operator(self.scene, view.camera)
+        labels, meaning = self._heard(seen, operator)
+        observation = StoredWeights(operator, labels)
+        if meaning is not None:
+            observation.meaning = meaning
+        return observation
 
 
 @intrinsic
