@@ -209,8 +209,7 @@ def _add_dense_lift(report: Report, sizes: Sizes) -> None:
         "have 40 a pixel, and so has workload (a): smaller Gaussians, which hit fewer pixels of a block of sixteen. "
         "The dense view is the same room with Gaussians larger and fainter. A lift ends with the votes of each "
         "Gaussian: ours adds them to those of all views, the first rasteriser writes them down. To observe is to lift, "
-        "and to note what later steps of `em` need; until 2026-11-21 that was called lift here, and is what lift rates "
-        "from before are to be compared with.",
+        "and to note what later steps of `em` need; runs without a row for that called it lift.",
     )
 
 
