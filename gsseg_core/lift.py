@@ -57,20 +57,22 @@ def cut_labels(
     columns: int,
     rows: int,
     num_labels: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Make what `Labels` holds."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Make what `Labels` holds, and count the pixels of each label, (num_labels,) int64."""
     height, width = labels.shape
     start = np.zeros(columns * rows + 1, np.int64)
     present = np.empty(height * width, np.int32)
     span_start = np.zeros(columns * rows * TILE + 1, np.int64)
     slots, lanes = np.empty(height * width, np.int32), np.empty(height * width, np.int32)
     slot_of, span_of = np.full(num_labels, -1, np.int64), np.full(num_labels, -1, np.int64)
+    areas = np.zeros(num_labels, np.int64)
     n = spans = 0
     for tile in range(columns * rows):
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
+        alike = _is_uniform(labels, left, top)
         for b in range(TILE):
             begin = spans
-            for lane in range(LANES):
+            for lane in range(1 if alike else LANES):
                 r, c = in_tile(b, lane)
                 label = labels[top + r, left + c] if top + r < height and left + c < width else -1
                 if label < 0:
@@ -83,12 +85,25 @@ def cut_labels(
                     span_of[label] = spans
                     slots[spans], lanes[spans] = slot_of[label], 0
                     spans += 1
-                lanes[span_of[label]] |= 1 << lane
+                lanes[span_of[label]] |= OPEN if alike else 1 << lane
+                areas[label] += LANES if alike else 1
             span_start[tile * TILE + b + 1] = spans
         for i in range(start[tile], n):
             slot_of[present[i]] = -1
         start[tile + 1] = n
-    return start, present[:n].copy(), span_start, slots[:spans].copy(), lanes[:spans].copy()
+    return start, present[:n].copy(), span_start, slots[:spans].copy(), lanes[:spans].copy(), areas
+
+
+@nb.njit
+def _is_uniform(labels: np.ndarray, left: int, top: int) -> bool:
+    """Whether a tile lies in the image as a whole, and all its pixels have one label, or none has."""
+    if top + TILE > labels.shape[0] or left + TILE > labels.shape[1]:
+        return False
+    different = 0
+    for r in range(top, top + TILE):
+        for c in range(left, left + TILE):
+            different |= labels[r, c] ^ labels[top, left]
+    return different == 0
 
 
 @nb.njit(parallel=True, nogil=True, cache=True, fastmath=FAST, error_model="numpy")

@@ -52,10 +52,13 @@ class LiftedMask:
         tiles: Tiles,
         labels: np.ndarray,  # (H, W)
     ) -> None:
-        areas = np.bincount(np.maximum(labels, -1).ravel() + 1, minlength=1)[1:]
+        labels = np.ascontiguousarray(labels, np.int32)
+        start, present, *spans, areas = cut_labels(labels, tiles.columns, tiles.rows, int(labels.max(initial=0)) + 1)
         self.classes = np.flatnonzero(areas).astype(np.int32)
         self.areas = areas[self.classes]
-        self.labels = mask = _cut(labels, self.classes, tiles)
+        position = np.zeros(len(areas), np.int32)
+        position[self.classes] = np.arange(len(self.classes))
+        self.labels = mask = Labels(start, position[present], *spans)
         self.slot_start = starts(np.diff(tiles.start) * np.diff(mask.start))
         self.reached = np.empty(len(tiles.entries), np.uint16)
         self.sums, self.counts = np.empty(self.slot_start[-1], np.float32), np.empty((len(mask.start) - 1, 3), np.int64)
@@ -79,37 +82,44 @@ class LiftedMask:
         sign: int,
     ) -> None:
         """Add the votes to those of other views, bit for bit as `sightings.add_votes` does with sightings."""
-        where, mask = np.empty(len(self.reached), np.int32), self.labels
-        _locate(tiles.start, self.reached, where)
+        if not len(self.classes):
+            return
+        said, mask = np.empty((len(self.reached), 2), np.float32), self.labels
         many = np.diff(mask.start)
-        facts = many, self.slot_start[:-1] - tiles.start[:-1] * many, mask.start[:-1]
+        facts = np.stack([many, self.slot_start[:-1] - tiles.start[:-1] * many, mask.start[:-1]], axis=1)
+        _put_beside(tiles.start, facts, self.sums, mask.present, said)
         _vote(
-            ids, tiles.gaussian_start, tiles.gaussian_entries, where, np.stack(facts, axis=1), self.sums, mask.present,
-            len(self.classes), *meaning.votes, units, sign, total,
+            ids, tiles.gaussian_start, tiles.gaussian_entries, said, facts, self.sums, mask.present, len(self.classes),
+            *meaning.votes, units, sign, total,
         )  # fmt: skip
 
 
-def _cut(
-    labels: np.ndarray,  # (H, W)
-    classes: np.ndarray,  # (L,)
-    tiles: Tiles,
-) -> Labels:
-    """Cut a mask into tiles, its labels numbered as in `classes`."""
-    position = np.full(max(classes.max(initial=0) + 1, 1), -1, np.int32)
-    position[classes] = np.arange(len(classes))
-    local = np.where(labels >= 0, position[np.maximum(labels, 0)], -1).astype(np.int32)
-    return Labels(*cut_labels(local, tiles.columns, tiles.rows, len(classes)))
-
-
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _locate(
+def _put_beside(
     start: np.ndarray,  # (T + 1,)
-    reached: np.ndarray,  # (E,)
-    where: np.ndarray,  # (E,) int32 out: tile of each entry, -1 where it reaches no labelled pixel
+    tiles: np.ndarray,  # (T, 3), as in `_vote`
+    sums: np.ndarray,
+    present: np.ndarray,
+    said: np.ndarray,  # (E, 2) float32 out
 ) -> None:
+    """Put beside each other what an entry says, in one place of memory: its label and its sum of weights.
+
+    Where it says several labels, there is -1 less the tile instead of one, in whose sums they are found.
+    """
     for tile in nb.prange(start.shape[0] - 1):
+        many, base, labels = tiles[tile, 0], tiles[tile, 1], tiles[tile, 2]
+        if many == 1:
+            only = np.float32(present[labels])
+            for e in range(start[tile], start[tile + 1]):
+                said[e, 0], said[e, 1] = only, sums[e + base]
+            continue
         for e in range(start[tile], start[tile + 1]):
-            where[e] = tile if reached[e] else -1
+            label, weight, found = np.float32(0), np.float32(0), 0
+            for j in range(many):
+                if sums[e * many + base + j] > 0:
+                    label, weight = np.float32(present[labels + j]), sums[e * many + base + j]
+                    found += 1
+            said[e, 0], said[e, 1] = label if found < 2 else np.float32(-1 - tile), weight
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
@@ -117,7 +127,7 @@ def _vote(
     ids: np.ndarray,  # (M,) int32, distinct
     gaussian_start: np.ndarray,  # (M + 1,)
     gaussian_entries: np.ndarray,  # (E,)
-    where: np.ndarray,  # (E,) int32
+    said_by: np.ndarray,  # (E, 2) from `_put_beside`
     tiles: np.ndarray,  # (T, 3) int64: how many labels; sums of entry e begin at e times these plus this; first label
     sums: np.ndarray,
     present: np.ndarray,
@@ -137,27 +147,38 @@ def _vote(
         who, labels = np.empty(WAITING + num_labels, np.int32), np.empty(WAITING + num_labels, np.int32)
         votes, n = np.empty(WAITING + num_labels, np.float32), 0
         for g in range(first, end):
+            # Most Gaussians say one label in all their tiles: nothing is decided for those.
+            name, vote, alone = np.float32(0), np.float32(0), True
             for i in range(gaussian_start[g], gaussian_start[g + 1]):
-                prefetch(where, gaussian_entries[min(i + 2 * AHEAD, last)])
-                later = gaussian_entries[min(i + AHEAD, last)]
-                facts = tiles[max(where[later], 0)]
-                prefetch(sums, later * facts[0] + facts[1])
+                prefetch(said_by, gaussian_entries[min(i + 2 * AHEAD, last)])
                 e = gaussian_entries[i]
-                if where[e] < 0:
-                    continue
-                facts = tiles[where[e]]
-                for j in range(facts[0]):
-                    weight = sums[e * facts[0] + facts[1] + j]
-                    if not weight > 0:
-                        continue
-                    label = present[facts[2] + j]
-                    if seen[label] != g:
-                        seen[label], place[label] = g, n
-                        who[n], labels[n], votes[n] = ids[g], label, 0.0
-                        n += 1
-                        if said_start[label] < said_start[label + 1]:
-                            prefetch(flat, ids[g] * classes + said_classes[said_start[label]])
-                    votes[place[label]] += weight
+                weight = said_by[e, 1]
+                name = name if vote > 0 else said_by[e, 0]
+                alone &= (weight == 0) | ((said_by[e, 0] == name) & (name >= 0))
+                vote += weight
+            if alone:
+                label = int(max(name, np.float32(0)))
+                who[n], labels[n], votes[n] = ids[g], label, vote
+                n += int(vote > 0)
+                if said_start[label] < said_start[label + 1]:
+                    prefetch(flat, ids[g] * classes + said_classes[said_start[label]])
+            else:
+                for i in range(gaussian_start[g], gaussian_start[g + 1]):
+                    e = gaussian_entries[i]
+                    tile = int(-1 - said_by[e, 0])
+                    slots = int(tiles[tile, 0]) if tile >= 0 else 1
+                    for j in range(slots if said_by[e, 1] > 0 else 0):
+                        weight = sums[e * slots + tiles[tile, 1] + j] if tile >= 0 else said_by[e, 1]
+                        if not weight > 0:
+                            continue
+                        label = int(present[tiles[tile, 2] + j] if tile >= 0 else said_by[e, 0])
+                        if seen[label] != g:
+                            seen[label], place[label] = g, n
+                            who[n], labels[n], votes[n] = ids[g], label, 0.0
+                            n += 1
+                            if said_start[label] < said_start[label + 1]:
+                                prefetch(flat, ids[g] * classes + said_classes[said_start[label]])
+                        votes[place[label]] += weight
             if n < WAITING and g < end - 1:
                 continue
             for s in range(n):
