@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 import numba as nb
 import numpy as np
 
-from gsseg_core.blend import in_block, open_rays
+from gsseg_core.blend import in_block, open_rays, stride_of, tile_of_turn
 from gsseg_core.cameras import Camera
 from gsseg_core.errors import MaskSizeError
 from gsseg_core.lanes import WIDTH, aim, blend_block, first_bit, store_row
@@ -225,7 +225,10 @@ def _add_reasons(
     go: np.ndarray,  # (E,) out
 ) -> None:
     height, width = shown.shape
-    for tile in nb.prange(start.shape[0] - 1):
+    rows = (start.shape[0] - 1) // columns
+    stride = stride_of(rows)
+    for turn in nb.prange(rows * columns):
+        tile = tile_of_turn(turn, columns, rows, stride)
         # Only labels of those who are asked matter here.
         slots, many = np.full(num_labels, -1, np.int64), 0
         for e in range(start[tile], start[tile + 1]):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
-from gsseg_core.blend import aim_next, in_tile, open_rays
+from gsseg_core.blend import aim_next, in_tile, open_rays, stride_of, tile_of_turn
 from gsseg_core.lanes import (
     FAST,
     LANES,
@@ -124,7 +124,10 @@ def lift(
     counts: np.ndarray,  # (T, 3) int64 out: entries with a block, their blocks, sums above zero
 ) -> None:
     """Blend the view, and sum weights by entry and label."""
-    for tile in nb.prange(start.shape[0] - 1):
+    rows = (start.shape[0] - 1) // columns
+    stride = stride_of(rows)
+    for turn in nb.prange(rows * columns):
+        tile = tile_of_turn(turn, columns, rows, stride)
         many = label_start[tile + 1] - label_start[tile]
         first, last = start[tile], start[tile + 1]
         reached[first:last] = 0

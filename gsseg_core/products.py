@@ -8,7 +8,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from gsseg_core.blend import AHEAD, aim_next, blend_tile, in_block, in_tile, open_rays
+from gsseg_core.blend import AHEAD, aim_next, blend_tile, in_block, in_tile, open_rays, stride_of, tile_of_turn
 from gsseg_core.lanes import (
     FAST,
     OPEN,
@@ -77,7 +77,10 @@ def render(
 ) -> None:
     """Blend codes into the image, W q."""
     height, width, channels = out.shape
-    for tile in nb.prange(start.shape[0] - 1):
+    rows = (start.shape[0] - 1) // columns
+    stride = stride_of(rows)
+    for turn in nb.prange(rows * columns):
+        tile = tile_of_turn(turn, columns, rows, stride)
         first, last = start[tile], start[tile + 1]
         rays, weights, blocks, ends = _scratch(last - first)
         used = blend_tile(tile, columns, width, height, table, entries, first, last, rays, weights, blocks, ends)
@@ -106,7 +109,10 @@ def render_few(
 ) -> None:
     """Do what `render` does for a few channels that hardly have zeros: weights are used where they are made."""
     height, width, channels = out.shape
-    for tile in nb.prange(start.shape[0] - 1):
+    rows = (start.shape[0] - 1) // columns
+    stride = stride_of(rows)
+    for turn in nb.prange(rows * columns):
+        tile = tile_of_turn(turn, columns, rows, stride)
         first, last = start[tile], start[tile + 1]
         rays, lines = np.empty((TILE, TILE), np.float32), np.empty((2, 2, TILE), np.float32)
         values = np.zeros((TILE, channels, TILE), np.float32)
@@ -141,7 +147,10 @@ def adjoint_entries(
 ) -> None:
     """Sum weight times residual over the pixels of each entry: the part of W^T r that one tile adds to a Gaussian."""
     height, width, channels = residual.shape
-    for tile in nb.prange(start.shape[0] - 1):
+    rows = (start.shape[0] - 1) // columns
+    stride = stride_of(rows)
+    for turn in nb.prange(rows * columns):
+        tile = tile_of_turn(turn, columns, rows, stride)
         first, last = start[tile], start[tile + 1]
         rays, weights, blocks, ends = _scratch(last - first)
         used = blend_tile(tile, columns, width, height, table, entries, first, last, rays, weights, blocks, ends)

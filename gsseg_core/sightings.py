@@ -11,7 +11,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from gsseg_core.blend import AHEAD, open_rays
+from gsseg_core.blend import AHEAD, open_rays, stride_of, tile_of_turn
 from gsseg_core.lanes import (
     FAST,
     WIDTH,
@@ -190,7 +190,10 @@ def share(
     sums: np.ndarray,  # (slot_start[-1],) float32 out: per entry and label, sum of w / likelihood
 ) -> None:
     """Share one vote per labelled pixel among the sightings that made it."""
-    for tile in nb.prange(start.shape[0] - 1):
+    rows = (start.shape[0] - 1) // columns
+    stride = stride_of(rows)
+    for turn in nb.prange(rows * columns):
+        tile = tile_of_turn(turn, columns, rows, stride)
         labels = present[label_start[tile] : label_start[tile + 1]]
         logs[tile] = 0.0
         if labels.shape[0] == 0:

@@ -6,9 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from operator_backends import CPU
 from operator_cases import dense, make_camera, make_scene, one_gaussian, random_mask, random_view
 
+from gsseg_core import blend
 from gsseg_core.cameras import Camera
 from gsseg_core.errors import MaskSizeError, SceneValueError, SettingsError
 from gsseg_core.operator import make_operator
@@ -306,3 +309,21 @@ def test_a_gaussian_may_be_as_large_as_it_likes(backend, scale):
 def test_an_unknown_device_is_refused():
     with pytest.raises(SettingsError, match="abacus"):
         make_operator(*random_view(0), device="abacus")
+
+
+@settings(deadline=None)  # the first example may compile a kernel
+@given(st.integers(1, 300), st.integers(1, 40))
+def test_every_tile_has_its_turn_once(rows, columns):
+    stride = blend.stride_of(rows)
+    turns = [blend.tile_of_turn.py_func(turn, columns, rows, stride) for turn in range(rows * columns)]
+    assert sorted(turns) == list(range(rows * columns))
+
+
+@settings(deadline=None)
+@given(st.integers(1, 300), st.integers(2, 16))
+def test_every_thread_gets_rows_from_all_parts_of_the_image(rows, threads):
+    stride = blend.stride_of(rows)
+    visited = np.array([turn * stride % rows for turn in range(rows)])
+    for part in np.array_split(visited, threads):
+        if len(part) >= 8:
+            assert abs(part.mean() / rows - 0.5) < 0.2
