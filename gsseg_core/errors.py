@@ -70,6 +70,10 @@ class WriteError(GssegError):
     """A file could not be written: disk full, folder not writable, path taken by a folder."""
 
 
+class PathTakenError(WriteError):
+    """What lies where something should be written is not ours to replace; nothing was written."""
+
+
 class StateFileError(GssegError):
     """A saved state or segmentation is missing or broken."""
 
