@@ -1,9 +1,9 @@
 """Useful pairs per second of the lift, beside what the processor could do at most.
 
 A *pair* is a non-zero weight of W: one Gaussian in one pixel. The lift blends a view and sums its weights by label. Its
-work is counted here in *aims*, one Gaussian in one tile (`lanes.aim`: which blocks of 4 x 4 pixels does it reach?), and
+work is counted here in *aims*, one Gaussian in one tile (`splat.aim`: which blocks of 4 x 4 pixels does it reach?), and
 *evaluations*, one Gaussian over the sixteen pixels of a block that it reaches and in which a ray is open
-(`lanes.blend_block`). Operations, each on sixteen numbers:
+(`splat.blend_block`). Operations, each on sixteen numbers:
 
 | step of an aim                                    | fma | add, sub, mul | other                      |
 | ------------------------------------------------- | --- | ------------- | -------------------------- |
@@ -37,19 +37,9 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from gsseg_core.blend import in_tile
-from gsseg_core.lanes import (
-    ALPHA_MAX,
-    HEIGHT,
-    LANES,
-    LOG_ALPHA_MIN,
-    LOG_OPACITY,
-    SHEAR,
-    T_MIN,
-    WIDTH,
-    U,
-    V,
-)
+from gsseg_core.lanes import LANES
 from gsseg_core.projection import Projected
+from gsseg_core.splat import ALPHA_MAX, HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, T_MIN, WIDTH, U, V
 from gsseg_core.tiles import TILE, Tiles
 
 AIM_FLOPS, AIM_INSTRUCTIONS = 22, 29  # of one aim, per lane and per sixteen

@@ -14,13 +14,10 @@ import numpy as np
 from gsseg_core.blend import AHEAD, open_rays, stride_of, tile_of_turn
 from gsseg_core.lanes import (
     FAST,
-    WIDTH,
     add_product,
     add_product_where,
     add_scaled,
     add_scaled_where,
-    aim,
-    blend_block,
     first_bit,
     load_row,
     nothing,
@@ -28,6 +25,7 @@ from gsseg_core.lanes import (
     store_row,
     sum_row,
 )
+from gsseg_core.splat import WIDTH, aim, blend_block
 from gsseg_core.tiles import TILE
 
 _TINY = np.float32(1e-30)

@@ -1,0 +1,144 @@
+"""One projected Gaussian over the pixels of a tile: which blocks it reaches, and how it is blended into one of them.
+
+Both are vector instructions on sixteen numbers (`gsseg_core.lanes`): the sixteen rows of a tile, and the sixteen pixels
+of a block. A row of the table of projected Gaussians is what they read of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from llvmlite import ir
+from numba.core import cgutils, types
+
+from gsseg_core.lanes import BITS, F32, I64, LANES, ROW, Builder, constant, intrinsic, row_type
+
+SIDE = 4
+"""Side of a block in px: its sixteen pixels, row by row, are one vector."""
+
+OPEN = (1 << LANES) - 1
+"""Of the bits of `blend_block`, those of the rays that are still open."""
+
+ALPHA_MAX = 0.99
+LOG_ALPHA_MIN = -math.log2(255.0)
+"""log2 of the least alpha that counts."""
+
+T_MIN = 1e-4
+"""A ray ends when its transmittance falls below this."""
+
+# Columns of the table of projected Gaussians.
+U, V, SHEAR, WIDTH, HEIGHT, LOG_OPACITY, Y_REACH, X_TURN = range(8)
+
+_ROWS = ir.Constant(ROW, [float(r) for r in range(LANES)])
+_FOUR = ir.VectorType(F32, SIDE)
+_EACH_FOUR_TIMES = ir.Constant(BITS, [lane // SIDE for lane in range(LANES)])
+_COLUMNS_OF_BLOCKS = ir.Constant(
+    ir.ArrayType(ROW, SIDE),
+    [ir.Constant(ROW, [float(SIDE * i + lane % SIDE) for lane in range(LANES)]) for i in range(SIDE)],
+)
+
+
+class _Splat(Builder):
+    """Reads the table and the lines of one Gaussian."""
+
+    def columns(self, position: int) -> Callable[[int], Any]:
+        """Columns of a row of eight: argument `position` is the array, the next one the row's number."""
+        number = self.arguments[position + 1]
+        first = self.llvm.mul(number, ir.Constant(number.type, 8))
+
+        def column(j: int) -> Any:
+            place = self.llvm.add(first, ir.Constant(number.type, j))
+            return self.llvm.load(self.element(position, place), align=4, typ=F32)
+
+        return column
+
+    def four_of(self, position: int, i: int, block: Any) -> Any:
+        """Entries of row i that belong to the four rows of a block, each four times."""
+        first = self.llvm.and_(block, ir.Constant(block.type, LANES - SIDE))
+        place = self.llvm.add(first, ir.Constant(block.type, i * LANES))
+        address = self.llvm.bitcast(self.element(position, place), ir.PointerType(_FOUR))
+        four = self.llvm.load(address, align=4, typ=_FOUR)
+        return self.llvm.shuffle_vector(four, ir.Constant(_FOUR, ir.Undefined), _EACH_FOUR_TIMES)
+
+    def columns_of(self, position: int) -> Any:
+        """Columns in the tile of the pixels of a block, which is argument `position`."""
+        block = self.arguments[position]
+        insert: Any = cgutils.global_constant
+        table = insert(self.llvm.module, "columns_of_blocks", _COLUMNS_OF_BLOCKS)
+        number = self.llvm.and_(block, ir.Constant(block.type, SIDE - 1))
+        place = self.llvm.gep(table, [ir.Constant(block.type, 0), number], source_etype=_COLUMNS_OF_BLOCKS.type)
+        return self.llvm.load(place, align=4, typ=ROW)
+
+
+@intrinsic
+def aim(typing: Any, table: Any, g: Any, left: Any, top: Any, lines: Any) -> tuple[Any, Callable[..., Any]]:
+    """Tell which blocks of a tile a Gaussian reaches: bit b is set if alpha is at least 1/255 at some pixel of block b.
+
+    The tile's first pixel has its centre at (left, top). For each row of the tile, lines[0] gets the column of the
+    largest alpha, and lines[1] what log2 of alpha would be there.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        row = _Splat(context, builder, signature, arguments)
+        column = row.columns(0)
+        dy = builder.fsub(_ROWS, row.spread(builder.fsub(column(V), arguments[3])))
+        x = row.fma(row.spread(column(SHEAR)), dy, row.spread(builder.fsub(column(U), arguments[2])))
+        high, wide = row.spread(builder.fneg(column(HEIGHT))), row.spread(builder.fneg(column(WIDTH)))
+        peak = row.fma(high, builder.fmul(dy, dy), row.spread(column(LOG_OPACITY)))
+        row.store(x, row.address(4, ir.Constant(I64, 0)))
+        row.store(peak, row.address(4, ir.Constant(I64, 1)))
+        # In each row, no pixel of a block is nearer to the peak than this one, and its alpha is computed as
+        # `blend_block` does: so the bits say exactly what will be found there.
+        whole, bits = row.rint(x), ir.Constant(I64, 0)
+        for i in range(SIDE):
+            nearest = row.least(row.most(whole, constant(float(SIDE * i))), constant(SIDE * i + SIDE - 1.0))
+            offset = builder.fsub(nearest, x)
+            power = row.fma(wide, builder.fmul(offset, offset), peak)
+            found = row.bits(builder.fcmp_ordered(">=", power, constant(LOG_ALPHA_MIN)))
+            bits = builder.or_(bits, builder.shl(found, ir.Constant(I64, LANES * i)))
+        # Bit 16 i + r of these is row r's, in the i-th column of blocks. Rows of four are put together, and columns
+        # of blocks beside each other.
+        for shift in (1, 2):
+            bits = builder.or_(bits, builder.lshr(bits, ir.Constant(I64, shift)))
+        bits = builder.and_(bits, ir.Constant(I64, 0x1111111111111111))
+        for shift in (LANES - 1, 2 * LANES - 2):
+            bits = builder.or_(bits, builder.lshr(bits, ir.Constant(I64, shift)))
+        return builder.and_(bits, ir.Constant(I64, OPEN))
+
+    number = types.float32
+    return types.int64(table, types.intp, number, number, lines), generate
+
+
+@intrinsic
+def blend_block(typing: Any, rays: Any, b: Any, lines: Any, wide: Any) -> tuple[Any, Callable[..., Any]]:
+    """Blend one Gaussian into block b of the rays.
+
+    In column c of row r its log2 of alpha is peak - wide * (c - x)^2, with x and peak of row r from `aim`; below that
+    of 1/255 alpha counts as 0. Returns its weights, and bits: the low sixteen say which rays are still open, the next
+    ones which were hit.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        row = _Splat(context, builder, signature, arguments)
+        offset = builder.fsub(row.columns_of(1), row.four_of(2, 0, arguments[1]))
+        peak = row.four_of(2, 1, arguments[1])
+        power = row.fma(row.spread(builder.fneg(arguments[3])), builder.fmul(offset, offset), peak)
+        alpha = row.exp2(power)
+        alpha = builder.select(builder.fcmp_ordered("<", alpha, constant(ALPHA_MAX)), alpha, constant(ALPHA_MAX))
+        address = row.row(0)
+        before = row.load(address)
+        hit = builder.and_(
+            builder.fcmp_ordered(">=", power, constant(LOG_ALPHA_MIN)),
+            builder.fcmp_ordered(">=", before, constant(T_MIN)),
+        )
+        weight = builder.select(hit, builder.fmul(alpha, before), constant(0.0))
+        after = builder.fsub(before, weight)
+        row.store(after, address)
+        still_open = row.bits(builder.fcmp_ordered(">=", after, constant(T_MIN)))
+        bits = builder.or_(builder.shl(row.bits(hit), ir.Constant(I64, LANES)), still_open)
+        return context.make_tuple(builder, signature.return_type, [weight, bits])
+
+    both: Any = types.Tuple((row_type, types.int64))  # type: ignore[no-untyped-call]
+    return both(rays, b, lines, types.float32), generate
