@@ -14,17 +14,16 @@ WARM_UP := $(BIN)/python -c 'from gsseg_core.warm_up import warm_up; warm_up(say
 INSTALLED := setup.py package.xml $(wildcard config/* foxglove/* launch/* resource/* rviz/* scripts/* sros2/*)
 MSGS := $(wildcard msg_defs/*.* msg_defs/action/* msg_defs/msg/* msg_defs/srv/*)
 
-# All that start nodes. They wait more than they work, so all others have time beside them; two of them would meet in one
-# ROS domain.
-ROS_TESTS := $(wildcard tests/test_ros_*.py) tests/test_docs.py
+# Of tests that run beside each other: those that start nodes wait more than they work.
+TEST_WORKERS ?= 4
 
 # Both builders of the messages obey it; without it one of them compiles file after file.
 export CMAKE_BUILD_PARALLEL_LEVEL ?= $(shell nproc 2>/dev/null || echo 1)
 
-# Targets that `make test` makes as well, while the tests with ROS still wait for their nodes.
-AFTER_CORE ?=
+# Targets that `make test` makes beside the tests.
+BESIDE ?=
 
-.PHONY: help demo demo-local view test test-ros test-core docs colcon results robustness bench clean
+.PHONY: help demo demo-local view test run-tests docs colcon results robustness bench clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{ printf "%-16s %s\n", $$1, $$2 }'
@@ -45,14 +44,10 @@ test: $(READY) $(ROS_READY) $(MSGS_READY)  ## lint, check the types and run the 
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(WARM_UP)
-	@echo 'tests with ROS and all others run beside each other; either prints once it has ended'
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync --keep-going test-ros test-core $(AFTER_CORE)
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target --keep-going run-tests $(BESIDE)
 
-test-ros:
-	$(BIN)/python -m pytest -W error --durations=10 -o cache_dir=.pytest_cache/ros $(ROS_TESTS)
-
-test-core:
-	$(BIN)/python -m pytest -W error --durations=10 -o cache_dir=.pytest_cache/core $(addprefix --ignore=,$(ROS_TESTS))
+run-tests:
+	$(BIN)/python -m pytest -W error --durations=20 --numprocesses=$(TEST_WORKERS) --dist=loadfile
 
 docs: $(READY)  ## build the documentation into site/index.html, and refuse links that lead nowhere
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

@@ -59,6 +59,7 @@ setup(
             "mypy>=1.15",
             "playwright>=1.45",
             "pytest>=8",
+            "pytest-xdist>=3.6",
             "pyyaml>=6.0",
             "ruff>=0.9",
             "rosbags>=0.10",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 
 import numpy as np
 from numba.core import event
@@ -40,8 +41,14 @@ def warm_up(device: str = "cpu", say: Callable[[str], object] = lambda text: Non
     That takes a third of a second when they are in the cache, and a minute or two at the first time after an
     installation; then `say` is told.
     """
-    with event.install_listener("numba:compile", _FirstCompilation(say)):
+    with telling(say):
         _segment_something(device)
+
+
+def telling(say: Callable[[str], object]) -> AbstractContextManager[object]:
+    """Tell, within the context, when the first kernel is compiled that was not in the cache."""
+    context: AbstractContextManager[object] = event.install_listener("numba:compile", _FirstCompilation(say))
+    return context
 
 
 def _segment_something(device: str) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import browser
 import pytest
+from hypothesis import HealthCheck, settings
 
 if TYPE_CHECKING:
     from operator_backends import Backend
@@ -19,6 +20,11 @@ DATA = Path(os.environ.get("GSSEG_DATA") or Path(__file__).parents[2] / "shared"
 _NO_DATA = "real data not found"
 _NO_GPU = "no GPU for gsplat"
 _NO_BROWSER = "no Chromium"
+
+
+# How fast examples are drawn and run says something of the machine only.
+settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any machine")
 
 
 def pytest_configure() -> None:

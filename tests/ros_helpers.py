@@ -24,16 +24,19 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
+from patience import PATIENCE
 
 try:
     # Set before any message class is imported: only then do they check their fields.
     os.environ.setdefault("ROS_PYTHON_CHECK_FIELDS", "1")
     from rclpy.context import Context
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+    from rclpy.handle import InvalidHandle
     from rclpy.node import Node
 
     with warnings.catch_warnings():
@@ -44,15 +47,16 @@ except ImportError as _error:
     pytest.skip(f"ROS is not installed ({_error})", allow_module_level=True)
 
 REPOSITORY = Path(__file__).parents[1]
-PATIENCE = 30.0
-"""Seconds until a wait gives up; a busy machine needs some just to start a node."""
-
-_counter = itertools.count()
+_counter = itertools.count(os.getpid() * 17)
+_WORKER, _WORKERS = (
+    int(os.environ.get(f"PYTEST_XDIST_WORKER{name}", alone).strip("gw")) for name, alone in (("", "0"), ("_COUNT", "1"))
+)
 
 
 def next_domain() -> int:
-    """A ROS domain that the tests of this run, and of one beside it, do not use soon: 1 to 100."""
-    return (os.getpid() * 17 + next(_counter)) % 100 + 1
+    """A ROS domain from 1 to 100 that no other worker of this run has, and that this one does not use again soon."""
+    share = 100 // _WORKERS
+    return _WORKER * share + next(_counter) % share + 1
 
 
 def wait_until(condition: Callable[[], Any], what: str, timeout: float = PATIENCE) -> None:
@@ -208,7 +212,8 @@ class Ros:
         # Not executor.spin(): its end, asked for from another thread, races with its own clean-up.
         try:
             while not self._closing:
-                self.executor.spin_once(timeout_sec=0.5)
+                with suppress(InvalidHandle):  # A client or subscription that the test took away in this moment.
+                    self.executor.spin_once(timeout_sec=0.5)
         except ExternalShutdownException:
             pass
 

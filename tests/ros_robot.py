@@ -88,6 +88,7 @@ class Robot:
             topic: ros.node.create_publisher(kind, f"{namespace}/{topic}", RELIABLE) for topic, kind in KINDS.items()
         }
         # The question for the state comes last: a node that answers it has heard of all the others (see `_greet`).
+        self.goals: list[Goal] = []
         self._learner = ActionClient(ros.node, Learn, f"{self.name}/learn")
         self._clients = {
             service: ros.node.create_client(kind, f"{self.name}/{service}") for service, kind in SERVICES.items()
@@ -122,7 +123,7 @@ class Robot:
     def wait_active(self) -> None:
         """Wait until the node is active and its inputs are connected."""
         assert self.process is not None
-        self.process.wait_for("active: listening", timeout=120)  # Compiles its kernels after an installation.
+        self.process.wait_for("active: listening", timeout=PATIENCE)  # Compiles its kernels after an installation.
         self.ros.wait_until(
             lambda: all(self.publishers[topic].get_subscription_count() for topic in ("mask", "camera_info")),
             "the node's subscriptions",
@@ -206,7 +207,8 @@ class Robot:
         sent = self.ros.run(lambda: learner.send_goal_async(goal, lambda message: feedback.append(message.feedback)))
         handle = self.ros.result(sent, "the goal to be accepted")
         assert handle.accepted
-        return Goal(handle, self.ros.run(handle.get_result_async), feedback)
+        self.goals.append(Goal(handle, self.ros.run(handle.get_result_async), feedback))
+        return self.goals[-1]
 
     def outcome(self, goal: Goal) -> tuple[int, Any]:
         """Wait for the end of a goal; returns status and result. To learn may take a busy machine long."""

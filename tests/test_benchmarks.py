@@ -86,7 +86,7 @@ def test_work_is_counted_as_the_operator_lists_it() -> None:
 
 def test_peak_is_beyond_what_is_reached_without_vectors(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lift_rate, "CHAINS", (8,))
-    assert lift_rate.fma_peak(0.01, 1) * 16 > 1e9
+    assert lift_rate.fma_peak(0.01, 20) * 16 > 1e9
 
 
 def test_flashsplat_takes_the_largest_vote_and_the_bias_moves_the_background() -> None:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 from small_scenes import NUM_CLASSES, balls_on_a_table, taught, with_clutter, write_dataset, wrong_views
 
 from gsseg_core import scheduler
@@ -51,7 +52,7 @@ def address() -> Iterator[str]:
 @pytest.fixture
 def client(address: str) -> Iterator[Any]:
     with scheduler.connected(address) as client:
-        client.wait_for_workers(3, timeout=20)
+        client.wait_for_workers(3, timeout=PATIENCE)
         yield client
 
 
@@ -184,7 +185,7 @@ def test_the_views_of_killed_workers_are_done_again_elsewhere(
     assert len(killed) == many and steps[-1] == SETTINGS.max_steps
     np.testing.assert_array_equal(there.codes_, here.codes_)
     assert there.history_ == here.history_
-    client.wait_for_workers(3, timeout=20)
+    client.wait_for_workers(3, timeout=PATIENCE)
     assert_same(there, here)  # Workers that came back take their part.
 
 
@@ -342,7 +343,7 @@ def test_the_documented_commands_make_a_cluster_and_its_loss_is_one_clear_error(
                 pass
             with subprocess.Popen([*run, "worker", address, "--no-dashboard", "--nthreads", "1"], **quiet) as worker:
                 with distributed.Client(address, set_as_default=False) as client:
-                    client.wait_for_workers(1, timeout=20)
+                    client.wait_for_workers(1, timeout=PATIENCE)
                 with scheduler.connected(address) as client:
                     there = DistributedEM(client, SCENE, NUM_CLASSES, SETTINGS)
                     there.observe_all(VIEWS)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 from scipy.spatial.transform import Rotation
 from small_scenes import NAMES, write_dataset
 
@@ -26,7 +27,8 @@ NOTEBOOK = REPOSITORY / "examples/from_ply_to_objects.ipynb"
 def run_example(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, str(REPOSITORY / "examples" / name), *map(str, arguments)],
-        env={**os.environ, "PYTHONPATH": str(REPOSITORY)}, text=True, capture_output=True, timeout=120, check=False,
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY)}, text=True, capture_output=True,
+        timeout=PATIENCE, check=False,
     )  # fmt: skip
 
 

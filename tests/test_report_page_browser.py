@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 from PIL import Image
 from report_cases import run_with_nasty_names
 
@@ -43,7 +44,7 @@ def after(page: Page, change: Callable[[], object]) -> np.ndarray:
     frames = int(page.locator(CANVAS).get_attribute("data-frames") or 0)
     change()
     # Not by wait_for_function, which needs eval, and that the page's policy forbids.
-    page.locator(f"{CANVAS}:not([data-frames='{frames}'])").wait_for(timeout=10_000)
+    page.locator(f"{CANVAS}:not([data-frames='{frames}'])").wait_for(timeout=1000 * PATIENCE)
     return shot(page.locator(CANVAS))
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 from ros_client_cases import (  # noqa: F401
     FOREVER,
     Background,
@@ -91,7 +92,7 @@ def test_ctrl_c_in_a_plain_script_cancels_learning(place: Place) -> None:
     )
     assert script.stdout is not None and script.stdout.readline() == "told\n"
     script.send_signal(signal.SIGINT)
-    output, _ = script.communicate(timeout=30)
+    output, _ = script.communicate(timeout=PATIENCE)
     assert script.returncode == 0 and output.endswith("interrupted\n"), output
     assert place.client.learn("data").report.num_views == 4
 
@@ -106,7 +107,7 @@ def test_a_script_that_forgets_to_close_ends_cleanly(place: Place) -> None:
         print("active")
         """,
     )
-    output, _ = script.communicate(timeout=60)
+    output, _ = script.communicate(timeout=PATIENCE)
     assert (script.returncode, output) == (0, "active\n")
 
 

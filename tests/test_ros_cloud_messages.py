@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from patience import PATIENCE
 
 pytest.importorskip("sensor_msgs")
 
@@ -104,7 +105,7 @@ def test_a_million_points_are_converted_at_once_even_where_rclpy_checks_fields()
         """
     environment = os.environ | {"ROS_PYTHON_CHECK_FIELDS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run(
-        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True, timeout=PATIENCE, check=True
     )
     seconds, checked = done.stdout.split()
     assert checked == "checked"

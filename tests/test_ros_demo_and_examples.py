@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 from PIL import Image as Picture
 from ros_helpers import REPOSITORY, Process, Ros, ros_fixture, wait_until  # noqa: F401
 from small_scenes import NAMES, write_dataset
@@ -57,11 +58,11 @@ class Demo:
 
     def wait_for_log(self, module: str, text: str) -> None:
         log = self.out / f"logs/{module}.log"
-        wait_until(lambda: log.exists() and text in log.read_text(), f"{text!r} in {log}", 60)
+        wait_until(lambda: log.exists() and text in log.read_text(), f"{text!r} in {log}")
 
     def end(self) -> tuple[int, str, str]:
         """Exit code and output, once it has ended."""
-        output, errors = self.process.communicate(timeout=120)
+        output, errors = self.process.communicate(timeout=PATIENCE)
         return self.process.returncode, output, errors
 
 
@@ -174,7 +175,7 @@ def start_example(
     environment = ros.environment if ros is not None else dict(os.environ)
     return subprocess.run(
         [sys.executable, str(REPOSITORY / "examples" / name), *arguments],
-        cwd=folder, env={**environment, **PYTHONPATH}, text=True, capture_output=True, timeout=120, check=False,
+        cwd=folder, env={**environment, **PYTHONPATH}, text=True, capture_output=True, timeout=PATIENCE, check=False,
     )  # fmt: skip
 
 

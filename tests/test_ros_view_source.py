@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 from ros_helpers import Ros, ros_fixture  # noqa: F401
 from small_scenes import NAMES, many_classes, write_dataset
 
@@ -34,7 +35,7 @@ def test_live_codes_are_those_of_the_node_wherever_the_scene_lies_in_the_map(ros
     scene = GaussianScene.load(tmp_path / "data/scene.ply")
     parameters = {"data_root": tmp_path, "scene_path": tmp_path / "data/scene.ply", "class_names": list(NAMES.values())}
     ros.start("segment_node", {**parameters, **MOVED})
-    source = RosSource(scene, domain_id=ros.domain, find_timeout=60.0)
+    source = RosSource(scene, domain_id=ros.domain, find_timeout=PATIENCE)
     try:
         with SegmentationClient(domain_id=ros.domain) as client:
             client.wait_until_active()

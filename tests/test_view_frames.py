@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 from small_scenes import NAMES, balls_on_a_table, clean_views
 
 pytest.importorskip("viser")
@@ -20,7 +21,6 @@ from gsseg_core.view_model import Labelling, ViewModel
 from gsseg_core.view_nodes import cut
 from gsseg_core.view_picture import Picture
 
-PATIENCE = 30.0
 SCENE, TRUTH = balls_on_a_table()
 MODEL = ViewModel(SCENE, Labelling(TRUTH.astype(np.int32), np.eye(4, dtype=np.float32)[TRUTH], dict(NAMES)))
 CAMERA = clean_views(1)[0].camera

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from browser import opened_page, screenshot
+from patience import PATIENCE
 from small_scenes import NAMES, balls_on_a_table, clean_views, write_dataset
 
 from gsseg_core.cli import main
@@ -33,7 +34,6 @@ from gsseg_core.viewer import Viewer
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
-PATIENCE = 30.0
 SCENE, TRUTH = balls_on_a_table()
 LEARNT = Labelling(TRUTH.astype(np.int32), np.eye(4, dtype=np.float32)[TRUTH] * np.float32(0.9), dict(NAMES))
 
@@ -334,6 +334,6 @@ def test_without_viser_one_error_says_what_to_install(tmp_path: Path) -> None:
         "from gsseg_core.cli import main\n"
         f"sys.exit(main(['view', {str(tmp_path / 'scene.ply')!r}]))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE)
     expected = "gsseg: error: `gsseg view` needs viser, which is missing: pip install 'gsseg[view]'\n"
     assert (done.returncode, done.stderr) == (2, expected)

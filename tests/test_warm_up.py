@@ -1,15 +1,24 @@
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from numba.core import event
 from small_scenes import write_dataset
 
 from gsseg_core.errors import SettingsError
+from gsseg_core.warm_up import telling, warm_up
+
+COUNTED = """
+from numba.core import event
 from gsseg_core.warm_up import warm_up
+warm_up()
+with event.install_recorder("numba:compile") as compiled:
+    {work}
+assert not compiled.buffer, [begun.data["dispatcher"] for _, begun in compiled.buffer]
+"""
 
 
 def test_a_device_that_is_not_there_is_refused() -> None:
@@ -17,34 +26,40 @@ def test_a_device_that_is_not_there_is_refused() -> None:
         warm_up("toaster")
 
 
-def run(program: str, cache: Path) -> str:
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
-    command = [sys.executable, "-c", program]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+def test_the_first_compilation_is_said_and_only_once() -> None:
+    said: list[str] = []
+    with telling(said.append):
+        assert not said
+        for _ in range(2):
+            with event.trigger_event("numba:compile"):
+                pass
+    assert len(said) == 1 and said[0].startswith("compiling kernels")
 
 
-def test_kernels_compile_once_the_first_run_says_so_and_no_other_are_needed(tmp_path: Path) -> None:
-    cache, data = tmp_path / "cache", write_dataset(tmp_path / "data")
-    program = (
-        "import time; from gsseg_core.warm_up import warm_up; start = time.perf_counter(); warm_up(say=print); "
-        "print('seconds', time.perf_counter() - start)"
+def test_warm_up_says_nothing_where_the_kernels_are_there() -> None:
+    warm_up()
+    program = "from gsseg_core.warm_up import warm_up; warm_up(say=print)"
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert told == ""
+
+
+@pytest.mark.parametrize("what", ["segment", "fuse"])
+def test_after_warm_up_nothing_is_compiled_any_more(tmp_path: Path, what: str) -> None:
+    data, out = str(write_dataset(tmp_path / "data")), str(tmp_path / "out")
+    scene = str(Path(data) / "scene.ply")
+    work = {
+        "segment": f"""
+    from gsseg_core.cli import main
+    assert main(["segment", {scene!r}, "--data", {data!r}, "--out", {out!r}, "--no-graph", "--quiet"]) == 0""",
+        "fuse": f"""
+    from gsseg_core.dataset import Dataset
+    from gsseg_core.live import LiveSession
+    from gsseg_core.scene import GaussianScene
+    session, data = LiveSession(GaussianScene.load({scene!r})), Dataset({data!r})
+    assert not any(map(session.fuse, data.views("train")))
+    session.segmentation()""",
+    }
+    run = subprocess.run(
+        [sys.executable, "-c", COUNTED.format(work=work[what])], capture_output=True, text=True, check=False
     )
-    first, second = run(program, cache), run(program, cache)
-    assert first.startswith("compiling kernels"), first
-    assert second.startswith("seconds"), second
-    slow, fast = (float(told.split()[-1]) for told in (first, second))
-    assert fast < 0.5 * slow
-    compiled = {path.name for path in cache.rglob("*.nb?")}
-    run(
-        f"from gsseg_core.cli import main; main(['segment', {str(data / 'scene.ply')!r}, '--data', {str(data)!r}, "
-        f"'--out', {str(tmp_path / 'out')!r}, '--no-graph'])",
-        cache,
-    )
-    run(
-        "from gsseg_core.dataset import Dataset; from gsseg_core.live import LiveSession; "
-        "from gsseg_core.scene import GaussianScene; "
-        f"session, data = LiveSession(GaussianScene.load({str(data / 'scene.ply')!r})), Dataset({str(data)!r}); "
-        "assert not any(map(session.fuse, data.views('train'))); session.segmentation()",
-        cache,
-    )
-    assert {path.name for path in cache.rglob("*.nb?")} == compiled
+    assert run.returncode == 0, run.stderr
