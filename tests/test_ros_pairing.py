@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsseg_core.errors import SettingsError
@@ -314,10 +314,11 @@ class CameraPoses(ExactPoses):
         return None if found is None else rigid(np.eye(3), [found[0, 3], len(frame_id), 0])
 
 
+@settings(max_examples=30, deadline=None)
 @given(st.data())
 def test_masks_of_synchronised_cameras_get_the_camera_info_and_the_pose_of_their_own(data: st.DataObject) -> None:
     pairing = Pairing(CameraPoses())
-    stamps, cameras = [1 * S + i * 100 * MS for i in range(20)], ("left", "right")
+    stamps, cameras = [1 * S + i * 100 * MS for i in range(5)], ("left", "right")
     sent = [(kind, camera) for kind in ("mask", "info") for camera in cameras] + [("pose", "")]
     for stamp in stamps:
         for kind, camera in data.draw(st.permutations(sent)):
@@ -330,7 +331,7 @@ def test_masks_of_synchronised_cameras_get_the_camera_info_and_the_pose_of_their
     pairing.add_mask(stamps[-1] + 1, "to go on", "left")
     found = [paired for paired in pairing.take() if paired.stamp in stamps]
     assert {p.mask for p in found} == {(camera, stamp) for camera in cameras for stamp in stamps}
-    assert len(found) == 40 == len({p.name for p in found})
+    assert len(found) == 10 == len({p.name for p in found})
     for p in found:
         camera, stamp = p.mask
         assert p.camera_info == (camera, stamp)
