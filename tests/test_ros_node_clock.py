@@ -1,4 +1,4 @@
-"""The segmentation node with use_sim_time, and a clock that never comes, runs, stands still, and is set back."""
+"""The segmentation node with use_sim_time, and a clock that does not come, comes, and is set back."""
 
 from __future__ import annotations
 
@@ -54,15 +54,14 @@ def fused(robot: Robot, count: int, what: str) -> dict[str, str]:
     return robot.wait_for_status(lambda status: status.get("views fused") == str(count), what)
 
 
-def test_without_a_clock_there_are_diagnostics_and_the_log_says_so_every_five_seconds(robot: Robot) -> None:
+def test_without_a_clock_there_are_diagnostics_and_they_and_the_log_say_so(robot: Robot) -> None:
     status = robot.wait_for_status(lambda status: "use_sim_time" in status["message"], "the complaint")
     assert status["message"].startswith("use_sim_time is true, but no /clock has come for ")
     assert "and nobody publishes it; expected a simulator or 'ros2 bag play --clock'" in status["message"]
     assert robot.received_status[-1].status[0].level == DiagnosticStatus.WARN
     assert min(stamps(robot)) > 1e9, "a stamp of zero says that there is none"
     assert robot.process is not None
-    output = robot.process
-    robot.ros.wait_until(lambda: output.output.count("no /clock has come for") >= 2, "two complaints")
+    robot.process.wait_for("use_sim_time is true, but no /clock has come for ")
 
 
 def test_without_a_clock_masks_are_fused_all_the_same(robot: Robot) -> None:
@@ -70,18 +69,9 @@ def test_without_a_clock_masks_are_fused_all_the_same(robot: Robot) -> None:
     robot.fuse(clean_views(2))
 
 
-def test_a_clock_that_stands_still_is_complained_of_until_it_goes_on(robot: Robot, clock: Any) -> None:
-    clock(50.0)
-    status = robot.wait_for_status(lambda status: "stood still" in status["message"], "the complaint")
-    assert "/clock has stood still at 50.000 s for " in status["message"]
-    assert "and it has 1 publisher (is it paused?)" in status["message"]
-    assert stamps(robot)[-3:] == [50.0] * 3
-    clock(51.0)
-    robot.wait_for_status(lambda status: "clock" not in status["message"], "no complaint any more")
-
-
 def test_after_the_clock_is_set_back_no_pose_of_before_is_taken_for_a_new_one(robot: Robot, clock: Any) -> None:
     clock(200.0)
+    robot.wait_for_status(lambda status: "clock" not in status["message"], "no complaint any more")
     robot.done("reset")
     views = clean_views(3)
     fused(robot, 0, "the reset")
