@@ -222,9 +222,9 @@ class Pairing:
 
     @property
     def waiting(self) -> int:
-        """How many masks wait."""
+        """How many masks wait, for what belongs to them or until it is clear to which time they belong."""
         with self._lock:
-            return len(self._waiting)
+            return len(self._waiting) + self._timeline.held_masks
 
     @property
     def time_jumps(self) -> int:

@@ -70,6 +70,11 @@ class Timeline:
         self._quiet_since: float | None = None
         self._went_on = False  # Anything, while these are held.
 
+    @property
+    def held_masks(self) -> int:
+        """How many masks are held back."""
+        return sum(message.stream == _MASK for message in self._held)
+
     def take_in(self, message: Message) -> list[Message]:
         """Take in a message; return those that can be used now, in order.
 

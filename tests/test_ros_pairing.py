@@ -208,6 +208,7 @@ def test_a_late_mask_is_paired_with_what_belongs_to_it_and_is_no_time_jump(late:
     on_time = len(pairing.take())
     # Two late ones in a row, and a third: a segmenter with several workers.
     send(pairing, [("mask", missing), ("mask", missing + 10 * MS), ("mask", missing)])
+    assert pairing.waiting == (3 if late >= S else 1)
     send(pairing, at_all([stamps[-1] + 100 * MS]))
     found = pairing.take()
     assert on_time == 79
