@@ -1,15 +1,23 @@
-"""How the node is: counts and ages for `/diagnostics`, and the reason why nothing arrives for the log."""
+"""How the node is: counts, ages and a verdict for `/diagnostics`, and for the log why nothing arrives or is fused."""
 
 from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Mapping
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from gsseg_ros.inputs import COMPLAIN_PERIOD, Inputs
+from gsseg_ros.complaints import CLOCK, MISSING, PERIOD, TIME_JUMP, Complaints
+from gsseg_ros.inputs import Inputs
 from gsseg_ros.workspace import Workspace
+
+WINDOW_SECONDS = 10.0
+"""For which masks the verdict counts how many were refused, of a clock that never stands still."""
+
+WARN_SHARE, ERROR_COUNT = 0.1, 3
+"""The verdict is WARN from this share of refused masks on, and ERROR if all were, and at least so many."""
+
+_ACCEPTED = "accepted"
 
 _HINTS = {
     "mask": "is the segmenter running, and is its topic remapped to this one (--ros-args -r mask:=...)?",
@@ -28,12 +36,12 @@ def rejections(inputs: Inputs) -> dict[str, int]:
     return dict(sorted(counts.items()))
 
 
-def missing_inputs(inputs: Inputs) -> list[str]:
-    """Say of each input from which nothing came for five seconds what to check."""
-    now, complaints = time.monotonic(), []
+def missing_inputs(inputs: Inputs) -> dict[str, str]:
+    """Say of each input from which nothing came for five seconds what to check; by what it is, such as "mask"."""
+    now, complaints = time.monotonic(), {}
     for topic, (count, last) in inputs.arrivals.items():
-        silence = now - last
-        if silence < COMPLAIN_PERIOD:
+        silence, role = now - last, inputs.roles[topic]
+        if silence < PERIOD:
             continue
         publishers = inputs.publishers_of(topic)
         many = f"{publishers} publisher{'s' * (publishers > 1)}"
@@ -45,52 +53,137 @@ def missing_inputs(inputs: Inputs) -> list[str]:
         elif publishers:
             hint = f"{count} came before, and it still has {many}"
         else:
-            hint = f"nobody publishes it: {_HINTS.get(topic.rsplit('/', 1)[-1], 'check the remapping')}"
-        complaints.append(f"no data on {topic} for {silence:.0f} s; {hint}")
+            hint = f"nobody publishes it: {_HINTS[role]}"
+        complaints[role] = f"no data on {topic} for {silence:.0f} s; {hint}"
     return complaints
 
 
-def unpaired(inputs: Inputs, before: Mapping[str, int]) -> list[str]:
-    """Say why masks were dropped since `before` for want of a pose or camera_info at their stamp."""
-    dropped, complaints = inputs.pairing.dropped, []
-    tf_problem = inputs.tf.problem if inputs.tf is not None else ""
-    for reason, what in (("no_pose", "pose"), ("no_camera_info", "camera_info")):
-        count = dropped[reason] - before.get(reason, 0)
-        if count > 0:
-            why = f": {tf_problem}" if reason == "no_pose" and tf_problem else ""
-            complaints.append(
-                f"{count} masks were dropped because no {what} with their stamp came within a second{why}; expected "
-                f"mask and {what} to carry the stamp of the same image, from the same clock (use_sim_time?)"
-            )
-    return complaints
+def why_dropped(inputs: Inputs, reason: str) -> str:
+    """Say why masks are dropped before they are fused, and what to check; empty for other reasons."""
+    return {
+        "no_pose": f"no pose with their stamp came within a second{_pose_problem(inputs)}; expected mask and pose to "
+        "carry the stamp of the same image, from the same clock (use_sim_time?)",
+        "no_camera_info": f"no camera_info with their stamp came within a second{_frame_problem(inputs)}; expected "
+        "mask and camera_info to carry the stamp of the same image, from the same clock (use_sim_time?)",
+        "repeated_stamp": "a mask with their stamp and frame_id came before; expected every image once: is the "
+        "segmenter, or a bag, running twice?",
+        "several_cameras": "masks of several cameras (frame_id) carry one stamp, and their poses do not say whose they "
+        "are; expected the parameter pose_source to be tf, or a node for each camera",
+        "time_jump": "they are from before time was set back; expected so only for a moment, then check the clocks",
+        "queue_full": "they come faster than they are fused; expected a lower rate or smaller masks (the parameter "
+        "queue_size says how many may wait)",
+    }.get(reason, "")
 
 
-def diagnostic_array(name: str, workspace: Workspace, inputs: Inputs | None, stamp: object) -> DiagnosticArray:
-    """Put all that an operator wants to know into one message."""
-    level, message = _verdict(workspace, inputs)
+def complain(complaints: Complaints, inputs: Inputs | None, clock_problem: str) -> None:
+    """Say in the log what is missing and what was lost; call it once a second."""
+    if clock_problem and complaints.due(CLOCK):
+        complaints.add(CLOCK, clock_problem)
+    if inputs is not None:
+        for role, line in missing_inputs(inputs).items():
+            if complaints.due(MISSING[role]):
+                complaints.add(MISSING[role], line)
+        _complain_of_losses(complaints, inputs)
+    complaints.flush()
+
+
+def _complain_of_losses(complaints: Complaints, inputs: Inputs) -> None:
+    jumps, logged = inputs.pairing.time_jumps, inputs.logged
+    if jumps > logged[TIME_JUMP] and complaints.due(TIME_JUMP):
+        before, after = (stamp / 1e9 for stamp in inputs.pairing.last_jump)
+        times = f" {jumps - logged[TIME_JUMP]} times, the last time" * (jumps - logged[TIME_JUMP] > 1)
+        complaints.add(
+            TIME_JUMP,
+            f"time was set back{times} from {before:.3f} s to {after:.3f} s: poses, camera_infos and masks of before "
+            "are forgotten (did a bag begin again, or a simulator?)",
+        )
+        logged[TIME_JUMP] = jumps
+    for reason, count in rejections(inputs).items():
+        why, more = why_dropped(inputs, reason), count - logged[reason]
+        if why and more and complaints.due(reason):
+            complaints.add(reason, f"{more} mask{'s were' if more > 1 else ' was'} dropped because {why}")
+            logged[reason] = count
+
+
+def _pose_problem(inputs: Inputs) -> str:
+    refused_at, refusal = inputs.last_refusal
+    if time.monotonic() - refused_at < WINDOW_SECONDS:
+        return f" ({refusal})"
+    return f" ({inputs.tf.problem})" if inputs.tf is not None and inputs.tf.problem else ""
+
+
+def _frame_problem(inputs: Inputs) -> str:
+    mask, infos = inputs.pairing.unmatched_frame, inputs.pairing.camera_frames
+    if mask in infos or not infos or "" in infos:
+        return ""
+    return f" (masks have the frame_id '{mask}', camera_infos have {', '.join(map(repr, infos))}: expected the same)"
+
+
+def diagnostic_array(
+    name: str, workspace: Workspace, inputs: Inputs | None, stamp: object, clock_problem: str = ""
+) -> DiagnosticArray:
+    """Put all that an operator wants to know into one message.
+
+    Its level is OK while masks are fused; WARN if something is amiss that may cost views: not active, no scene, no
+    clock, silent inputs, refused poses, a tenth or more of the masks of the last ten seconds refused; ERROR if all of
+    these masks were refused, three at least.
+    """
+    recent = _recent(inputs) if inputs is not None else Counter[str]()
+    level, message = _verdict(workspace, inputs, recent, clock_problem)
     status = DiagnosticStatus(level=level, name=name, message=message, hardware_id="gsseg")
     values: dict[str, object] = {"active": workspace.active, "last job": workspace.last_job}
     values.update(_scene_values(workspace))
     if inputs is not None:
         values.update(_input_values(inputs))
+        refused = recent.total() - recent[_ACCEPTED]
+        values[f"refused in the last {WINDOW_SECONDS:.0f} s"] = f"{refused} of {recent.total()}"
     status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
     array = DiagnosticArray(status=[status])
     array.header.stamp = stamp
     return array
 
 
-def _verdict(workspace: Workspace, inputs: Inputs | None) -> tuple[bytes, str]:
+def _recent(inputs: Inputs) -> Counter[str]:
+    """Masks of the last ten seconds that were fused, and that were refused, by reason."""
+    now, counted = time.monotonic(), inputs.counted
+    counts = Counter(rejections(inputs))
+    counts[_ACCEPTED] = inputs.accepted
+    counted.append((now, counts))
+    while len(counted) > 2 and counted[1][0] <= now - WINDOW_SECONDS:
+        counted.popleft()
+    return counts - counted[0][1]
+
+
+def _verdict(
+    workspace: Workspace, inputs: Inputs | None, recent: Counter[str], clock_problem: str
+) -> tuple[bytes, str]:
+    if clock_problem:
+        return DiagnosticStatus.WARN, clock_problem
     if inputs is None or not workspace.active:
         return DiagnosticStatus.WARN, "not active"
     if not workspace.has_scene:
         return DiagnosticStatus.WARN, "no scene is loaded"
+    refused = recent.total() - recent[_ACCEPTED]
+    if refused and refused >= WARN_SHARE * recent.total():
+        all_refused = refused == recent.total() >= ERROR_COUNT
+        return DiagnosticStatus.ERROR if all_refused else DiagnosticStatus.WARN, _refusals(inputs, recent)
     refused_at, why = inputs.last_refusal
-    if time.monotonic() - refused_at < COMPLAIN_PERIOD:
+    if time.monotonic() - refused_at < PERIOD:
         return DiagnosticStatus.WARN, why
     complaints = missing_inputs(inputs)
     if complaints:
-        return DiagnosticStatus.WARN, complaints[0]
+        return DiagnosticStatus.WARN, next(iter(complaints.values()))
     return DiagnosticStatus.OK, "fusing"
+
+
+def _refusals(inputs: Inputs, recent: Counter[str]) -> str:
+    reasons = Counter({reason: count for reason, count in recent.items() if reason != _ACCEPTED})
+    (reason, count), *_ = reasons.most_common(1)
+    why = why_dropped(inputs, reason) or inputs.explained.get(reason, "")
+    return (
+        f"{reasons.total()} of {recent.total()} masks of the last {WINDOW_SECONDS:.0f} s were refused, {count} of them "
+        f"as {reason}: {why}"
+    )
 
 
 def _scene_values(workspace: Workspace) -> dict[str, object]:

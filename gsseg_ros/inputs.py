@@ -1,15 +1,17 @@
-"""What the node listens to: masks, camera_infos and poses, paired by stamp and fused in a thread of their own."""
+"""What the node listens to: masks, camera_infos and poses, paired by stamp and camera, fused in their own thread."""
 
 from __future__ import annotations
 
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo, Image
@@ -18,6 +20,7 @@ from gsseg_core.dataset import View
 from gsseg_core.errors import GssegError, PoseError
 from gsseg_core.live import Rejection
 from gsseg_ros.camera_images import CameraImages
+from gsseg_ros.complaints import LIVE, PERIOD, REFUSED_POSE, Complaints
 from gsseg_ros.conversions import camera_from_messages, labels_from_image, matrix_from_pose, stamp_ns
 from gsseg_ros.errors import NoSceneError
 from gsseg_ros.jobs import Worker
@@ -25,10 +28,11 @@ from gsseg_ros.live_outputs import LiveOutputs
 from gsseg_ros.outputs import Outputs
 from gsseg_ros.pairing import ExactPoses, InterpolatedPoses, Paired, Pairing, PoseSource
 from gsseg_ros.qos import sensor_data
+from gsseg_ros.sim_time import on_set_back
 from gsseg_ros.tf_poses import TfPoses
 from gsseg_ros.workspace import Workspace
 
-EXPIRE_PERIOD, COMPLAIN_PERIOD = 0.1, 5.0  # s
+EXPIRE_PERIOD = 0.1  # s
 
 
 class Inputs:
@@ -38,10 +42,18 @@ class Inputs:
     ----------
     arrivals : dict of str to (int, float)
         By full name of the topic: messages so far, and when the last one came (s, `time.monotonic`).
+    roles : dict of str to str
+        By full name of the topic: what it is, such as "mask".
     accepted : int
         Views that were fused.
     rejected : Counter of str
         Masks that were not, by reason.
+    explained : dict of str to str
+        By reason: what was wrong with the last of these.
+    counted : deque of (float, Counter)
+        What `gsseg_ros.diagnostics` counted lately, and when (s, `time.monotonic`).
+    logged : Counter of str
+        How many of these it has named in the log.
     refused_poses : int
         Poses that could not be used.
     last_refusal : (float, str)
@@ -50,17 +62,20 @@ class Inputs:
         By full name of the topic: quality of service of the subscription, overrides included.
     """
 
-    def __init__(self, node: LifecycleNode, workspace: Workspace, outputs: Outputs) -> None:
+    def __init__(self, node: LifecycleNode, workspace: Workspace, outputs: Outputs, complaints: Complaints) -> None:
         settings = workspace.settings
-        self._node, self._workspace = node, workspace
+        self._node, self._workspace, self._complaints = node, workspace, complaints
         self.accepted = 0
         self.rejected: Counter[str] = Counter()
+        self.explained: dict[str, str] = {}
         self.refused_poses = 0
-        self.last_refusal = (-COMPLAIN_PERIOD, "")
+        self.last_refusal = (-PERIOD, "")
         self.arrivals: dict[str, tuple[int, float]] = {}
+        self.roles: dict[str, str] = {}
         self.policies: dict[str, str] = {}
         self.started = time.monotonic()
-        self._complained: dict[str, float] = {}
+        self.counted: deque[tuple[float, Counter[str]]] = deque([(self.started, Counter())])
+        self.logged: Counter[str] = Counter()
         self._told: Counter[str] = Counter()
         self._group = MutuallyExclusiveCallbackGroup()
         self.tf = TfPoses(node, settings.map_frame) if settings.pose_source == "tf" else None
@@ -68,7 +83,11 @@ class Inputs:
         self.pairing = Pairing(poses)
         self.worker: Worker[Paired] = Worker(self._fuse, settings.queue_size)
         self.live = LiveOutputs(
-            workspace, outputs, lambda: self.worker.waiting > 0, lambda: node.get_clock().now().to_msg(), self.complain
+            workspace,
+            outputs,
+            lambda: self.worker.waiting > 0,
+            lambda: node.get_clock().now().to_msg(),
+            lambda _, message: complaints.add(LIVE, message),
         )
         self._images = CameraImages(node, outputs, self.live, self.tf or type(poses)(), self._group)
         self._subscriptions = [
@@ -79,10 +98,14 @@ class Inputs:
             self._subscriptions.append(self._listen(PoseStamped, "pose", self._on_pose))
         elif settings.pose_source == "odometry":
             self._subscriptions.append(self._listen(Odometry, "odometry", self._on_odometry))
-        self._timer = node.create_timer(EXPIRE_PERIOD, self._expire, callback_group=self._group)
+        # Not by /clock, which may stand still.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = node.create_timer(EXPIRE_PERIOD, self._expire, callback_group=self._group, clock=steady)
+        self._jumps = on_set_back(node, self._set_back)
 
     def close(self) -> None:
         """Stop listening; a mask that is being fused is finished."""
+        self._jumps.unregister()
         self._node.destroy_timer(self._timer)
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
@@ -95,13 +118,6 @@ class Inputs:
     def publishers_of(self, topic: str) -> int:
         """How many publish on an input."""
         return int(self._node.count_publishers(topic))
-
-    def complain(self, key: str, message: str) -> None:
-        """Warn, of the same thing once in five seconds."""
-        now = time.monotonic()
-        if now - self._complained.get(key, -COMPLAIN_PERIOD) >= COMPLAIN_PERIOD:
-            self._complained[key] = now
-            self._node.get_logger().warning(message)
 
     def _listen(self, kind: Any, topic: str, callback: Callable[[str, Any], None]) -> Any:
         subscription: Any = None
@@ -122,6 +138,7 @@ class Inputs:
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
         self.arrivals[subscription.topic_name] = (0, self.started)
+        self.roles[subscription.topic_name] = topic
         policies = f"{quality.reliability.short_key}, {quality.durability.short_key}"
         self.policies[subscription.topic_name] = policies.replace("_", " ")
         return subscription
@@ -131,7 +148,7 @@ class Inputs:
 
     def _on_camera_info(self, topic: str, message: CameraInfo) -> None:
         for pairing in (self.pairing, self._images.pairing):
-            pairing.add_camera_info(stamp_ns(message.header.stamp), (topic, message))
+            pairing.add_camera_info(stamp_ns(message.header.stamp), (topic, message), message.header.frame_id)
 
     def _on_pose(self, topic: str, message: PoseStamped) -> None:
         self._add_pose(topic, message.header, message.pose)
@@ -150,10 +167,17 @@ class Inputs:
         except PoseError as error:
             self.refused_poses += 1
             self.last_refusal = (time.monotonic(), str(error))
-            self.complain(f"pose {str(error)[:60]}", str(error))
+            self._complaints.add(REFUSED_POSE, str(error))
             return
         for pairing in (self.pairing, self._images.pairing):
             pairing.add_pose(stamp_ns(header.stamp), matrix)
+
+    def _set_back(self, stamp: int) -> None:
+        for pairing in (self.pairing, self._images.pairing):
+            pairing.set_back(stamp)
+        if self.tf is not None:  # It may hold what the pairings, without a mask, have not asked for.
+            self.tf.clear()
+        self._hand_over()
 
     def _expire(self) -> None:
         self.pairing.expire(time.monotonic())
@@ -184,7 +208,8 @@ class Inputs:
             self.live.fused(paired)
             return
         self.rejected[rejection.reason] += 1
-        self.complain(rejection.reason, f"a view was rejected ({rejection.reason}): {rejection.message}")
+        self.explained[rejection.reason] = rejection.message
+        self._complaints.add(rejection.reason, f"a view was rejected ({rejection.reason}): {rejection.message}")
 
     def _fused(self, paired: Paired) -> Rejection | None:
         workspace = self._workspace

@@ -1,4 +1,4 @@
-"""Pairs every mask with the camera_info and the pose that belong to its stamp.
+"""Pairs every mask with the camera_info and the pose that belong to its stamp and its camera.
 
 Stamps are whole nanoseconds. The three inputs come in any order; a mask waits for its pose, a pose is never replaced by
 "the latest". Nothing here knows ROS: messages are passed through unread.
@@ -16,20 +16,25 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_ros.frames import interpolate
+from gsseg_ros.timeline import BEHIND_NS, SECOND, Message, Timeline
 
 Pose: TypeAlias = npt.NDArray[np.float64]  # (4, 4)
 T = TypeVar("T")
+_Key: TypeAlias = tuple[int, str]  # stamp and frame_id
 
-_NS = 1_000_000_000
-# How much older than its predecessors a message may be before time is taken to have been set back.
-_JUMP_NS = _NS
 _POSES_KEPT = 2000  # At 200 Hz, those of ten seconds.
-_CAMERA_INFOS_KEPT = 200
+_CAMERA_INFOS_KEPT = 600  # Of each camera; at 60 Hz, those of ten seconds.
 _STAMPS_KEPT = 1000
+_CAMERAS_KEPT = 16
+_UNCLEAR_NS = 10 * SECOND
 
 
 class PoseSource(Protocol):
     """Where poses of the camera in the map come from."""
+
+    @property
+    def knows_frames(self) -> bool:
+        """Whether it tells cameras apart, by the frame_id of their masks."""
 
     def at(self, stamp: int, frame_id: str = "") -> Pose | None:
         """Pose (4, 4) at exactly `stamp` of the camera whose masks carry `frame_id`; None if it is not known (yet)."""
@@ -44,7 +49,7 @@ class PoseSource(Protocol):
 class Paired(NamedTuple):
     """A mask, and what belongs to it."""
 
-    name: str  # Unique: the epoch and the stamp.
+    name: str  # Unique: the epoch, the stamp, and at one stamp the number of the camera.
     stamp: int
     mask: Any
     camera_info: Any
@@ -70,6 +75,8 @@ class PairingSettings:
 class ExactPoses:
     """Poses that were measured for the masks themselves: only that of exactly a mask's stamp will do."""
 
+    knows_frames = False
+
     def __init__(self) -> None:
         self._poses: _History[Pose] = _History(_POSES_KEPT)
 
@@ -83,7 +90,7 @@ class ExactPoses:
 
     def too_late(self, stamp: int) -> bool:
         """Whether the poses have gone on from `stamp` by more than they come out of order."""
-        return bool(self._poses.stamps) and self._poses.stamps[-1] >= stamp + _JUMP_NS
+        return bool(self._poses.stamps) and self._poses.stamps[-1] >= stamp + BEHIND_NS
 
     def clear(self) -> None:
         """Forget all poses."""
@@ -101,7 +108,7 @@ class InterpolatedPoses(ExactPoses):
 
     def __init__(self, max_gap_s: float = 0.2) -> None:
         super().__init__()
-        self._max_gap_ns = round(max_gap_s * _NS)
+        self._max_gap_ns = round(max_gap_s * SECOND)
 
     def at(self, stamp: int, frame_id: str = "") -> Pose | None:
         """Pose (4, 4) at `stamp`, whatever the frame; None without poses before and after it that are close enough."""
@@ -118,10 +125,17 @@ class InterpolatedPoses(ExactPoses):
 
 
 class Pairing:
-    """Pairs masks with camera_info and pose by stamp. Its methods may be called from any thread.
+    """Pairs masks with camera_info and pose by stamp and camera. Its methods may be called from any thread.
 
-    A camera_info belongs to a mask if it has its stamp; otherwise, once a later one has come or the waiting time is
-    over, the newest earlier one does. Every mask comes out of `take`, or is counted in `dropped`, or still waits.
+    A camera_info belongs to a mask if it has its stamp and its frame_id, which names the camera; otherwise, once a
+    later one of this camera has come or the waiting time is over, the newest earlier one does. A mask without a
+    frame_id goes with the only camera there is, a camera_info without one with every camera that has none of its own.
+    Every mask comes out of `take`, or is counted in `dropped`, or still waits.
+
+    Poses that come from messages do not say of which camera they are. So when masks of two cameras carry one stamp, and
+    the poses are not from a source that knows frames, none is paired until ten seconds (of stamps) later.
+
+    What is late and what shows that time was set back is said in `gsseg_ros.timeline.Timeline`.
 
     Parameters
     ----------
@@ -133,50 +147,39 @@ class Pairing:
     Attributes
     ----------
     dropped : Counter
-        Masks not paired, by reason: "no_pose", "no_camera_info", "repeated_stamp", and "time_jump" for one from before
-        time was set back that came after it.
+        Masks not paired, by reason: "no_pose", "no_camera_info", "repeated_stamp" (and the same frame_id),
+        "several_cameras" (whose poses cannot be told apart), and "time_jump" for one from before time was set back that
+        came after it.
     out_of_order : int
-        Masks that were older than one before them, by less than a second; they are paired all the same.
+        Masks that were older than one before them; they are paired all the same.
     time_jumps : int
         How often time was set back by a second or more: a bag loops, a simulator starts again. All that was kept is
         dropped then, and the same stamps are new ones.
+    unmatched_frame : str
+        The frame_id of the last mask that was dropped for want of a camera_info.
     """
 
     def __init__(self, poses: PoseSource, settings: PairingSettings | None = None) -> None:
         self.dropped: Counter[str] = Counter()
         self.out_of_order = 0
-        self.time_jumps = 0
+        self.unmatched_frame = ""
         self._poses = poses
         self._settings = settings or PairingSettings()
         self._lock = threading.Lock()
-        self._clock = _Clock(self._settings.max_waiting)
-        self._camera_infos: _History[Any] = _History(_CAMERA_INFOS_KEPT)
-        self._seen: _History[None] = _History(_STAMPS_KEPT)
-        self._waiting: dict[int, _Waiting] = {}
+        self._timeline = Timeline(self._settings.max_waiting, self._settings.wait_s)
+        self._camera_infos: dict[str, _History[Any]] = {}  # By frame_id, that last heard at the end.
+        self._seen: _History[list[str]] = _History(_STAMPS_KEPT)  # Frames of the masks of a stamp.
+        self._unclear_until = 0  # Up to this stamp poses may be of another camera.
+        self._waiting: dict[_Key, _Waiting] = {}
         self._finished: list[Paired] = []
 
     def add_mask(self, stamp: int, message: Any, frame_id: str = "") -> None:
         """Take in a mask whose header has this stamp and frame."""
-        with self._lock:
-            newest = self._clock.newest.get("mask", stamp)
-            if not self._arrives("mask", stamp):
-                self.dropped["time_jump"] += 1
-            elif stamp in self._seen.values:
-                self.dropped["repeated_stamp"] += 1
-            else:
-                self.out_of_order += newest - _JUMP_NS < stamp < newest
-                self._seen.add(stamp, None)
-                self._waiting[stamp] = _Waiting(message, frame_id)
-                self._pair(stamp)
-                if len(self._waiting) > self._settings.max_waiting:
-                    self._pair(min(self._waiting), last_chance=True)
+        self._take_in(Message("mask", stamp, message, frame_id))
 
-    def add_camera_info(self, stamp: int, message: Any) -> None:
-        """Take in a camera_info."""
-        with self._lock:
-            if self._arrives("camera_info", stamp):
-                self._camera_infos.add(stamp, message)
-                self._pair_all()
+    def add_camera_info(self, stamp: int, message: Any, frame_id: str = "") -> None:
+        """Take in a camera_info whose header has this stamp and frame."""
+        self._take_in(Message("camera_info", stamp, message, frame_id))
 
     def add_pose(
         self,
@@ -184,12 +187,15 @@ class Pairing:
         matrix: Pose,  # (4, 4)
     ) -> None:
         """Take in a pose of the camera in the map; not for TF, which gets its poses by itself."""
+        if not isinstance(self._poses, ExactPoses):
+            raise TypeError(f"{type(self._poses).__name__} takes no poses")
+        self._take_in(Message("pose", stamp, matrix))
+
+    def set_back(self, stamp: int) -> None:
+        """Take in that the clock was set back to `stamp` (ns): nothing of a later time belongs to what comes now."""
         with self._lock:
-            if not isinstance(self._poses, ExactPoses):
-                raise TypeError(f"{type(self._poses).__name__} takes no poses")
-            if self._arrives("pose", stamp):
-                self._poses.add(stamp, matrix)
-                self._pair_all()
+            epoch = self._timeline.epoch
+            self._deliver(epoch, self._timeline.set_back(stamp))
 
     def expire(self, now_s: float) -> None:
         """Pair or drop the masks that have waited long enough; call it some ten times a second.
@@ -202,9 +208,11 @@ class Pairing:
             Seconds of a clock that never goes back, such as `time.monotonic`.
         """
         with self._lock:
-            for stamp, waiting in sorted(self._waiting.items()):
+            epoch = self._timeline.epoch
+            self._deliver(epoch, self._timeline.expire(now_s))
+            for key, waiting in sorted(self._waiting.items()):
                 waiting.since = now_s if waiting.since is None else waiting.since
-                self._pair(stamp, last_chance=now_s - waiting.since >= self._settings.wait_s)
+                self._pair(key, last_chance=now_s - waiting.since >= self._settings.wait_s)
 
     def take(self) -> list[Paired]:
         """Hand over what was paired since the last call; call it after each of the others."""
@@ -214,44 +222,98 @@ class Pairing:
 
     @property
     def waiting(self) -> int:
-        """How many masks wait."""
+        """How many masks wait, for what belongs to them or until it is clear to which time they belong."""
         with self._lock:
-            return len(self._waiting)
+            return len(self._waiting) + self._timeline.held_masks
 
-    def _arrives(self, stream: str, stamp: int) -> bool:
-        """Note that time went on, or was set back; return False for a straggler from before that."""
-        epoch = self._clock.epoch
-        current = self._clock.arrives(stream, stamp)
-        if self._clock.epoch > epoch:
-            self.time_jumps += 1
+    @property
+    def time_jumps(self) -> int:
+        """How often time was set back."""
+        return self._timeline.epoch
+
+    @property
+    def last_jump(self) -> tuple[int, int]:
+        """From where to where time was set back last, ns."""
+        return self._timeline.last_jump
+
+    @property
+    def camera_frames(self) -> list[str]:
+        """The frame_ids of the camera_infos."""
+        with self._lock:
+            return sorted(self._camera_infos)
+
+    def _take_in(self, message: Message) -> None:
+        with self._lock:
+            epoch = self._timeline.epoch
+            self._deliver(epoch, self._timeline.take_in(message))
+
+    def _deliver(self, epoch: int, messages: list[Message]) -> None:
+        """Work on what is now known to be of this time; `epoch` is that of before the last message."""
+        if self._timeline.epoch > epoch:
             for waiting in sorted(self._waiting):
                 self._pair(waiting, last_chance=True, epoch=epoch)
             for kept in (self._poses, self._camera_infos, self._seen):
                 kept.clear()
-        return current
+            self._unclear_until = 0
+        if self._timeline.lost_masks:
+            self.dropped["time_jump"] = self._timeline.lost_masks
+        for stream, stamp, content, frame_id in messages:
+            if stream == "camera_info":
+                self._add_camera_info(stamp, content, frame_id)
+            elif stream == "pose" and isinstance(self._poses, ExactPoses):
+                self._poses.add(stamp, content)
+        for stream, stamp, content, frame_id in messages:
+            if stream == "mask":
+                self._await(stamp, content, frame_id)
+        if messages:
+            for key in sorted(self._waiting):
+                self._pair(key)
+            while len(self._waiting) > self._settings.max_waiting:
+                self._pair(min(self._waiting), last_chance=True)
 
-    def _pair_all(self) -> None:
-        for stamp in sorted(self._waiting):
-            self._pair(stamp)
+    def _await(self, stamp: int, mask: Any, frame_id: str) -> None:
+        frames = self._seen.values.get(stamp, [])
+        if frame_id in frames or len(frames) >= _CAMERAS_KEPT:
+            self.dropped["repeated_stamp"] += 1
+            return
+        self.out_of_order += bool(self._seen.stamps) and stamp < self._seen.stamps[-1]
+        self._seen.add(stamp, frames)
+        frames.append(frame_id)
+        if len(frames) > 1 and not self._poses.knows_frames:
+            self._unclear_until = max(self._unclear_until, stamp + _UNCLEAR_NS)
+        self._waiting[stamp, frame_id] = _Waiting(mask, len(frames))
 
-    def _pair(self, stamp: int, last_chance: bool = False, epoch: int | None = None) -> None:
-        waiting = self._waiting[stamp]
+    def _add_camera_info(self, stamp: int, message: Any, frame_id: str) -> None:
+        infos = self._camera_infos.pop(frame_id, None) or _History(_CAMERA_INFOS_KEPT)
+        self._camera_infos[frame_id] = infos
+        if len(self._camera_infos) > _CAMERAS_KEPT:
+            del self._camera_infos[next(iter(self._camera_infos))]
+        infos.add(stamp, message)
+
+    def _pair(self, key: _Key, last_chance: bool = False, epoch: int | None = None) -> None:
+        waiting, (stamp, frame_id) = self._waiting[key], key
         if waiting.pose is None:
-            waiting.pose = self._poses.at(stamp, waiting.frame_id)
-        info = self._camera_info(stamp, last_chance)
-        if waiting.pose is not None and info is not None:
-            name = f"{self._clock.epoch if epoch is None else epoch}_{stamp}"
+            waiting.pose = self._poses.at(stamp, frame_id)
+        info = self._camera_info(stamp, frame_id, last_chance)
+        if stamp < self._unclear_until:
+            self.dropped["several_cameras"] += 1
+        elif waiting.pose is not None and info is not None:
+            name = f"{self._timeline.epoch if epoch is None else epoch}_{stamp}"
+            name += f"_{waiting.camera}" * (waiting.camera > 1)
             self._finished.append(Paired(name, stamp, waiting.mask, info, waiting.pose))
         elif waiting.pose is None and (last_chance or self._poses.too_late(stamp)):
             self.dropped["no_pose"] += 1
         elif last_chance:
             self.dropped["no_camera_info"] += 1
+            self.unmatched_frame = frame_id
         else:
             return
-        del self._waiting[stamp]
+        del self._waiting[key]
 
-    def _camera_info(self, stamp: int, last_chance: bool) -> Any:
-        infos = self._camera_infos
+    def _camera_info(self, stamp: int, frame_id: str, last_chance: bool) -> Any:
+        infos = self._infos_of(frame_id)
+        if infos is None:
+            return None
         if stamp in infos.values:
             return infos.values[stamp]
         after = bisect_left(infos.stamps, stamp)
@@ -259,11 +321,16 @@ class Pairing:
             return infos.values[infos.stamps[after - 1]]
         return None
 
+    def _infos_of(self, frame_id: str) -> _History[Any] | None:
+        if not frame_id and len(self._camera_infos) == 1:
+            return next(iter(self._camera_infos.values()))
+        return self._camera_infos.get(frame_id) or self._camera_infos.get("")
+
 
 @dataclass
 class _Waiting:
     mask: Any
-    frame_id: str
+    camera: int  # Among those with masks of this stamp, from 1.
     pose: Pose | None = None
     since: float | None = None
 
@@ -287,36 +354,3 @@ class _History(Generic[T]):
     def clear(self) -> None:
         self.stamps.clear()
         self.values.clear()
-
-
-class _Clock:
-    """Sees time being set back, once, though every stream shows it on its own and some still send from before."""
-
-    def __init__(self, max_stragglers: int) -> None:
-        self.epoch = 0
-        self.newest: dict[str, int] = {}  # Of each stream, in this epoch.
-        self._before: dict[str, int] = {}  # Of the streams that have sent nothing in this epoch, in the one before.
-        self._stragglers: Counter[str] = Counter()
-        self._max_stragglers = max_stragglers
-
-    def arrives(self, stream: str, stamp: int) -> bool:
-        """Take in a stamp; return False for one of an earlier epoch."""
-        if stream in self._before:
-            if self._is_straggler(stream, stamp):
-                return False
-            del self._before[stream]
-        elif stamp <= self.newest.get(stream, stamp) - _JUMP_NS:
-            self.epoch += 1
-            self._before, self.newest = self.newest, {}
-            self._before.pop(stream)
-            self._stragglers.clear()
-        self.newest[stream] = max(stamp, self.newest.get(stream, stamp))
-        return True
-
-    def _is_straggler(self, stream: str, stamp: int) -> bool:
-        went_on = stamp > self._before[stream] - _JUMP_NS
-        ahead = stamp >= max(self.newest.values()) + _JUMP_NS
-        # A single wrong stamp looks like a jump. The other streams then never follow, but only so many of their
-        # messages can have been under way.
-        self._stragglers[stream] += 1
-        return went_on and ahead and self._stragglers[stream] <= self._max_stragglers

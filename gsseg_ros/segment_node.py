@@ -14,6 +14,8 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -23,11 +25,13 @@ from gsseg_core.errors import GssegError
 from gsseg_core.freed_memory import keep_freed_memory
 from gsseg_core.warm_up import warm_up
 from gsseg_ros import diagnostics, parameters
+from gsseg_ros.complaints import Complaints
 from gsseg_ros.inputs import Inputs
 from gsseg_ros.learn_action import LearnAction
 from gsseg_ros.outputs import Outputs
 from gsseg_ros.parameters import Settings
 from gsseg_ros.services import Services
+from gsseg_ros.sim_time import SimTime
 from gsseg_ros.viewpoints import Lookup
 from gsseg_ros.workspace import Workspace
 
@@ -61,8 +65,10 @@ class SegmentNode(LifecycleNode):
         self._requests = Services(self, self.workspace, self._require_outputs, self._lookup)
         self._learn = LearnAction(self, self.workspace, self._require_outputs)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._dropped_before: dict[str, int] = {}
-        self.create_timer(1.0, self._tell)
+        self._complaints = Complaints(self.get_logger().warning)
+        self._sim_time = SimTime(self)
+        # Not by /clock: that it does not come is what there may be to tell.
+        self.create_timer(1.0, self._tell, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
 
@@ -95,7 +101,7 @@ class SegmentNode(LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Begin to listen."""
         try:
-            self.inputs = Inputs(self, self.workspace, self._require_outputs())
+            self.inputs = Inputs(self, self.workspace, self._require_outputs(), self._complaints)
         except GssegError as error:
             self.get_logger().error(f"cannot be activated: {error}")
             return TransitionCallbackReturn.FAILURE
@@ -178,17 +184,10 @@ class SegmentNode(LifecycleNode):
             self.workspace.settings = Settings.read(self)
 
     def _tell(self) -> None:
-        inputs, stamp = self.inputs, self.get_clock().now().to_msg()
-        self._diagnostics.publish(
-            diagnostics.diagnostic_array(self.get_fully_qualified_name(), self.workspace, inputs, stamp)
-        )
-        if inputs is None:
-            return
-        for line in diagnostics.missing_inputs(inputs):
-            inputs.complain(line.split(" for ")[0], line)
-        for line in diagnostics.unpaired(inputs, self._dropped_before):
-            inputs.complain(line.split(" masks")[1], line)
-        self._dropped_before = dict(inputs.pairing.dropped)
+        inputs, clock_problem = self.inputs, self._sim_time.problem()
+        name, stamp = self.get_fully_qualified_name(), self._sim_time.stamp()
+        self._diagnostics.publish(diagnostics.diagnostic_array(name, self.workspace, inputs, stamp, clock_problem))
+        diagnostics.complain(self._complaints, inputs, clock_problem)
 
 
 def _spin_once(executor: MultiThreadedExecutor, node: SegmentNode) -> None:

@@ -23,6 +23,8 @@ class TfPoses:
 
     Attributes
     ----------
+    knows_frames : bool
+        True: every camera has a pose of its own.
     problem : str
         Why the last lookup found nothing; empty if it found a pose.
 
@@ -31,6 +33,8 @@ class TfPoses:
     SettingsError
         tf2_ros cannot be imported.
     """
+
+    knows_frames = True
 
     def __init__(self, node: Any, map_frame: str) -> None:
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -66,7 +67,7 @@ class RosSource:
         self._scene, self._name = scene, "/" + node_name.strip("/")
         self._said: tuple[str, ...] | None = None
         self._shown: tuple[str, ...] | None = None
-        self._clouds: dict[str, PointCloud2] = {}
+        self._clouds: dict[str, PointCloud2 | None] = {}  # None until one comes.
         self._spinner = Spinner("gsseg_view", None, domain_id)
         try:
             self._calls = Calls(self._spinner, self._name, find_timeout)
@@ -91,7 +92,7 @@ class RosSource:
         """
         if not self._spinner.wait_for(lambda: self._said != self._shown, timeout):
             return None
-        said = self._said
+        said, before = self._said, dict(self._clouds)
         try:
             report = self._calls.call(self._segment, Segment.Request(), ANSWER_SECONDS).report
         except SegmentationError as error:
@@ -104,7 +105,7 @@ class RosSource:
                 f"{self._name} has the scene {report.scene_path}, which is not {self._scene.path or 'this one'}; "
                 "expected the same file"
             )
-        update = LiveUpdate(self._labelling(report), int(report.num_views))
+        update = LiveUpdate(self._labelling(report, before), int(report.num_views))
         self._shown = said
         return update
 
@@ -112,7 +113,7 @@ class RosSource:
         """Leave ROS; the node goes on."""
         self._spinner.close()
 
-    def _labelling(self, report: Any) -> Labelling:
+    def _labelling(self, report: Any, before: Mapping[str, PointCloud2 | None]) -> Labelling:
         names = {summary.class_id: summary.name for summary in report.classes}
         names = {k: names.get(k, f"class_{k:02d}") for k in range(max(names, default=0) + 1)}
         labels = np.full(len(self._scene), UNOBSERVED, np.int32)
@@ -121,7 +122,7 @@ class RosSource:
         topics = [f"{self._name}/cloud", *(s.topic for s in report.classes if s.class_id == 0 and s.num_gaussians)]
         for topic in topics:
             self._listen(topic)
-            cloud = self._cloud(topic, stamp_ns(report.header.stamp))
+            cloud = self._cloud(topic, stamp_ns(report.header.stamp), before.get(topic))
             index = self._places.find(cloud.points, topic)
             labels[index] = cloud.labels
             probabilities[index, cloud.labels] = cloud.confidence
@@ -129,16 +130,21 @@ class RosSource:
 
     def _listen(self, topic: str) -> None:
         if topic not in self._clouds:
-            self._clouds[topic] = PointCloud2()
+            self._clouds[topic] = None
             self._spinner.run(
                 lambda: self._spinner.node.create_subscription(
                     PointCloud2, topic, lambda message: self._clouds.update({topic: message}), latched()
                 )
             )
 
-    def _cloud(self, topic: str, stamp: int) -> CloudArrays:
-        # A later run's cloud is as good as this one's: it is what is known now.
-        if not self._spinner.wait_for(lambda: stamp_ns(self._clouds[topic].header.stamp) >= stamp, ANSWER_SECONDS):
+    def _cloud(self, topic: str, stamp: int, before: PointCloud2 | None) -> CloudArrays:
+        def came() -> bool:
+            # A later run's cloud is as good as this one's: it is what is known now. But one that was there before this
+            # run has a later stamp where time was set back, and the same one where /clock stands still.
+            cloud = self._clouds[topic]
+            return cloud is not before and cloud is not None and stamp_ns(cloud.header.stamp) >= stamp
+
+        if not self._spinner.wait_for(came, ANSWER_SECONDS):
             raise NodeUnavailableError(f"{topic}: no cloud of the last run within {ANSWER_SECONDS:g} s")
         return arrays_from_cloud(self._clouds[topic], topic)
 

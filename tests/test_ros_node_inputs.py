@@ -148,6 +148,31 @@ def test_a_bag_that_loops_is_fused_again(robot: Robot, scene: GaussianScene) -> 
     assert_same(learnt(robot, "loop"), expected(scene, renamed(views + views)))
 
 
+def test_synchronised_cameras_whose_poses_cannot_be_told_apart_are_refused_and_diagnostics_say_what_to_do(
+    robot: Robot,
+) -> None:
+    before = robot.wait_for_status(lambda status: status.get("views fused") == "0", "the reset")
+    refused = int(before.get("rejected several_cameras", 0))
+    views = clean_views(2)
+    for i in range(3):
+        stamp = robot.next_stamp()
+        for view, frame in zip(views, ("left", "right"), strict=True):
+            sent = messages(view, stamp)
+            for topic in ("mask", "camera_info"):
+                sent[topic].header.frame_id = frame
+            # Without a pose the first mask still waits when the second comes.
+            robot.publish(sent if i else {topic: sent[topic] for topic in ("mask", "camera_info")})
+        refused += 2
+        status = robot.wait_for_status(
+            lambda status, n=refused: status.get("rejected several_cameras") == str(n), "two refused masks"
+        )
+    robot.stamp += 11 * SECOND  # Until masks are believed again.
+    assert status.get("rejected repeated_stamp") == before.get("rejected repeated_stamp")
+    assert status["views fused"] == "0"
+    assert robot.process is not None
+    robot.process.wait_for("masks of several cameras (frame_id) carry one stamp, and their poses do not say whose")
+
+
 def turned(angle: float, axis: int = 2, shift: float = 0.0) -> np.ndarray:
     """A rigid motion (4, 4): a turn about an axis, and a shift along x."""
     c, s = np.cos(angle), np.sin(angle)

@@ -20,6 +20,7 @@ from gsseg_core.segmentation import Segmentation
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from gsseg_msgs.msg import SegmentationReport
 from gsseg_msgs.srv import Segment
 from std_msgs.msg import Header
@@ -87,7 +88,8 @@ BAD = [
     Bad("a view of nothing", "sees_no_Gaussian", "sees no Gaussian", turn_away),
     Bad("no pose at the stamp", "no_pose", "masks were dropped because no pose with their stamp came",
         lambda sent: sent.pop("pose")),
-    Bad("a repeated stamp", "repeated_stamp", "", lambda sent: set_stamp(sent, -STEP)),
+    Bad("a repeated stamp", "repeated_stamp", "dropped because a mask with their stamp and frame_id came before",
+        lambda sent: set_stamp(sent, -STEP)),
 ]  # fmt: skip
 BAD_POSES = [
     Bad("nan", "no_pose", "pose: position is (nan,", lambda sent: setattr(sent["pose"].pose.position, "x", np.nan)),
@@ -150,6 +152,14 @@ def test_a_view_that_cannot_be_used_is_counted_by_its_reason_and_explained(rejec
     assert bad.log in rejected.robot.process.output
 
 
+def test_while_masks_are_refused_diagnostics_say_of_how_many_and_why(rejected: Rejected) -> None:
+    verdicts = [(s.level, s.message) for array in rejected.robot.received_status for s in array.status]
+    assert verdicts[-1][1] != "fusing"
+    level, message = next(said for said in verdicts if "masks of the last 10 s were refused" in said[1])
+    assert level in (DiagnosticStatus.WARN, DiagnosticStatus.ERROR)
+    assert re.match(r"\d+ of \d+ masks of the last 10 s were refused, \d+ of them as \w+: .*expected ", message)
+
+
 def test_the_report_counts_all_rejected_views_until_the_reset(rejected: Rejected) -> None:
     assert rejected.report.num_views_rejected == 200
     assert dict(zip(rejected.report.rejection_reasons, rejected.report.rejection_counts, strict=True)) == (
@@ -196,6 +206,18 @@ def test_a_bad_pose_is_no_pose_and_the_log_says_what_is_wrong_with_it(misplaced:
     assert robot.process is not None
     assert bad.log in robot.process.output
     assert robot.ask("segment").error_code == Segment.Response.NO_CODES
+
+
+def test_two_hundred_bad_poses_are_a_few_lines_that_count_the_others(misplaced: dict[str, Robot]) -> None:
+    robot = misplaced["nan"]
+    sent = messages(clean_views(1)[0], robot.next_stamp())["pose"]
+    for i in range(200):
+        sent.pose.position.x, sent.pose.position.y = np.nan, float(i)
+        robot.publish({"pose": sent})
+    robot.wait_for_status(lambda status: int(status["poses refused"]) >= 202, "all poses")
+    assert robot.process is not None
+    robot.process.wait_for("more of this kind since the last such line")
+    assert robot.process.output.count("pose: position is (nan,") < 10
 
 
 def test_masks_that_come_before_there_is_a_scene_are_counted(ros: Ros, parameters: dict[str, Any]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,10 @@ from ros_helpers import Ros, ros_fixture  # noqa: F401
 from small_scenes import NAMES, many_classes, write_dataset
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
+
+from builtin_interfaces.msg import Time
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
 
 from gsseg_core.errors import SettingsError, StateMismatchError
 from gsseg_core.scene import GaussianScene
@@ -64,3 +69,21 @@ def test_without_a_node_or_a_source_one_error_says_so(ros: Ros) -> None:
         RosSource(scene, domain_id=ros.domain, find_timeout=0.5)
     with pytest.raises(SettingsError, match=r"live source 'nothing': none is installed"):
         open_source("nothing", scene)
+
+
+def test_a_cloud_of_before_a_run_is_not_taken_for_its_own_whatever_the_clock_did(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    source = RosSource.__new__(RosSource)
+    source._spinner = SimpleNamespace(wait_for=lambda condition, _: condition())
+    monkeypatch.setattr("gsseg_ros.view_source.arrays_from_cloud", lambda cloud, _: cloud)
+    before, later, after = (PointCloud2(header=Header(stamp=Time(sec=sec))) for sec in (50, 51, 50))
+    source._clouds = {"/cloud": before, "/new": None}
+    for stamp in (10, 50):  # Set back, and standing still.
+        with pytest.raises(NodeUnavailableError, match="no cloud of the last run"):
+            source._cloud("/cloud", stamp * 10**9, before)
+    with pytest.raises(NodeUnavailableError, match="no cloud of the last run"):
+        source._cloud("/new", 0, None)
+    for cloud in (later, after):
+        source._clouds["/cloud"] = cloud
+        assert source._cloud("/cloud", 50 * 10**9, before) is cloud

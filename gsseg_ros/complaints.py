@@ -1,0 +1,85 @@
+"""Warnings in the log, of one kind at most once in five seconds."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+PERIOD = 5.0  # s
+
+MISSING = {role: f"no data on {role}" for role in ("mask", "camera_info", "pose", "odometry")}
+"""Kinds of complaint: an input that is silent."""
+
+REFUSED_POSE, TIME_JUMP, CLOCK, LIVE, OTHER = "refused pose", "time set back", "no clock", "overlay or objects", "other"
+
+REASONS = (
+    "no_pose", "no_camera_info", "repeated_stamp", "several_cameras", "time_jump", "queue_full", "no_scene",
+    "mask_format", "size_mismatch", "unknown_label", "bad_pose", "bad_camera_info", "all_pixels_unknown",
+    "sees_no_Gaussian", "no_mask", "unusable", "unexpected",
+)  # fmt: skip
+"""Kinds of complaint: why a mask became no view."""
+
+KINDS = frozenset((*MISSING.values(), REFUSED_POSE, TIME_JUMP, CLOCK, LIVE, *REASONS, OTHER))
+
+
+@dataclass
+class _Said:
+    when: float = -PERIOD
+    left_out: int = 0
+    last: str = ""
+
+
+class Complaints:
+    """Warns, and says of how many of a kind it did not.
+
+    Its methods may be called from any thread. A kind that is not in `KINDS` counts as `OTHER`, so that there are never
+    more of them, whatever a message says.
+
+    Parameters
+    ----------
+    warn : callable
+        Writes one line to the log.
+    now : callable
+        Seconds of a clock that never goes back.
+    """
+
+    def __init__(self, warn: Callable[[str], object], now: Callable[[], float] = time.monotonic) -> None:
+        self._warn, self._now = warn, now
+        self._lock = threading.Lock()
+        self._said = {kind: _Said() for kind in KINDS}
+
+    def add(self, kind: str, message: str) -> None:
+        """Warn of an event now; or, where that would be too often, count it."""
+        with self._lock:
+            said = self._of(kind)
+            if self._is_due(said):
+                self._write(said, message)
+            else:
+                said.left_out += 1
+                said.last = message
+
+    def due(self, kind: str) -> bool:
+        """Whether something may be said again that goes on: what is not said then need not be counted."""
+        with self._lock:
+            return self._is_due(self._of(kind))
+
+    def flush(self) -> None:
+        """Write what was counted and is due, the last of each kind; call it once a second."""
+        with self._lock:
+            for said in self._said.values():
+                if said.left_out and self._is_due(said):
+                    said.left_out -= 1
+                    self._write(said, said.last)
+
+    def _of(self, kind: str) -> _Said:
+        return self._said.get(kind, self._said[OTHER])
+
+    def _is_due(self, said: _Said) -> bool:
+        return self._now() - said.when >= PERIOD
+
+    def _write(self, said: _Said, message: str) -> None:
+        more = f" ({said.left_out} more of this kind since the last such line)" if said.left_out else ""
+        said.when, said.left_out = self._now(), 0
+        self._warn(message + more)
