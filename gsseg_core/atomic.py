@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
+import re
 import secrets
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-from gsseg_core.errors import WriteError
+from gsseg_core.errors import PathTakenError, WriteError
+
+_TEMPORARY = re.compile(r"\.gsseg-[0-9a-f]{12}(\..*)?", re.DOTALL)
 
 
 @contextlib.contextmanager
@@ -16,7 +21,8 @@ def write_atomically(path: str | os.PathLike[str], *, suffix: str | None = None)
     """Give a temporary path beside `path`, and move what was written there to `path` at the end.
 
     An earlier file at `path` stays whole until the new one is complete and on the disk. If the body raises, whatever
-    it raises, the temporary file is removed and the earlier file remains.
+    it raises, the temporary file is removed and the earlier file remains; after a kill the next write into the same
+    folder removes it. A link to a file stays, and what it points to is replaced.
 
     Parameters
     ----------
@@ -28,12 +34,14 @@ def write_atomically(path: str | os.PathLike[str], *, suffix: str | None = None)
     Yields
     ------
     pathlib.Path
-        Name of a file, not yet existing, that the body must create.
+        Name of an empty file, which the body must write.
 
     Raises
     ------
+    PathTakenError
+        `path` is a folder, a device, a FIFO or a socket.
     WriteError
-        In place of any `OSError`: disk full, folder not writable, `path` is a folder.
+        In place of any `OSError`: disk full, folder not writable.
 
     Examples
     --------
@@ -41,17 +49,102 @@ def write_atomically(path: str | os.PathLike[str], *, suffix: str | None = None)
     ...     temporary.write_text("{}")
     """
     path = Path(path)
-    temporary = path.with_name(f".gsseg-{secrets.token_hex(6)}{path.suffix if suffix is None else suffix}")
+    temporary, lock = None, -1
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        target = _replaceable(path)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _remove_leftovers(target.parent)
+        temporary, lock = _locked_file(target.parent, path.suffix if suffix is None else suffix)
         yield temporary
         with open(temporary, "rb+") as file:
             os.fsync(file.fileno())
-        os.replace(temporary, path)
+        os.replace(temporary, target)
     except OSError as error:
         why = error.strerror or error
         raise WriteError(f"{path}: cannot be written ({why}); what was there before is unchanged") from error
     finally:
         # After success the temporary name is gone; where even removal fails the first error is the one to report.
         with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
+            if temporary is not None:
+                temporary.unlink(missing_ok=True)
+            if lock >= 0:
+                os.close(lock)
+
+
+def check_writable(path: str | os.PathLike[str]) -> None:
+    """Raise at once most of what `write_atomically` would raise after the work; writes nothing.
+
+    Raises
+    ------
+    PathTakenError, WriteError
+        As `write_atomically` does, but for a disk that is full.
+    """
+    path = Path(path)
+    try:
+        folder = _replaceable(path).parent
+        while not os.path.lexists(folder):
+            folder = folder.parent
+        if not folder.is_dir():
+            raise WriteError(f"{path}: cannot be written ({folder} is not a folder)")
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise WriteError(f"{path}: cannot be written (no permission to write into {folder})")
+    except OSError as error:
+        raise WriteError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def try_lock(file: int) -> bool | None:
+    """Lock an open file for this process if nobody has; None where the file system has no locks.
+
+    The lock ends with the process, however that ends.
+    """
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
+
+
+def sync_folder(folder: Path) -> None:
+    """Have the names in a folder on the disk, where its file system can do that."""
+    with contextlib.suppress(OSError):
+        file = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            os.fsync(file)
+        finally:
+            os.close(file)
+
+
+def _replaceable(path: Path) -> Path:
+    """Follow a link, and refuse what is neither a file nor missing; raises `OSError`, too."""
+    target = Path(os.path.realpath(path)) if path.is_symlink() else path
+    try:
+        mode = os.stat(target).st_mode
+    except FileNotFoundError:
+        return target
+    if not stat.S_ISREG(mode):
+        what = "a folder" if stat.S_ISDIR(mode) else "a device, a FIFO or a socket"
+        raise PathTakenError(f"{path}: cannot be written (it is {what}); expected a file, or nothing")
+    return target
+
+
+def _locked_file(folder: Path, suffix: str) -> tuple[Path, int]:
+    """Make an empty file that `_remove_leftovers` leaves alone while this process lives; its name and descriptor."""
+    while True:
+        path = folder / f".gsseg-{secrets.token_hex(6)}{suffix}"
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        # Between the two calls somebody may have taken it for a leftover.
+        if try_lock(file) is not False and path.exists():
+            return path, file
+        os.close(file)
+
+
+def _remove_leftovers(folder: Path) -> None:
+    """Remove temporary files in a folder whose writers are dead."""
+    with os.scandir(folder) as entries:
+        names = [entry.path for entry in entries if _TEMPORARY.fullmatch(entry.name)]
+    for name in names:
+        with contextlib.suppress(OSError), open(name, "rb") as file:
+            if try_lock(file.fileno()):
+                os.unlink(name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from gsseg_core.atomic import check_writable
 from gsseg_core.export import write_json
 
 HELP = "score label maps: mIoU, mAcc, boundary IoU"
@@ -31,6 +32,8 @@ def run(options: argparse.Namespace) -> int:
     from gsseg_core.metrics import evaluate_folders
     from gsseg_core.tables import evaluation_summary
 
+    if options.json:
+        check_writable(options.json)
     classes = Path(options.truth).parent / "classes.json"
     names = read_classes(classes) if classes.is_file() else None
     scores = evaluate_folders(options.pred, options.truth).as_dict(names)

@@ -37,10 +37,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Pick, and say what was written."""
     from gsseg_core.dataset import Dataset, View
+    from gsseg_core.earlier_outputs import earlier_pick
     from gsseg_core.export import background_image
     from gsseg_core.operator import make_operator
     from gsseg_core.pick import pick_clicks, pick_mask, read_object_mask
     from gsseg_core.pictures import overlay, palette, save_png
+    from gsseg_core.run_folder import staged_run
     from gsseg_core.scene import GaussianScene
 
     cameras = {camera.name: camera for camera in Dataset(options.data).cameras}
@@ -51,16 +53,17 @@ def run(options: argparse.Namespace) -> int:
     camera, out = cameras[options.view], Path(options.out)
     scene = GaussianScene.load(options.scene)
     load_kernels(options.quiet, options.device)
-    if options.mask:
-        view = View.from_arrays(camera, read_object_mask(options.mask, options.label))
-        picked = pick_mask(scene, view, device=options.device)
-    else:
-        inside, outside = ([(row, column) for column, row in clicks] for clicks in (options.click, options.outside))
-        picked = pick_clicks(scene, camera, inside, outside, device=options.device)
-    scene.subset(picked.ids).save(out / "object.ply")
-    picked.save(out / "pick.npz")
-    shown = picked.silhouette(scene, camera, device=options.device)
-    image = background_image(scene, make_operator(scene, camera, options.device))
-    save_png(out / "pick.png", overlay(image, shown.astype(int), palette(2)))
+    with staged_run(out, "pick", earlier=earlier_pick, places=("object.ply", "pick.npz", "pick.png")) as run:
+        if options.mask:
+            view = View.from_arrays(camera, read_object_mask(options.mask, options.label))
+            picked = pick_mask(scene, view, device=options.device)
+        else:
+            inside, outside = ([(row, column) for column, row in clicks] for clicks in (options.click, options.outside))
+            picked = pick_clicks(scene, camera, inside, outside, device=options.device)
+        shown = picked.silhouette(scene, camera, device=options.device)
+        image = background_image(scene, make_operator(scene, camera, options.device))
+        scene.subset(picked.ids).save(run.folder / "object.ply", run.id)
+        picked.save(run.folder / "pick.npz", run.id)
+        save_png(run.folder / "pick.png", overlay(image, shown.astype(int), palette(2)), run.id)
     print(f"{len(picked.ids):,} of {len(scene):,} Gaussians: {out}/object.ply, pick.npz, and pick.png to look at")
     return 0

@@ -35,10 +35,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Remove, and say what is left."""
+    from gsseg_core.atomic import check_writable
     from gsseg_core.removal import class_ids, without_objects
     from gsseg_core.scene import GaussianScene
     from gsseg_core.segmentation import Segmentation
 
+    check_writable(options.out)
     scene = GaussianScene.load(options.scene)
     segmentation = Segmentation.load(options.segmentation, scene)
     rest = without_objects(scene, segmentation, class_ids(segmentation, options.classes))

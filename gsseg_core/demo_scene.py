@@ -22,6 +22,7 @@ from gsseg_core.atomic import write_atomically
 from gsseg_core.cameras import Camera
 from gsseg_core.mask_errors import MaskErrors, corrupt
 from gsseg_core.masks import write_mask
+from gsseg_core.run_folder import staged_run
 from gsseg_core.scene import GaussianScene
 from gsseg_core.solids import Box, Cone, Ellipsoid, Solid, dot
 from gsseg_core.spherical_harmonics import C0, basis
@@ -84,6 +85,8 @@ def build_demo(folder: str | os.PathLike[str], seed: int = 0) -> DemoScene:
 
     Raises
     ------
+    PathTakenError
+        The folder holds other files of these names.
     WriteError
         The folder cannot be written to.
     """
@@ -95,18 +98,29 @@ def build_demo(folder: str | os.PathLike[str], seed: int = 0) -> DemoScene:
     test = [camera.name for camera in cameras[TEST_EVERY // 2 :: TEST_EVERY]]
     train = [camera.name for camera in cameras if camera.name not in test]
 
-    scene.save(root / "scene.ply")
-    with write_atomically(root / "truth.npz") as temporary:
-        np.savez_compressed(temporary, labels=truth)
-    _write_json(root / "cameras.json", [_as_3dgs(camera) for camera in cameras])
-    _write_json(root / "classes.json", dict(enumerate(CLASS_NAMES)))
-    _write_json(root / "split.json", {"train": train, "test": test})
-    for camera in cameras:
-        labels = _cast_view(parts, camera)
-        write_mask(root / "labels_true" / f"{camera.name}.png", labels, bits=8)
-        if camera.name in train:
-            write_mask(root / "labels" / f"{camera.name}.png", corrupt(labels, mask_rng, MaskErrors()), bits=8)
+    with staged_run(root, "demo", earlier=_earlier_demo) as run:
+        scene.save(run.folder / "scene.ply")
+        with write_atomically(run.folder / "truth.npz") as temporary:
+            np.savez_compressed(temporary, labels=truth)
+        _write_json(run.folder / "cameras.json", [_as_3dgs(camera) for camera in cameras])
+        _write_json(run.folder / "classes.json", dict(enumerate(CLASS_NAMES)))
+        _write_json(run.folder / "split.json", {"train": train, "test": test})
+        for camera in cameras:
+            labels = _cast_view(parts, camera)
+            write_mask(run.folder / "labels_true" / f"{camera.name}.png", labels, bits=8)
+            if camera.name in train:
+                write_mask(
+                    run.folder / "labels" / f"{camera.name}.png", corrupt(labels, mask_rng, MaskErrors()), bits=8
+                )
     return DemoScene(root, scene, truth, dict(enumerate(CLASS_NAMES)), train, test)
+
+
+def _earlier_demo(root: Path) -> list[str]:
+    """Files of a demo of gsseg before it wrote manifests, which is known by its truth."""
+    if not ((root / "truth.npz").is_file() and (root / "labels_true").is_dir()):
+        return []
+    masks = [f"{folder}/{camera.name}.png" for folder in ("labels", "labels_true") for camera in _make_cameras()]
+    return ["scene.ply", "truth.npz", "cameras.json", "classes.json", "split.json", *masks]
 
 
 # The room

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
-import shutil
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,12 +15,16 @@ import numpy.typing as npt
 
 from gsseg_core.atomic import write_atomically
 from gsseg_core.dataset import View
-from gsseg_core.errors import WriteError
+from gsseg_core.earlier_outputs import earlier_classes
 from gsseg_core.operator import ViewOperator, make_operator
 from gsseg_core.pictures import contact_sheet, legend, overlay, palette, save_png
 from gsseg_core.ply import write_vertices
+from gsseg_core.run_folder import staged_run
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
+
+_LONGEST_NAME = 255
+"""Bytes that file systems take as the name of a file."""
 
 
 def export_classes(
@@ -33,38 +36,30 @@ def export_classes(
 
     Two properties are added: `label` (int), the class, and `confidence` (float), that of the segmentation.
 
-    The folder is replaced as a whole, at the end: it never mixes two segmentations.
+    All PLYs of an earlier export are replaced in one step, as `gsseg_core.run_folder` says; other files stay.
 
     Raises
     ------
+    PathTakenError
+        The folder, or the name of a PLY, is taken by what is no earlier export; nothing was written.
     WriteError
-        Something cannot be written, or the folder holds files that are no export; an earlier folder is unchanged.
+        Something cannot be written; an earlier export is unchanged.
     """
     folder = Path(folder)
-    _check_replaceable(folder)
-    names = {k: class_file_name(k, segmentation.class_names[k]) for k in np.flatnonzero(segmentation.counts()).tolist()}
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=".gsseg-", dir=folder.parent))
-    except OSError as error:
-        raise WriteError(f"{folder}: cannot be written ({error.strerror or error})") from error
-    confidence = segmentation.confidence
-    try:
-        (work / "new").mkdir()
-        for k, name in names.items():
-            members = segmentation.labels == k
-            vertices = scene.vertices[members]
-            write_vertices(work / "new" / name, with_confidence(vertices, k, confidence[members]))
-        if folder.exists():
-            folder.rename(work / "old")
-        (work / "new").rename(folder)
-    except OSError as error:
-        raise WriteError(f"{folder}: cannot be written ({error.strerror or error})") from error
-    finally:
-        if (work / "old").exists() and not folder.exists():
-            (work / "old").rename(folder)
-        shutil.rmtree(work, ignore_errors=True)
-    return {k: folder / name for k, name in names.items()}
+    with staged_run(folder, "classes", earlier=earlier_classes) as run:
+        written = write_classes(scene, segmentation, run.folder, run.id)
+    return {k: folder / path.name for k, path in written.items()}
+
+
+def write_classes(scene: GaussianScene, segmentation: Segmentation, folder: Path, run: str) -> dict[int, Path]:
+    """Write the PLYs of `export_classes` into a folder of a run with this id."""
+    confidence, paths = segmentation.confidence, {}
+    for k in np.flatnonzero(segmentation.counts()).tolist():
+        members = segmentation.labels == k
+        vertices = scene.vertices[members]
+        paths[k] = folder / class_file_name(k, segmentation.class_names[k])
+        write_vertices(paths[k], with_confidence(vertices, k, confidence[members]), run)
+    return paths
 
 
 def with_confidence(
@@ -82,22 +77,31 @@ def with_confidence(
     return out
 
 
-def _check_replaceable(folder: Path) -> None:
-    if not folder.exists():
-        return
-    if not folder.is_dir():
-        raise WriteError(f"{folder}: is a file; expected a folder, or nothing")
-    names = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
-    strangers = [name for name in names if not re.fullmatch(r"[0-9]+_.+\.ply", name)]
-    if strangers:
-        raise WriteError(
-            f"{folder}: holds {strangers[0]!r}, which is no earlier export; expected a folder that can be replaced"
-        )
-
-
 def class_file_name(label: int, name: str) -> str:
     """File name of a class, safe on any file system."""
     return f"{label}_{re.sub(r'[^0-9A-Za-z._-]+', '_', name)[:100].strip('._') or 'class'}.ply"
+
+
+def view_file_name(name: str, prefix: str = "") -> str:
+    """File name of a picture of a view: `<prefix><name>.png`, or one near to it where no file can be named so."""
+    safe = re.sub(r"[\x00-\x1f\x7f/\ud800-\udfff]", "_", name)
+    room = _LONGEST_NAME - len(f"{prefix}.png")
+    if safe != name or len(safe.encode()) > room:
+        # What tells it from others that would be cut to the same.
+        digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]
+        safe = safe.encode()[: room - 9].decode(errors="ignore") + f"-{digest}"
+    return f"{prefix}{safe}.png"
+
+
+def segment_places(class_names: Mapping[int, str], views: Iterable[View]) -> list[str]:
+    """Files that `gsseg segment` writes, as far as they are known before it learns; relative to its folder."""
+    pictures = ["contact_sheet.png", "legend.png", "worst_views.png"]
+    pictures += [view_file_name(view.name, "overlay_") for view in views]
+    plys = [class_file_name(k, name) for k, name in class_names.items()]
+    return [
+        "segmentation.npz", "report.json", "report.html",
+        *(f"classes/{name}" for name in plys), *(f"pictures/{name}" for name in pictures),
+    ]  # fmt: skip
 
 
 def write_json(path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:
@@ -146,8 +150,15 @@ def draw_views(
         yield Drawn(view, labels, overlay(image, labels, colors), image)
 
 
-def write_pictures(segmentation: Segmentation, drawn: Iterable[Drawn], folder: str | os.PathLike[str]) -> list[Path]:
+def write_pictures(
+    segmentation: Segmentation, drawn: Iterable[Drawn], folder: str | os.PathLike[str], run: str | None = None
+) -> list[Path]:
     """Write overlays of some views, as `draw_views` gives them, a contact sheet of them, and the legend.
+
+    Parameters
+    ----------
+    run : str, optional
+        Id of the run that they belong to.
 
     Returns
     -------
@@ -159,24 +170,24 @@ def write_pictures(segmentation: Segmentation, drawn: Iterable[Drawn], folder: s
     for one in drawn:
         images.append(one.overlay)
         captions.append(one.view.name)
-        paths.append(folder / f"overlay_{one.view.name}.png")
-        save_png(paths[-1], one.overlay)
-    paths += write_overview(segmentation, images, captions, folder)
-    # Overlays of views that an earlier run drew would show another segmentation.
-    for stale in set(folder.glob("overlay_*.png")) - set(paths):
-        stale.unlink(missing_ok=True)
-    return paths
+        paths.append(folder / view_file_name(one.view.name, "overlay_"))
+        save_png(paths[-1], one.overlay, run)
+    return paths + write_overview(segmentation, images, captions, folder, run)
 
 
 def write_overview(
-    segmentation: Segmentation, images: Sequence[np.ndarray], captions: Sequence[str], folder: Path
+    segmentation: Segmentation,
+    images: Sequence[np.ndarray],
+    captions: Sequence[str],
+    folder: Path,
+    run: str | None = None,
 ) -> list[Path]:
     """Write `contact_sheet.png` of some pictures, if there are any, and `legend.png`."""
     paths = []
     if images:
         paths.append(folder / "contact_sheet.png")
-        save_png(paths[-1], contact_sheet(images, captions, min(4, len(images))))
+        save_png(paths[-1], contact_sheet(images, captions, min(4, len(images))), run)
     paths.append(folder / "legend.png")
     colors = palette(segmentation.num_classes)
-    save_png(paths[-1], legend(segmentation.class_names, colors, segmentation.counts()))
+    save_png(paths[-1], legend(segmentation.class_names, colors, segmentation.counts()), run)
     return paths

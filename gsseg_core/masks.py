@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from gsseg_core.atomic import write_atomically
 from gsseg_core.errors import ClassesFileError, MaskFormatError, SettingsError
@@ -85,8 +86,11 @@ def write_mask(
     path: str | os.PathLike[str],
     labels: npt.NDArray[np.integer[Any]],  # (H, W)
     bits: int,
+    run: str | None = None,
 ) -> None:
     """Write a label image as a gray PNG of 8 or 16 bits, atomically; `UNKNOWN` becomes 255 or 65535.
+
+    `run` is the id of the run that it belongs to, for a text in the file.
 
     Raises
     ------
@@ -103,7 +107,15 @@ def write_mask(
         raise MaskFormatError(f"{path}: labels are {low} to {high}; {bits} bits hold {UNKNOWN} to {unknown - 1}")
     values = np.where(labels == UNKNOWN, unknown, labels).astype(np.uint8 if bits == 8 else np.uint16)
     with write_atomically(path) as temporary:
-        Image.fromarray(values).save(temporary, format="PNG")
+        Image.fromarray(values).save(temporary, format="PNG", pnginfo=run_text(run))
+
+
+def run_text(run: str | None) -> PngInfo:
+    """Text for a PNG: the id of the run that it belongs to, if there is one."""
+    text = PngInfo()
+    if run is not None:
+        text.add_text("gsseg_run", run)
+    return text
 
 
 class PackedLabels:

@@ -17,6 +17,7 @@ from scipy import ndimage
 
 from gsseg_core.errors import MaskFormatError, MaskSizeError, NoUsableViewsError
 from gsseg_core.masks import UNKNOWN, read_mask
+from gsseg_core.run_folder import settle
 
 BOUNDARY_SHARE = 0.02
 """Width of the boundary band as a share of the image diagonal (Cheng et al., Boundary IoU, CVPR 2021)."""
@@ -217,6 +218,7 @@ def evaluate_folders(pred_dir: str | Path, truth_dir: str | Path) -> Evaluation:
         A prediction and its truth differ in size.
     """
     pred_dir, truth_dir = Path(pred_dir), Path(truth_dir)
+    settle(pred_dir)
     predictions = sorted(pred_dir.glob("*.png"))
     if not predictions:
         raise NoUsableViewsError(f"{pred_dir}: found no predictions; expected label images <stem>.png")

@@ -65,3 +65,12 @@ def open_npz(path: Path, what: str, file_format: str, digest: str) -> Iterator[t
         raise StateFileError(f"{path}: does not exist; expected {what}") from error
     except _DAMAGED as error:
         raise StateFileError(f"{path}: is not {what}, or is damaged ({error})") from error
+
+
+def npz_format(path: Path) -> str:
+    """Read from the header of an npz what it says that it is; empty if it is missing, damaged or says nothing."""
+    try:
+        with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
+            return str(json.loads(str(file["header"]))["format"])
+    except _DAMAGED:
+        return ""

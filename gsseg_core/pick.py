@@ -76,15 +76,17 @@ class Pick:
         seen: np.ndarray = operator.render(self.membership[:, None])[..., 0] >= 0.5
         return seen
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: str | os.PathLike[str], run: str | None = None) -> None:
         """Write `ids`, `membership` and the digest of the scene as one npz, atomically.
+
+        `run` is the id of the run that it belongs to, for the header.
 
         Raises
         ------
         WriteError
             The file cannot be written; an earlier one is unchanged.
         """
-        header = json.dumps({"format": FORMAT, "scene": self.scene_digest})
+        header = json.dumps({"format": FORMAT, "scene": self.scene_digest, **({} if run is None else {"run": run})})
         with write_atomically(path, suffix=".npz") as temporary, open(temporary, "wb") as file:
             np.savez_compressed(
                 file, allow_pickle=False, ids=self.ids, membership=self.membership, header=np.array(header)

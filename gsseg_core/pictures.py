@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from gsseg_core.atomic import write_atomically
+from gsseg_core.masks import run_text
 
 BACKGROUND = (58, 60, 66)
 """The colour of label 0, a dark neutral grey."""
@@ -17,6 +18,8 @@ BACKGROUND = (58, 60, 66)
 PAPER, INK, FAINT_INK = (255, 255, 255), (32, 34, 38), (128, 131, 138)
 FILL = 0.55
 """How much of a label's colour goes into an overlaid pixel."""
+
+_LONGEST = 400  # characters of a name that are ever looked at; no picture has room for more
 
 
 @lru_cache(maxsize=8)
@@ -167,8 +170,10 @@ def legend(
     return np.asarray(sheet)
 
 
-def save_png(path: str | Path, image: np.ndarray) -> None:
+def save_png(path: str | Path, image: np.ndarray, run: str | None = None) -> None:
     """Write a picture as PNG; an earlier file stays whole until the new one is complete.
+
+    `run` is the id of the run that it belongs to, for a text in the file.
 
     Raises
     ------
@@ -177,7 +182,7 @@ def save_png(path: str | Path, image: np.ndarray) -> None:
     """
     with write_atomically(path) as temporary:
         # Two fifths of the time of Pillow's own level, and files 7 % larger.
-        Image.fromarray(image).save(temporary, format="PNG", compress_level=4)
+        Image.fromarray(image).save(temporary, format="PNG", compress_level=4, pnginfo=run_text(run))
 
 
 def outline(
@@ -195,6 +200,7 @@ def outline(
 
 def _shorten(text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: float) -> str:
     """As much of a text as fits into a width in px, with an ellipsis where it was cut."""
+    text = "".join("\ufffd" if ord(c) < 32 or 0xD800 <= ord(c) < 0xE000 else c for c in text[:_LONGEST])
     if font.getlength(text) <= width:
         return text
     while text and font.getlength(text + "...") > width:

@@ -12,9 +12,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsseg_core.dataset import Dataset, View, spread
+from gsseg_core.earlier_outputs import earlier_render, earlier_segment
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import NoUsableViewsError, SettingsError
-from gsseg_core.export import Drawn, draw_views, export_classes, write_json, write_overview, write_pictures
+from gsseg_core.export import (
+    Drawn,
+    draw_views,
+    segment_places,
+    view_file_name,
+    write_classes,
+    write_json,
+    write_overview,
+    write_pictures,
+)
 from gsseg_core.graph import GraphSettings, is_scarce, spread_if_scarce
 from gsseg_core.held_out import calibrate
 from gsseg_core.layout import mask_hint
@@ -28,6 +38,7 @@ from gsseg_core.report import Stopwatch, build_report
 from gsseg_core.report_findings import Evidence
 from gsseg_core.report_page import write_report_page
 from gsseg_core.report_pictures import ViewImages
+from gsseg_core.run_folder import StagedRun, staged_run
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.votes import VoteLearner
@@ -158,8 +169,45 @@ def segment(
     Raises
     ------
     GssegError
-        Whatever is wrong with the input; see `gsseg_core.errors`.
+        Whatever is wrong with the input; see `gsseg_core.errors`. What was in `out` before is whole and unchanged.
     """
+    with staged_run(out, "segment", earlier=earlier_segment, places=segment_places({}, [])) as run:
+        return _segment(
+            run,
+            scene_path,
+            data,
+            labels=labels,
+            learner=learner,
+            views=views,
+            refine=refine,
+            graph=graph,
+            device=device,
+            memory_budget=memory_budget,
+            seed=seed,
+            scheduler=scheduler,
+            ids=ids,
+            progress=progress,
+        )
+
+
+def _segment(
+    run: StagedRun,
+    scene_path: str | os.PathLike[str],
+    data: str | os.PathLike[str],
+    *,
+    labels: str,
+    learner: str,
+    views: int | None,
+    refine: RefineSettings | None,
+    graph: bool,
+    device: str,
+    memory_budget: int,
+    seed: int,
+    scheduler: str | None,
+    ids: str,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Do what `segment` does, and leave it to the caller to make the run the result."""
     if scheduler is not None and learner not in DISTRIBUTED:
         raise SettingsError(
             f"scheduler {scheduler}: the learner {learner} takes one view after the other, each at the codes that the "
@@ -185,6 +233,8 @@ def segment(
             with watch.stage("associate"):
                 table = find_objects(scene, train, device=device, progress=progress)
                 train, class_names = [table.relabelled(view) for view in train], table.class_names
+        chosen = spread(dataset.views("all"), PICTURED_VIEWS)
+        run.claim(segment_places(class_names, chosen))
         with watch.stage("observe"):
             teacher = make_learner(
                 learner, scene, max(class_names) + 1,
@@ -201,7 +251,6 @@ def segment(
         if type(teacher) is not EMLearner:
             with watch.stage("calibrate"):  # while there still are workers
                 calibration = calibrate(teacher, progress=progress)
-    out = Path(out)
     learnt: dict[str, Any] = {
         "views": {"used": len(teacher.views), "rejected": teacher.reject_summary(), "names": teacher.rejected},
         "objective": teacher.history_,
@@ -233,18 +282,17 @@ def segment(
             cameras = [view.camera for view in spread(train, refine.carve_views)]
             result = carved(scene, result, cameras, device)
     with watch.stage("export"):
-        result.save(out / "segmentation.npz")
-        plys = export_classes(scene, result, out / "classes")
+        result.save(run.folder / "segmentation.npz", run.id)
+        plys = write_classes(scene, result, run.folder / "classes", run.id)
     with watch.stage("pictures"):
-        chosen = spread(dataset.views("all"), PICTURED_VIEWS)
         images = ViewImages(scene, device)
         drawn = draw_views(scene, result, chosen, device=device)
         if not held_out:
             drawn = _held_against_masks(drawn, masks, result.num_classes, checks)
-        pictures = write_pictures(result, _keeping_images(drawn, images), out / "pictures")
+        pictures = write_pictures(result, _keeping_images(drawn, images), run.folder / "pictures", run.id)
         if worst is not None:
-            pictures.append(out / "pictures" / "worst_views.png")
-            save_png(pictures[-1], worst)
+            pictures.append(run.folder / "pictures" / "worst_views.png")
+            save_png(pictures[-1], worst, run.id)
     report = build_report(
         scene,
         result,
@@ -254,18 +302,19 @@ def segment(
             "seed": seed, "scheduler": scheduler, "ids": ids, "refine": asdict(refine),
             "graph": asdict(GraphSettings()) if graph and is_scarce(evidence) else None, **more,
         },
-        plys={k: str(path.relative_to(out)) for k, path in plys.items()},
-        pictures=[str(path.relative_to(out)) for path in pictures],
+        plys={k: str(path.relative_to(run.folder)) for k, path in plys.items()},
+        pictures=[str(path.relative_to(run.folder)) for path in pictures],
         seconds=watch.seconds,
     )  # fmt: skip
+    report["run"] = run.id
     report["calibration"] = calibration.as_dict()
     if table is not None:
         report["ids"] = table.summary()
     with watch.stage("report page"):
-        write_report_page(out / "report.html", report, scene, result, Evidence(checks, masks, held_out), images)
+        write_report_page(run.folder / "report.html", report, scene, result, Evidence(checks, masks, held_out), images)
     report["page"] = "report.html"
     report["seconds"]["report page"] = round(watch.seconds["report page"], 3)
-    write_json(out / "report.json", report)
+    write_json(run.folder / "report.json", report)
     return report
 
 
@@ -281,6 +330,8 @@ def render(
 ) -> list[Path]:
     """Render label maps of a split as `<stem>.png`, in the masks' own encoding, and overlays in `overlays/`.
 
+    Those of an earlier `render` into the same folder are replaced, all of them, whatever their split.
+
     Returns
     -------
     list of pathlib.Path
@@ -292,18 +343,19 @@ def render(
     views = dataset.views(split)
     if not views:
         raise NoUsableViewsError(f"{data}: split {split!r} has no views; expected at least one to render")
-    out = Path(out)
     bits = 16 if result.num_classes > 255 else max((view.mask_bits or 8 for view in views), default=8)
-    paths, overlays = [], []
-    for done, (view, labels, image, _) in enumerate(draw_views(scene, result, views, device=device)):
-        progress("render", done, len(views))
-        paths.append(out / f"{view.name}.png")
-        write_mask(paths[-1], labels, bits)
-        overlays.append(image)
-        save_png(out / "overlays" / f"{view.name}.png", image)
-    progress("render", len(views), len(views))
-    write_overview(result, overlays, [view.name for view in views], out / "overlays")
-    return paths
+    names = [view_file_name(view.name) for view in views]
+    overlays = []
+    places = [*names, *(f"overlays/{name}" for name in (*names, "contact_sheet.png", "legend.png"))]
+    with staged_run(out, "render", earlier=earlier_render, places=places) as run:
+        for done, (_, labels, image, _) in enumerate(draw_views(scene, result, views, device=device)):
+            progress("render", done, len(views))
+            write_mask(run.folder / names[done], labels, bits, run.id)
+            overlays.append(image)
+            save_png(run.folder / "overlays" / names[done], image, run.id)
+        progress("render", len(views), len(views))
+        write_overview(result, overlays, [view.name for view in views], run.folder / "overlays", run.id)
+    return [Path(out) / name for name in names]
 
 
 def _keeping_images(drawn: Iterable[Drawn], images: ViewImages) -> Iterator[Drawn]:

@@ -56,14 +56,18 @@ def read_vertices(path: str | os.PathLike[str]) -> npt.NDArray[np.void]:
     return np.array(data, dtype=data.dtype.newbyteorder("="), subok=False)
 
 
-def write_vertices(path: str | os.PathLike[str], vertices: npt.NDArray[Any]) -> None:
+def write_vertices(path: str | os.PathLike[str], vertices: npt.NDArray[Any], run: str | None = None) -> None:
     """Write a structured array (N,) as the `vertex` element of a binary little-endian PLY, atomically.
+
+    The id of a run, if one is given, becomes the comment `gsseg_run <id>`. It stands below the line of the element:
+    some viewers count on that being the third.
 
     Raises
     ------
     WriteError
         The file cannot be written; an earlier file at `path` stays whole.
     """
-    ply = plyfile.PlyData([plyfile.PlyElement.describe(vertices, "vertex")], byte_order="<")
+    comments = [] if run is None else [f"gsseg_run {run}"]
+    ply = plyfile.PlyData([plyfile.PlyElement.describe(vertices, "vertex", comments=comments)], byte_order="<")
     with write_atomically(path) as temporary:
         ply.write(str(temporary))

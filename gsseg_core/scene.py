@@ -192,9 +192,12 @@ class GaussianScene:
         """Count the Gaussians."""
         return len(self.means)
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a binary little-endian 3DGS PLY with all properties that were read, atomically (`WriteError`)."""
-        write_vertices(path, self.vertices)
+    def save(self, path: str | os.PathLike[str], run: str | None = None) -> None:
+        """Write a binary little-endian 3DGS PLY with all properties that were read, atomically (`WriteError`).
+
+        `run` is the id of the run that it belongs to, for a comment in the file.
+        """
+        write_vertices(path, self.vertices, run)
 
     def subset(self, index: npt.NDArray[Any]) -> GaussianScene:
         """Pick Gaussians by a boolean mask (N,) or by integer indices.

@@ -21,6 +21,7 @@ from gsseg_core.operator import ViewOperator
 from gsseg_core.refine import cluster, statistical_filter
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.rows import largest
+from gsseg_core.run_folder import settle
 from gsseg_core.scene import GaussianScene
 
 UNOBSERVED, REMOVED = -1, -2
@@ -190,8 +191,10 @@ class Segmentation:
     def _shows_background(self) -> bool:
         return bool(self._blended[:, 0].any())
 
-    def save(self, path: str | os.PathLike[str]) -> None:
+    def save(self, path: str | os.PathLike[str], run: str | None = None) -> None:
         """Write labels, probabilities, confidence and class names as one npz, atomically.
+
+        `run` is the id of the run that it belongs to, for the header.
 
         Raises
         ------
@@ -199,7 +202,7 @@ class Segmentation:
             The file cannot be written; an earlier one is unchanged.
         """
         header = {"format": FORMAT, "scene": self.scene_digest, "class_names": self.class_names,
-                  "temperature": self.temperature}  # fmt: skip
+                  "temperature": self.temperature, **({} if run is None else {"run": run})}  # fmt: skip
         with write_atomically(path, suffix=".npz") as temporary, open(temporary, "wb") as file:
             np.savez_compressed(
                 file,
@@ -222,8 +225,11 @@ class Segmentation:
             The file is missing or damaged.
         StateMismatchError
             It belongs to another scene.
+        WriteError
+            The run that wrote it was cut short at its very end, and cannot be finished now (`gsseg_core.run_folder`).
         """
         path = Path(path)
+        settle(path.parent)
         with open_npz(path, "a segmentation.npz", FORMAT, scene.digest) as (file, header):
             names = {int(k): str(name) for k, name in header["class_names"].items()}
             temperature = float(header.get("temperature", 1.0))

@@ -16,10 +16,12 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.lifecycle import LifecycleNode
 from std_msgs.msg import Header
 
+from gsseg_core.earlier_outputs import earlier_segment
 from gsseg_core.errors import GssegError
-from gsseg_core.export import export_classes, write_json
+from gsseg_core.export import write_classes, write_json
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.report import build_report
+from gsseg_core.run_folder import staged_run
 from gsseg_ros.errors import InvalidRequestError, error_code
 from gsseg_ros.outputs import Outputs
 from gsseg_ros.reports import Selection, finish, report_message, stage_timings
@@ -191,10 +193,13 @@ class Services:
             selection, refine = self._select(request, run)
             session = selection.session
             result = selection.result.selected(selection.chosen, selection.min_confidence)
-            with run.watch.stage("write"):
-                result.save(folder / "segmentation.npz")
-                plys = export_classes(session.scene, result, folder / "classes")
-                names = {k: str(path.relative_to(folder)) for k, path in plys.items()}
+            with (
+                run.watch.stage("write"),
+                staged_run(folder, "segment", earlier=earlier_segment, only_own=True) as staged,
+            ):
+                result.save(staged.folder / "segmentation.npz", staged.id)
+                plys = write_classes(session.scene, result, staged.folder / "classes", staged.id)
+                names = {k: str(path.relative_to(staged.folder)) for k, path in plys.items()}
                 report = finish(report_message(run, selection, refine, settings.map_frame), run)
                 content = build_report(
                     session.scene,
@@ -204,7 +209,7 @@ class Services:
                     seconds=run.watch.seconds,
                     plys=names,
                 )
-                write_json(folder / "report.json", content)
+                write_json(staged.folder / "report.json", {**content, "run": staged.id})
         response.report = finish(report, run)
         response.directory, response.files = str(folder), ["segmentation.npz", *names.values(), "report.json"]
 

@@ -6,13 +6,14 @@ import contextlib
 import errno
 import os
 import resource
-from collections.abc import Iterator
+import signal
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from gsseg_core.atomic import write_atomically
-from gsseg_core.errors import GssegError, SettingsError, WriteError
+from gsseg_core.atomic import check_writable, write_atomically
+from gsseg_core.errors import GssegError, PathTakenError, SettingsError, WriteError
 
 
 @contextlib.contextmanager
@@ -83,3 +84,50 @@ def test_a_path_that_is_a_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(WriteError, match="cannot be written"), write_atomically(tmp_path / "out") as temporary:
         temporary.write_text("x")
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, Path.mkdir, lambda path: path.symlink_to("/dev/null")])
+def test_what_is_no_file_is_never_replaced(tmp_path: Path, make: Callable[[Path], object]) -> None:
+    path = tmp_path / "out.ply"
+    make(path)
+    before = path.lstat()
+    for attempt in (lambda: check_writable(path), lambda: write_atomically(path).__enter__()):
+        with pytest.raises(PathTakenError, match=r"out\.ply: cannot be written \(it is a "):
+            attempt()
+    assert path.lstat().st_ino == before.st_ino and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_link_to_a_file_stays_and_the_file_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link.json").symlink_to("real/report.json")
+    for text in ("first, where nothing is yet", "second"):
+        with write_atomically(tmp_path / "link.json") as temporary:
+            temporary.write_text(text)
+        assert (tmp_path / "link.json").is_symlink() and (tmp_path / "real/report.json").read_text() == text
+    assert len(list((tmp_path / "real").iterdir())) == 1
+
+
+def test_a_temporary_file_of_a_dead_process_is_removed_by_the_next_and_one_of_a_live_process_is_not(
+    tmp_path: Path,
+) -> None:
+    child = os.fork()
+    if not child:
+        with write_atomically(tmp_path / "a.ply") as temporary:
+            temporary.write_text("half")
+            os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
+    assert len(list(tmp_path.iterdir())) == 1
+    with write_atomically(tmp_path / "b.ply") as first, write_atomically(tmp_path / "c.ply") as second:
+        first.write_text("b")
+        second.write_text("c")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["b.ply", "c.ply"]
+
+
+@pytest.mark.parametrize("name", ["file/below.json", "x" * 300])
+def test_a_path_that_cannot_be_written_is_known_before_the_work(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(WriteError, match="cannot be written"):
+        check_writable(tmp_path / name)
+    check_writable(tmp_path / "file")
+    check_writable(tmp_path / "no" / "such" / "folder" / "yet.json")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

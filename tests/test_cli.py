@@ -73,7 +73,7 @@ def test_segment_writes_labels_objects_report_and_pictures(pristine: Path) -> No
     assert report["views"]["used"] == 4 and report["views"]["rejected"] == {}
     assert all((out / picture).is_file() for picture in report["pictures"])
     assert {"pictures/contact_sheet.png", "pictures/legend.png"} <= set(report["pictures"])
-    assert not [path for path in pristine.rglob(".gsseg-*")]
+    assert [path.relative_to(out) for path in pristine.rglob(".gsseg-*")] == [Path(".gsseg-run.json")]
 
 
 def test_segment_says_which_masks_the_other_views_contradict(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -271,8 +271,13 @@ def test_a_full_disk_is_one_clear_line_and_the_earlier_results_stay_whole(
 ) -> None:
     before = contents(place / "out")
 
-    def disk_full(*_: object) -> None:
-        raise OSError(28, os.strerror(28))
+    sync, calls = os.fsync, []
+
+    def disk_full(file: int) -> None:
+        calls.append(file)
+        if len(calls) > 1:  # There is space for the probe.
+            raise OSError(28, os.strerror(28))
+        sync(file)
 
     monkeypatch.setattr(atomic.os, "fsync", disk_full)
     assert main(segment(place)) == 2

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +11,17 @@ from PIL import Image
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views
 
 from gsseg_core import export
-from gsseg_core.errors import WriteError
-from gsseg_core.export import class_file_name, draw_views, export_classes, write_json, write_pictures
+from gsseg_core.errors import PathTakenError, WriteError
+from gsseg_core.export import (
+    class_file_name,
+    draw_views,
+    export_classes,
+    view_file_name,
+    write_json,
+    write_pictures,
+)
 from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.run_folder import RUN_FILE
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
@@ -32,12 +39,16 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
+def visible(folder: Path) -> list[Path]:
+    return [path for path in folder.iterdir() if path.name != RUN_FILE]
+
+
 def test_every_class_is_a_valid_ply_of_exactly_its_gaussians(tmp_path: Path) -> None:
     paths = export_classes(SCENE, RESULT, tmp_path / "classes")
     assert {k: path.name for k, path in paths.items()} == {
         0: "0_background.ply", 1: "1_red_ball.ply", 2: "2_cup_mug.ply", 3: "3_box.ply",
     }  # fmt: skip
-    assert sorted(paths.values()) == sorted((tmp_path / "classes").iterdir())
+    assert sorted(paths.values()) == sorted(visible(tmp_path / "classes"))
     assert (RESULT.labels == -2).any()
     for k, path in paths.items():
         part, mine = GaussianScene.load(path), RESULT.labels == k
@@ -52,11 +63,13 @@ def test_no_ply_of_an_earlier_export_remains(tmp_path: Path) -> None:
     folder = tmp_path / "classes"
     export_classes(SCENE, RESULT, folder)
     export_classes(SCENE, only(2), folder)
-    assert [path.name for path in folder.iterdir()] == ["2_cup_mug.ply"]
+    assert [path.name for path in visible(folder)] == ["2_cup_mug.ply"]
     assert len(GaussianScene.load(folder / "2_cup_mug.ply")) == len(SCENE)
 
 
-@pytest.mark.parametrize("error", [OSError(28, os.strerror(28)), KeyboardInterrupt()], ids=["disk full", "Ctrl-C"])
+@pytest.mark.parametrize(
+    "error", [WriteError("x: cannot be written"), KeyboardInterrupt()], ids=["disk full", "Ctrl-C"]
+)
 def test_a_failed_export_leaves_the_earlier_folder_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
 ) -> None:
@@ -65,48 +78,58 @@ def test_a_failed_export_leaves_the_earlier_folder_whole(
     before, write = contents(folder), export.write_vertices
     written: list[Path] = []
 
-    def fails_at_the_third(path: Path, vertices: np.ndarray) -> None:
+    def fails_at_the_third(path: Path, vertices: np.ndarray, run: str) -> None:
         written.append(path)
         if len(written) == 3:
             raise error
-        write(path, vertices)
+        write(path, vertices, run)
 
     monkeypatch.setattr(export, "write_vertices", fails_at_the_third)
-    with pytest.raises(WriteError if isinstance(error, OSError) else KeyboardInterrupt):
+    with pytest.raises(type(error)):
         export_classes(SCENE, RESULT, folder)
     assert contents(folder) == before and list(tmp_path.iterdir()) == [folder]
 
 
-def test_a_move_that_fails_at_the_very_end_brings_the_earlier_folder_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_of_others_in_the_folder_stay(tmp_path: Path) -> None:
     folder = tmp_path / "classes"
-    export_classes(SCENE, only(1), folder)
-    before, rename = contents(folder), Path.rename
-
-    def fails_for_the_new_one(path: Path, target: Path) -> Path:
-        if path.name == "new":
-            raise OSError(5, os.strerror(5))
-        return rename(path, target)
-
-    monkeypatch.setattr(Path, "rename", fails_for_the_new_one)
-    with pytest.raises(WriteError, match="classes: cannot be written"):
-        export_classes(SCENE, RESULT, folder)
-    assert contents(folder) == before and list(tmp_path.iterdir()) == [folder]
+    folder.mkdir()
+    for name in ("thesis.tex", "1_mine.ply", ".hidden"):
+        (folder / name).write_text("years of work")
+    export_classes(SCENE, RESULT, folder)
+    export_classes(SCENE, only(2), folder)
+    assert sorted(path.name for path in visible(folder)) == [".hidden", "1_mine.ply", "2_cup_mug.ply", "thesis.tex"]
+    assert all((folder / name).read_text() == "years of work" for name in ("thesis.tex", "1_mine.ply", ".hidden"))
 
 
-def test_a_folder_with_other_files_is_never_replaced(tmp_path: Path) -> None:
+def test_names_that_are_taken_are_refused_and_nothing_is_written(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "thesis.tex").write_text("years of work")
+    (tmp_path / "mine" / "3_box.ply").write_text("years of work")
     (tmp_path / "file").write_text("a file")
-    with pytest.raises(WriteError, match=r"mine: holds 'thesis\.tex', which is no earlier export; expected"):
+    with pytest.raises(PathTakenError, match=r"mine/3_box\.ply: was not written by gsseg"):
         export_classes(SCENE, RESULT, tmp_path / "mine")
-    with pytest.raises(WriteError, match="file: is a file; expected"):
+    with pytest.raises(PathTakenError, match="file: is not a folder; expected"):
         export_classes(SCENE, RESULT, tmp_path / "file")
     with pytest.raises(WriteError, match="cannot be written"):
         export_classes(SCENE, RESULT, tmp_path / "file" / "classes")
-    assert (tmp_path / "mine" / "thesis.tex").read_text() == "years of work"
+    assert contents(tmp_path / "mine") == {"3_box.ply": b"years of work"}
     assert (tmp_path / "file").read_text() == "a file"
+
+
+def test_an_export_of_an_earlier_version_is_replaced(tmp_path: Path) -> None:
+    """It had no manifest: its PLYs are known by their names and the property `label`."""
+    folder = tmp_path / "classes"
+    export_classes(SCENE, RESULT, folder)
+    (folder / RUN_FILE).unlink()
+    SCENE.save(folder / "9_mine.ply")
+    export_classes(SCENE, only(2), folder)
+    assert sorted(path.name for path in visible(folder)) == ["2_cup_mug.ply", "9_mine.ply"]
+
+
+@pytest.mark.parametrize("name", ["a" * 300, "\x00", "\ud800", "a/b", "椅" * 120])
+def test_every_name_of_a_view_gives_a_file_name_that_can_be_written(tmp_path: Path, name: str) -> None:
+    file_name = view_file_name(name, "overlay_")
+    (tmp_path / file_name).write_bytes(b"")
+    assert file_name != view_file_name(name + "x", "overlay_") and view_file_name("view 7") == "view 7.png"
 
 
 @pytest.mark.parametrize(

@@ -110,7 +110,7 @@ def test_the_command_writes_a_ply_and_the_ids(tmp_path: Path, capsys: pytest.Cap
         ids, header = file["ids"], json.loads(str(file["header"]))
         assert file["membership"].shape == (len(SCENE),)
     scene = GaussianScene.load(data / "scene.ply")
-    assert header == {"format": "gsseg-pick-1", "scene": scene.digest}
+    assert header.pop("run") and header == {"format": "gsseg-pick-1", "scene": scene.digest}
     np.testing.assert_array_equal(GaussianScene.load(tmp_path / "mask/object.ply").means, scene.means[ids])
     assert (tmp_path / "mask/pick.png").is_file()
     rows, columns = np.nonzero(LABELS == 1)

@@ -237,7 +237,7 @@ def test_the_library_alone_segments_a_dataset(tmp_path: Path) -> None:
     output, _ = run_example(
         "segment_from_python.py", str(tmp_path / "data/scene.ply"), str(tmp_path / "data"), str(tmp_path / "out")
     )
-    files = sorted((tmp_path / "out").iterdir())
+    files = sorted((tmp_path / "out").glob("*.ply"))
     assert [path.name for path in files] == ["0_background.ply", "1_red_ball.ply", "2_cup_mug.ply", "3_box.ply"]
     for path in files:
         assert f"{path}: {len(GaussianScene.load(path))} Gaussians, " in output

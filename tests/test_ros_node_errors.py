@@ -107,7 +107,8 @@ CASES = [
     Case("save_state", "NO_SCENE", "bare", "no scene is loaded"),
     Case("save_state", "NO_CODES", "fresh", "nothing to save"),
     Case("save_state", "PATH_NOT_ALLOWED", "main", NOT_BELOW, {"path": "../state.npz"}),
-    Case("save_state", "WRITE_FAILED", "main", "taken.npz: cannot be written", {"path": "taken.npz"}),
+    Case("save_state", "WRITE_FAILED", "main", "below.npz: cannot be written", {"path": "other.ply/below.npz"}),
+    Case("save_state", "PATH_TAKEN", "main", "taken.npz: cannot be written", {"path": "taken.npz"}),
     Case("save_state", "UNKNOWN", "starved", "unexpected MemoryError"),
     Case("load_state", "NOT_ACTIVE", "idle", "the node is not active"),
     Case("load_state", "BUSY", "busy", "learn is running", {"path": "other_state.npz"}),
@@ -123,7 +124,8 @@ CASES = [
     Case("export", "NO_CODES", "fresh", "expected at least one posed mask"),
     Case("export", "UNKNOWN_CLASS", "main", "class '4' does not exist", {"classes": ["4"]}),
     Case("export", "PATH_NOT_ALLOWED", "main", NOT_BELOW, {"directory": "../out"}),
-    Case("export", "WRITE_FAILED", "main", "classes: is a file; expected a folder", {"directory": "taken"}),
+    Case("export", "WRITE_FAILED", "main", "below: cannot be written", {"directory": "other.ply/below"}),
+    Case("export", "PATH_TAKEN", "main", "data: holds 'cameras.json', and no results", {"directory": "data"}),
     Case("export", "UNKNOWN", "starved", "unexpected MemoryError"),
     Case("reset", "NOT_ACTIVE", "idle", "the node is not active"),
     Case("reset", "BUSY", "busy", "learn is running"),
@@ -156,6 +158,10 @@ MORE_CASES = [
     Case("load_scene", "PATH_NOT_ALLOWED", "main", NOT_BELOW, {"path": "link/outside.ply"}),
     Case("load_scene", "PATH_NOT_ALLOWED", "main", NOT_BELOW, {"path": "/etc/passwd"}),
     Case("export", "PATH_NOT_ALLOWED", "main", NOT_BELOW, {"directory": "link"}),
+    *(
+        Case("export", "PATH_TAKEN", "main", says, {"directory": directory})
+        for directory, says in ((".", "root: holds "), ("taken", "holds 'classes'"), ("other.ply", "is not a folder"))
+    ),
     *(
         Case(service, "PATH_NOT_ALLOWED", "unset", "data_root is empty, so no path is allowed", fields)
         for service, fields in (

@@ -1,0 +1,218 @@
+"""What the commands write is one run, whole, and only over what is gsseg's: the real command, on a small scene."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from small_scenes import balls_on_a_table, write_dataset
+
+from gsseg_core.cli import main
+from gsseg_core.run_folder import COMMIT_FILE, RUN_FILE
+from gsseg_core.scene import GaussianScene
+from gsseg_core.segmentation import Segmentation
+
+
+def command(place: Path, name: str = "segment") -> list[str]:
+    inputs = [f"{place}/data/scene.ply", "--data", f"{place}/data", "--quiet"]
+    if name == "segment":
+        return ["segment", *inputs, "--out", f"{place}/out", "--learner", "votes", "--views", "2"]
+    return ["render", *inputs, "--out", f"{place}/maps", "--segmentation", f"{place}/out/segmentation.npz"]
+
+
+@pytest.fixture(scope="module")
+def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset, and what `segment` and `render` make of it."""
+    place = tmp_path_factory.mktemp("pristine")
+    write_dataset(place / "data")
+    assert main(command(place)) == 0 and main(command(place, "render")) == 0
+    return place
+
+
+@pytest.fixture
+def place(pristine: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    shutil.copytree(pristine, tmp_path / "place")
+    return tmp_path / "place"
+
+
+def run_id(path: Path) -> str:
+    """Id of the run that a file says that it belongs to."""
+    if path.suffix == ".npz":
+        with np.load(path) as file:
+            return str(json.loads(str(file["header"]))["run"])
+    if path.suffix == ".png":
+        with Image.open(path) as image:
+            return str(image.info["gsseg_run"])
+    if path.suffix == ".json":
+        return str(json.loads(path.read_text())["run"])
+    pattern = rb"\ncomment gsseg_run (.+)\n" if path.suffix == ".ply" else rb'<meta name="gsseg-run" content="(.+)">'
+    found = re.search(pattern, path.read_bytes())
+    assert found is not None, path
+    return found[1].decode()
+
+
+def results(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*") if path.is_file() and path.name != RUN_FILE)
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def in_a_process(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    program = (
+        f"import os, signal, resource, sys\nfrom gsseg_core.cli import main\n{program}\nsys.exit(main(sys.argv[1:]))"
+    )
+    return subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("name", ["out", "maps"])
+def test_every_file_of_a_run_carries_its_id(pristine: Path, name: str) -> None:
+    files = results(pristine / name)
+    manifest = json.loads((pristine / name / RUN_FILE).read_text())
+    (run,) = manifest["runs"].values()
+    assert {run_id(path) for path in files} == {run["run"]}
+    assert [path.relative_to(pristine / name).as_posix() for path in files] == sorted(run["files"], key=Path)
+
+
+def test_a_ply_of_a_class_opens_in_viewers_that_count_the_lines_of_its_header(pristine: Path) -> None:
+    header = (pristine / "out/classes/1_red_ball.ply").read_bytes().split(b"\n", 3)
+    assert header[:2] == [b"ply", b"format binary_little_endian 1.0"] and header[2].startswith(b"element vertex ")
+
+
+def test_a_run_that_is_killed_while_it_is_moved_is_finished_by_whoever_reads_it(place: Path) -> None:
+    before = {run_id(path) for path in results(place / "out")}
+    (place / "out/classes/1_mine.ply").write_text("mine")
+    program = (
+        "replace = os.replace\n"
+        "def killed(source, target):\n"
+        "    if '/new/pictures' in str(source) and '/new/' not in str(target): os.kill(os.getpid(), signal.SIGKILL)\n"
+        "    replace(source, target)\n"
+        "os.replace = killed"
+    )
+    assert in_a_process(program, *command(place)).returncode == -signal.SIGKILL
+    assert (place / "out" / COMMIT_FILE).exists()
+    Segmentation.load(place / "out/segmentation.npz", GaussianScene.load(place / "data/scene.ply"))
+    files = set(results(place / "out")) - {place / "out/classes/1_mine.ply"}
+    after = {run_id(path) for path in files}
+    assert len(after) == 1 and after != before
+    assert sorted(path.name for path in (place / "out").rglob(".gsseg-*")) == [RUN_FILE]
+    assert (place / "out/classes/1_mine.ply").read_text() == "mine"
+
+
+def test_a_disk_that_fills_up_is_one_clear_line_and_the_earlier_run_stays_whole(place: Path) -> None:
+    before = contents(place / "out")
+    limit = 70_000  # bytes: more than the probe, and less than report.html
+    ended = in_a_process(f"resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}))", *command(place))
+    assert ended.returncode == 2 and ended.stdout == ""
+    assert re.fullmatch(r"gsseg: error: .*/out/\S+: cannot be written \(File too large\); .*unchanged\n", ended.stderr)
+    assert contents(place / "out") == before
+
+
+def read_only(out: Path) -> None:
+    shutil.rmtree(out)
+    out.symlink_to("/proc/self")  # Nobody can write there, not even root.
+
+
+def linked_classes(out: Path) -> None:
+    (out / "classes").rename(out.parent / "elsewhere")
+    (out / "classes").symlink_to(out.parent / "elsewhere")
+
+
+def own_report(out: Path) -> None:
+    (out / RUN_FILE).unlink()
+    (out / "report.json").write_text('{"my": "thesis"}')
+
+
+def a_file(out: Path) -> None:
+    shutil.rmtree(out)
+    out.write_text("mine")
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [(read_only, "out: cannot be written"), (linked_classes, "classes: is a link"), (a_file, "out: is not a folder"),
+     (own_report, "report.json: was not written by gsseg")],
+)  # fmt: skip
+def test_an_out_that_cannot_be_written_or_holds_what_is_not_ours_is_said_before_learning(
+    place: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    damage: Callable[[Path], None],
+    said: str,
+) -> None:
+    damage(place / "out")
+    before = contents(place)
+    monkeypatch.setattr("gsseg_core.pipeline.make_learner", lambda *_, **__: pytest.fail("learns"))
+    assert main(command(place)) == 2
+    stderr = capsys.readouterr().err
+    assert said in stderr and stderr.count("\n") == 1
+    assert contents(place) == before
+
+
+def test_render_never_writes_over_the_masks(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = contents(place / "data")
+    assert main([*command(place, "render"), "--out", f"{place}/data/labels"]) == 2
+    assert "view2.png: was not written by gsseg render" in capsys.readouterr().err
+    assert contents(place / "data") == before
+
+
+def test_results_of_a_version_without_manifests_are_replaced(place: Path) -> None:
+    for name in ("out", "maps"):
+        (place / name / RUN_FILE).unlink()
+    (place / "out/pictures/overlay_mine.png").write_text("mine")
+    (place / "maps/mine.png").write_text("mine")
+    (place / "out/classes/9_gone.ply").write_bytes((place / "out/classes/1_red_ball.ply").read_bytes())
+    assert main(command(place)) == 0 and main(command(place, "render")) == 0
+    assert not (place / "out/classes/9_gone.ply").exists()
+    for mine in (place / "out/pictures/overlay_mine.png", place / "maps/mine.png"):
+        assert mine.read_text() == "mine"
+        mine.unlink()
+    assert len({run_id(path) for path in results(place / "out")}) == 1
+    assert len({run_id(path) for path in results(place / "maps")}) == 1
+
+
+def test_single_files_replace_no_device_and_keep_links(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    remove = ["remove", f"{place}/data/scene.ply", "--segmentation", f"{place}/out/segmentation.npz", "--class", "box"]
+    os.mkfifo(place / "fifo")
+    for option in (["--out", f"{place}/fifo"], ["--out", f"{place}/data"], ["--out", f"{place}/data/scene.ply/x"]):
+        assert main([*remove, *option]) == 2
+        assert "cannot be written (" in capsys.readouterr().err
+    assert (place / "fifo").is_fifo()
+    scores = ["eval", "--pred", f"{place}/maps", "--truth", f"{place}/data/labels", "--json", f"{place}/fifo"]
+    assert main(scores) == 2 and capsys.readouterr().out == ""
+    (place / "link.ply").symlink_to("rest.ply")
+    assert main([*remove, "--out", f"{place}/link.ply"]) == 0
+    assert (place / "link.ply").is_symlink() and len(GaussianScene.load(place / "rest.ply")) > 0
+
+
+def test_names_of_views_that_no_file_can_have_do_not_end_a_run(place: Path) -> None:
+    path = place / "data/cameras.json"
+    cameras = json.loads(path.read_text())
+    cameras += [{**cameras[0], "img_name": name} for name in ("v" * 250, "nul\x00nul", "half \ud800 pair")]
+    path.write_text(json.dumps(cameras))
+    assert main(command(place)) == 0
+    report = json.loads((place / "out/report.json").read_text())
+    assert all((place / "out" / picture).is_file() for picture in report["pictures"])
+    assert sum(picture.startswith("pictures/overlay_") for picture in report["pictures"]) == len(cameras)
+
+
+def test_the_scene_with_a_comment_is_read_as_without(tmp_path: Path) -> None:
+    scene, _ = balls_on_a_table()
+    scene.save(tmp_path / "with.ply", "a run")
+    scene.save(tmp_path / "without.ply")
+    assert (tmp_path / "with.ply").stat().st_size == (tmp_path / "without.ply").stat().st_size + len(
+        "comment gsseg_run a run\n"
+    )
+    np.testing.assert_array_equal(GaussianScene.load(tmp_path / "with.ply").vertices, scene.vertices)

@@ -1,0 +1,280 @@
+"""A folder of results holds one run, whole, after any end of the process that writes it; and files of others stay."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import signal
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from test_atomic import small_files_only
+
+from gsseg_core import run_folder
+from gsseg_core.errors import PathTakenError, SettingsError, WriteError
+from gsseg_core.run_folder import COMMIT_FILE, RUN_FILE, settle, staged_run
+
+FIRST = ["a.npz", "classes/1_cup.ply", "classes/2_box.ply", "old/gone.png", "report.json"]
+SECOND = ["a.npz", "classes/1_cup.ply", "classes/3_ball.ply", "new/here.png", "report.json"]
+
+
+def write(out: Path, files: list[str], kind: str = "segment", **more: object) -> str:
+    with staged_run(out, kind, **more) as run:  # type: ignore[arg-type]
+        for name in files:
+            (run.folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (run.folder / name).write_text(run.id)
+    return run.id
+
+
+def contents(out: Path) -> dict[str, str]:
+    """All files but those that gsseg keeps for itself."""
+    files = {path.relative_to(out).as_posix(): path for path in out.rglob("*") if path.is_file()}
+    return {name: path.read_text() for name, path in files.items() if not name.startswith(".gsseg-")}
+
+
+def hidden(out: Path) -> list[str]:
+    return sorted(path.name for path in out.iterdir() if path.name.startswith(".gsseg-"))
+
+
+def killed_at(count: int, work: Callable[[], object]) -> bool:
+    """Say whether some work, in another process, was killed: before its `count`-th change of the name of a file."""
+    child = os.fork()
+    if child:
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+    calls = 0
+
+    def counted(function: Callable[..., object]) -> Callable[..., object]:
+        def call(*given: object, **named: object) -> object:
+            nonlocal calls
+            calls += 1
+            if calls == count:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return function(*given, **named)
+
+        return call
+
+    for name in ("rename", "replace", "link", "unlink", "rmdir", "mkdir"):
+        setattr(os, name, counted(getattr(os, name)))
+    try:
+        work()
+    finally:
+        os._exit(0)
+
+
+def test_after_a_kill_at_any_step_all_files_are_of_one_run_and_the_next_run_cleans_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "fsync", lambda _: None)  # The machine goes on, and it takes most of the time.
+    out, before, after = tmp_path / "out", 0, 0
+    write(out, FIRST)
+    (out / "classes" / "1_mine.ply").write_text("mine")
+    (out / ".mine").write_text("mine")
+    shutil.copytree(out, tmp_path / "start")
+    mine = {"classes/1_mine.ply": "mine", ".mine": "mine"}
+    for step in range(1, 200):
+        shutil.rmtree(out)
+        shutil.copytree(tmp_path / "start", out)
+        was_killed = killed_at(step, lambda: write(out, SECOND))
+        settle(out)
+        found = contents(out)
+        assert {name: found.pop(name) for name in mine} == mine
+        (run_id,) = set(found.values())
+        manifest = json.loads((out / RUN_FILE).read_text())
+        assert manifest["runs"]["segment"]["run"] == run_id and not (out / COMMIT_FILE).exists()
+        is_new = "new/here.png" in found
+        assert sorted(found) == sorted(SECOND if is_new else FIRST)
+        before, after = before + (not is_new), after + is_new
+        if not was_killed:
+            break
+        assert set(contents(out)) == set(found) | set(mine)
+        if step % 5 == 0:
+            last = write(out, FIRST)
+            assert contents(out) == dict.fromkeys(FIRST, last) | mine and hidden(out) == [RUN_FILE]
+    assert before > 10 and after > 10 and not was_killed
+
+
+def test_a_move_that_is_killed_again_while_it_is_finished_is_finished_in_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "fsync", lambda _: None)
+    out = tmp_path / "out"
+    write(out, FIRST)
+    step = 1
+    while not (out / COMMIT_FILE).exists():
+        assert killed_at(step, lambda: write(out, SECOND))
+        step += 1
+    step = 1
+    while killed_at(step, lambda: settle(out)):
+        step += 1
+    assert set(contents(out)) == set(SECOND) and len(set(contents(out).values())) == 1 and step > 5
+
+
+def test_a_run_that_fails_leaves_everything_as_it_was(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    write(out, FIRST)
+    before = contents(out)
+    for error in (KeyboardInterrupt, SettingsError, OSError):
+        with pytest.raises(error), staged_run(out, "segment") as run:
+            (run.folder / "a.npz").write_text("half")
+            raise error
+        assert contents(out) == before and hidden(out) == [RUN_FILE]
+    with pytest.raises(KeyboardInterrupt), staged_run(tmp_path / "no" / "such", "segment"):
+        raise KeyboardInterrupt
+    assert not (tmp_path / "no").exists()
+
+
+def test_an_interrupt_within_the_move_leaves_the_new_run_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out, replace = tmp_path / "out", os.replace
+    write(out, FIRST)
+
+    def interrupted(source: Path, target: Path) -> None:
+        monkeypatch.setattr(os, "replace", replace)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write(out, SECOND)
+    assert set(contents(out)) == set(SECOND) and len(set(contents(out).values())) == 1 and hidden(out) == [RUN_FILE]
+
+
+def test_a_full_disk_is_one_clear_error_and_the_earlier_run_stays_whole(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(WriteError, match="with free space"), small_files_only():
+        write(out, FIRST)
+    assert not out.exists()
+    write(out, FIRST)
+    before, full = contents(out), os.strerror(errno.ENOSPC)
+
+    def no_space(*_: object) -> None:
+        raise OSError(errno.ENOSPC, full)
+
+    for name in ("open", "rename"):  # Of the manifest, and the commit itself.
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(run_folder.Manifest, "write", no_space)
+            if name == "rename":
+                patch.undo()
+                patch.setattr(os, "rename", no_space)
+            with pytest.raises(WriteError, match=f"{full}.*what was there before is unchanged"):
+                write(out, SECOND)
+        assert contents(out) == before and hidden(out) == [RUN_FILE]
+
+
+def test_a_file_that_was_edited_since_keeps_its_content_under_another_name(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    write(out, FIRST)
+    for name in ("report.json", "classes/2_box.ply"):
+        (out / name).write_text("edited")
+    last = write(out, SECOND)
+    assert contents(out) == dict.fromkeys(SECOND, last) | {
+        f"report.edited-{last}.json": "edited", f"classes/2_box.edited-{last}.ply": "edited",
+    }  # fmt: skip
+
+
+def test_a_copy_of_a_folder_is_as_much_gssegs_as_the_folder(tmp_path: Path) -> None:
+    write(tmp_path / "out", FIRST)
+    shutil.copytree(tmp_path / "out", tmp_path / "copy", copy_function=shutil.copyfile)
+    last = write(tmp_path / "copy", SECOND)
+    assert contents(tmp_path / "copy") == dict.fromkeys(SECOND, last)
+
+
+def test_results_of_another_kind_in_the_same_folder_stay(tmp_path: Path) -> None:
+    first = write(tmp_path, ["a.npz", "both.png"])
+    second = write(tmp_path, ["x.png"], "render")
+    third = write(tmp_path, ["y.png"], "render")
+    assert second != third and contents(tmp_path) == {"a.npz": first, "both.png": first, "y.png": third}
+    with pytest.raises(PathTakenError, match=r"both\.png: was not written by gsseg render"):
+        write(tmp_path, ["both.png"], "render")
+
+
+def put_file(path: Path) -> None:
+    path.write_text("mine")
+
+
+def put_link(path: Path) -> None:
+    path.symlink_to(path.parent / "elsewhere")
+
+
+@pytest.mark.parametrize(
+    ("place", "put", "said"),
+    [("report.json", put_file, "report.json: was not written by gsseg"), ("classes", put_link, "classes: is a link"),
+     ("classes", put_file, "classes: is a link or a file"), ("report.json", os.mkfifo, "report.json: is a link, a f"),
+     ("report.json", Path.mkdir, "report.json: is a link, a folder"), ("a.npz", put_link, "a.npz: is a link")],
+)  # fmt: skip
+def test_a_place_that_is_taken_is_refused_by_name_before_the_work(
+    tmp_path: Path, place: str, put: Callable[[Path], object], said: str
+) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    put(tmp_path / place)
+    for places in (SECOND, []):  # Known before; and only found out in the end.
+        with pytest.raises(PathTakenError, match=said), staged_run(tmp_path, "segment", places=places) as run:
+            assert not places
+            for name in SECOND:
+                (run.folder / name).parent.mkdir(parents=True, exist_ok=True)
+                (run.folder / name).write_text(run.id)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted({"elsewhere", place})
+
+
+def test_a_folder_for_exports_only_must_be_new_empty_or_an_export(tmp_path: Path) -> None:
+    for _ in range(2):
+        write(tmp_path / "new", FIRST, only_own=True)
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "scene.ply").write_text("mine")
+    with pytest.raises(PathTakenError, match=r"data: holds 'scene\.ply', and no results of gsseg segment"):
+        write(tmp_path / "data", FIRST, only_own=True)
+    assert contents(tmp_path / "data") == {"scene.ply": "mine"} and hidden(tmp_path / "data") == []
+
+
+def test_of_two_runs_at_once_the_last_to_end_wins_whole(tmp_path: Path) -> None:
+    ids, errors = [], []
+
+    def run(files: list[str]) -> None:
+        try:
+            ids.extend(write(tmp_path, files) for _ in range(15))
+        except BaseException as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=run, args=(files,)) for files in (FIRST, SECOND)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert errors == []
+    (last,) = set(contents(tmp_path).values())
+    assert last in ids and set(contents(tmp_path)) in (set(FIRST), set(SECOND)) and hidden(tmp_path) == [RUN_FILE]
+
+
+def test_a_manifest_that_names_files_outside_the_folder_is_not_believed(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    write(out, FIRST)
+    (tmp_path / "mine").write_text("mine")
+    manifest = json.loads((out / RUN_FILE).read_text())
+    files = manifest["runs"]["segment"]["files"]
+    status = (tmp_path / "mine").stat()
+    entry = {"size": status.st_size, "mtime_ns": status.st_mtime_ns, "sha256": ""}
+    files |= {"../mine": entry, str(tmp_path / "mine"): entry}
+    (out / RUN_FILE).write_text(json.dumps(manifest))
+    write(out, SECOND)
+    assert (tmp_path / "mine").read_text() == "mine"
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"format": "gsseg-run-1"}', '{"format": "other"}', "\udc80"])
+def test_a_broken_manifest_makes_the_files_somebody_elses(tmp_path: Path, text: str) -> None:
+    write(tmp_path, FIRST)
+    (tmp_path / RUN_FILE).write_bytes(text.encode(errors="surrogateescape"))
+    with pytest.raises(PathTakenError, match=r"was not written by gsseg segment"):
+        write(tmp_path, FIRST)
+    last = write(tmp_path, SECOND, earlier=lambda _: FIRST)
+    assert contents(tmp_path) == dict.fromkeys(SECOND, last)
+
+
+def test_a_lock_that_is_never_released_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_folder, "_PATIENCE", 0.1)
+    started = time.monotonic()
+    with run_folder._locked(tmp_path), pytest.raises(WriteError, match="another process of gsseg"):
+        write(tmp_path, FIRST)
+    assert time.monotonic() - started < 30
