@@ -130,5 +130,8 @@ def _plain(files: Mapping[str, FileRecord]) -> dict[str, dict[str, Any]]:
 
 
 def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
     with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
