@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import unicodedata
+from html import escape
 
 _JOINERS = "\u200c\u200d"
 """They change how their neighbours are written, as in Persian and in emoji, and nothing else."""
@@ -23,6 +24,11 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(c if _stays(c) else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def html_text(value: object) -> str:
+    """Make anything harmless between tags and in quoted attributes: `printable`, without markup."""
+    return escape(printable(str(value)))
 
 
 def _stays(character: str) -> bool:

@@ -27,7 +27,18 @@ def test_characters_that_steer_or_hide_are_seen_as_their_escapes(text: str, show
     assert printable(text) == shown
 
 
-@pytest.mark.parametrize("text", ["Tasse ä", "椅子\u3000二", "می\u200cخواهم", "👩\u200d🚀", "C:\\x1b", "a\u00a0b", ""])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Tasse \u00e4",
+        "\u6905\u5b50\u3000\u4e8c",
+        "\u0645\u06cc\u200c\u062e\u0648\u0627\u0647\u0645",
+        "\U0001f469\u200d\U0001f680",
+        "C:\\x1b",
+        "a\u00a0b",
+        "",
+    ],
+)
 def test_words_of_all_languages_stay(text: str) -> None:
     assert printable(text) == text
 
