@@ -22,7 +22,7 @@ from urllib.parse import parse_qs, urlsplit
 from gsseg_core.errors import SettingsError
 from gsseg_core.printable import printable
 
-PATIENCE = 8.0
+PATIENCE = 5.0
 """Most seconds to find out what the name of a host means."""
 
 MOST_TRIED = 1000

@@ -51,40 +51,44 @@ def start_server(listener: Listener) -> viser.ViserServer:
     SettingsError
         This version of viser does not let itself be guarded.
     """
-    guarded = threading.Event()
+    # viser draws a box with its address whatever `verbose` says.
+    with _guarding(listener) as guarded, contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host="127.0.0.1", port=listener.port, label="gsseg", verbose=False)
+        if guarded.is_set() and all(hasattr(_messages, name) for name in _HEARD):
+            return server
+        server.stop()
+    raise SettingsError(
+        f"viser {viser.__version__} cannot be guarded against foreign pages; expected a version like 1.1, "
+        "in which that works: pip install 'viser~=1.1'"
+    )
 
-    def guard(connection: ServerConnection, request: Request) -> Response | None:
-        refusal = listener.refusal(request.path, request.headers.get_all)
-        return None if refusal is None else connection.respond(HTTPStatus.FORBIDDEN, f"gsseg: {refusal}\n")
+
+@contextlib.contextmanager
+def _guarding(listener: Listener) -> Iterator[threading.Event]:
+    """Have the server that viser starts meanwhile guarded; the event is set once it has."""
+    real, guarded = websockets.asyncio.server.serve, threading.Event()
 
     def serve(handler: Any, *_: object, process_request: Any = None, **options: Any) -> Any:
         async def process(connection: ServerConnection, request: Request) -> Response | None:
-            refused = guard(connection, request)
-            if refused is not None or process_request is None:
-                return refused
+            asked = request.path, request.headers.get_all
+            refusal = listener.refusal(*asked)
+            if refusal is not None:
+                return connection.respond(HTTPStatus.FORBIDDEN, f"gsseg: {refusal}\n")
             response = process_request(connection, request)
             answer: Response | None = await response if inspect.isawaitable(response) else response
             if answer is not None:
-                answer.headers.update(listener.headers(request.path, request.headers.get_all))
+                answer.headers.update(listener.headers(*asked))
             return answer
 
         guarded.set()
         ours = {"sock": listener.socket, "create_connection": _Connection, "max_size": MOST_BYTES}
         return real(handler, process_request=process, **{**options, **ours})
 
-    real = websockets.asyncio.server.serve
-    known = all(hasattr(_messages, name) for name in _HEARD)
-    # viser draws a box with its address whatever `verbose` says.
-    with _replaced(serve), contextlib.redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(host="127.0.0.1", port=listener.port, label="gsseg", verbose=False)
-        if not (guarded.is_set() and known):
-            server.stop()
-    if not (guarded.is_set() and known):
-        raise SettingsError(
-            f"viser {viser.__version__} cannot be guarded against foreign pages; expected a version like 1.1, "
-            "in which that works: pip install 'viser~=1.1'"
-        )
-    return server
+    websockets.asyncio.server.serve = serve  # type: ignore[assignment, misc]
+    try:
+        yield guarded
+    finally:
+        websockets.asyncio.server.serve = real  # type: ignore[misc]
 
 
 def understood(
@@ -154,13 +158,3 @@ class _Connection(ServerConnection):
             data = await super().recv(decode)
             if understood(data):
                 return data
-
-
-@contextlib.contextmanager
-def _replaced(serve: Callable[..., Any]) -> Iterator[None]:
-    real = websockets.asyncio.server.serve
-    websockets.asyncio.server.serve = serve  # type: ignore[assignment, misc]
-    try:
-        yield
-    finally:
-        websockets.asyncio.server.serve = real  # type: ignore[misc]

@@ -330,6 +330,14 @@ def test_markup_in_names_and_errors_runs_nothing_and_fetches_nothing(chromium: B
         assert page.title() != "hacked" and not page.locator("iframe").count() and not other.asked
 
 
+def test_a_browser_with_the_printed_address_gets_the_page_and_one_without_the_token_does_not(chromium: Browser) -> None:
+    with served("0.0.0.0") as viewer, opened_page(chromium, tolerated="403") as page:
+        refused = page.goto(viewer.url.partition("?")[0])
+        assert refused is not None and refused.status == 403 and "address that `gsseg view` printed" in page.content()
+        page.goto(viewer.url)
+        wait(lambda: page.wait_for_timeout(50) or viewer.server.get_clients(), "the page")
+
+
 def test_an_address_that_makes_the_page_connect_elsewhere_does_not(chromium: Browser, viewer: Viewer) -> None:
     with closing(Asked()) as other, opened_page(chromium, tolerated="Content Security Policy") as page:
         said: list[str] = []
