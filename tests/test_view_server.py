@@ -110,15 +110,15 @@ def say(page: ClientConnection, message: dict[str, Any], **changes: Any) -> None
     page.send(msgspec.msgpack.encode({**message, **changes}))
 
 
-def heard(page: ClientConnection, kind: str) -> dict[str, Any]:
-    """Wait for a message of a kind."""
+def heard(page: ClientConnection, kind: str, label: str | None = None) -> dict[str, Any]:
+    """Wait for a message of a kind, that of the widget of this label."""
     deadline = time.monotonic() + PATIENCE
     while True:
         frame = page.recv(timeout=deadline - time.monotonic())
         assert isinstance(frame, bytes)
         packed = frame[16 : 16 + int.from_bytes(frame[8:16], "little")]
         for message in msgspec.msgpack.decode(zstandard.decompress(packed))["messages"]:
-            if message["type"] == kind:
+            if message["type"] == kind and label in (None, message.get("props", {}).get("label")):
                 found: dict[str, Any] = message
                 return found
 
@@ -169,18 +169,31 @@ def test_other_machines_need_the_token_for_the_page_and_for_the_websocket() -> N
             connected(viewer, origin="http://evil.example", Cookie=cookie)
 
 
-def test_a_browser_without_a_height_gets_images_once_it_has_one(
+def test_a_browser_without_a_height_is_answered_and_gets_images_once_it_has_one(
     viewer: Viewer, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with connected(viewer) as page:
         say(page, CAMERA, image_height=0)
         say(page, CAMERA)
         assert heard(page, "BackgroundImageMessage")
-        say(page, CAMERA, image_height=0)
-        say(page, CAMERA, image_width=0)
+        for sizes in ({"image_height": 0}, {"image_width": 0}):
+            say(page, CAMERA, **sizes)
+            # An answer asks for the camera, too.
+            say(page, CLICK, ray_origin=[100.0] * 3, ray_direction=[1.0] * 3)
+            assert "Nothing is there." in told(page)
+            say(page, CLICK, ray_direction=(SCENE.means[0] - CAMERA["position"]).tolist())
+            assert "Gaussian 0, " in told(page)
         say(page, CAMERA, position=[0.0, 0.1, 3.0])
         assert heard(page, "BackgroundImageMessage")
     assert capfd.readouterr() == ("", "")
+
+
+def told(page: ClientConnection) -> str:
+    """What the panel answers next."""
+    while True:
+        updates = heard(page, "GuiUpdateMessage")["updates"]
+        if "content" in updates:
+            return str(updates["content"])
 
 
 @pytest.mark.parametrize(
@@ -255,6 +268,15 @@ def test_whatever_a_browser_says_the_viewer_answers_the_next_one(
         say(page, CAMERA)
         assert heard(page, "BackgroundImageMessage")
     assert "Traceback" not in capfd.readouterr().err
+
+
+def test_names_that_look_alike_are_told_apart_in_the_list_of_classes() -> None:
+    names = {0: "background", 1: "cup", 2: "cup", 3: "cup (2)", 4: "a" * 10**4 + "b", 5: "a" * 10**4 + "c", 6: "\x1b"}
+    learnt = Labelling(TRUTH.astype(np.int32), np.eye(7, dtype=np.float32)[TRUTH], names)
+    viewer = Viewer(ViewModel(SCENE, learnt), listener=listen(port=PORT), draw=SERVER)
+    with closing(viewer), connected(viewer) as page:
+        options = heard(page, "GuiDropdownMessage", "class")["props"]["options"]
+    assert options == ["background", "cup", "cup (2)", "cup (2) (3)", "a" * 80, "a" * 80 + " (5)", r"\x1b"]
 
 
 def test_a_viser_that_cannot_be_guarded_does_not_stay_open(monkeypatch: pytest.MonkeyPatch) -> None:
