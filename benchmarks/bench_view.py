@@ -34,6 +34,7 @@ from playwright.sync_api import Page
 
 from gsseg_core.dataset import View
 from gsseg_core.operator import make_operator
+from gsseg_core.view_access import listen
 from gsseg_core.view_model import Labelling, ViewModel
 from gsseg_core.view_screens import BROWSER, SERVER
 from gsseg_core.viewer import Viewer
@@ -223,7 +224,7 @@ def main() -> None:
 def measure_page(model: ViewModel, views: list[View], draw: str, toggles: int) -> None:
     started = time.monotonic()
     model.show_all()
-    viewer = Viewer(model, views, port=PORT, draw=draw)
+    viewer = Viewer(model, views, listener=listen(port=PORT), draw=draw)
     counter = Counter(PORT + 500, viewer.server.get_port())
     with closing(viewer), closing(counter), started_chromium() as browser:
         print(f"\ndrawn by the {draw}: ready after {time.monotonic() - started:.1f} s")

@@ -9,9 +9,13 @@ import webbrowser
 from contextlib import closing, suppress
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 from gsseg_core.cli_shared import add_quiet, load_kernels
 from gsseg_core.errors import SettingsError
+
+if TYPE_CHECKING:
+    from gsseg_core.view_access import Listener
 
 HELP = "look at a scene in the browser, class by class, and correct labels"
 DESCRIPTION = """
@@ -32,7 +36,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--data", metavar="DATASET", help="folder of the views that it was learnt from, for jumping to them"
     )
     parser.add_argument("--ros", action="store_true", help="follow the ROS 2 node `gsseg` while it learns")
-    parser.add_argument("--host", default="127.0.0.1", help="0.0.0.0 lets other machines look (default: %(default)s)")
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="0.0.0.0 lets others look who have the token of the address (default: %(default)s)",
+    )
     parser.add_argument("--port", type=int, default=8080, help="default: %(default)s, or the next one that is free")
     parser.add_argument(
         "--draw",
@@ -48,16 +56,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Show the scene until interrupted."""
     viewer_module = load_viewer()
+    from gsseg_core.view_access import listen
+
+    if options.ros and options.segmentation:
+        raise SettingsError("both --ros and --segmentation are given; expected one: the node has codes of its own")
+    with listen(options.host, options.port) as listener:
+        return _show(options, listener, viewer_module)
+
+
+def _show(options: argparse.Namespace, listener: Listener, viewer_module: ModuleType) -> int:
     from gsseg_core.dataset import Dataset
     from gsseg_core.scene import GaussianScene
     from gsseg_core.segmentation import Segmentation
     from gsseg_core.view_live import open_source
     from gsseg_core.view_model import BY_CLASS, TRUE_COLOURS, Labelling, ViewModel, read_reliability
 
-    if not 0 < options.port < 2**16:
-        raise SettingsError(f"port is {options.port}; expected 1 to 65535")
-    if options.ros and options.segmentation:
-        raise SettingsError("both --ros and --segmentation are given; expected one: the node has codes of its own")
     load_kernels(options.quiet, options.device)
     scene = GaussianScene.load(options.scene)
     dataset = Dataset(options.data) if options.data else None
@@ -75,13 +88,14 @@ def run(options: argparse.Namespace) -> int:
         views,
         reliability,
         source,
-        host=options.host,
-        port=options.port,
+        listener=listener,
         draw=options.draw,
         device=options.device,
     )
     with closing(viewer), suppress(KeyboardInterrupt):  # How it is meant to end.
         print(f"gsseg: {len(scene):,} Gaussians at {viewer.url} (Ctrl-C ends it)", flush=True)
+        if listener.everywhere:
+            print("gsseg: from elsewhere, put a name or address of this machine in place of localhost", flush=True)
         # Without a screen, that would start a browser of text in this very terminal.
         if options.open and any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
             webbrowser.open(viewer.url)

@@ -6,9 +6,10 @@ Text in them is escaped here; whatever a caller hands in may hold anything.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from html import escape
 
 import numpy as np
+
+from gsseg_core.printable import html_text
 
 MATRIX_PX, LARGEST_CELL, SMALLEST_CELL = 420, 30, 16
 NAMES_PX, SLANTED_PX, OVERHANG = 130, 110, 60
@@ -18,7 +19,7 @@ def bar(share: float, label: str, css_class: str = "fill") -> str:
     """Draw a horizontal bar filled up to a share in [0, 1]; as wide as its place."""
     width = 100 * min(max(share, 0.0), 1.0)
     return (
-        f'<svg class="bar" viewBox="0 0 100 6" preserveAspectRatio="none" role="img" aria-label="{escape(label)}">'
+        f'<svg class="bar" viewBox="0 0 100 6" preserveAspectRatio="none" role="img" aria-label="{html_text(label)}">'
         f'<rect class="track" width="100" height="6"/><rect class="{css_class}" width="{width:.1f}" height="6"/></svg>'
     )
 
@@ -29,7 +30,7 @@ def stacked_bar(parts: Sequence[tuple[str, float]]) -> str:
     x, drawn = 0.0, []
     for i, (name, value) in enumerate(parts):
         width = 100 * value / total
-        title = escape(f"{name}: {value:.2f} s")
+        title = html_text(f"{name}: {value:.2f} s")
         drawn.append(f'<rect class="s{i % 8}" x="{x:.2f}" width="{width:.2f}" height="6"><title>{title}</title></rect>')
         x += width
     return (
@@ -48,7 +49,7 @@ def columns(values: Sequence[float | None], titles: Sequence[str], low: float) -
         kind = "none" if value is None else "bad" if value < low else "fill"
         drawn.append(
             f'<rect class="{kind}" x="{(i + 0.5) * step - width / 2:.2f}" y="{30 - height:.2f}" width="{width:.2f}" '
-            f'height="{height:.2f}"><title>{escape(title)}</title></rect>'
+            f'height="{height:.2f}"><title>{html_text(title)}</title></rect>'
         )
     y = 30 - 30 * low
     return (
@@ -81,7 +82,7 @@ def histogram(
     edges = np.linspace(low, high, bins + 1)
     for i, (name, counts) in enumerate(series):
         for j in np.flatnonzero(counts).tolist():
-            title = escape(f"{edges[j]:.2f} to {edges[j + 1]:.2f}: {int(counts[j]):,} {name}")
+            title = html_text(f"{edges[j]:.2f} to {edges[j + 1]:.2f}: {int(counts[j]):,} {name}")
             y, size = floor - unit * (below[j] + counts[j]), unit * counts[j]
             drawn.append(
                 f'<rect class="s{i}" x="{left + j * step + 0.5:.1f}" y="{y:.2f}" width="{step - 1:.1f}" '
@@ -120,7 +121,7 @@ def heatmap(
     width, height = left + size + OVERHANG, top + size + 4
     drawn = [f'<rect class="track" x="{left}" y="{top}" width="{size}" height="{size}"/>']
     for i, name in enumerate(names):
-        middle, short = (i + 0.5) * cell, escape(_cut(name))
+        middle, short = (i + 0.5) * cell, html_text(_cut(name))
         drawn.append(f'<text x="{left - 6}" y="{top + middle + 4:.1f}" text-anchor="end">{short}</text>')
         x, y = left + middle + 4, top - 6
         drawn.append(f'<text x="{x:.1f}" y="{y}" transform="rotate(-60 {x:.1f} {y})">{short}</text>')
@@ -129,7 +130,7 @@ def heatmap(
         opacity, kind = max(float(shares[i, j]) ** 0.4, 0.1), "fill" if i == j else "bad"
         drawn.append(
             f'<rect class="{kind}" x="{left + j * cell + 0.5}" y="{top + i * cell + 0.5}" width="{cell - 1}" '
-            f'height="{cell - 1}" opacity="{opacity:.2f}"><title>{escape(titles[i][j])}</title></rect>'
+            f'height="{cell - 1}" opacity="{opacity:.2f}"><title>{html_text(titles[i][j])}</title></rect>'
         )
     return (
         f'<svg class="heatmap" width="{width}" height="{height}" viewBox="0 0 {width} {height}" role="img" '

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
-from html import escape
 from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 
 from gsseg_core import report_charts as charts
+from gsseg_core.printable import html_text as text
 from gsseg_core.report_findings import TRUSTED, largest_confusions, most_confused
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.tables import percent
@@ -21,12 +20,6 @@ MATRIX_CLASSES = 24
 """The matrix shows this many of the classes that are confused most."""
 PAIRS = 10
 WORST = 8
-
-
-def text(value: object) -> str:
-    """Make anything harmless between tags and in quoted attributes; control characters and half pairs become U+FFFD."""
-    clean = "".join("\ufffd" if unicodedata.category(c) in ("Cc", "Cs") else c for c in str(value))
-    return escape(clean)
 
 
 def embedded_json(value: object) -> str:

@@ -18,6 +18,7 @@ import numpy as np
 from gsseg_core import report_html as html
 from gsseg_core.atomic import write_atomically
 from gsseg_core.pictures import palette
+from gsseg_core.printable import html_text
 from gsseg_core.report_findings import Evidence, class_ious, mean_reliability, warnings_of
 from gsseg_core.report_pictures import PICTURE_PX, THUMBNAIL_PX, ViewImages, draw_triple, jpeg_uri, thumbnails
 from gsseg_core.report_preview import look_from, make_preview, up_of
@@ -90,7 +91,7 @@ def report_page(
         ("Time", "time", html.timings(report["seconds"])),
         ("Settings and versions", "settings", _settings(report)),
     ]
-    name = html.text(os.path.basename(report["scene"]["path"]))
+    name = html_text(os.path.basename(report["scene"]["path"]))
     links = "".join(f'<a href="#{anchor}">{title}</a>' for title, anchor, body in sections if body)
     body = "".join(
         f'<section id="{anchor}"><h2>{title}</h2>{content}</section>' for title, anchor, content in sections if content
@@ -108,20 +109,20 @@ def report_page(
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="gsseg-run" content="{html.text(report.get("run", ""))}">
 <meta name="color-scheme" content="light dark">
-<meta name="generator" content="gsseg {html.text(report["versions"]["gsseg"])}">
+<meta name="generator" content="gsseg {html_text(report["versions"]["gsseg"])}">
 <link rel="icon" href="data:,">
 <title>gsseg: {name}</title>
 <style>{style}</style>
 </head>
 <body>
 <header>
-<p class="brand">gsseg</p><h1>{name}</h1><p class="faint">{html.text(report["scene"]["path"])}</p>
+<p class="brand">gsseg</p><h1>{name}</h1><p class="faint">{html_text(report["scene"]["path"])}</p>
 {html.cards(_figures(report, segmentation))}
 </header>
 {html.notices(warnings_of(report, ious))}
 <nav aria-label="sections">{links}</nav>
 <main>{body}</main>
-<footer>Written by gsseg {html.text(report["versions"]["gsseg"])}. The figures are in report.json, too.</footer>
+<footer>Written by gsseg {html_text(report["versions"]["gsseg"])}. The figures are in report.json, too.</footer>
 <script>{script}</script>
 </body>
 </html>
@@ -177,7 +178,7 @@ def _preview(
     if ranked:
         picture = draw_triple(ranked[0], evidence.views[ranked[0].name], images, colors).prediction
         poster = f'<img class="poster" src="{jpeg_uri(picture, 640)}" alt="the scene, coloured by class">'
-    options = "".join(f'<option value="{i}">view {html.text(camera.name)}</option>' for i, camera in enumerate(cameras))
+    options = "".join(f'<option value="{i}">view {html_text(camera.name)}</option>' for i, camera in enumerate(cameras))
     left_out = f"{len(preview.records):,} of {len(scene):,} Gaussians" if preview.left_out else "All Gaussians"
     return f"""<div class="viewer">
 <div class="stage">{poster}

@@ -1,4 +1,8 @@
-"""The panel of the viewer: its widgets, and what they call."""
+"""The panel of the viewer: its widgets, and what they call.
+
+viser draws Markdown with whatever HTML stands in it. So text of others, which names and errors hold, gets there only
+through `_paragraph`, and into labels, which are text, only through `_shown`.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,8 @@ import viser
 
 from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
-from gsseg_core.errors import GssegError
+from gsseg_core.errors import GssegError, SettingsError
+from gsseg_core.printable import html_text, printable
 from gsseg_core.view_corrections import box, disc, region
 from gsseg_core.view_model import MODES, ClassRow
 from gsseg_core.view_nodes import BANDS
@@ -24,9 +29,13 @@ if TYPE_CHECKING:
 MOST_CLASSES, MOST_VIEWS = 5, 8
 """Of probabilities and views that the answer to a click names."""
 
+LONGEST_NAME = 80
+"""Characters of a name; of a longer one, the first."""
+
 ONLY, REMOVE = "only this", "remove"
 REGION, DISC = "the whole region", "a disc"
 _OFF = (73, 80, 87)
+_STYLE = "padding: 0 0.75em 0.75em; font-size: 0.875em; overflow-wrap: anywhere"
 _ASK = "Click on something in the picture to ask what it is."
 
 
@@ -42,10 +51,10 @@ class Panel:
     def __init__(self, viewer: Viewer) -> None:
         self._viewer, self._gui = viewer, viewer.server.gui
         self._rows: dict[int, tuple[ClassRow, viser.GuiButtonHandle, viser.GuiButtonGroupHandle]] = {}
-        self._live: viser.GuiMarkdownHandle | None = None
+        self._live: viser.GuiHtmlHandle | None = None
         self._gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="medium")
         self._gui.set_panel_label("gsseg")
-        self._answer = self._gui.add_markdown(_ASK)
+        self._answer = self._gui.add_html(_paragraph(_ASK))
         tabs = self._gui.add_tab_group()
         with tabs.add_tab("Classes"):
             self._build_classes()
@@ -74,16 +83,16 @@ class Panel:
             hint="above 0: show what has at least this probability of a shown class, whatever its label is",
         )
         self._listen(self._mode, self._choose_mode)
-        self._listen(self._confidence, lambda: self._threshold("min_confidence", self._confidence.value))
-        self._listen(self._probability, lambda: self._threshold("min_probability", self._probability.value))
+        self._listen(self._confidence, lambda: self._threshold("min_confidence", self._confidence))
+        self._listen(self._probability, lambda: self._threshold("min_probability", self._probability))
         show_all = gui.add_button("show all", icon=viser.Icon.EYE)
         self._press(show_all, self._show_all)
         self._list = gui.add_folder("classes")
 
     def _build_views(self) -> None:
         gui = self._gui
-        self._names = {self._view_text(view): view for view in self._viewer.views}
-        self._view = gui.add_dropdown("view", tuple(self._names))
+        self._texts = _distinct([self._view_text(view) for view in self._viewer.views])
+        self._view = gui.add_dropdown("view", self._texts)
         self._with_mask = gui.add_checkbox("mask over it", True)
         go = gui.add_button("go there", icon=viser.Icon.CAMERA)
         steps = gui.add_button_group("", ("previous", "next"))
@@ -93,7 +102,8 @@ class Panel:
             if event.client is None:  # It was set from here, and whoever did that goes there.
                 return
             with self.telling(event.client):
-                self._viewer.jump(event.client, self._names[self._view.value], self._with_mask.value)
+                view = self._viewer.views[_chosen(self._view, self._texts)]
+                self._viewer.jump(event.client, view, self._with_mask.value)
 
         go.on_click(jump)
         self._view.on_update(jump)
@@ -101,10 +111,10 @@ class Panel:
 
         @steps.on_click
         def _step(event: viser.GuiEvent[Any]) -> None:
-            names = list(self._names)
-            step = 1 if event.target.value == "next" else -1
-            _set(self._view, names[(names.index(self._view.value) + step) % len(names)])
-            jump(event)
+            with self.telling(event.client):
+                step = 1 if event.target.value == "next" else -1
+                _set(self._view, self._texts[(_chosen(self._view, self._texts) + step) % len(self._texts)])
+                jump(event)
 
         self._press(leave, self._viewer.hide_mask)
 
@@ -136,7 +146,7 @@ class Panel:
                 self._send(event.client, "segmentation.npz", self._viewer.segmentation_npz())
 
         if self._viewer.follows:
-            self._live = self._gui.add_markdown("live: waiting for the first codes")
+            self._live = self._gui.add_html(_paragraph("live: waiting for the first codes"))
 
     # What the viewer tells.
 
@@ -161,35 +171,35 @@ class Panel:
     def show_picked(self, picked: Picked | None, voices: Sequence[Voice] | None) -> None:
         """Answer a click: what it hit, and what the views say of that, if that is known."""
         if picked is None:
-            self._answer.content = "Nothing is there."
+            self._answer.content = _paragraph("Nothing is there.")
             return
         model = self._viewer.model
         i = picked.gaussian
         label, probabilities = int(model.labelling.labels[i]), model.labelling.probabilities[i]
         best = [k for k in np.argsort(-probabilities, kind="stable")[:MOST_CLASSES].tolist() if probabilities[k] > 0]
         lines = [
-            f"**{model.name(label)}**" + (f", class {label}" if label >= 0 else ""),
+            f", class {label}" if label >= 0 else "",
             f"Gaussian {i}, {100 * picked.weight:.0f} % of the pixel",
-            "probabilities: " + (", ".join(f"{model.name(k)} {probabilities[k]:.2f}" for k in best) or "none"),
+            "probabilities: " + (", ".join(f"{_shown(model.name(k))} {probabilities[k]:.2f}" for k in best) or "none"),
         ]
         if voices is not None:
-            said = [f"{v.view}: {model.name(v.label)}, {v.weight:.1f} px" for v in voices[:MOST_VIEWS]]
+            said = [f"{_shown(v.view)}: {_shown(model.name(v.label))}, {v.weight:.1f} px" for v in voices[:MOST_VIEWS]]
             count = len({voice.view for voice in voices})
             lines.append(f"{count} view{'s' * (count != 1)} spoke for it" + (", the loudest:" if said else ""))
             lines += said
-        self._answer.content = "  \n".join(lines)
+        self._answer.content = _paragraph(*lines, title=_shown(model.name(label)))
 
     def show_progress(self, stage: str, done: int, total: int) -> None:
         """Say how far a long job is."""
         if done < total:
-            self._answer.content = f"{stage}: {done} of {total} views"
+            self._answer.content = _paragraph(f"{stage}: {done} of {total} views")
         else:
-            self._answer.content = _ASK
+            self._answer.content = _paragraph(_ASK)
 
     def show_live(self, text: str) -> None:
         """Say what the live source has."""
         if self._live is not None:
-            self._live.content = f"live: {text}"
+            self._live.content = _paragraph(f"live: {text}")
 
     def tell_corrected(self, changed: int) -> None:
         """Say what the last correction did."""
@@ -204,9 +214,10 @@ class Panel:
         try:
             yield
         except GssegError as error:
-            self._answer.content = f"**That did not work.** {error}"
+            self._answer.content = _paragraph(f" {error}", title="That did not work.")
             if client is not None:
-                client.add_notification("That did not work", str(error), color="red", auto_close_seconds=10.0)
+                text = printable(str(error))
+                client.add_notification("That did not work", text, color="red", auto_close_seconds=10.0)
 
     # Corrections as they are set up in the panel.
 
@@ -214,14 +225,15 @@ class Panel:
         """Turn a click into a correction."""
         if self._tool.value == REGION:
             return region(camera, label_map(), column, row, self._label())
-        return disc(camera, column, row, self._radius.value / 100 * camera.height, self._label())
+        radius = _number(self._radius, 0, 100) / 100 * camera.height
+        return disc(camera, column, row, radius, self._label())
 
     def drawn_box(self, camera: Camera, corner: tuple[float, ...], opposite: tuple[float, ...]) -> View:
         """Turn a rectangle into a correction."""
         return box(camera, (corner[0], corner[1]), (opposite[0], opposite[1]), self._label())
 
     def _label(self) -> int:
-        return self._target_names().index(self._target.value)
+        return _chosen(self._target, self._target_names())
 
     # Callbacks.
 
@@ -232,7 +244,8 @@ class Panel:
             _set(self._mode, self._viewer.model.mode)
             raise
 
-    def _threshold(self, name: str, value: float) -> None:
+    def _threshold(self, name: str, slider: viser.GuiSliderHandle[float]) -> None:
+        value = _number(slider, 0, 1)
         self._viewer.change(lambda model: setattr(model, name, value))
 
     def _show_all(self) -> None:
@@ -241,12 +254,13 @@ class Panel:
         _set(self._probability, 0.0)
 
     def _add_class(self) -> None:
-        name, names = self._new.value.strip(), self._target_names()
-        if name and name not in names:
+        name, names = printable(self._new.value.strip()), self._target_names()
+        if not 0 < len(name) <= LONGEST_NAME:
+            raise SettingsError(f"new class: name has {len(name)} characters; expected 1 to {LONGEST_NAME}")
+        if name not in names:
             self._viewer.added_names[len(names)] = name
             self._target.options = (*names, name)
-        if name:
-            _set(self._target, name)
+        _set(self._target, name)
 
     def _undo(self) -> None:
         if self._viewer.undo():
@@ -262,20 +276,21 @@ class Panel:
         @group.on_click
         def _pressed(event: viser.GuiEvent[Any]) -> None:
             with self.telling(event.client):
-                only = event.target.value == ONLY
-                self._viewer.change(lambda model: model.isolate(label) if only else model.remove(label))
+                if event.target.value == ONLY:
+                    self._viewer.change(lambda model: model.isolate(label))
+                elif event.target.value == REMOVE:
+                    self._viewer.change(lambda model: model.remove(label))
 
         return button, group
 
     def _target_names(self) -> tuple[str, ...]:
-        """Names by class id; one that occurs twice gets its id appended, since the names are the only key there is."""
+        """Names by class id, as they are shown."""
         known = {**self._viewer.added_names, **self._viewer.model.labelling.class_names}
-        names = [known.get(k, f"class_{k:02d}") for k in range(max(known) + 1)]
-        return tuple(name if names.index(name) == k else f"{name} ({k})" for k, name in enumerate(names))
+        return _distinct([_shown(known.get(k, f"class_{k:02d}")) for k in range(max(known) + 1)])
 
     def _view_text(self, view: View) -> str:
         trust = self._viewer.reliability.get(view.name, math.nan)
-        return view.name if math.isnan(trust) else f"{view.name} ({100 * trust:.0f} % reliable)"
+        return _shown(view.name) + ("" if math.isnan(trust) else f" ({100 * trust:.0f} % reliable)")
 
     def _listen(self, widget: Any, action: Callable[[], object]) -> None:
         @widget.on_update
@@ -300,8 +315,43 @@ def _set(widget: Any, value: object) -> None:
     widget.value = value
 
 
+def _number(slider: viser.GuiSliderHandle[float], lowest: float, highest: float) -> float:
+    """Value of a slider; a browser may say anything."""
+    value = float(slider.value)
+    if not lowest <= value <= highest:
+        raise SettingsError(f"{slider.label} is {value:g}; expected {lowest:g} to {highest:g}")
+    return value
+
+
+def _chosen(dropdown: viser.GuiDropdownHandle[str], options: Sequence[str]) -> int:
+    """Which of the options is chosen; a browser may say anything."""
+    if dropdown.value not in options:
+        raise SettingsError(f"{dropdown.label} is {_shown(dropdown.value)!r}; expected one of the list")
+    return options.index(dropdown.value)
+
+
+def _distinct(texts: Sequence[str]) -> tuple[str, ...]:
+    """Append its number to a text that occurs a second time: texts are the only key that a dropdown has."""
+    found: dict[str, None] = {}
+    for k, text in enumerate(texts):
+        while text in found:
+            text = f"{text} ({k})"
+        found[text] = None
+    return tuple(found)
+
+
+def _shown(name: str) -> str:
+    return printable(name[:LONGEST_NAME])
+
+
+def _paragraph(*lines: str, title: str = "") -> str:
+    """HTML of lines that hold text of any origin; `title` begins the first one, in bold."""
+    content = "<br>".join(map(html_text, lines))
+    return f'<div style="{_STYLE}"><strong>{html_text(title)}</strong>{content}</div>'
+
+
 def _text(row: ClassRow) -> str:
-    return f"{row.name}  {row.size:,}"
+    return f"{_shown(row.name)}  {row.size:,}"
 
 
 def _color(row: ClassRow) -> tuple[int, int, int]:

@@ -177,7 +177,7 @@ class Screens:
         if self._drawn_by == AUTO:
             try:
                 self._decide(client, screen)
-            except (RuntimeError, TimeoutError):  # It has left, or it cannot even draw the trial.
+            except (RuntimeError, TimeoutError, OSError, ValueError):  # It has left, or cannot even draw the trial.
                 return
 
     def _leave(self, client: viser.ClientHandle) -> None:

@@ -21,14 +21,16 @@ from gsseg_core.export import background_image
 from gsseg_core.operator import make_operator
 from gsseg_core.pictures import overlay, palette
 from gsseg_core.segmentation import Segmentation
+from gsseg_core.view_access import Listener, listen
 from gsseg_core.view_corrections import Corrections
 from gsseg_core.view_live import LiveSource
-from gsseg_core.view_model import BY_RELIABILITY, ViewModel
+from gsseg_core.view_model import BY_RELIABILITY, MODES, ViewModel
 from gsseg_core.view_nodes import cut
 from gsseg_core.view_panel import Panel
 from gsseg_core.view_picking import Evidence, pick, scene_camera
 from gsseg_core.view_picture import Picture
 from gsseg_core.view_screens import AUTO, DRAWN_BY, Screens
+from gsseg_core.view_server import start_server
 
 DRAWING_HEIGHT = 480
 """Most rows of the image in which a correction is drawn; finer than the Gaussians is of no use."""
@@ -50,8 +52,8 @@ class Viewer:
         How far each can be trusted, in [0, 1], as far as that is known.
     source : LiveSource, optional
         Codes that change while the viewer runs.
-    host, port : str, int
-        Where to listen; if the port is taken, at the next one that is free.
+    listener : Listener, optional
+        Where to listen, and who is answered; it is closed with the viewer. By default, what `listen` gives.
     draw : str
         Who draws: 'browser'; 'server', this program, which sends images; or 'auto', the browser if it is fast.
     device : str
@@ -67,7 +69,7 @@ class Viewer:
     Raises
     ------
     SettingsError
-        `draw` is none of these.
+        `draw` is none of these, no port is free, or viser is of an unknown version.
     """
 
     def __init__(
@@ -77,8 +79,7 @@ class Viewer:
         reliability: Mapping[str, float] | None = None,
         source: LiveSource | None = None,
         *,
-        host: str = "127.0.0.1",
-        port: int = 8080,
+        listener: Listener | None = None,
         draw: str = AUTO,
         device: str = "cpu",
     ) -> None:
@@ -93,9 +94,9 @@ class Viewer:
         self.lock = threading.RLock()
         self._stale, self._closing = threading.Event(), threading.Event()
         self._source = source
-        with contextlib.redirect_stdout(io.StringIO()):  # viser draws a box with its address whatever `verbose` says.
-            self.server = viser.ViserServer(host=host, port=port, label="gsseg", verbose=False)
-        self.url = f"http://{'localhost' if host in ('127.0.0.1', '0.0.0.0') else host}:{self.server.get_port()}"
+        self._listener = listener or listen()
+        self.server = start_server(self._listener)
+        self.url = self._listener.url
         self.screens = Screens(self.server, model.scene, self._seen_by, draw, device)
         self._set_up_camera()
         self.panel = Panel(self)
@@ -121,6 +122,7 @@ class Viewer:
         self.screens.close()
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
+        self._listener.close()
 
     @property
     def follows(self) -> bool:
@@ -141,8 +143,10 @@ class Viewer:
         Raises
         ------
         SettingsError
-            It is the reliability of the views, and that is not known.
+            There is no such mode, or it is the reliability of the views, and that is not known.
         """
+        if mode not in MODES:
+            raise SettingsError(f"colour by {mode!r}; expected one of {', '.join(MODES)}")
         if mode == BY_RELIABILITY and self.model.reliability is None:
             if not self.reliability or not self.views:
                 raise SettingsError(

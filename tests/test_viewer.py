@@ -22,6 +22,7 @@ from gsseg_core.cli import main
 from gsseg_core.errors import SettingsError
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
+from gsseg_core.view_access import listen
 from gsseg_core.view_live import LiveUpdate
 from gsseg_core.view_model import BY_RELIABILITY, TRUE_COLOURS, Labelling, ViewModel
 
@@ -84,7 +85,7 @@ def opened(chromium: Browser, request: pytest.FixtureRequest) -> Iterator[Shown]
     views = clean_views(3)
     reliability = {view.name: 0.2 + 0.3 * i for i, view in enumerate(views)}
     # three.js complains of the splats' own geometry, which is flat, wherever one points at it.
-    viewer = Viewer(ViewModel(SCENE, LEARNT), views, reliability, port=18080, draw=request.param)
+    viewer = Viewer(ViewModel(SCENE, LEARNT), views, reliability, listener=listen(port=18080), draw=request.param)
     with closing(viewer), opened_page(chromium, 960, 640, tolerated="computeBoundingSphere") as page:
         page.goto(viewer.url)
         shown = Shown(viewer, page)
@@ -249,7 +250,9 @@ def test_codes_of_a_live_source_refresh_the_picture(chromium: Browser) -> None:
             pass
 
     source = Source()
-    viewer = Viewer(ViewModel(SCENE, Labelling.unknown(len(SCENE))), source=source, port=18080, draw=SERVER)
+    viewer = Viewer(
+        ViewModel(SCENE, Labelling.unknown(len(SCENE))), source=source, listener=listen(port=18080), draw=SERVER
+    )
     with closing(viewer), opened_page(chromium, 960, 640, tolerated="computeBoundingSphere") as page:
         page.goto(viewer.url)
         shown = Shown(viewer, page)
@@ -263,7 +266,7 @@ def test_codes_of_a_live_source_refresh_the_picture(chromium: Browser) -> None:
 
 def test_who_is_to_draw_must_be_known() -> None:
     with pytest.raises(SettingsError, match="draw is 'gpu'; expected one of auto, browser, server"):
-        Viewer(ViewModel(SCENE, LEARNT), port=18080, draw="gpu")
+        Viewer(ViewModel(SCENE, LEARNT), draw="gpu")
 
 
 @pytest.mark.parametrize(("limit", "draws"), [(-1.0, False), (np.inf, True)])
@@ -274,7 +277,7 @@ def test_a_browser_gets_images_until_it_has_shown_that_it_draws_fast(
     taken: list[bool] = []
     stop = view_screens.Screen.stop_images
     monkeypatch.setattr(view_screens.Screen, "stop_images", lambda screen: (stop(screen), taken.append(True)))
-    viewer = Viewer(ViewModel(SCENE, LEARNT), clean_views(1), port=18080, draw=AUTO)
+    viewer = Viewer(ViewModel(SCENE, LEARNT), clean_views(1), listener=listen(port=18080), draw=AUTO)
     with closing(viewer), opened_page(chromium, 960, 640, tolerated="computeBoundingSphere") as page:
         page.goto(viewer.url)
         shown = Shown(viewer, page)

@@ -18,6 +18,7 @@ from browser import opened_page, screenshot, started_chromium
 from gsseg_core.dataset import Dataset
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
+from gsseg_core.view_access import listen
 from gsseg_core.view_model import Labelling, ViewModel, read_reliability
 from gsseg_core.viewer import Viewer
 
@@ -31,7 +32,7 @@ def main(demo: Path = ROOT / "demo_out", out: Path = ROOT / "docs/pictures/viewe
     result = Segmentation.load(demo / "segmented/segmentation.npz", scene)
     views = [view for view in Dataset(demo / "scene").views("train") if view.has_mask]
     reliability = read_reliability(demo / "segmented/report.json")
-    viewer = Viewer(ViewModel(scene, Labelling.of(result)), views, reliability, port=18400)
+    viewer = Viewer(ViewModel(scene, Labelling.of(result)), views, reliability, listener=listen(port=18400))
     with (
         closing(viewer),
         started_chromium() as browser,

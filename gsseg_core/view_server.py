@@ -1,0 +1,160 @@
+"""viser's server behind our own door: it listens where it is told, and hears only what the viewer understands.
+
+viser checks neither who asks nor what a browser says. It takes its server from `websockets`, and that is the one place
+where both can be checked before viser sees it. Another version of viser may do so in another way; then nothing starts.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import io
+import math
+import threading
+from collections.abc import Callable, Iterator
+from http import HTTPStatus
+from typing import Any
+
+import msgspec
+import viser
+import websockets.asyncio.server
+from viser import _messages
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
+from websockets.typing import Data
+
+from gsseg_core.errors import SettingsError
+from gsseg_core.view_access import Listener
+
+MOST_BYTES = 2**20
+"""Of one message from a browser; the largest is a small picture."""
+
+LARGEST_WINDOW = 2**14
+"""Most pixels of a browser's picture, each way."""
+
+_LARGEST_NUMBER, _LONGEST_TEXT = 1e9, 1000
+
+_HEARD = ("ViewerCameraMessage", "ScenePointerMessage", "GuiUpdateMessage", "GetRenderResponseMessage")
+"""What a page sends that the viewer has a use for. viser itself would also take files, and open itself to everybody."""
+
+
+def start_server(listener: Listener) -> viser.ViserServer:
+    """Start viser's server.
+
+    Parameters
+    ----------
+    listener : Listener
+        Where, and who is answered. It has to stay open as long as the server runs.
+
+    Raises
+    ------
+    SettingsError
+        This version of viser does not let itself be guarded.
+    """
+    # viser draws a box with its address whatever `verbose` says.
+    with _guarding(listener) as guarded, contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host="127.0.0.1", port=listener.port, label="gsseg", verbose=False)
+        if guarded.is_set() and all(hasattr(_messages, name) for name in _HEARD):
+            return server
+        server.stop()
+    raise SettingsError(
+        f"viser {viser.__version__} cannot be guarded against foreign pages; expected a version like 1.1, "
+        "in which that works: pip install 'viser~=1.1'"
+    )
+
+
+@contextlib.contextmanager
+def _guarding(listener: Listener) -> Iterator[threading.Event]:
+    """Have the server that viser starts meanwhile guarded; the event is set once it has."""
+    real, guarded = websockets.asyncio.server.serve, threading.Event()
+
+    def serve(handler: Any, *_: object, process_request: Any = None, **options: Any) -> Any:
+        async def process(connection: ServerConnection, request: Request) -> Response | None:
+            asked = request.path, request.headers.get_all
+            refusal = listener.refusal(*asked)
+            if refusal is not None:
+                return connection.respond(HTTPStatus.FORBIDDEN, f"gsseg: {refusal}\n")
+            response = process_request(connection, request)
+            answer: Response | None = await response if inspect.isawaitable(response) else response
+            if answer is not None:
+                answer.headers.update(listener.headers(*asked))
+            return answer
+
+        guarded.set()
+        ours = {"sock": listener.socket, "create_connection": _Connection, "max_size": MOST_BYTES}
+        return real(handler, process_request=process, **{**options, **ours})
+
+    websockets.asyncio.server.serve = serve  # type: ignore[assignment, misc]
+    try:
+        yield guarded
+    finally:
+        websockets.asyncio.server.serve = real  # type: ignore[misc]
+
+
+def understood(
+    data: Any,  # bytes of one message
+) -> bool:
+    """Whether what a browser says is something that the viewer can use.
+
+    Not so where it is no message that a page of ours sends, has other fields or types than viser says, or numbers that
+    mean nothing: NaN, infinities, a window without a height, a direction of no length.
+    """
+    try:
+        content = msgspec.msgpack.decode(data)
+        kind = content["type"]
+        if kind not in _HEARD or not _is_sane(content):
+            return False
+        message = msgspec.convert(content, getattr(_messages, kind))
+    except (msgspec.MsgspecError, TypeError, KeyError, ValueError, RecursionError):
+        return False
+    return _CHECKS[kind](message) if kind in _CHECKS else True
+
+
+def _is_sane(content: object) -> bool:
+    if isinstance(content, dict):
+        return all(map(_is_sane, content)) and all(map(_is_sane, content.values()))
+    if isinstance(content, list):
+        return all(map(_is_sane, content))
+    if isinstance(content, str):
+        return len(content) <= _LONGEST_TEXT
+    if isinstance(content, (int, float)):
+        return math.isfinite(content) and abs(content) <= _LARGEST_NUMBER
+    return content is None or isinstance(content, bytes)
+
+
+def _sees(camera: _messages.ViewerCameraMessage) -> bool:
+    sides = (camera.image_width, camera.image_height)
+    return (
+        all(0 < side <= LARGEST_WINDOW for side in sides)
+        and 0.5 < math.hypot(*camera.wxyz) < 2
+        and 1e-3 < camera.fov < math.pi - 1e-3
+        and 0 < camera.near < camera.far
+    )
+
+
+def _points(pointer: _messages.ScenePointerMessage) -> bool:
+    if pointer.event_type != "click":
+        return len(pointer.screen_pos) == 2
+    ray = pointer.ray_origin is not None and pointer.ray_direction is not None
+    return ray and len(pointer.screen_pos) == 1 and math.hypot(*pointer.ray_direction or ()) > 1e-6
+
+
+def _sets(update: _messages.GuiUpdateMessage) -> bool:
+    return set(update.updates) == {"value"} and isinstance(update.updates["value"], (bool, int, float, str))
+
+
+_CHECKS: dict[str, Callable[[Any], bool]] = {
+    "ViewerCameraMessage": _sees,
+    "ScenePointerMessage": _points,
+    "GuiUpdateMessage": _sets,
+}
+
+
+class _Connection(ServerConnection):
+    """A connection on which only what is understood is heard."""
+
+    async def recv(self, decode: bool | None = None) -> Data:  # type: ignore[override]
+        while True:
+            data = await super().recv(decode)
+            if understood(data):
+                return data

@@ -1,0 +1,51 @@
+"""Text of others on terminals and pages: nothing in it steers, nothing hides, and words of all languages stay."""
+
+from __future__ import annotations
+
+import unicodedata
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsseg_core.printable import printable
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("\x1b[31mred\x1b[0m", r"\x1b[31mred\x1b[0m"),
+        ("two\r\nlines\tand\x07", r"two\r\nlines\tand\x07"),
+        ("a\x85b\u2028c\u2029d", r"a\x85b\u2028c\u2029d"),
+        ("exe.\u202egnp", r"exe.\u202egnp"),
+        ("\u2066isolated\u2069", r"\u2066isolated\u2069"),
+        ("zero\u200bwidth\ufeff", r"zero\u200bwidth\ufeff"),
+        ("not \udcff UTF-8", r"not \udcff UTF-8"),
+    ],
+)
+def test_characters_that_steer_or_hide_are_seen_as_their_escapes(text: str, shown: str) -> None:
+    assert printable(text) == shown
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Tasse \u00e4",
+        "\u6905\u5b50\u3000\u4e8c",
+        "\u0645\u06cc\u200c\u062e\u0648\u0627\u0647\u0645",
+        "\U0001f469\u200d\U0001f680",
+        "C:\\x1b",
+        "a\u00a0b",
+        "",
+    ],
+)
+def test_words_of_all_languages_stay(text: str) -> None:
+    assert printable(text) == text
+
+
+@given(st.text(st.characters()))
+def test_any_text_is_one_line_that_can_be_encoded_and_a_second_time_changes_nothing(text: str) -> None:
+    shown = printable(text)
+    shown.encode()
+    assert not {unicodedata.category(c) for c in shown} & {"Cc", "Cs", "Zl", "Zp"}
+    assert shown.splitlines() in ([shown], []) and printable(shown) == shown
