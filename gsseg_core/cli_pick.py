@@ -8,6 +8,7 @@ from typing import Any
 
 from gsseg_core.cli_shared import add_scene, load_kernels
 from gsseg_core.errors import SettingsError
+from gsseg_core.terminal import tell
 
 HELP = "pick one object by a mask or clicks in one view, and write it as a PLY"
 DESCRIPTION = """
@@ -62,5 +63,5 @@ def run(options: argparse.Namespace) -> int:
     shown = picked.silhouette(scene, camera, device=options.device)
     image = background_image(scene, make_operator(scene, camera, options.device))
     save_png(out / "pick.png", overlay(image, shown.astype(int), palette(2)))
-    print(f"{len(picked.ids):,} of {len(scene):,} Gaussians: {out}/object.ply, pick.npz, and pick.png to look at")
+    tell(f"{len(picked.ids):,} of {len(scene):,} Gaussians: {out}/object.ply, pick.npz, and pick.png to look at")
     return 0

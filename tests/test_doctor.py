@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 
 from gsseg_core import doctor
-from gsseg_core.cli import COMMANDS, build_parser, main
+from gsseg_core.cli import main
 from gsseg_core.cli_completion import SHELLS, subparsers
+from gsseg_core.cli_parser import COMMANDS, build_parser
 from gsseg_core.doctor import Finding, describe, examine, works
 
 

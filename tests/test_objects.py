@@ -35,9 +35,10 @@ from gsseg_core.cli import main
 from gsseg_core.dataset import View
 from gsseg_core.errors import EmptySceneError, MaskSizeError, SceneValueError, SettingsError
 from gsseg_core.export import export_classes
+from gsseg_core.names import class_ids
 from gsseg_core.operator import make_operator
 from gsseg_core.refine_settings import RefineSettings
-from gsseg_core.removal import class_ids, without_objects
+from gsseg_core.removal import without_objects
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
 from gsseg_core.silhouettes import BEHIND, ObjectScores, depths, objects_of, surface
@@ -298,9 +299,9 @@ def test_what_cannot_be_removed_is_refused_by_name() -> None:
         without_objects(SCENE, result, [])
     with pytest.raises(EmptySceneError, match="nothing is left without 4 classes"):
         without_objects(SCENE, result, range(NUM_CLASSES))
-    with pytest.raises(SettingsError, match="class 'chair' is not in the segmentation; expected one of background"):
-        class_ids(result, ["box", "chair"])
-    assert class_ids(result, ["box", "1"]) == [3, 1]
+    with pytest.raises(SettingsError, match=r"class 'chair' does not exist; expected one of 0 \(background\), 1"):
+        class_ids(["box", "chair"], result.class_names)
+    assert class_ids(["box", "1"], result.class_names) == [3, 1]
 
 
 def test_gsseg_remove_writes_the_rest_and_refuses_what_is_not_there(
@@ -314,7 +315,7 @@ def test_gsseg_remove_writes_the_rest_and_refuses_what_is_not_there(
     assert f"{kept} of {len(SCENE)} Gaussians" in capsys.readouterr().out
     assert len(GaussianScene.load(tmp_path / "rest.ply")) == kept
     assert main([*command, "--class", "chair", "--out", f"{tmp_path}/none.ply"]) == 2
-    assert "class 'chair' is not in the segmentation" in capsys.readouterr().err
+    assert "class 'chair' does not exist" in capsys.readouterr().err
     assert not (tmp_path / "none.ply").exists()
 
 
