@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import re
 import textwrap
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -61,7 +62,7 @@ class _Parser(argparse.ArgumentParser):
             if argument == "--" or (self._subparsers and not argument.startswith("-")):
                 return
             name = argument.split("=")[0]
-            if not name.startswith("--") or " " in name or any(option.startswith(name) for option in known):
+            if not re.match(r"--?[A-Za-z]\S*$", name) or any(option.startswith(name) for option in known):
                 continue
             near = difflib.get_close_matches(name, known, 1)
             self.error(f"unknown option {name}" + (f"; did you mean {near[0]}?" if near else ""))

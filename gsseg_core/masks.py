@@ -141,8 +141,8 @@ def read_classes(path: str | os.PathLike[str]) -> dict[int, str]:
     Raises
     ------
     ClassesFileError
-        The file is missing or broken, an id is not a whole number from 0 to 65534, or a name is not a line of text, of 200
-        characters at most.
+        The file is missing or broken, an id is not a whole number from 0 to 65534, or a name is not one line of text
+        of at most 200 characters.
     """
     path = Path(path)
     content = read_json(path, ClassesFileError)
