@@ -353,11 +353,11 @@ def test_an_interrupt_while_learning_ends_with_130_and_changes_nothing(
 
 def test_ctrl_c_in_a_real_process_ends_with_130_and_no_traceback(place: Path) -> None:
     before = contents(place / "out")
-    # The learner waits, so that the signal meets it at work.
+    # The learner waits, so that the signal meets it at work; the warm-up, which tells nobody, goes on.
     program = (
         "import sys, time; from gsseg_core.votes import VoteLearner; from gsseg_core.cli import main\n"
         "def fit(self, progress=None):\n"
-        "    if progress: progress('learn', 0, 9); time.sleep(60)  # The warm-up, which tells nobody, goes on.\n"
+        "    if progress: progress('learn', 0, 9); print('at work', file=sys.stderr); time.sleep(60)\n"
         "VoteLearner.fit = fit\n"
         "sys.exit(main())"
     )
@@ -367,7 +367,7 @@ def test_ctrl_c_in_a_real_process_ends_with_130_and_no_traceback(place: Path) ->
     ) as process:
         assert process.stderr is not None
         stderr = b""
-        while b"learn:" not in stderr and process.poll() is None:
+        while b"at work" not in stderr and process.poll() is None:
             stderr += os.read(process.stderr.fileno(), 4096)
         process.send_signal(signal.SIGINT)
         stderr += process.stderr.read()
