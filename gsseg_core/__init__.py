@@ -14,6 +14,9 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+# Before any kernel is defined.
+from gsseg_core import kernel_cache as _kernel_cache  # noqa: F401
+
 if TYPE_CHECKING:
     from gsseg_core.boxes import OrientedBox, object_boxes
     from gsseg_core.cameras import Camera

@@ -15,8 +15,9 @@ import numpy.typing as npt
 
 from gsseg_core.cameras import Camera
 from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError
-from gsseg_core.json_files import read_json
+from gsseg_core.json_files import kind_of, read_json
 from gsseg_core.layout import camera_hint
+from gsseg_core.names import flaw_of_view_name
 
 if TYPE_CHECKING:
     import pycolmap
@@ -74,6 +75,9 @@ def read_cameras(folder: str | os.PathLike[str]) -> list[Camera]:
         cameras = _read_colmap(path)
     if not cameras:
         raise CameraFileError(f"{path}: holds no camera; expected at least one")
+    for camera in cameras:
+        if flaw := flaw_of_view_name(camera.name):
+            raise CameraFileError(f"{path}: an image has the name {flaw}")
     stem, count = Counter(camera.name for camera in cameras).most_common(1)[0]
     if count > 1:
         raise CameraFileError(f"{path}: {count} images have the stem '{stem}'; expected another stem for each image")
@@ -95,7 +99,7 @@ def _read_nerfstudio(path: Path) -> list[Camera]:
     """Read camera-to-world poses in OpenGL axes (y up, z backward), intrinsics per file or per frame."""
     content = read_json(path, CameraFileError)
     if not isinstance(content, dict):
-        raise CameraFileError(f"{path}: holds a {type(content).__name__}; expected an object with 'frames'")
+        raise CameraFileError(f"{path}: holds {kind_of(content)}; expected an object with 'frames'")
     shared = {key: value for key, value in content.items() if key != "frames"}
     cameras = []
     for where, frame in _entries(path, content.get("frames"), "a list 'frames'"):
@@ -249,7 +253,7 @@ def _inverse(
 def _entries(path: Path, content: object, expected: str) -> list[tuple[str, dict[str, Any]]]:
     """Objects of a JSON list, each with words that say where it stands."""
     if not isinstance(content, list) or not all(isinstance(entry, dict) for entry in content):
-        raise CameraFileError(f"{path}: holds {type(content).__name__}; expected {expected}, each an object")
+        raise CameraFileError(f"{path}: holds {kind_of(content)}; expected {expected}, each an object")
     return [(f"{path}, entry {i}", entry) for i, entry in enumerate(content)]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from gsseg_core.errors import SettingsError
+from gsseg_core.terminal import tell
 
 SHELLS = ("bash", "zsh", "fish")
 
@@ -30,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Print the script."""
-    from gsseg_core.cli import build_parser
+    from gsseg_core.cli_parser import build_parser
 
     try:
         import shtab
@@ -42,7 +43,7 @@ def run(options: argparse.Namespace) -> int:
             # What a placeholder stands for is what the shell shall offer.
             if action.metavar in _FOLDERS | _FILES:
                 action.complete = shtab.DIRECTORY if action.metavar in _FOLDERS else shtab.FILE  # type: ignore[attr-defined]
-    print(shtab.complete(parser, shell=options.shell))
+    tell(shtab.complete(parser, shell=options.shell))
     return 0
 
 

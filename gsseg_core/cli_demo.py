@@ -6,6 +6,7 @@ import argparse
 
 from gsseg_core.cli_shared import add_quiet, load_kernels
 from gsseg_core.progress import progress_bars
+from gsseg_core.terminal import tell
 
 HELP = "make a small scene with known truth and segment it"
 DESCRIPTION = """
@@ -32,5 +33,5 @@ def run(options: argparse.Namespace) -> int:
     load_kernels(options.quiet)
     with progress_bars(options.quiet) as progress:
         summary = run_demo(options.out, seed=options.seed, progress=progress)
-    print(summary)
+    tell(summary)
     return 0

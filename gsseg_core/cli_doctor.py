@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import sys
+
+from gsseg_core.terminal import note, tell
 
 HELP = "say what this machine has and lacks, and how to get it"
 DESCRIPTION = """
@@ -24,6 +25,6 @@ def run(options: argparse.Namespace) -> int:
     """Look, and print what was found."""
     from gsseg_core.doctor import describe, examine, works
 
-    findings = examine(lambda text: print(f"gsseg: {text}", file=sys.stderr))
-    print(describe(findings))
+    findings = examine(note)
+    tell(describe(findings))
     return 0 if works(findings) else 2

@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gsseg_core.atomic import check_writable
-from gsseg_core.export import write_json
+from gsseg_core.terminal import tell
 
 HELP = "score label maps: mIoU, mAcc, boundary IoU"
 DESCRIPTION = """
@@ -28,6 +27,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Score, and print a table."""
+    from gsseg_core.atomic import check_writable
+    from gsseg_core.export import write_json
     from gsseg_core.masks import read_classes
     from gsseg_core.metrics import evaluate_folders
     from gsseg_core.tables import evaluation_summary
@@ -39,5 +40,5 @@ def run(options: argparse.Namespace) -> int:
     scores = evaluate_folders(options.pred, options.truth).as_dict(names)
     if options.json:
         write_json(options.json, scores)
-    print(evaluation_summary(scores))
+    tell(evaluation_summary(scores))
     return 0

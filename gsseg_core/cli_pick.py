@@ -8,6 +8,7 @@ from typing import Any
 
 from gsseg_core.cli_shared import add_scene, load_kernels
 from gsseg_core.errors import SettingsError
+from gsseg_core.terminal import tell
 
 HELP = "pick one object by a mask or clicks in one view, and write it as a PLY"
 DESCRIPTION = """
@@ -65,5 +66,5 @@ def run(options: argparse.Namespace) -> int:
         scene.subset(picked.ids).save(run.folder / "object.ply", run.id)
         picked.save(run.folder / "pick.npz", run.id)
         save_png(run.folder / "pick.png", overlay(image, shown.astype(int), palette(2)), run.id)
-    print(f"{len(picked.ids):,} of {len(scene):,} Gaussians: {out}/object.ply, pick.npz, and pick.png to look at")
+    tell(f"{len(picked.ids):,} of {len(scene):,} Gaussians: {out}/object.ply, pick.npz, and pick.png to look at")
     return 0

@@ -5,6 +5,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from gsseg_core.names import class_ids, clipped, listed
+from gsseg_core.printable import printable
+from gsseg_core.tables import counted
+from gsseg_core.terminal import tell
+
 HELP = "write the scene without some of its objects"
 DESCRIPTION = """
 Writes a valid 3DGS PLY of all Gaussians but those of the given classes. What an object hid, no camera has seen: where
@@ -28,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         required=True,
         metavar="NAME",
-        help="name or id of a class to leave out; may be given several times",
+        help="id or name of a class to leave out, a number being an id; may be given several times",
     )
     parser.add_argument("--out", required=True, metavar="PLY", help="file to write")
 
@@ -36,14 +41,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Remove, and say what is left."""
     from gsseg_core.atomic import check_writable
-    from gsseg_core.removal import class_ids, without_objects
+    from gsseg_core.removal import without_objects
     from gsseg_core.scene import GaussianScene
     from gsseg_core.segmentation import Segmentation
 
     check_writable(options.out)
     scene = GaussianScene.load(options.scene)
     segmentation = Segmentation.load(options.segmentation, scene)
-    rest = without_objects(scene, segmentation, class_ids(segmentation, options.classes))
+    chosen = class_ids(options.classes, segmentation.class_names)
+    rest = without_objects(scene, segmentation, chosen)
     rest.save(Path(options.out))
-    print(f"{len(rest)} of {len(scene)} Gaussians in {options.out}")
+    removed = listed(f"{k} ({printable(clipped(segmentation.class_names[k]))})" for k in chosen)
+    tell(f"without {removed}: {len(rest):,} of {counted(len(scene), 'Gaussian')} in {options.out}")
     return 0

@@ -6,6 +6,8 @@ import argparse
 
 from gsseg_core.cli_shared import add_scene, load_kernels
 from gsseg_core.progress import progress_bars
+from gsseg_core.tables import counted
+from gsseg_core.terminal import tell
 
 HELP = "render label maps and overlays of a segmentation"
 DESCRIPTION = """
@@ -43,5 +45,5 @@ def run(options: argparse.Namespace) -> int:
             device=options.device,
             progress=progress,
         )
-    print(f"{len(paths)} label maps in {options.out}, overlays in {options.out}/overlays")
+    tell(f"{counted(len(paths), 'label map')} in {options.out}, overlays in {options.out}/overlays")
     return 0

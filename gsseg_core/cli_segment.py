@@ -7,6 +7,7 @@ import argparse
 from gsseg_core.cli_shared import add_scene, load_kernels
 from gsseg_core.progress import progress_bars
 from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.terminal import tell
 
 HELP = "learn from masks, refine, write labels and one PLY per object"
 DESCRIPTION = """
@@ -105,5 +106,5 @@ def run(options: argparse.Namespace) -> int:
         )
     from gsseg_core.tables import segment_summary
 
-    print(segment_summary(report, options.out))
+    tell(segment_summary(report, options.out))
     return 0

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import sys
 
 from gsseg_core.devices import DEVICES, checked_device
 from gsseg_core.errors import SettingsError
+from gsseg_core.terminal import note
 
 
 def add_scene(parser: argparse.ArgumentParser) -> None:
@@ -31,7 +31,7 @@ def load_kernels(quiet: bool, device: str = "cpu") -> None:
     """Compile the kernels or load them, and say so if it takes long."""
     from gsseg_core.warm_up import warm_up
 
-    warm_up(device, lambda text: None if quiet else print(f"gsseg: {text}", file=sys.stderr))
+    warm_up(device, (lambda text: None) if quiet else note)
 
 
 def _device(text: str) -> str:

@@ -13,7 +13,7 @@ from gsseg_core.learner import Progress, silent
 from gsseg_core.metrics import evaluate_folders
 from gsseg_core.report import Stopwatch
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.tables import percent, seconds_table, table
+from gsseg_core.tables import counted, percent, seconds_table, table
 
 
 def run_demo(out: str | os.PathLike[str], *, seed: int = 0, progress: Progress = silent) -> str:
@@ -46,9 +46,9 @@ def run_demo(out: str | os.PathLike[str], *, seed: int = 0, progress: Progress =
         [
             seconds_table(watch.seconds),
             table(["class", "Gaussians", "IoU of Gaussians", "IoU in test views"], rows),
-            f"{report['views']['used']} views with missed, swapped and frayed masks; scored on {scores['views']} "
-            f"others against the truth: mIoU {percent(scores['mean_iou'])}, mAcc {percent(scores['mean_accuracy'])}, "
-            f"boundary IoU {percent(scores['mean_boundary_iou'])}",
+            f"{counted(report['views']['used'], 'view')} with missed, swapped and frayed masks; scored on "
+            f"{counted(scores['views'], 'other')} against the truth: mIoU {percent(scores['mean_iou'])}, "
+            f"mAcc {percent(scores['mean_accuracy'])}, boundary IoU {percent(scores['mean_boundary_iou'])}",
             f"Look at: {out}/segmented/report.html and {out}/rendered/overlays\n"
             f"Objects: {out}/segmented/classes, PLYs for any 3DGS viewer",
         ]

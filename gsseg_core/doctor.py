@@ -15,8 +15,8 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
-from pathlib import Path
 
+from gsseg_core import kernel_cache
 from gsseg_core.errors import GssegError
 
 _REQUIREMENT = re.compile(r"(?P<name>[A-Za-z0-9._-]+)")
@@ -116,7 +116,7 @@ def _extras() -> Iterator[Finding]:
         if not names:
             continue
         if missing:
-            fix = f"in the folder of gsseg: pip install '.[{extra}]'"
+            fix = f"pip install 'gsseg[{extra}]'"
             yield Finding("options", extra, f"{purpose}: lacks {', '.join(missing)}", "-", fix)
         else:
             yield Finding("options", extra, purpose)
@@ -162,16 +162,16 @@ def _kernels(say: Callable[[str], object]) -> Iterator[Finding]:
             "kernels", "run", f"{type(error).__name__}: {error}", "!!", "install the packages marked !! above"
         )
         return
-    folder = Path(add_votes.stats.cache_path or "")
     compiled = "from the cache" if add_votes.stats.cache_hits else "compiled just now"
     yield Finding(
         "kernels", "run", f"segmented {SIDE**2:,} Gaussians in {time.perf_counter() - start:.1f} s, {compiled}"
     )
-    if os.access(folder, os.W_OK):
-        yield Finding("kernels", "cache", str(folder))
+    if kernel_cache.FOLDER:
+        yield Finding("kernels", "cache", add_votes.stats.cache_path or kernel_cache.FOLDER)
     else:
-        fix = "set NUMBA_CACHE_DIR to a folder that you can write to; else every run compiles what is not there"
-        yield Finding("kernels", "cache", f"{folder} cannot be written to", "-", fix)
+        state = f"none: cannot write to {' or '.join(kernel_cache.candidates())}"
+        fix = f"{kernel_cache.REMEDY}; else every run compiles for a minute or two"
+        yield Finding("kernels", "cache", state, "-", fix)
 
 
 def _ros() -> Iterator[Finding]:

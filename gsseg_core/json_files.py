@@ -7,6 +7,16 @@ from pathlib import Path
 
 from gsseg_core.errors import GssegError
 
+_KINDS = {
+    dict: "an object", list: "a list", str: "text", bool: "true or false", int: "a number", float: "a number",
+    type(None): "null",
+}  # fmt: skip
+
+
+def kind_of(content: object) -> str:
+    """Name the kind of something read from a JSON file, in the words of JSON."""
+    return _KINDS[type(content)]
+
 
 def read_json(path: Path, error: type[GssegError]) -> object:
     """Read a JSON file; raise `error` with one clear line if it is missing or broken."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -15,6 +15,8 @@ from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchEr
 from gsseg_core.gaussian_kernels import share_votes
 from gsseg_core.meaning import decided, guess
 from gsseg_core.operator import Observation, ViewOperator, make_operator
+from gsseg_core.progress import Progress as Progress
+from gsseg_core.progress import silent as silent
 from gsseg_core.scene import GaussianScene
 from gsseg_core.soft_masks import SeenLabels
 from gsseg_core.state_file import State
@@ -30,14 +32,7 @@ MEMORY_BUDGET = 2 << 30
 
 NO_MASK, SEES_NOTHING, ALL_UNKNOWN = "no mask", "sees no Gaussian", "all pixels unknown"
 
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how many steps of it are done, and of how many."""
-
 Self = TypeVar("Self", bound="Learner")
-
-
-def silent(stage: str, done: int, total: int) -> None:
-    """Report no progress."""
 
 
 class Learner(ABC):

@@ -6,6 +6,7 @@ encoding, 255 or 65535, stands for unknown.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import struct
@@ -20,7 +21,8 @@ from PIL.PngImagePlugin import PngInfo
 
 from gsseg_core.atomic import write_atomically
 from gsseg_core.errors import ClassesFileError, MaskFormatError, SettingsError
-from gsseg_core.json_files import read_json
+from gsseg_core.json_files import kind_of, read_json
+from gsseg_core.names import flaw_of_class_name
 
 UNKNOWN = -1
 MAX_LABEL = 65534
@@ -151,17 +153,20 @@ def read_classes(path: str | os.PathLike[str]) -> dict[int, str]:
     Raises
     ------
     ClassesFileError
-        The file is missing or broken, an id is not a whole number from 0 to 65534, or a name is not text.
+        The file is missing or broken, an id is not a whole number from 0 to 65534, or a name is not one line of text
+        of at most 200 characters.
     """
     path = Path(path)
     content = read_json(path, ClassesFileError)
     if not isinstance(content, dict):
-        raise ClassesFileError(f'{path}: holds {type(content).__name__}; expected an object such as {{"1": "chair"}}')
+        raise ClassesFileError(f'{path}: holds {kind_of(content)}; expected an object such as {{"1": "chair"}}')
     names = {0: BACKGROUND_NAME}
     for key, name in content.items():
         if not re.fullmatch(r"0|[1-9][0-9]{0,4}", key) or int(key) >= 2**16 - 1:
             raise ClassesFileError(f"{path}: id {key[:60]!r} is unusable; expected whole numbers from 0 to 65534")
-        if not isinstance(name, str) or not name.strip():
-            raise ClassesFileError(f"{path}: id {key} has the name {name!r}; expected text")
+        if not isinstance(name, str):
+            raise ClassesFileError(f"{path}: id {key} has the name {json.dumps(name)[:60]}; expected text")
+        if flaw := flaw_of_class_name(name):
+            raise ClassesFileError(f"{path}: id {key} has the name {flaw}")
         names[int(key)] = name
     return dict(sorted(names.items()))

@@ -1,14 +1,21 @@
-"""Progress on a terminal."""
+"""Progress of long work, and how it is shown on a terminal."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING
 
-from tqdm import tqdm
+if TYPE_CHECKING:
+    from tqdm import tqdm
 
-from gsseg_core.learner import Progress, silent
+Progress = Callable[[str, int, int], None]
+"""Called with what is being done, how many steps of it are done, and of how many."""
+
+
+def silent(stage: str, done: int, total: int) -> None:
+    """Report no progress."""
 
 
 @contextmanager
@@ -26,22 +33,26 @@ def progress_bars(quiet: bool = False) -> Iterator[Progress]:
 
 
 class _Bars:
-    """One progress bar a stage, on standard error."""
+    """One progress bar a stage, on standard error; where that cannot be written, the work goes on without."""
 
     def __init__(self) -> None:
         self._stage = ""
         self._bar: tqdm[None] | None = None
 
     def __call__(self, stage: str, done: int, total: int) -> None:
-        if self._bar is None or stage != self._stage:
-            self.close()
-            self._stage, self._bar = stage, tqdm(total=total, desc=stage, file=sys.stderr, dynamic_ncols=True)
-        self._bar.update(done - self._bar.n)
-        if done == total:
-            self.close()
+        from tqdm import tqdm
+
+        with suppress(OSError):
+            if self._bar is None or stage != self._stage:
+                self.close()
+                self._stage, self._bar = stage, tqdm(total=total, desc=stage, file=sys.stderr, dynamic_ncols=True)
+            self._bar.update(done - self._bar.n)
+            if done == total:
+                self.close()
 
     def close(self) -> None:
         """Finish the bar that is shown, if there is one."""
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None
+        bar, self._bar = self._bar, None
+        if bar is not None:
+            with suppress(OSError):
+                bar.close()

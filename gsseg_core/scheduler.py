@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import re
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -42,6 +43,7 @@ def connected(address: str) -> Iterator[Client]:
         raise SettingsError(
             f"scheduler {address}: needs Dask, which is not installed; expected: pip install 'gsseg[distributed]'"
         ) from error
+    _check_scheduler(address)
     # What it would tell is raised as an error anyway.
     log = logging.getLogger("distributed.client")
     level = log.level
@@ -50,10 +52,7 @@ def connected(address: str) -> Iterator[Client]:
         client = Client(address, timeout=PATIENCE, set_as_default=False)
     except UNREACHABLE as error:
         log.setLevel(level)
-        raise SchedulerError(
-            f"scheduler {address}: does not answer within {PATIENCE:g} s; expected the address that `dask scheduler` "
-            "prints, such as tcp://host:8786"
-        ) from error
+        raise _no_scheduler(address, "does not answer any more") from error
     try:
         _check_version(f"scheduler {address}", client.run_on_scheduler(_probe()))
         check_workers(client, find_workers(client))
@@ -61,6 +60,48 @@ def connected(address: str) -> Iterator[Client]:
     finally:
         client.close()
         log.setLevel(level)
+
+
+def _check_scheduler(address: str) -> None:
+    """See whether a scheduler answers there; a client of Dask's that is refused or not answered waits for ever."""
+    from distributed.core import rpc
+
+    async def ask() -> str:
+        async with rpc(address if "://" in address else f"tcp://{address}", timeout=PATIENCE) as server:
+            identity: dict[str, str] = await asyncio.wait_for(server.identity(), PATIENCE)
+            return identity["type"]
+
+    answers: list[str | BaseException] = []
+
+    def wait() -> None:
+        try:
+            answers.append(asyncio.run(asyncio.wait_for(ask(), PATIENCE)))
+        except BaseException as error:  # Garbage is read as sizes, kinds and names: anything can come of it.
+            answers.append(error)
+
+    # In a thread, since there may be a loop in this one; and Ctrl-C need not wait for it.
+    log = logging.getLogger("distributed.core")
+    level = log.level
+    log.setLevel(logging.CRITICAL + 1)
+    try:
+        thread = threading.Thread(target=wait, daemon=True)
+        thread.start()
+        thread.join(PATIENCE + 1)
+    finally:
+        log.setLevel(level)
+    answer = answers[0] if answers else TimeoutError()
+    if isinstance(answer, UNREACHABLE):
+        raise _no_scheduler(address, f"does not answer within {PATIENCE:g} s") from answer
+    if isinstance(answer, BaseException):
+        raise _no_scheduler(address, f"what answers is no scheduler ({type(answer).__name__})") from answer
+    if answer != "Scheduler":
+        raise _no_scheduler(address, f"is a {answer.lower()}")
+
+
+def _no_scheduler(address: str, found: str) -> SchedulerError:
+    return SchedulerError(
+        f"scheduler {address}: {found}; expected the address that `dask scheduler` prints, such as tcp://host:8786"
+    )
 
 
 def find_workers(client: Client) -> dict[str, int]:

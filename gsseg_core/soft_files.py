@@ -18,7 +18,7 @@ import numpy.typing as npt
 from PIL import Image, UnidentifiedImageError
 
 from gsseg_core.errors import MaskFormatError, MaskSizeError, SupervisesFileError, UnknownLabelError
-from gsseg_core.json_files import read_json
+from gsseg_core.json_files import kind_of, read_json
 from gsseg_core.masks import MAX_LABEL
 from gsseg_core.soft_masks import SeenLabels, combine_detections, quantise
 
@@ -77,7 +77,7 @@ def read_supervises(
         return {}
     content = read_json(path, SupervisesFileError)
     if not isinstance(content, dict):
-        raise SupervisesFileError(f'{path}: holds {type(content).__name__}; expected {{"*": [ids]}} or stems and ids')
+        raise SupervisesFileError(f'{path}: holds {kind_of(content)}; expected {{"*": [ids]}} or stems and ids')
     known, entries = set(stems), {}
     for stem, ids in content.items():
         if stem != _ANY and stem not in known:

@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from gsseg_core.names import clipped
+from gsseg_core.printable import printable
+
 LEAST = 3
 """Views that are named as those that agree least with the others."""
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Lay out rows in columns: the first flush left, the others flush right."""
-    lines = [list(header), *map(list, rows)]
+    """Lay out rows in columns: the first flush left, the others flush right; long cells are shortened."""
+    lines = [[clipped(printable(cell)) for cell in row] for row in (header, *rows)]
     widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
     lines.insert(1, ["-" * width for width in widths])
     return "\n".join(
@@ -21,6 +24,11 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
         )
         for line in lines
     )
+
+
+def counted(count: int, thing: str, things: str = "") -> str:
+    """Write how many there are of something, such as "1 view" or "1,200 views"."""
+    return f"{count:,} {thing if count == 1 else things or thing + 's'}"
 
 
 def seconds_table(seconds: Mapping[str, float]) -> str:
@@ -39,15 +47,17 @@ def segment_summary(report: Mapping[str, Any], out: str) -> str:
     views, gaussians = report["views"], report["gaussians"]
     rejected = ", ".join(f"{count} {why}" for why, count in views["rejected"].items())
     checked = [view for view in views.get("reliability", []) if view["reliability"] is not None]
-    worst = ", ".join(f"{view['name']} ({percent(view['reliability'])})" for view in checked[:LEAST])
+    worst = ", ".join(
+        f"{printable(clipped(view['name']))} ({percent(view['reliability'])})" for view in checked[:LEAST]
+    )
     return "\n\n".join(
         [
             table(["class", "Gaussians", "confidence"], classes),
-            f"{views['used']} views used"
+            f"{counted(views['used'], 'view')} used"
             + (f", rejected: {rejected}" if rejected else "")
             + (f"\nmasks that agree least with the other views: {worst}" if worst else "")
             + "\n"
-            f"{report['scene']['gaussians']:,} Gaussians: {gaussians['labelled']:,} labelled "
+            f"{counted(report['scene']['gaussians'], 'Gaussian')}: {gaussians['labelled']:,} labelled "
             f"({gaussians['from_neighbours']:,} of them by their neighbours), {gaussians['removed']:,} removed by the "
             f"filter, {gaussians['unobserved']:,} unobserved",
             seconds_table(report["seconds"]),
@@ -64,7 +74,7 @@ def evaluation_summary(scores: Mapping[str, Any]) -> str:
         [f"{entry['id']} {entry['name']}", *(percent(entry[name]) for name in names)] for entry in scores["classes"]
     ]
     mean = ["mean", *(percent(scores[f"mean_{name}"]) for name in names)]
-    return table(["class", "IoU", "accuracy", "boundary IoU"], [*rows, mean]) + f"\n{scores['views']} views"
+    return table(["class", "IoU", "accuracy", "boundary IoU"], [*rows, mean]) + f"\n{counted(scores['views'], 'view')}"
 
 
 def percent(value: float | None) -> str:

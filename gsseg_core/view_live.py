@@ -70,7 +70,7 @@ def open_source(name: str, scene: GaussianScene) -> LiveSource:
     except ModuleNotFoundError as missing:
         raise SettingsError(
             f"live source {name!r}: the Python package {missing.name!r} is missing; expected ROS 2 Jazzy, from apt "
-            "with its setup.sh sourced, or as wheels: pip install ./msg_defs 'gsseg[ros]'"
+            "with its setup.sh sourced, or as wheels: pip install ./msg_defs '.[ros]'"
         ) from missing
     source: LiveSource = make(scene)
     return source

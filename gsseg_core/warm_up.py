@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager
 import numpy as np
 from numba.core import event
 
+from gsseg_core import kernel_cache
 from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
 from gsseg_core.em import EMLearner, EMSettings
@@ -16,6 +17,9 @@ from gsseg_core.reliability import OtherViews
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.votes import VoteLearner
+
+FIRST_RUN = "compiling kernels, a minute or two; only the first run after installing does this"
+EVERY_RUN = f"compiling kernels, a minute or two, as in every run: they cannot be kept; {kernel_cache.REMEDY}"
 
 SIDE = 72
 """Gaussians on a side of the square that is segmented; trees of fewer than 4,096 in all are built by other kernels."""
@@ -29,7 +33,7 @@ class _FirstCompilation(event.Listener):
     def on_start(self, begun: event.Event) -> None:
         if not self._said:
             self._said = True
-            self._say("compiling kernels, a minute or two; only the first run after installing does this")
+            self._say(FIRST_RUN if kernel_cache.FOLDER else EVERY_RUN)
 
     def on_end(self, ended: event.Event) -> None:
         pass

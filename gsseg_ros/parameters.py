@@ -15,6 +15,7 @@ from rclpy.parameter import Parameter
 
 from gsseg_core.devices import DEVICES, checked_device
 from gsseg_core.errors import GssegError, SettingsError
+from gsseg_core.names import flaw_of_class_name
 from gsseg_core.pipeline import PER_VIEW
 from gsseg_core.refine_settings import MAX_K, RefineSettings
 from gsseg_ros.frames import Similarity, pose_from_parameters
@@ -132,9 +133,9 @@ class Settings:
             )
         if not self.map_frame:
             raise SettingsError("parameter map_frame is empty; expected the name of a frame, such as 'map'")
-        if "" in self.class_names:
-            index = self.class_names.index("")
-            raise SettingsError(f"parameter class_names: name {index} is empty; expected a name for every label")
+        for index, flaw in enumerate(map(flaw_of_class_name, self.class_names)):
+            if flaw:
+                raise SettingsError(f"parameter class_names: label {index} has the name {flaw}")
         twice = sorted({name for name in self.class_names if self.class_names.count(name) > 1})
         if twice:
             raise SettingsError(f"parameter class_names: {twice[0]!r} occurs more than once; expected distinct names")

@@ -14,8 +14,10 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 
+from gsseg_core.errors import SettingsError
 from gsseg_core.live import LiveSession
 from gsseg_core.live_ids import PerViewSession
+from gsseg_core.names import class_ids
 from gsseg_core.pipeline import PER_VIEW
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.report import Stopwatch
@@ -207,17 +209,12 @@ def chosen_classes(request: Any, class_names: Mapping[int, str]) -> list[int]:
     Raises
     ------
     UnknownClassError
-        A name or number does not exist.
+        A name or number does not exist, or several classes have the name.
     """
-    ids = {name: k for k, name in class_names.items()}
-    chosen: set[int] = set()
-    for wanted in request.classes:
-        k = ids.get(wanted, int(wanted) if wanted.isascii() and wanted.isdigit() else -1)
-        if k not in class_names:
-            known = ", ".join(class_names.values())
-            raise UnknownClassError(f"class '{wanted[:60]}' does not exist; expected one of {known[:500]}")
-        chosen.add(k)
-    return sorted(chosen or class_names)
+    try:
+        return sorted(class_ids(request.classes, class_names) or class_names)
+    except SettingsError as error:
+        raise UnknownClassError(str(error)) from error
 
 
 def checked_confidence(request: Any) -> float:

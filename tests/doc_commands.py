@@ -23,7 +23,8 @@ from unittest import mock
 import pytest
 from doc_blocks import REPOSITORY
 
-from gsseg_core.cli import build_parser, main
+from gsseg_core.cli import main
+from gsseg_core.cli_parser import build_parser
 
 TIMEOUT = 60
 _SHELL = re.compile(r"[|&><;`]|\$\(")

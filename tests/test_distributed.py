@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -310,6 +313,58 @@ def test_what_cannot_be_distributed_is_one_clear_line(
     stderr = capsys.readouterr().err
     assert stderr.startswith("gsseg: error: ") and says in stderr and stderr.count("\n") == 1
     assert not (data.parent / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("answer", "says"),
+    [(None, "does not answer within 0.5 s"), (b"HTTP/1.1 400 Bad Request\r\n\r\n" * 9, "what answers is no scheduler")],
+)
+def test_a_port_where_no_scheduler_answers_is_one_clear_line_in_time(
+    data: Path,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    answer: bytes | None,
+    says: str,
+) -> None:
+    monkeypatch.setattr(scheduler, "PATIENCE", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve() -> None:
+            with suppress(OSError), server.accept()[0] as connection:
+                if answer:
+                    connection.sendall(answer)
+                connection.recv(1 << 20)
+                connection.recv(1 << 20)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+        assert main(segment(data, "out", "--scheduler", address)) == 2
+        thread.join(20)
+    stderr = capfd.readouterr().err
+    assert stderr.startswith(f"gsseg: error: scheduler {address}: {says}") and stderr.count("\n") == 1
+    assert not thread.is_alive() and not (data.parent / "out").exists()
+
+
+def test_an_address_of_a_worker_is_said_to_be_none_of_a_scheduler(client: Any) -> None:
+    worker = next(iter(client.nthreads()))
+    with pytest.raises(SchedulerError, match="is a worker; expected the address that"), scheduler.connected(worker):
+        pass
+
+
+def test_ctrl_c_while_workers_learn_ends_with_130_and_not_a_word(address: str, data: Path) -> None:
+    arguments = [option for option in segment(data, "out", "--scheduler", address) if option != "--quiet"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "gsseg_core.cli", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stderr is not None
+        stderr = b""
+        while b"observe:" not in stderr and process.poll() is None:
+            stderr += os.read(process.stderr.fileno(), 4096)
+        process.send_signal(signal.SIGINT)
+        out, rest = process.communicate(timeout=60)
+    assert (process.returncode, out) == (130, b""), stderr + rest
+    assert not re.search(rb"Traceback|Exception|Error|distributed", stderr + rest), stderr + rest
 
 
 def test_without_dask_the_error_says_what_to_install(

@@ -22,7 +22,8 @@ import pytest
 from doc_blocks import FENCE, FIRST, PAGES, REPOSITORY, Block, blocks_of, needs_ros
 from doc_commands import Started, check, core_libraries, kind_of, run_commands, words_of
 
-from gsseg_core.cli import COMMANDS, main
+from gsseg_core.cli import main
+from gsseg_core.cli_parser import COMMANDS
 from gsseg_core.dataset import Dataset
 
 MOST_NOT_RUN = 4

@@ -12,9 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from gsseg_core import doctor
-from gsseg_core.cli import COMMANDS, build_parser, main
+from gsseg_core import doctor, kernel_cache
+from gsseg_core.cli import main
 from gsseg_core.cli_completion import SHELLS, subparsers
+from gsseg_core.cli_parser import COMMANDS, build_parser
 from gsseg_core.doctor import Finding, describe, examine, works
 
 
@@ -55,10 +56,10 @@ def test_every_argument_is_explained() -> None:
             assert action.help, f"gsseg {name}: {action.option_strings or action.dest} is not explained"
 
 
-def test_help_waits_for_no_kernel_and_no_pytorch() -> None:
-    slow = ("torch", "distributed", "pycolmap", "shtab", "viser", "rclpy")
+def test_help_waits_for_no_kernel_and_no_large_library() -> None:
+    slow = ("numpy", "numba", "scipy", "torch", "distributed", "pycolmap", "shtab", "viser", "rclpy")
     program = (
-        "import sys; from gsseg_core.cli import build_parser; build_parser();"
+        "import sys; from gsseg_core.cli import main; from gsseg_core.cli_parser import build_parser; build_parser();"
         f"sys.exit(','.join(m for m in {slow} if m in sys.modules) or 0)"
     )
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
@@ -124,7 +125,7 @@ def test_doctor_finds_that_the_core_works(findings: list[Finding], capsys: pytes
     assert works(findings)
     assert named(findings, "numpy").state == metadata.version("numpy")
     assert "segmented 5,184 Gaussians" in named(findings, "run").state
-    assert Path(named(findings, "cache").state.removesuffix(" cannot be written to")).is_dir()
+    assert Path(named(findings, "cache").state).is_dir()
     assert main(["doctor"]) == 0
     text = capsys.readouterr().out
     assert "gsseg works here" in text and all(finding.name in text for finding in findings)
@@ -137,16 +138,16 @@ def test_doctor_says_what_to_type_for_all_that_is_missing(monkeypatch: pytest.Mo
     found = examine()
     assert not works(found)
     assert named(found, "nosuch-library").fix == "pip install nosuch-library"
-    assert named(found, "view").mark == "-" and "pip install '.[view]'" in named(found, "view").fix
+    assert named(found, "view").mark == "-" and "pip install 'gsseg[view]'" in named(found, "view").fix
     assert named(found, "rclpy").mark == "-"
     assert all(finding.fix for finding in found if finding.mark in ("-", "!!") and finding.name != "programs")
     assert "does not work here" in describe(found)
 
 
 def test_doctor_reports_a_kernel_cache_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor.os, "access", lambda path, mode: False)
+    monkeypatch.setattr(kernel_cache, "FOLDER", None)
     found = named(examine(), "cache")
-    assert found.mark == "-" and "NUMBA_CACHE_DIR" in found.fix
+    assert found.mark == "-" and "NUMBA_CACHE_DIR" in found.fix and kernel_cache.candidates()[-1] in found.state
 
 
 def test_doctor_reports_kernels_that_do_not_run(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,9 +35,10 @@ from gsseg_core.cli import main
 from gsseg_core.dataset import View
 from gsseg_core.errors import EmptySceneError, MaskSizeError, SceneValueError, SettingsError
 from gsseg_core.export import export_classes
+from gsseg_core.names import class_ids
 from gsseg_core.operator import make_operator
 from gsseg_core.refine_settings import RefineSettings
-from gsseg_core.removal import class_ids, without_objects
+from gsseg_core.removal import without_objects
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
 from gsseg_core.silhouettes import BEHIND, ObjectScores, depths, objects_of, surface
@@ -298,9 +299,19 @@ def test_what_cannot_be_removed_is_refused_by_name() -> None:
         without_objects(SCENE, result, [])
     with pytest.raises(EmptySceneError, match="nothing is left without 4 classes"):
         without_objects(SCENE, result, range(NUM_CLASSES))
-    with pytest.raises(SettingsError, match="class 'chair' is not in the segmentation; expected one of background"):
-        class_ids(result, ["box", "chair"])
-    assert class_ids(result, ["box", "1"]) == [3, 1]
+    with pytest.raises(SettingsError, match=r"class 'chair' does not exist; expected one of 0 \(background\), 1"):
+        class_ids(["box", "chair"], result.class_names)
+    assert class_ids(["box", "1"], result.class_names) == [3, 1]
+    with pytest.raises(SettingsError, match=r"2 classes have the name 'chair'; expected one of their ids, 4, 6$"):
+        class_ids(["chair"], {4: "chair", 5: "cup", 6: "chair"})
+
+
+def test_a_number_is_the_id_of_a_class_whatever_others_are_called() -> None:
+    names = {1: "7", 2: "007", 7: "chair", 9: "8"}
+    assert class_ids(["7", "1", "7"], names) == [7, 1]
+    assert class_ids(["8", "chair"], names) == [9, 7]
+    with pytest.raises(SettingsError, match="class '²' does not exist"):
+        class_ids(["²"], names)
 
 
 def test_gsseg_remove_writes_the_rest_and_refuses_what_is_not_there(
@@ -311,10 +322,10 @@ def test_gsseg_remove_writes_the_rest_and_refuses_what_is_not_there(
     command = ["remove", f"{data}/scene.ply", "--segmentation", f"{tmp_path}/segmentation.npz"]
     assert main([*command, "--class", "box", "--class", "1", "--out", f"{tmp_path}/rest.ply"]) == 0
     kept = int((~np.isin(TRUTH, [1, 3])).sum())
-    assert f"{kept} of {len(SCENE)} Gaussians" in capsys.readouterr().out
+    assert f"without 3 (box), 1 (red ball): {kept:,} of {len(SCENE):,} Gaussians" in capsys.readouterr().out
     assert len(GaussianScene.load(tmp_path / "rest.ply")) == kept
     assert main([*command, "--class", "chair", "--out", f"{tmp_path}/none.ply"]) == 2
-    assert "class 'chair' is not in the segmentation" in capsys.readouterr().err
+    assert "class 'chair' does not exist" in capsys.readouterr().err
     assert not (tmp_path / "none.ply").exists()
 
 

@@ -245,7 +245,7 @@ def test_supervises_json_tells_what_label_images_say_something_of(tmp_path: Path
     ("content", "message"),
     [
         ("{", "supervises.json"),
-        ("[1]", "holds list; expected"),
+        ("[1]", "holds a list; expected"),
         ('{"nobody": [1]}', "names the view 'nobody', which has no camera"),
         ('{"view1": []}', "expected a list of ids"),
         ('{"view1": [true]}', "expected a list of ids"),

@@ -1,0 +1,65 @@
+"""What Ctrl-C does to the program `gsseg`: it ends with exit code 130, in silence.
+
+Python raises KeyboardInterrupt wherever it happens to be, and in an import, in a callback from C or at the end of the
+program nobody can catch that. So there the program leaves at once, which no file minds: all are written beside and
+renamed. Only while a command works the interrupt is raised, so that it can tidy up; a second one does not wait for it.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from types import FrameType, TracebackType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sys import UnraisableHookArgs
+
+EXIT_CODE = 130
+
+_came = False
+
+
+def leave_at_once() -> None:
+    """From now on Ctrl-C ends this process on the spot."""
+    _handle(_leave)
+    sys.excepthook, sys.unraisablehook = _print_exception, _print_unraisable
+
+
+def raise_once() -> None:
+    """From now on the first Ctrl-C raises KeyboardInterrupt."""
+    _handle(_raise)
+
+
+def came() -> bool:
+    """Whether KeyboardInterrupt was raised; an error that arrives in its place is a consequence."""
+    return _came
+
+
+def _handle(handler: object) -> None:
+    # Who starts a program in the background may have it deaf to what is typed; it stays so.
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, handler)  # type: ignore[arg-type]
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    os._exit(EXIT_CODE)
+
+
+def _raise(number: int, frame: FrameType | None) -> None:
+    global _came
+    _came = True
+    _handle(_leave)
+    raise KeyboardInterrupt
+
+
+def _print_exception(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    if not issubclass(kind, KeyboardInterrupt):
+        sys.__excepthook__(kind, error, trace)
+
+
+def _print_unraisable(unraisable: UnraisableHookArgs) -> None:
+    if issubclass(unraisable.exc_type, KeyboardInterrupt):
+        os._exit(EXIT_CODE)  # Raised where Python could only have printed it.
+    sys.__unraisablehook__(unraisable)

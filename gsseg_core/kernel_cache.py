@@ -1,0 +1,60 @@
+"""Where compiled kernels are kept from one run to the next, and what is done where they cannot be kept.
+
+numba looks for a folder when a kernel is defined, that is, when its module is imported, and raises an error if it may
+write to none. So `gsseg_core` looks before, and where there is none the kernels do without.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+
+REMEDY = "set NUMBA_CACHE_DIR to a folder that you can write to"
+
+
+def candidates() -> list[str]:
+    """List the folders that numba tries, in its order."""
+    user = "~/Library/Caches" if sys.platform == "darwin" else os.environ.get("XDG_CACHE_HOME", "~/.cache")
+    own = os.path.join(os.path.dirname(os.path.abspath(__file__)), "__pycache__")
+    return [
+        *filter(None, [os.environ.get("NUMBA_CACHE_DIR")]),
+        own,
+        os.path.join(os.path.expanduser(user), "numba"),
+    ]
+
+
+def writable(folder: str) -> bool:
+    """Whether a file can be written there; only trying tells, on read-only and full disks and for root alike."""
+    path = os.path.join(folder, f".gsseg-{os.urandom(6).hex()}")
+    try:
+        os.makedirs(folder, exist_ok=True)
+        with open(path, "xb") as file:
+            file.write(bytes(4096))
+    except OSError:
+        return False
+    finally:
+        with contextlib.suppress(OSError):
+            os.unlink(path)
+    return True
+
+
+def _do_without() -> None:
+    """Have numba compile the kernels of gsseg as if nobody had asked to keep them."""
+    from numba.core.dispatcher import Dispatcher
+
+    keep = Dispatcher.enable_caching
+
+    def enable_caching(self: Dispatcher) -> None:
+        if not self.py_func.__module__.startswith(__package__):
+            keep(self)
+
+    Dispatcher.enable_caching = enable_caching  # type: ignore[method-assign]
+
+
+FOLDER: str | None = next(filter(writable, candidates()), None)
+"""The folder that numba will take; None where it can write to none, so that each run compiles anew."""
+
+if FOLDER is None:
+    with contextlib.suppress(ImportError):  # Without numba there are no kernels; `gsseg doctor` says so.
+        _do_without()

@@ -1,0 +1,99 @@
+"""Ctrl-C ends the program `gsseg` with exit code 130, in silence, whatever it is doing."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+# Like `bin/gsseg`. A finder that finds nothing counts imports, and interrupts a copy of the process at every so many.
+COPIES = """
+import os, signal, sys, warnings
+warnings.simplefilter("ignore", DeprecationWarning)  # Newer Pythons warn of copies of processes with threads.
+every = int(sys.argv.pop(1))
+class Interrupter:
+    count, codes = 0, {}
+    def find_spec(self, name, path=None, target=None):
+        Interrupter.count += 1
+        if Interrupter.count % every or "gsseg_core.interrupts" not in sys.modules:
+            return
+        copy = os.fork()
+        if copy == 0:
+            sys.meta_path.remove(self)
+            signal.alarm(60)
+            os.kill(os.getpid(), signal.SIGINT)
+        else:
+            Interrupter.codes[name] = os.waitstatus_to_exitcode(os.waitpid(copy, 0)[1])
+process = os.getpid()
+from gsseg_core.cli import main
+sys.meta_path.insert(0, Interrupter())
+try:
+    sys.exit(main())
+finally:
+    if os.getpid() == process:
+        print(len(Interrupter.codes), {name: code for name, code in Interrupter.codes.items() if code != 130})
+"""
+
+# The command `gsseg doctor` does `work` instead.
+AT_WORK = """
+import atexit, ctypes, os, signal, sys
+def interrupt():
+    os.kill(os.getpid(), signal.SIGINT)
+def work(options):
+{work}
+from gsseg_core import cli_doctor
+cli_doctor.run, sys.argv = work, ["gsseg", "doctor"]
+from gsseg_core.cli import main
+sys.exit(main())
+"""
+
+
+def run(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", program, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+
+
+@pytest.mark.parametrize(
+    ("every", "arguments", "told"),
+    [(1, ["completion", "bash"], ""), (151, ["segment", "no.ply", "--data", "no", "--out", "no"], "no.ply")],
+)
+def test_ctrl_c_at_any_import_ends_with_130_and_not_a_word(every: int, arguments: list[str], told: str) -> None:
+    done = run(COPIES, str(every), *arguments)
+    count, wrong = done.stdout.splitlines()[-1].split(" ", 1)
+    assert wrong == "{}" and int(count) >= 5, done.stderr
+    assert done.stderr.count("\n") == bool(told) and told in done.stderr, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("work", "code"),
+    [("interrupt()", 130),
+     ("ctypes.CFUNCTYPE(None)(interrupt)(); import time; time.sleep(60)", 130),
+     ("try: interrupt()\n    except KeyboardInterrupt: raise RuntimeError('cancelled')", 130),
+     ("try: interrupt()\n    finally: interrupt()", 130),
+     ("atexit.register(interrupt); return 0", 130),
+     ("signal.signal(signal.SIGINT, signal.SIG_IGN); interrupt(); return 7", 7)],
+)  # fmt: skip
+def test_an_interrupt_is_not_lost_and_not_printed_wherever_it_is_raised(work: str, code: int) -> None:
+    done = run(AT_WORK.replace("{work}", f"    {work}"))
+    assert (done.returncode, done.stdout, done.stderr) == (code, "", "")
+
+
+def test_a_job_in_the_background_stays_deaf_to_what_is_typed() -> None:
+    program = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n" + AT_WORK
+    done = run(program.replace("{work}", "    interrupt(); return 7"))
+    assert (done.returncode, done.stderr) == (7, "")
+
+
+def test_ctrl_c_while_kernels_compile_ends_with_130_and_not_a_word(tmp_path: Path) -> None:
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-m", "gsseg_core.cli", "doctor"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment) as process:
+        assert process.stdout is not None and process.stderr is not None
+        assert b"compiling kernels" in process.stderr.readline()
+        process.send_signal(signal.SIGINT)
+        assert process.communicate(timeout=120) == (b"", b"")
+    assert process.returncode == 130

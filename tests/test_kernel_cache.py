@@ -1,0 +1,82 @@
+"""Where compiled kernels cannot be kept, everything works all the same."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import gsseg_core
+from gsseg_core import kernel_cache, warm_up
+
+# Every module with kernels is imported; one is compiled and run.
+EVERY_KERNEL = """
+import importlib, os, pathlib, gsseg_core
+folder = pathlib.Path(gsseg_core.__file__).parent
+kernels = [path.stem for path in folder.glob("*.py") if "cache=True" in path.read_text()]
+for name in kernels:
+    importlib.import_module(f"gsseg_core.{name}")
+import numpy as np
+from gsseg_core import kernel_cache
+from gsseg_core.regions import _root
+print(len(kernels) > 15, kernel_cache.FOLDER, _root(np.array([0, 0, 1]), 2), _root.stats.cache_path)
+"""
+
+
+@pytest.fixture
+def nowhere(tmp_path: Path) -> dict[str, str]:
+    """The environment of a copy of the package that numba can write nothing for; root may write to any real folder."""
+    shutil.copytree(Path(gsseg_core.__file__).parent, tmp_path / "gsseg_core", ignore=shutil.ignore_patterns("__pyc*"))
+    (tmp_path / "gsseg_core/__pycache__").touch()  # A file, where a folder is expected.
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path), "HOME": "/dev/null", "PYTHONDONTWRITEBYTECODE": "1"}
+    for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
+        environment.pop(name, None)
+    return environment
+
+
+def run(environment: dict[str, str], *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False, env=environment, cwd="/")
+
+
+def test_every_kernel_loads_and_runs_where_none_can_be_kept(nowhere: dict[str, str], tmp_path: Path) -> None:
+    done = run(nowhere, "-c", EVERY_KERNEL)
+    assert done.stdout == "True None 0 None\n", done.stderr
+    done = run(nowhere, "-m", "gsseg_core.cli", "segment", "--help")
+    assert done.returncode == 0 and done.stderr == ""
+    done = run({**nowhere, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}, "-c", EVERY_KERNEL)
+    assert done.stdout.startswith(f"True {tmp_path}/cache 0 {tmp_path}/cache/"), done.stderr
+    assert list((tmp_path / "cache").rglob("*.nbi"))
+
+
+def test_only_trying_tells_whether_a_folder_can_be_written_to(tmp_path: Path) -> None:
+    assert kernel_cache.writable(str(tmp_path / "new/folder")) and not list((tmp_path / "new/folder").iterdir())
+    (tmp_path / "file").touch()
+    assert not kernel_cache.writable(str(tmp_path / "file"))
+    assert not kernel_cache.writable("/proc/gsseg")
+
+
+def test_numbas_own_order_of_folders_is_followed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from numba.misc.appdirs import AppDirs
+
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "/first")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    first, own, user = kernel_cache.candidates()
+    assert first == "/first" and own.endswith("gsseg_core/__pycache__")
+    assert user == AppDirs(appname="numba", appauthor=False).user_cache_dir
+
+
+@pytest.mark.parametrize(("folder", "told"), [("/x", "only the first run"), (None, "set NUMBA_CACHE_DIR to a folder")])
+def test_who_waits_for_a_compilation_is_told_whether_it_comes_again(
+    monkeypatch: pytest.MonkeyPatch, folder: str | None, told: str
+) -> None:
+    monkeypatch.setattr(kernel_cache, "FOLDER", folder)
+    lines: list[str] = []
+    listener = warm_up._FirstCompilation(lines.append)
+    listener.on_start(None)
+    listener.on_start(None)
+    assert len(lines) == 1 and told in lines[0]
