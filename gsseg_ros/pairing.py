@@ -44,11 +44,12 @@ class PoseSource(Protocol):
 class Paired(NamedTuple):
     """A mask, and what belongs to it."""
 
-    name: str  # Unique: the epoch and the stamp.
+    name: str  # Unique: the pairing's prefix, the epoch and the stamp.
     stamp: int
     mask: Any
     camera_info: Any
     pose: Pose  # (4, 4) camera in the map
+    era: object = None  # As it was given with the mask.
 
 
 @dataclass(frozen=True)
@@ -129,6 +130,8 @@ class Pairing:
         `ExactPoses`, `InterpolatedPoses` or `gsseg_ros.tf_poses.TfPoses`.
     settings : PairingSettings
         How long masks wait.
+    prefix : str
+        What the names of all pairs begin with: epochs and stamps of another pairing may be the same.
 
     Attributes
     ----------
@@ -142,11 +145,12 @@ class Pairing:
         dropped then, and the same stamps are new ones.
     """
 
-    def __init__(self, poses: PoseSource, settings: PairingSettings | None = None) -> None:
+    def __init__(self, poses: PoseSource, settings: PairingSettings | None = None, prefix: str = "") -> None:
         self.dropped: Counter[str] = Counter()
         self.out_of_order = 0
         self.time_jumps = 0
         self._poses = poses
+        self._prefix = prefix
         self._settings = settings or PairingSettings()
         self._lock = threading.Lock()
         self._clock = _Clock(self._settings.max_waiting)
@@ -155,8 +159,8 @@ class Pairing:
         self._waiting: dict[int, _Waiting] = {}
         self._finished: list[Paired] = []
 
-    def add_mask(self, stamp: int, message: Any, frame_id: str = "") -> None:
-        """Take in a mask whose header has this stamp and frame."""
+    def add_mask(self, stamp: int, message: Any, frame_id: str = "", era: object = None) -> None:
+        """Take in a mask whose header has this stamp and frame; `era` comes out with it."""
         with self._lock:
             newest = self._clock.newest.get("mask", stamp)
             if not self._arrives("mask", stamp):
@@ -166,7 +170,7 @@ class Pairing:
             else:
                 self.out_of_order += newest - _JUMP_NS < stamp < newest
                 self._seen.add(stamp, None)
-                self._waiting[stamp] = _Waiting(message, frame_id)
+                self._waiting[stamp] = _Waiting(message, frame_id, era)
                 self._pair(stamp)
                 if len(self._waiting) > self._settings.max_waiting:
                     self._pair(min(self._waiting), last_chance=True)
@@ -212,6 +216,14 @@ class Pairing:
             finished, self._finished = self._finished, []
             return finished
 
+    def clear(self) -> int:
+        """Forget the masks that wait, but no pose and no camera_info; return how many they were."""
+        with self._lock:
+            forgotten = len(self._waiting) + len(self._finished)
+            self._waiting.clear()
+            self._finished.clear()
+            return forgotten
+
     @property
     def waiting(self) -> int:
         """How many masks wait."""
@@ -240,8 +252,8 @@ class Pairing:
             waiting.pose = self._poses.at(stamp, waiting.frame_id)
         info = self._camera_info(stamp, last_chance)
         if waiting.pose is not None and info is not None:
-            name = f"{self._clock.epoch if epoch is None else epoch}_{stamp}"
-            self._finished.append(Paired(name, stamp, waiting.mask, info, waiting.pose))
+            name = f"{self._prefix}{self._clock.epoch if epoch is None else epoch}_{stamp}"
+            self._finished.append(Paired(name, stamp, waiting.mask, info, waiting.pose, waiting.era))
         elif waiting.pose is None and (last_chance or self._poses.too_late(stamp)):
             self.dropped["no_pose"] += 1
         elif last_chance:
@@ -264,6 +276,7 @@ class Pairing:
 class _Waiting:
     mask: Any
     frame_id: str
+    era: object
     pose: Pose | None = None
     since: float | None = None
 
