@@ -105,7 +105,7 @@ class LiveSession:
 
     @property
     def era(self) -> object:
-        """Another one as soon as all that was known has been forgotten or replaced: by `reset`, by `load`."""
+        """Another one as soon as all that was known is forgotten or replaced, by `reset`, `load` or `retire`."""
         return self._era
 
     @property
@@ -341,6 +341,10 @@ class LiveSession:
 
         threading.Thread(target=find, name="neighbours").start()
 
+    def retire(self) -> None:
+        """Begin another `era`, in which no view of before is fused; call it when another session takes its place."""
+        self._era = object()
+
     def reset(self) -> int:
         """Forget votes, views and codes; return how many views were forgotten."""
         with self._lock:
@@ -356,10 +360,10 @@ class LiveSession:
         self._learnt, self._kept = None, None
         self.num_fused = 0
         self._version += 1
-        self._era = object()
+        self.retire()
 
     def _make_room(self, view: View) -> None:
-        if self._declared or (needed := view.largest_label + 1) <= self._live.num_classes:
+        if self._declared or not view.has_mask or (needed := view.largest_label + 1) <= self._live.num_classes:
             return
         affordable = VOTES_LIMIT // (8 * len(self.scene))
         if needed > min(self.max_classes, affordable):

@@ -163,7 +163,12 @@ class Services:
         else:
             raise InvalidRequestError("path and the parameter scene_path are both empty; expected a 3DGS PLY in either")
         with workspace.slot.take("load_scene") as job, workspace.run("load_scene") as run:
-            workspace.load_scene(path, job.check)
+
+            def check() -> None:
+                workspace.require_active()
+                job.check()
+
+            workspace.load_scene(path, check)
             self._clear(run)
             session = workspace.session
         corners = workspace.settings.scene_to_map.points_to_map(session.scene.means)

@@ -155,7 +155,8 @@ class Workspace:
         else:
             session = LiveSession(scene, settings.names_by_id, **kept)
         check()
-        self._session, self.dropped = session, Counter()
+        self._replace(session)
+        self.dropped = Counter()
         self.forget_waiting()
         session.prepare(RefineSettings(k=settings.k))
 
@@ -174,7 +175,12 @@ class Workspace:
 
     def close(self) -> None:
         """Forget the scene."""
-        self._session = None
+        self._replace(None)
+
+    def _replace(self, session: LiveSession | None) -> None:
+        before, self._session = self._session, session
+        if before is not None:
+            before.retire()
 
     def require_active(self) -> None:
         """Raise `NotActiveError` unless the node is active."""
