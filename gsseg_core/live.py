@@ -233,7 +233,7 @@ class LiveSession:
         outcome = Outcome(learnt, len(teacher.history_), teacher.converged_, teacher.loss, dict(teacher.rejected))
         with self._lock:
             if era is not self._era:
-                raise NoUsableViewsError("all views were forgotten while they were learnt from; nothing has changed")
+                raise NoUsableViewsError("all views were forgotten while they were learnt from; nothing was learnt")
             if dataset is not None and not self._declared:
                 self._names.update(dataset.class_names)
             self._live.grow(num_classes)
@@ -342,7 +342,7 @@ class LiveSession:
         threading.Thread(target=find, name="neighbours").start()
 
     def retire(self) -> None:
-        """Begin another `era`, in which no view of before is fused; call it when another session takes its place."""
+        """Begin another `era`: what is still being fused or learnt comes too late. What is known stays."""
         self._era = object()
 
     def reset(self) -> int:

@@ -138,6 +138,7 @@ class SegmentNode(LifecycleNode):
         if self.inputs is not None:
             self.inputs.close()
             self.inputs = None
+        self.workspace.retire()
 
     def close(self) -> None:
         """Stop all threads and take the node away."""

@@ -177,6 +177,11 @@ class Workspace:
         """Forget the scene."""
         self._replace(None)
 
+    def retire(self) -> None:
+        """Let nothing that is still at work have any effect; what is known stays."""
+        if self._session is not None:
+            self._session.retire()
+
     def _replace(self, session: LiveSession | None) -> None:
         before, self._session = self._session, session
         if before is not None:
@@ -205,8 +210,8 @@ class Workspace:
             run.stamp, run.revision, run.dropped = self._now(), self._revision, Counter(self.dropped)
 
     def holds(self, run: Run) -> bool:
-        """Whether what a run goes by is still what is known, of a node that is active."""
-        return self.active and run.era is self.era
+        """Whether what a run goes by is still what is known, and the node has not been deactivated meanwhile."""
+        return run.era is self.era
 
     def path(self, request: str, default: str = "") -> Path:
         """Resolve a path of a request, absolute or relative to data_root.

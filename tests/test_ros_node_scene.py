@@ -191,6 +191,8 @@ def test_deactivate_waits_for_a_request_at_work(here: NodeHere, robot: Robot) ->
     joined(ending)
     assert answers and answers[0].error_code == 0
     joined(asking)
+    (report,) = robot.latched((SegmentationReport, "report"))
+    assert report.revision == answers[0].report.revision
 
 
 def test_a_request_that_outlives_cleanup_publishes_nothing_and_makes_no_topic(
