@@ -6,23 +6,20 @@ import os
 import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
 from gsseg_core.dataset import Dataset, View, spread
 from gsseg_core.errors import (
     GssegError,
-    IntrinsicsError,
-    MaskFormatError,
-    MaskSizeError,
     NoCodesError,
-    PoseError,
+    NoUsableViewsError,
     SettingsError,
     StateFileError,
     UnknownLabelError,
 )
 from gsseg_core.held_out import calibrate
+from gsseg_core.live_results import SCENE_CHANGED, Outcome, Rejection
 from gsseg_core.masks import BACKGROUND_NAME
 from gsseg_core.neighbours import neighbours_of
 from gsseg_core.pipeline import make_learner
@@ -38,60 +35,6 @@ VOTES_LIMIT = 2 << 30
 
 LIVE = "votes"
 """Name of the learner that fuses views as they arrive."""
-
-_REASONS: dict[type[GssegError], str] = {
-    MaskFormatError: "mask_format",
-    MaskSizeError: "size_mismatch",
-    UnknownLabelError: "unknown_label",
-    PoseError: "bad_pose",
-    IntrinsicsError: "bad_camera_info",
-}
-
-
-@dataclass(frozen=True)
-class Rejection:
-    """Why a view could not be used.
-
-    Attributes
-    ----------
-    reason : str
-        A short name, to count by.
-    message : str
-        What was found and what was expected.
-    """
-
-    reason: str
-    message: str
-
-    @classmethod
-    def of(cls, error: GssegError) -> Rejection:
-        """Sort an error by its cause."""
-        return cls(_REASONS.get(type(error), "unusable"), str(error))
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    """What `LiveSession.learn` did.
-
-    Attributes
-    ----------
-    learnt : Learnt
-        The codes, in force from now on.
-    num_steps : int
-        Steps that were done; 0 for a learner that has none.
-    converged : bool
-        Whether it stopped because another step would have changed little.
-    loss : float
-        What the learner minimises, per labelled pixel, in nats, at the end; NaN where it has no such thing.
-    rejected : dict of str to str
-        Names of views that could not be used, and why.
-    """
-
-    learnt: Learnt
-    num_steps: int
-    converged: bool
-    loss: float
-    rejected: dict[str, str]
 
 
 class LiveSession:
@@ -112,6 +55,8 @@ class LiveSession:
         The last so many views are kept for `learn`; votes are never dropped.
     device : str
         Where views are rendered.
+    max_classes : int
+        Without `class_names`: a label that would make more classes than this, the background included, is refused.
 
     Attributes
     ----------
@@ -120,6 +65,8 @@ class LiveSession:
     num_fused : int
         Views in the votes.
     """
+
+    _LABEL, _REMEDY = "mask holds the label", ", or class_names that declare it"
 
     num_fused: int
     _learnt: Learnt | None
@@ -132,10 +79,12 @@ class LiveSession:
         *,
         max_views: int = 200,
         device: str = "cpu",
+        max_classes: int = 256,
     ) -> None:
-        if max_views < 1:
-            raise SettingsError(f"max_views is {max_views}; expected at least 1")
-        self.scene, self.max_views, self.device = scene, max_views, device
+        for name, value in (("max_views", max_views), ("max_classes", max_classes)):
+            if value < 1:
+                raise SettingsError(f"{name} is {value}; expected at least 1")
+        self.scene, self.max_views, self.device, self.max_classes = scene, max_views, device, max_classes
         self.rejected: Counter[str] = Counter()
         self._declared = bool(class_names)
         self._names = {0: BACKGROUND_NAME, **(class_names or {})}
@@ -155,6 +104,11 @@ class LiveSession:
         return self._version
 
     @property
+    def era(self) -> object:
+        """Another one as soon as all that was known is forgotten or replaced, by `reset`, `load` or `retire`."""
+        return self._era
+
+    @property
     def num_views(self) -> int:
         """Views that are kept for `learn`."""
         return len(self._live.views)
@@ -169,8 +123,19 @@ class LiveSession:
         """Whether anything is known of the scene."""
         return self._learnt is not None or self.num_fused > 0
 
-    def fuse(self, view: View) -> Rejection | None:
+    def fuse(self, view: View, era: object = None) -> Rejection | None:
         """Add a view to the votes, and keep it for `learn`.
+
+        A view that is kept under the same name is replaced, its votes taken back: it still is one view. The names of
+        views that are not kept any more are not known, so that under one of these comes another view.
+
+        Parameters
+        ----------
+        view : View
+            With a mask.
+        era : object, optional
+            What `era` was when the view was taken: if that has changed, the view belongs to what was forgotten, and is
+            not used. Such a view is not counted as rejected here.
 
         Returns
         -------
@@ -178,16 +143,22 @@ class LiveSession:
             Why it cannot be used; then nothing has changed but the count of rejected views.
         """
         with self._lock:
+            if era is not None and era is not self._era:
+                return Rejection(SCENE_CHANGED, f"view '{view.name}': it came before all that was known was forgotten")
             try:
-                self._make_room(view)
-                if not self._live.observe(view):
-                    why = self._live.rejected.pop(view.name)
-                    return self.reject(Rejection(why.replace(" ", "_"), f"view '{view.name}': {why}"))
+                return self._fuse(view)
             except GssegError as error:
                 return self.reject(Rejection.of(error))
-            self.num_fused += 1
-            self._version += 1
-            self._drop_old_views()
+
+    def _fuse(self, view: View) -> Rejection | None:
+        self._make_room(view)
+        repeated = view.name in self._live.views
+        if not self._live.observe(view):
+            why = self._live.rejected.pop(view.name)
+            return self.reject(Rejection(why.replace(" ", "_"), f"view '{view.name}': {why}"))
+        self.num_fused += not repeated
+        self._version += 1
+        self._drop_old_views()
         return None
 
     def reject(self, rejection: Rejection) -> Rejection:
@@ -228,17 +199,24 @@ class LiveSession:
         Raises
         ------
         NoUsableViewsError
-            There is no view to learn from.
+            There is no view to learn from, or all that was known was forgotten meanwhile.
+        UnknownLabelError
+            The dataset has more classes than `max_classes`.
         GssegError
             A file of the dataset is broken.
         """
         watch = watch or Stopwatch()
         with self._lock:
-            views, num_classes = list(self._live.views.values()), self._live.num_classes
+            views, num_classes, era = list(self._live.views.values()), self._live.num_classes, self._era
         if dataset is not None:
             views = dataset.views("train")
             if not self._declared:
                 num_classes = max(num_classes, dataset.num_classes)
+                if num_classes > self.max_classes:
+                    raise UnknownLabelError(
+                        f"{dataset.root}: has {num_classes} classes; expected at most {self.max_classes}, as "
+                        "max_classes says, or class_names that declare them"
+                    )
         teacher = make_learner(learner, self.scene, num_classes, max_steps=max_steps, device=self.device)
         views = spread(views, num_views)
 
@@ -254,6 +232,8 @@ class LiveSession:
         learnt = Learnt(learner, teacher.codes_, len(teacher.views), temperature)
         outcome = Outcome(learnt, len(teacher.history_), teacher.converged_, teacher.loss, dict(teacher.rejected))
         with self._lock:
+            if era is not self._era:
+                raise NoUsableViewsError("all views were forgotten while they were learnt from; nothing was learnt")
             if dataset is not None and not self._declared:
                 self._names.update(dataset.class_names)
             self._live.grow(num_classes)
@@ -294,10 +274,10 @@ class LiveSession:
         with self._lock:
             key, kept, names = (self._version, settings), self._kept, self.class_names
             temperature = 1.0 if self._learnt is None else self._learnt.temperature
-        if kept is not None and kept[0] == key:
-            return kept[1]
-        with watch.stage("codes"):
-            codes = self.codes()
+            if kept is not None and kept[0] == key:
+                return kept[1]
+            with watch.stage("codes"):
+                codes = self.codes()
         with watch.stage("knn"):
             result = Segmentation.unfiltered(self.scene, codes, names, settings)
         if settings.filter:
@@ -331,7 +311,8 @@ class LiveSession:
         Raises
         ------
         StateFileError
-            The file is missing or damaged, or has more classes than there are names for. Nothing has changed.
+            The file is missing or damaged, or has more classes than there are names for, or without names than
+            `max_classes`. Nothing has changed.
         StateMismatchError
             It belongs to another scene. Nothing has changed.
         """
@@ -339,6 +320,8 @@ class LiveSession:
         width = max(state.votes.shape[1], 0 if state.learnt is None else state.learnt.codes.shape[1])
         if self._declared and width > len(self._names):
             raise StateFileError(f"{path}: holds {width} classes; expected at most {len(self._names)}, as were named")
+        if not self._declared and width > self.max_classes:
+            raise StateFileError(f"{path}: holds {width} classes; expected at most {self.max_classes} (max_classes)")
         with self._lock:
             if not self._declared:
                 self._names = {0: BACKGROUND_NAME, **state.class_names}
@@ -358,6 +341,10 @@ class LiveSession:
 
         threading.Thread(target=find, name="neighbours").start()
 
+    def retire(self) -> None:
+        """Begin another `era`: what is still being fused or learnt comes too late. What is known stays."""
+        self._era = object()
+
     def reset(self) -> int:
         """Forget votes, views and codes; return how many views were forgotten."""
         with self._lock:
@@ -373,16 +360,18 @@ class LiveSession:
         self._learnt, self._kept = None, None
         self.num_fused = 0
         self._version += 1
+        self.retire()
 
     def _make_room(self, view: View) -> None:
-        if self._declared:
+        if self._declared or not view.has_mask or (needed := view.largest_label + 1) <= self._live.num_classes:
             return
-        needed = view.largest_label + 1
-        if needed > self._live.num_classes and needed * len(self.scene) * 8 > VOTES_LIMIT:
+        affordable = VOTES_LIMIT // (8 * len(self.scene))
+        if needed > min(self.max_classes, affordable):
+            most = f"{affordable - 1} for a scene of {len(self.scene)} Gaussians"
+            if self.max_classes <= affordable:
+                most = f"{self.max_classes - 1}, as max_classes is {self.max_classes}"
             raise UnknownLabelError(
-                f"view '{view.name}': mask holds the label {needed - 1}; expected at most "
-                f"{VOTES_LIMIT // (8 * len(self.scene)) - 1} for a scene of {len(self.scene)} Gaussians, or "
-                "class_names that declare it"
+                f"view '{view.name}': {self._LABEL} {needed - 1}; expected at most {most}{self._REMEDY}"
             )
         self._live.grow(needed)
 

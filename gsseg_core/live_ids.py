@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from gsseg_core.dataset import Dataset, View
 from gsseg_core.errors import GssegError, SettingsError
-from gsseg_core.live import LiveSession, Outcome, Rejection
+from gsseg_core.live import LiveSession
+from gsseg_core.live_results import Outcome, Rejection
 from gsseg_core.object_table import ObjectTable, Repair, object_name
 from gsseg_core.scene import GaussianScene
-from gsseg_core.state_file import Learnt, State
+from gsseg_core.state_file import State
 
 
 class PerViewSession(LiveSession):
@@ -30,12 +32,18 @@ class PerViewSession(LiveSession):
         The last so many views are kept for `repair` and `learn`; votes are never dropped.
     device : str
         Where views are rendered.
+    max_classes : int
+        A view that would make more objects than this, the background counted, is refused.
     """
+
+    _LABEL, _REMEDY = "would show the first of object", ""
 
     _table: ObjectTable
 
-    def __init__(self, scene: GaussianScene, *, max_views: int = 200, device: str = "cpu") -> None:
-        super().__init__(scene, max_views=max_views, device=device)
+    def __init__(
+        self, scene: GaussianScene, *, max_views: int = 200, device: str = "cpu", max_classes: int = 256
+    ) -> None:
+        super().__init__(scene, max_views=max_views, device=device, max_classes=max_classes)
 
     @property
     def class_names(self) -> dict[int, str]:
@@ -43,41 +51,50 @@ class PerViewSession(LiveSession):
         with self._lock:
             return {k: object_name(k) for k in range(self._live.num_classes)}
 
-    def fuse(self, view: View) -> Rejection | None:
-        """Match a view's ids to the objects so far, add it to the votes, and keep it for `repair` and `learn`."""
-        with self._lock:
-            try:
-                matched = self._table.match(view)
-            except GssegError as error:
-                return self.reject(Rejection.of(error))
-            rejection = super().fuse(matched)
-            if rejection is not None and view.name in self._table.views:
-                self._table.remove(view.name)
-            return rejection
+    def _fuse(self, view: View) -> Rejection | None:
+        undo = self._table.checkpoint()
+        try:
+            rejection = super()._fuse(self._table.match(view))
+        except GssegError:
+            undo()
+            raise
+        if rejection is not None:
+            undo()
+        return rejection
 
     def repair(self) -> Repair:
         """Find the objects anew from all views that are kept, and count their votes for the right ones.
 
         Votes of views that are no longer kept go along with most of their object.
+
+        Raises
+        ------
+        UnknownLabelError
+            There would be more objects than `max_classes`. Nothing has changed.
         """
         with self._lock:
+            undo = self._table.checkpoint()
             repair, order = self._table.solve(), list(self._live.views)
             moved = (repair.heirs != np.arange(len(repair.heirs))).any()
             forgotten = self.num_fused > len(order)
             names = order if moved and forgotten else [name for name in order if name in set(repair.changed)]
             views = {name: self._table.relabelled(self._table.views[name]) for name in names}
+            try:
+                for view in views.values():
+                    self._make_room(view)
+            except GssegError:
+                undo()
+                raise
             for name in names:
                 self._live.retract(name)
             if moved and forgotten:
                 self._live.adopt(self._renumbered(self._live.state(), repair.heirs))
             for view in views.values():
-                self._make_room(view)
                 self._live.observe(view)
             # The oldest view still is the first one to go.
             self._live.views = {name: self._live.views[name] for name in order if name in self._live.views}
             if self._learnt is not None and moved:
-                codes = _renumber(self._learnt.codes, repair.heirs)
-                self._learnt = Learnt(self._learnt.learner, codes, self._learnt.num_views)
+                self._learnt = replace(self._learnt, codes=_renumber(self._learnt.codes, repair.heirs))
             self._version += 1
         return repair
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -130,17 +130,33 @@ class ObjectTable:
         MaskFormatError, MaskSizeError, UnknownLabelError
             As `add` does, or there are too many objects. Nothing has changed.
         """
-        if self.add(view):
-            lifted = self._lifted[view.name]
-            best, seen = self._profiles.explain(lifted.gaussians, lifted.weights)
-            new = (lifted.ids > 0) & (seen < self.settings.unseen)
-            best[lifted.ids == 0] = 0
-            best[new] = self._largest + 1 + np.arange(np.count_nonzero(new))
-            if best.max(initial=0) > MAX_LABEL:
-                self.remove(view.name)
-                raise UnknownLabelError(f"view '{view.name}': shows object {best.max()}; expected at most {MAX_LABEL}")
-            self._give(view.name, best)
+        undo = self.checkpoint()
+        if not self.add(view):
+            return _turned_away(view)
+        lifted = self._lifted[view.name]
+        best, seen = self._profiles.explain(lifted.gaussians, lifted.weights)
+        new = (lifted.ids > 0) & (seen < self.settings.unseen)
+        best[lifted.ids == 0] = 0
+        best[new] = self._largest + 1 + np.arange(np.count_nonzero(new))
+        if best.max(initial=0) > MAX_LABEL:
+            undo()
+            raise UnknownLabelError(f"view '{view.name}': shows object {best.max()}; expected at most {MAX_LABEL}")
+        self._give(view.name, best)
         return self.relabelled(view)
+
+    def checkpoint(self) -> Callable[[], None]:
+        """Return what goes back to the present state, after `add`, `match`, `remove` or `solve`; not after `forget`."""
+        views, lifted, objects = dict(self.views), dict(self._lifted), dict(self._objects)
+        largest, forgotten = self._largest, self._forgotten
+
+        def undo() -> None:
+            same = len(objects) == len(self._objects) and all(self._objects.get(n) is objects[n] for n in objects)
+            self.views, self._lifted, self._objects = views, lifted, objects
+            self._largest, self._forgotten = largest, forgotten
+            if not same:
+                self._fill()
+
+        return undo
 
     def adopt(self, view: View) -> None:
         """Add a view whose ids are the numbers of objects already."""
@@ -187,17 +203,13 @@ class ObjectTable:
         A view that `add` would not take comes back with nothing but background and unknown pixels, or as it is if it
         has no mask, so that a learner turns it away for the right reason.
         """
-        if not view.has_mask:
-            return view
-        labels = replace(self.views.get(view.name, view), class_names=None).read_labels()
         lifted = self._lifted.get(view.name)
         if lifted is None:
-            labels = np.minimum(labels, 0)
-        else:
-            table = np.full(int(labels.max()) + 2, UNKNOWN, np.int32)  # The last one is for unknown pixels.
-            table[lifted.ids] = self._objects[view.name]
-            labels = table[labels]
-        return replace(View.from_arrays(view.camera, labels), image_path=view.image_path)
+            return _turned_away(view)
+        labels = self.views[view.name].read_labels()
+        table = np.full(int(labels.max()) + 2, UNKNOWN, np.int32)  # The last one is for unknown pixels.
+        table[lifted.ids] = self._objects[view.name]
+        return replace(View.from_arrays(view.camera, table[labels]), image_path=view.image_path)
 
     def alignment(self, name: str) -> Alignment:
         """Tell what the ids of a view mean, and how many of them do not fit."""
@@ -262,6 +274,13 @@ class ObjectTable:
         heirs = np.where(shared.any(axis=0), table[shared.argmax(axis=0)], np.arange(self._largest + 1))
         heirs[0] = 0
         return {name: table[objects].astype(np.int32) for name, objects in solved.items()}, heirs
+
+
+def _turned_away(view: View) -> View:
+    if not view.has_mask:
+        return view
+    labels = np.minimum(replace(view, class_names=None).read_labels(), 0)
+    return replace(View.from_arrays(view.camera, labels), image_path=view.image_path)
 
 
 def object_name(number: int) -> str:

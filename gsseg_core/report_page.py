@@ -107,7 +107,7 @@ def report_page(
 <meta charset="utf-8">
 <meta http-equiv="Content-Security-Policy" content="{policy}">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="gsseg-run" content="{html.text(report.get("run", ""))}">
+<meta name="gsseg-run" content="{html_text(report.get("run", ""))}">
 <meta name="color-scheme" content="light dark">
 <meta name="generator" content="gsseg {html_text(report["versions"]["gsseg"])}">
 <link rel="icon" href="data:,">

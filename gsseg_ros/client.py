@@ -281,16 +281,16 @@ class SegmentationClient:
         """
         deadline = time.monotonic() + timeout
         request = Segment.Request(
-            classes=class_names(classes),
-            min_confidence=float(min_confidence),
-            skip_refinement=not refine,
+            classes=class_names(classes), min_confidence=float(min_confidence), skip_refinement=not refine,
             skip_filter=not filter,
-        )
+        )  # fmt: skip
         if viewpoint is not None:
             request.viewpoint_pose, request.viewpoint_camera = viewpoint_messages(viewpoint.camera)
         with self._keeping_clouds():
             answer = self._call(Segment, request, timeout)
-            cloud = arrays_from_cloud(self._cloud_of(stamp_ns(answer.report.header.stamp), deadline))
+            while (message := self._cloud_of(stamp_ns(answer.report.header.stamp), deadline)) is None:
+                answer = self._call(Segment, request, deadline - time.monotonic())
+            cloud = arrays_from_cloud(message)
         labels = labels_from_image(answer.label_image, "label_image") if viewpoint is not None else None
         boxes = {thing.id: box_from_object(thing) for thing in answer.objects}
         return SegmentResult(cloud.points, cloud.labels, cloud.confidence, cloud.rgb, answer.report, labels, boxes)
@@ -380,14 +380,15 @@ class SegmentationClient:
                 if not self._awaiting_clouds:
                     self._clouds.clear()
 
-    def _cloud_of(self, stamp: int, deadline: float) -> PointCloud2:
-        if not self._spinner.wait_for(lambda: stamp in self._clouds, deadline - time.monotonic()):
+    def _cloud_of(self, stamp: int, deadline: float) -> PointCloud2 | None:
+        """Wait for the cloud of a run; None if that of a later one has come, so that this one was not published."""
+        if not self._spinner.wait_for(lambda: max([*self._clouds, -1]) >= stamp, deadline - time.monotonic()):
             raise NodeUnavailableError(
                 f"{self._cloud_topic.topic_name}: segment was answered, but its cloud did not come in time "
                 f"({self._cloud_topic.get_publisher_count()} publishers, {len(self._clouds)} other clouds); did "
                 "another request replace it, or does a qos_override make it best effort or volatile?"
             )
-        return self._clouds[stamp]
+        return self._clouds.get(stamp)
 
     def _on_cloud(self, message: PointCloud2) -> None:
         with self._lock:

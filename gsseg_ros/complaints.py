@@ -17,7 +17,7 @@ REFUSED_POSE, TIME_JUMP, CLOCK, LIVE, OTHER = "refused pose", "time set back", "
 REASONS = (
     "no_pose", "no_camera_info", "repeated_stamp", "several_cameras", "time_jump", "queue_full", "no_scene",
     "mask_format", "size_mismatch", "unknown_label", "bad_pose", "bad_camera_info", "all_pixels_unknown",
-    "sees_no_Gaussian", "no_mask", "unusable", "unexpected",
+    "sees_no_Gaussian", "no_mask", "too_large", "scene_changed", "unusable", "unexpected",
 )  # fmt: skip
 """Kinds of complaint: why a mask became no view."""
 

@@ -7,6 +7,7 @@ from collections import Counter
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+from gsseg_core.live_results import SCENE_CHANGED
 from gsseg_ros.complaints import CLOCK, MISSING, PERIOD, TIME_JUMP, Complaints
 from gsseg_ros.inputs import Inputs
 from gsseg_ros.workspace import Workspace
@@ -147,6 +148,7 @@ def _recent(inputs: Inputs) -> Counter[str]:
     """Masks of the last ten seconds that were fused, and that were refused, by reason."""
     now, counted = time.monotonic(), inputs.counted
     counts = Counter(rejections(inputs))
+    del counts[SCENE_CHANGED]  # Nothing was wrong with them.
     counts[_ACCEPTED] = inputs.accepted
     counted.append((now, counts))
     while len(counted) > 2 and counted[1][0] <= now - WINDOW_SECONDS:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import secrets
+import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
@@ -18,7 +20,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from gsseg_core.dataset import View
 from gsseg_core.errors import GssegError, PoseError
-from gsseg_core.live import Rejection
+from gsseg_core.live_results import SCENE_CHANGED, Rejection
 from gsseg_ros.camera_images import CameraImages
 from gsseg_ros.complaints import LIVE, PERIOD, REFUSED_POSE, Complaints
 from gsseg_ros.conversions import camera_from_messages, labels_from_image, matrix_from_pose, stamp_ns
@@ -47,7 +49,8 @@ class Inputs:
     accepted : int
         Views that were fused.
     rejected : Counter of str
-        Masks that were not, by reason.
+        Masks that were not, by reason; "scene_changed" are those that came before the scene was loaded, reset or
+        replaced by a saved state, and had not been fused by then.
     explained : dict of str to str
         By reason: what was wrong with the last of these.
     counted : deque of (float, Counter)
@@ -68,6 +71,7 @@ class Inputs:
         self.accepted = 0
         self.rejected: Counter[str] = Counter()
         self.explained: dict[str, str] = {}
+        self._counting = threading.Lock()
         self.refused_poses = 0
         self.last_refusal = (-PERIOD, "")
         self.arrivals: dict[str, tuple[int, float]] = {}
@@ -80,7 +84,8 @@ class Inputs:
         self._group = MutuallyExclusiveCallbackGroup()
         self.tf = TfPoses(node, settings.map_frame) if settings.pose_source == "tf" else None
         poses: PoseSource = self.tf or (InterpolatedPoses() if settings.pose_source == "odometry" else ExactPoses())
-        self.pairing = Pairing(poses)
+        # A simulator's stamps repeat, and views of an earlier activation may come back with a saved state.
+        self.pairing = Pairing(poses, prefix=f"{secrets.token_hex(4)}_")
         self.worker: Worker[Paired] = Worker(self._fuse, settings.queue_size)
         self.live = LiveOutputs(
             workspace,
@@ -102,9 +107,11 @@ class Inputs:
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = node.create_timer(EXPIRE_PERIOD, self._expire, callback_group=self._group, clock=steady)
         self._jumps = on_set_back(node, self._set_back)
+        workspace.forget_waiting = self._forget_waiting
 
     def close(self) -> None:
         """Stop listening; a mask that is being fused is finished."""
+        self._workspace.forget_waiting = lambda: None
         self._jumps.unregister()
         self._node.destroy_timer(self._timer)
         for subscription in self._subscriptions:
@@ -144,7 +151,8 @@ class Inputs:
         return subscription
 
     def _on_mask(self, topic: str, message: Image) -> None:
-        self.pairing.add_mask(stamp_ns(message.header.stamp), (topic, message), message.header.frame_id)
+        stamp, era = stamp_ns(message.header.stamp), self._workspace.era
+        self.pairing.add_mask(stamp, (topic, message), message.header.frame_id, era)
 
     def _on_camera_info(self, topic: str, message: CameraInfo) -> None:
         for pairing in (self.pairing, self._images.pairing):
@@ -193,6 +201,14 @@ class Inputs:
         self._workspace.dropped.update(dropped - self._told)
         self._told = dropped
 
+    def _forget_waiting(self) -> None:
+        """Drop the masks of before; those on their way to the session are known there by their era."""
+        self._count_rejected(SCENE_CHANGED, self.pairing.clear() + self.worker.clear())
+
+    def _count_rejected(self, reason: str, count: int = 1) -> None:
+        with self._counting:
+            self.rejected[reason] += count
+
     def _fuse(self, paired: Paired) -> None:
         try:
             rejection = self._fused(paired)
@@ -207,12 +223,14 @@ class Inputs:
             self.accepted += 1
             self.live.fused(paired)
             return
-        self.rejected[rejection.reason] += 1
+        self._count_rejected(rejection.reason)
         self.explained[rejection.reason] = rejection.message
         self._complaints.add(rejection.reason, f"a view was rejected ({rejection.reason}): {rejection.message}")
 
     def _fused(self, paired: Paired) -> Rejection | None:
         workspace = self._workspace
+        if paired.era is not workspace.era:
+            return Rejection(SCENE_CHANGED, f"mask {paired.name} came before the scene was loaded or reset")
         session = workspace.session
         (topic, mask), (info_topic, info) = paired.mask, paired.camera_info
         labels = labels_from_image(mask, topic)
@@ -220,4 +238,4 @@ class Inputs:
         if settings.pose_source == "odometry":
             pose = pose @ settings.camera_in_base
         camera = camera_from_messages(paired.name, info, pose, settings.scene_to_map, info_topic)
-        return session.fuse(View.from_arrays(camera, labels))
+        return session.fuse(View.from_arrays(camera, labels), paired.era)

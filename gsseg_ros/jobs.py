@@ -79,6 +79,31 @@ class JobSlot:
         return self._free.wait(timeout_s)
 
 
+class Requests:
+    """Counts the requests at work, so that a transition can wait for their end."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._count = 0
+
+    @contextmanager
+    def one(self) -> Iterator[None]:
+        """Count the body as one request."""
+        with self._changed:
+            self._count += 1
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._count -= 1
+                self._changed.notify_all()
+
+    def drained(self, timeout_s: float) -> bool:
+        """Wait until none is at work; return whether it came to that in time."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._count, timeout_s)
+
+
 class Worker(Generic[T]):
     """Handles items one after the other, in a thread of its own; of too many that wait, the oldest are dropped.
 
@@ -118,10 +143,12 @@ class Worker(Generic[T]):
         """How many items wait."""
         return len(self._items)
 
-    def clear(self) -> None:
-        """Forget the items that wait."""
+    def clear(self) -> int:
+        """Forget the items that wait; return how many they were."""
         with self._changed:
+            forgotten = len(self._items)
             self._items.clear()
+            return forgotten
 
     def stop(self, timeout_s: float = 5.0) -> None:
         """Finish the item in hand, and end."""

@@ -14,7 +14,8 @@ from rclpy.lifecycle import LifecycleNode
 from std_msgs.msg import Header
 
 from gsseg_core.dataset import Dataset
-from gsseg_core.live import LiveSession, Outcome
+from gsseg_core.live import LiveSession
+from gsseg_core.live_results import Outcome
 from gsseg_core.pipeline import LEARNERS
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_ros.errors import CanceledError, InvalidRequestError, error_code
@@ -83,6 +84,7 @@ class LearnAction:
             report=_Feedback(goal, job),
             watch=run.watch,
         )
+        self._workspace.number(run)
         result.num_steps, result.converged, result.loss = outcome.num_steps, outcome.converged, outcome.loss
         result.report = self._report(session, outcome, run)
 
@@ -92,7 +94,10 @@ class LearnAction:
         selection = Selection(session, raw, sorted(raw.class_names), 0.0, settings.scene_to_map)
         with run.watch.stage("boxes"):
             header = Header(stamp=run.stamp, frame_id=settings.map_frame)
-            self._outputs().publish_objects(selection.objects(header, run.revision))
+            objects, outputs = selection.objects(header, run.revision), self._outputs()
+        with outputs.turn(run.revision, lambda: self._workspace.holds(run)) as newest:
+            if newest:
+                outputs.publish_objects(objects)
         report = report_message(run, selection, RAW, settings.map_frame)
         if outcome.rejected:
             reasons = sorted(set(outcome.rejected.values()))

@@ -1,7 +1,8 @@
 """What the node shows by itself while views come in: pictures on ~/overlay, and the objects so far on ~/objects.
 
-All of it is made in a thread of its own, only while somebody listens, only of what is newest, and only while no mask
-waits to be fused. It goes by the codes as they are at that moment, without refinement.
+All of it is made in a thread of its own, only while somebody listens, and only of what is newest. Masks that wait to be
+fused go first, but for a second at most: they may come faster than they are fused. It goes by the codes as they are at
+that moment, without refinement.
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ from builtin_interfaces.msg import Time
 from std_msgs.msg import Header
 
 from gsseg_core.errors import GssegError
-from gsseg_core.live import LiveSession
 from gsseg_core.operator import make_operator
 from gsseg_core.pictures import overlay, palette
 from gsseg_core.refine_settings import RefineSettings
@@ -35,6 +35,9 @@ CODES_PERIOD, OBJECTS_PERIOD = 1.0, 2.0
 
 IMAGE_SILENCE = 2.0
 """Seconds without a usable camera image until the classes are drawn without one."""
+
+POSTPONED_SECONDS = 1.0
+"""How long a picture or objects wait, at most, for the masks to be fused."""
 
 _PAUSE = 0.05  # s, between two looks at whether masks still wait
 
@@ -71,7 +74,7 @@ class LiveOutputs:
         self._objects_due = False
         self._news: int | None = None  # `objects_count` when the newest view came whose objects nobody has been told
         self._stopping = False
-        self._codes: tuple[tuple[LiveSession, int], float, Segmentation] | None = None
+        self._codes: tuple[tuple[object, int], float, Segmentation] | None = None
         self._last_image = self._last_objects = -np.inf
         self._thread = threading.Thread(target=self._run, name="live outputs", daemon=True)
         self._thread.start()
@@ -118,7 +121,8 @@ class LiveOutputs:
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._picture or self._objects_due or self._stopping)
-                while self._busy() and not self._stopping:
+                latest = time.monotonic() + POSTPONED_SECONDS
+                while self._busy() and not self._stopping and time.monotonic() < latest:
                     self._changed.wait(_PAUSE)
                 if self._stopping:
                     return
@@ -139,6 +143,7 @@ class LiveOutputs:
 
     def _draw(self, paired: Paired, with_image: bool) -> None:
         session, settings = self._workspace.session, self._workspace.settings
+        era = session.era
         if not session.has_codes:
             return
         (topic, image), (info_topic, info) = paired.mask, paired.camera_info
@@ -157,7 +162,8 @@ class LiveOutputs:
                 )
             picture = overlay(photo, labels, colors)
         header = Header(stamp=image.header.stamp, frame_id=image.header.frame_id)
-        self._outputs.publish_overlay(rgb_image(picture, header))
+        # A reset meanwhile has cleared the overlay.
+        self._outputs.publish_overlay(rgb_image(picture, header), lambda: self._workspace.era is era)
 
     def _publish_objects(self) -> None:
         session, settings = self._workspace.session, self._workspace.settings
@@ -176,10 +182,10 @@ class LiveOutputs:
     def _current(self) -> Segmentation:
         """Codes as they are now, or were a second ago."""
         session = self._workspace.session
-        key = (session, session.version)
+        key = (session.era, session.version)
         if self._codes is not None:
             kept, since, result = self._codes
-            if kept == key or (kept[0] is session and time.monotonic() - since < CODES_PERIOD):
+            if kept == key or (kept[0] is key[0] and time.monotonic() - since < CODES_PERIOD):
                 return result
         learnt = session.learnt
         result = Segmentation.unfiltered(session.scene, session.codes(), session.class_names, RAW)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 from gsseg_msgs.msg import ObjectArray, SegmentationReport
 from rclpy.duration import Duration
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode
 from rclpy.publisher import Publisher
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -22,15 +24,20 @@ from gsseg_ros.object_messages import object_markers
 from gsseg_ros.qos import latched
 from gsseg_ros.reports import Selection
 
+InvalidHandle = rclpy_implementation.InvalidHandle
+
 FLOW_SECONDS = 0.5
 """How long the clouds of one run wait, all together, for subscribers to take in those before."""
 
+_POLL = 0.002  # s, between two looks at whether a cloud has arrived
+
 
 class Outputs:
-    """Publishes clouds, objects, report and overlay.
+    """Publishes clouds, objects, report and overlay. Its methods may be called from any thread.
 
-    A cloud that is latched always belongs to the last run: a class that this run was not asked for, or that is no more,
-    gets an empty one.
+    A cloud that is latched always belongs to the last run: a class that this run was not asked for gets an empty one. A
+    class has a topic while it has Gaussians in the last run; the names that were announced have theirs all the time.
+    Once closed, nothing is published.
 
     Attributes
     ----------
@@ -40,7 +47,8 @@ class Outputs:
 
     def __init__(self, node: LifecycleNode) -> None:
         self._node = node
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
+        self._revision, self._closed = 0, False
         self.objects_count = 0
         self._cloud = self._overridable(PointCloud2, "~/cloud")
         self._report = self._overridable(SegmentationReport, "~/report")
@@ -48,37 +56,61 @@ class Outputs:
         self._objects = self._overridable(ObjectArray, "~/objects")
         self._markers = self._overridable(MarkerArray, "~/object_markers")
         self._classes: dict[str, Publisher] = {}
+        self._announced: set[str] = set()
         self._filled: set[str] = set()
+        self._shown = False  # whether an overlay is latched
 
     @property
     def wants_overlay(self) -> bool:
         """Whether anybody listens to `~/overlay`."""
-        return self._overlay.get_subscription_count() > 0
+        return self._heard(self._overlay)
 
     @property
     def wants_objects(self) -> bool:
         """Whether anybody listens to `~/objects` or `~/object_markers`."""
-        return max(self._objects.get_subscription_count(), self._markers.get_subscription_count()) > 0
+        return self._heard(self._objects, self._markers)
 
-    def announce(self, class_names: Mapping[int, str]) -> dict[int, str]:
-        """Make a topic for every class, so that subscribers find it before its first cloud; return their full names."""
+    def announce(self, class_names: Mapping[int, str]) -> None:
+        """Make a topic for every class, so that subscribers find it before its first cloud."""
         with self._lock:
-            return {k: self._class(token).topic_name for k, token in topic_tokens(class_names).items()}
+            self._announced = set(topic_tokens(class_names).values())
+            for token in self._announced:
+                self._class(token)
+
+    def topics(self, class_names: Mapping[int, str]) -> dict[int, str]:
+        """Full names of the topics of those classes that have one."""
+        with self._lock:
+            tokens = topic_tokens(class_names).items()
+            return {k: self._classes[token].topic_name for k, token in tokens if token in self._classes}
+
+    @contextmanager
+    def turn(self, revision: int, holds: Callable[[], bool] = lambda: True) -> Iterator[bool]:
+        """Let one run publish all that it has in the body, and no other meanwhile.
+
+        Yields whether it may: not if a newer run has, nor once closed, nor if what it goes by no longer `holds`.
+        """
+        with self._lock:
+            newest = not self._closed and revision > self._revision and holds()
+            if newest:
+                self._revision = revision
+            yield newest
 
     def publish_clouds(self, selection: Selection, header: Header) -> None:
         """Publish one cloud per class that was asked for, empty ones for all others, and that of all objects."""
         tokens = topic_tokens(selection.result.class_names)
+        kept = self._announced | {tokens[k] for k in selection.present}
         with self._lock:
             flow, filled = _Flow(), set()
             for k in selection.chosen:
-                message = selection.class_cloud(k, header)
-                flow.publish(self._class(tokens[k]), message)
-                if message.width:
-                    filled.add(tokens[k])
-            for token in self._filled - {tokens[k] for k in selection.chosen}:
-                flow.publish(self._class(token), _empty(header))
+                if tokens[k] in kept:
+                    message = selection.class_cloud(k, header)
+                    flow.publish(self._class(tokens[k]), message)
+                    if message.width:
+                        filled.add(tokens[k])
+            self._empty(self._filled - {tokens[k] for k in selection.chosen if tokens[k] in kept}, header)
             self._filled = filled
             flow.publish(self._cloud, selection.objects_cloud(header))
+            self._take_away(self._classes.keys() - kept, flow)
 
     def publish_objects(self, objects: ObjectArray, since: int | None = None) -> bool:
         """Publish the objects, and draw them for people; with `since`, only if `objects_count` is still that.
@@ -86,7 +118,7 @@ class Outputs:
         Returns whether they were published.
         """
         with self._lock:
-            if since is not None and since != self.objects_count:
+            if self._closed or (since is not None and since != self.objects_count):
                 return False
             self.objects_count += 1
             self._objects.publish(objects)
@@ -95,28 +127,60 @@ class Outputs:
 
     def publish_report(self, report: SegmentationReport) -> None:
         """Publish the report of a run."""
-        self._report.publish(report)
-
-    def publish_overlay(self, image: Image) -> None:
-        """Publish a picture."""
-        self._overlay.publish(image)
-
-    def clear(self, header: Header) -> None:
-        """Replace all latched clouds by empty ones, and say that there is no object."""
-        self.publish_objects(ObjectArray(header=header))
         with self._lock:
-            for token in self._filled:
-                self._class(token).publish(_empty(header))
+            if not self._closed:
+                self._report.publish(report)
+
+    def publish_overlay(self, image: Image, wanted: Callable[[], bool] = lambda: True) -> None:
+        """Publish a picture, if it still is `wanted` when its turn has come."""
+        with self._lock:
+            if not self._closed and wanted():
+                self._overlay.publish(image)
+                self._shown = True
+
+    def clear(self, report: SegmentationReport) -> None:
+        """Replace all that is latched: clouds, objects and overlay by empty ones, the report by this one."""
+        header = report.header
+        with self.turn(report.revision) as newest:
+            if not newest:
+                return
+            self.publish_objects(ObjectArray(header=header, revision=report.revision))
+            self._empty(self._filled, header)
             self._filled = set()
+            self._take_away(self._classes.keys() - self._announced, _Flow())
             self._cloud.publish(_empty(header))
+            if self._shown:
+                self._overlay.publish(Image(header=header))
+                self._shown = False
+            self._report.publish(report)
 
     def close(self) -> None:
         """Take all topics away."""
         with self._lock:
+            if self._closed:
+                return
+            self._closed = True
             ours = (self._cloud, self._report, self._overlay, self._objects, self._markers)
             for publisher in (*ours, *self._classes.values()):
                 self._node.destroy_publisher(publisher)
             self._classes.clear()
+
+    def _heard(self, *publishers: Publisher) -> bool:
+        # Without the lock: whoever asks must not wait for a run that is being published.
+        try:
+            return any(publisher.get_subscription_count() for publisher in publishers)
+        except InvalidHandle:  # Closed.
+            return False
+
+    def _empty(self, tokens: Iterable[str], header: Header) -> None:
+        for token in tokens:
+            self._class(token).publish(_empty(header))
+
+    def _take_away(self, tokens: Iterable[str], flow: _Flow) -> None:
+        for token in list(tokens):
+            publisher = self._classes.pop(token)
+            flow.settle(publisher)  # Whoever listens should hear that it is empty now.
+            self._node.destroy_publisher(publisher)
 
     def _overridable(self, kind: Any, topic: str) -> Publisher:
         return self._node.create_publisher(
@@ -147,7 +211,15 @@ class _Flow:
 
     def publish(self, publisher: Publisher, message: PointCloud2) -> None:
         publisher.publish(message)
-        if self._patience > 0 and message.width and publisher.get_subscription_count():
-            started = time.monotonic()
-            publisher.wait_for_all_acked(Duration(seconds=self._patience))
-            self._patience -= time.monotonic() - started
+        if message.width:
+            self.settle(publisher)
+
+    def settle(self, publisher: Publisher) -> None:
+        """Wait until all that was published there has arrived."""
+        if self._patience <= 0 or not publisher.get_subscription_count():
+            return
+        started = time.monotonic()
+        # With a time to wait, rclpy would hold the interpreter for as long.
+        while not publisher.wait_for_all_acked(Duration()) and time.monotonic() - started < self._patience:
+            time.sleep(_POLL)
+        self._patience -= time.monotonic() - started

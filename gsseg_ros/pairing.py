@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_ros.frames import interpolate
-from gsseg_ros.timeline import BEHIND_NS, SECOND, Message, Timeline
+from gsseg_ros.timeline import BEHIND_NS, MASK, SECOND, Message, Timeline
 
 Pose: TypeAlias = npt.NDArray[np.float64]  # (4, 4)
 T = TypeVar("T")
@@ -49,11 +49,12 @@ class PoseSource(Protocol):
 class Paired(NamedTuple):
     """A mask, and what belongs to it."""
 
-    name: str  # Unique: the epoch, the stamp, and at one stamp the number of the camera.
+    name: str  # Unique: the pairing's prefix, the epoch, the stamp, and at one stamp the number of the camera.
     stamp: int
     mask: Any
     camera_info: Any
     pose: Pose  # (4, 4) camera in the map
+    era: object = None  # As it was given with the mask.
 
 
 @dataclass(frozen=True)
@@ -143,6 +144,8 @@ class Pairing:
         `ExactPoses`, `InterpolatedPoses` or `gsseg_ros.tf_poses.TfPoses`.
     settings : PairingSettings
         How long masks wait.
+    prefix : str
+        What the names of all pairs begin with: epochs and stamps of another pairing may be the same.
 
     Attributes
     ----------
@@ -159,11 +162,12 @@ class Pairing:
         The frame_id of the last mask that was dropped for want of a camera_info.
     """
 
-    def __init__(self, poses: PoseSource, settings: PairingSettings | None = None) -> None:
+    def __init__(self, poses: PoseSource, settings: PairingSettings | None = None, prefix: str = "") -> None:
         self.dropped: Counter[str] = Counter()
         self.out_of_order = 0
         self.unmatched_frame = ""
         self._poses = poses
+        self._prefix = prefix
         self._settings = settings or PairingSettings()
         self._lock = threading.Lock()
         self._timeline = Timeline(self._settings.max_waiting, self._settings.wait_s)
@@ -173,9 +177,9 @@ class Pairing:
         self._waiting: dict[_Key, _Waiting] = {}
         self._finished: list[Paired] = []
 
-    def add_mask(self, stamp: int, message: Any, frame_id: str = "") -> None:
-        """Take in a mask whose header has this stamp and frame."""
-        self._take_in(Message("mask", stamp, message, frame_id))
+    def add_mask(self, stamp: int, message: Any, frame_id: str = "", era: object = None) -> None:
+        """Take in a mask whose header has this stamp and frame; `era` comes out with it."""
+        self._take_in(Message(MASK, stamp, (message, era), frame_id))
 
     def add_camera_info(self, stamp: int, message: Any, frame_id: str = "") -> None:
         """Take in a camera_info whose header has this stamp and frame."""
@@ -220,6 +224,14 @@ class Pairing:
             finished, self._finished = self._finished, []
             return finished
 
+    def clear(self) -> int:
+        """Forget the masks that wait, but no pose and no camera_info; return how many they were."""
+        with self._lock:
+            forgotten = len(self._waiting) + len(self._finished) + self._timeline.forget_masks()
+            self._waiting.clear()
+            self._finished.clear()
+            return forgotten
+
     @property
     def waiting(self) -> int:
         """How many masks wait, for what belongs to them or until it is clear to which time they belong."""
@@ -263,15 +275,16 @@ class Pairing:
             elif stream == "pose" and isinstance(self._poses, ExactPoses):
                 self._poses.add(stamp, content)
         for stream, stamp, content, frame_id in messages:
-            if stream == "mask":
-                self._await(stamp, content, frame_id)
+            if stream == MASK:
+                mask, era = content
+                self._await(stamp, mask, era, frame_id)
         if messages:
             for key in sorted(self._waiting):
                 self._pair(key)
             while len(self._waiting) > self._settings.max_waiting:
                 self._pair(min(self._waiting), last_chance=True)
 
-    def _await(self, stamp: int, mask: Any, frame_id: str) -> None:
+    def _await(self, stamp: int, mask: Any, era: object, frame_id: str) -> None:
         frames = self._seen.values.get(stamp, [])
         if frame_id in frames or len(frames) >= _CAMERAS_KEPT:
             self.dropped["repeated_stamp"] += 1
@@ -281,7 +294,7 @@ class Pairing:
         frames.append(frame_id)
         if len(frames) > 1 and not self._poses.knows_frames:
             self._unclear_until = max(self._unclear_until, stamp + _UNCLEAR_NS)
-        self._waiting[stamp, frame_id] = _Waiting(mask, len(frames))
+        self._waiting[stamp, frame_id] = _Waiting(mask, era, len(frames))
 
     def _add_camera_info(self, stamp: int, message: Any, frame_id: str) -> None:
         infos = self._camera_infos.pop(frame_id, None) or _History(_CAMERA_INFOS_KEPT)
@@ -298,9 +311,9 @@ class Pairing:
         if stamp < self._unclear_until:
             self.dropped["several_cameras"] += 1
         elif waiting.pose is not None and info is not None:
-            name = f"{self._timeline.epoch if epoch is None else epoch}_{stamp}"
+            name = f"{self._prefix}{self._timeline.epoch if epoch is None else epoch}_{stamp}"
             name += f"_{waiting.camera}" * (waiting.camera > 1)
-            self._finished.append(Paired(name, stamp, waiting.mask, info, waiting.pose))
+            self._finished.append(Paired(name, stamp, waiting.mask, info, waiting.pose, waiting.era))
         elif waiting.pose is None and (last_chance or self._poses.too_late(stamp)):
             self.dropped["no_pose"] += 1
         elif last_chance:
@@ -330,6 +343,7 @@ class Pairing:
 @dataclass
 class _Waiting:
     mask: Any
+    era: object
     camera: int  # Among those with masks of this stamp, from 1.
     pose: Pose | None = None
     since: float | None = None

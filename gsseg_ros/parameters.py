@@ -15,6 +15,7 @@ from rclpy.parameter import Parameter
 
 from gsseg_core.devices import DEVICES, checked_device
 from gsseg_core.errors import GssegError, SettingsError
+from gsseg_core.masks import MAX_LABEL
 from gsseg_core.names import flaw_of_class_name
 from gsseg_core.pipeline import PER_VIEW
 from gsseg_core.refine_settings import MAX_K, RefineSettings
@@ -68,6 +69,14 @@ DECLARATIONS = (
     Declaration("pose_source", "topic", f"where the camera's pose comes from: {', '.join(POSE_SOURCES)}"),
     Declaration("map_frame", "map", "frame of the poses and of all outputs"),
     Declaration("max_views", 200, "views kept for learning, the last ones [count]", 1, 100_000),
+    Declaration(
+        "max_classes",
+        256,
+        "without class_names: classes that may turn up, the background included; a mask that would make more is "
+        "rejected [count]",
+        1,
+        MAX_LABEL + 1,
+    ),
     Declaration("k", RefineSettings.k, "neighbours in KNN clustering and filter [count]", 1, MAX_K, True),
     Declaration(
         "beta", RefineSettings.beta, "probability below which KNN clustering decides [0..1]", 0.0, 1.0, at_once=True
@@ -109,6 +118,7 @@ class Settings:
     pose_source: str
     map_frame: str
     max_views: int
+    max_classes: int
     k: int
     beta: float
     device: str

@@ -59,6 +59,11 @@ class Selection:
         return {k: kept[first:last] for k, (first, last) in zip(self.chosen, bounds.tolist(), strict=True)}
 
     @cached_property
+    def present(self) -> list[int]:
+        """Ids of the classes that have Gaussians, whether asked for or not."""
+        return [int(k) for k in np.unique(self.result.labels) if k >= 0]
+
+    @cached_property
     def _confidence(self) -> np.ndarray:
         return self.result.confidence
 
@@ -153,6 +158,18 @@ def report_message(
         min_confidence=selection.min_confidence,
         classes=[selection.class_summary(k, (topics or {}).get(k, "")) for k in selection.chosen],
     )
+
+
+def empty_report(run: Run, session: LiveSession | None, map_frame: str) -> SegmentationReport:
+    """Report that nothing of what was published before a run holds any more."""
+    report = SegmentationReport(
+        header=Header(stamp=run.stamp, frame_id=map_frame), revision=run.revision, job=run.job,
+        total_seconds=run.total_seconds,
+    )  # fmt: skip
+    if session is not None:
+        report.scene_path, report.scene_hash = str(session.scene.path), session.scene.digest
+        report.num_gaussians = report.num_unobserved = len(session.scene)
+    return report
 
 
 def finish(report: SegmentationReport, run: Run) -> SegmentationReport:

@@ -135,13 +135,16 @@ class SegmentNode(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def stop(self) -> None:
-        """Stop a running job, and listening."""
+        """Stop a running job, wait for the requests at work, and stop listening."""
         self.workspace.active = False
         if not self.workspace.slot.cancel(STOP_SECONDS):
             self.get_logger().warning(f"a job did not stop within {STOP_SECONDS:g} s; going on without it")
+        if not self.workspace.requests.drained(STOP_SECONDS):
+            self.get_logger().warning(f"a request did not end within {STOP_SECONDS:g} s; it will publish nothing")
         if self.inputs is not None:
             self.inputs.close()
             self.inputs = None
+        self.workspace.retire()
 
     def close(self) -> None:
         """Stop all threads and take the node away."""

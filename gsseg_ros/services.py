@@ -24,7 +24,7 @@ from gsseg_core.report import build_report
 from gsseg_core.run_folder import staged_run
 from gsseg_ros.errors import InvalidRequestError, error_code
 from gsseg_ros.outputs import Outputs
-from gsseg_ros.reports import Selection, finish, report_message, stage_timings
+from gsseg_ros.reports import Selection, empty_report, finish, report_message, stage_timings
 from gsseg_ros.viewpoints import Lookup, draw, viewpoint
 from gsseg_ros.workspace import Run, Workspace, checked_confidence, chosen_classes
 
@@ -39,8 +39,9 @@ def answered(handler: Handler) -> Handler:
     @functools.wraps(handler)
     def answer(self: Services, request: Any, response: Any) -> Any:
         try:
-            self.workspace.require_active()
-            handler(self, request, response)
+            with self.workspace.requests.one():
+                self.workspace.require_active()
+                handler(self, request, response)
         except Exception as error:
             response = type(response)()  # Nothing half filled in goes out.
             response.error_code = error_code(error, type(response))
@@ -112,32 +113,36 @@ class Services:
         """Segment the scene, publish clouds and objects, and draw the viewpoint if there is one."""
         settings, outputs = self.workspace.settings, self._outputs()
         with self.workspace.run("segment") as run:
-            camera = None
+            drawing = None
             selection, refine = self._select(request, run)
+            self.workspace.number(run)
             if request.viewpoint_camera.width:
                 camera = viewpoint(request, settings, self._lookup())
-            with run.watch.stage("publish"):
-                topics = outputs.announce(selection.result.class_names)
-                outputs.publish_clouds(selection, self._header(run))
-            with run.watch.stage("boxes"):
-                objects = selection.objects(self._header(run), run.revision)
-                outputs.publish_objects(objects)
-                response.objects = objects.objects
-            if camera is not None:
                 header = Header(stamp=run.stamp, frame_id=request.viewpoint_camera.header.frame_id)
                 with run.watch.stage("render"):
                     drawing = draw(selection, camera, header, with_overlay=outputs.wants_overlay)
                 response.label_image = drawing.labels
-                if drawing.overlay.width:
-                    outputs.publish_overlay(drawing.overlay)
-            response.report = finish(report_message(run, selection, refine, settings.map_frame, topics), run)
-            outputs.publish_report(response.report)
+            with outputs.turn(run.revision, lambda: self.workspace.holds(run)) as newest:
+                if newest:
+                    with run.watch.stage("publish"):
+                        outputs.publish_clouds(selection, self._header(run))
+                with run.watch.stage("boxes"):
+                    objects = selection.objects(self._header(run), run.revision)
+                response.objects = objects.objects
+                topics = outputs.topics(selection.result.class_names)
+                response.report = finish(report_message(run, selection, refine, settings.map_frame, topics), run)
+                if newest:
+                    outputs.publish_objects(objects)
+                    if drawing is not None and drawing.overlay.width:
+                        outputs.publish_overlay(drawing.overlay)
+                    outputs.publish_report(response.report)
 
     @answered
     def render_view(self, request: RenderView.Request, response: RenderView.Response) -> None:
         """Draw a viewpoint."""
         session, settings = self.workspace.session, self.workspace.settings
         with self.workspace.run("render_view") as run:
+            self.workspace.number(run)
             result = session.segmentation(refinement(request, self.workspace), run.watch)
             camera = viewpoint(request, settings, self._lookup())
             header = Header(stamp=run.stamp, frame_id=request.viewpoint_camera.header.frame_id)
@@ -159,10 +164,15 @@ class Services:
             path = workspace.scene_path()
         else:
             raise InvalidRequestError("path and the parameter scene_path are both empty; expected a 3DGS PLY in either")
-        with workspace.slot.take("load_scene"), workspace.run("load_scene") as run:
-            workspace.load_scene(path)
-            self._outputs().clear(self._header(run))
-        session = workspace.session
+        with workspace.slot.take("load_scene") as job, workspace.run("load_scene") as run:
+
+            def check() -> None:
+                workspace.require_active()
+                job.check()
+
+            workspace.load_scene(path, check)
+            self._clear(run)
+            session = workspace.session
         corners = workspace.settings.scene_to_map.points_to_map(session.scene.means)
         response.path, response.scene_hash = str(session.scene.path), session.scene.digest
         response.num_gaussians = len(session.scene)
@@ -181,8 +191,9 @@ class Services:
     def load_state(self, request: LoadState.Request, response: LoadState.Response) -> None:
         """Load what was saved, in place of what is known."""
         session, path = self.workspace.session, self.workspace.existing(request.path, STATE_FILE)
-        with self.workspace.slot.take("load_state"), self.workspace.run("load_state"):
-            response.num_views = session.load(path)
+        with self.workspace.slot.take("load_state"), self.workspace.run("load_state") as run:
+            response.num_views = self.workspace.load_state(path)
+            self._clear(run)
         response.path, response.class_names = str(path), list(session.class_names.values())
 
     @answered
@@ -191,6 +202,7 @@ class Services:
         folder, settings = self.workspace.path(request.directory, EXPORT_FOLDER), self.workspace.settings
         with self.workspace.run("export") as run:
             selection, refine = self._select(request, run)
+            self.workspace.number(run)
             session = selection.session
             result = selection.result.selected(selection.chosen, selection.min_confidence)
             with (
@@ -219,7 +231,7 @@ class Services:
         workspace = self.workspace
         with workspace.slot.take("reset"), workspace.run("reset") as run:
             response.num_views_dropped = workspace.reset()
-            self._outputs().clear(self._header(run))
+            self._clear(run)
 
     def _select(self, request: Any, run: Run) -> tuple[Selection, RefineSettings]:
         session, refine = self.workspace.session, refinement(request, self.workspace)
@@ -230,6 +242,13 @@ class Services:
         result = session.segmentation(refine, run.watch)
         chosen = chosen_classes(request, result.class_names)
         return Selection(session, result, chosen, threshold, self.workspace.settings.scene_to_map), refine
+
+    def _clear(self, run: Run) -> None:
+        """Take back what was published of what is known no more."""
+        workspace = self.workspace
+        workspace.number(run)
+        session = workspace.session if workspace.has_scene else None
+        self._outputs().clear(empty_report(run, session, workspace.settings.map_frame))
 
     def _header(self, run: Run) -> Header:
         return Header(stamp=run.stamp, frame_id=self.workspace.settings.map_frame)

@@ -10,7 +10,8 @@ BEHIND_NS = SECOND
 """How much older than the newest of its stream a message is that is not merely out of order."""
 
 _IN_A_ROW = 10
-_MASK = "mask"
+MASK = "mask"
+"""The stream whose messages are counted where they are lost."""
 
 
 class Message(NamedTuple):
@@ -73,7 +74,7 @@ class Timeline:
     @property
     def held_masks(self) -> int:
         """How many masks are held back."""
-        return sum(message.stream == _MASK for message in self._held)
+        return sum(message.stream == MASK for message in self._held)
 
     def take_in(self, message: Message) -> list[Message]:
         """Take in a message; return those that can be used now, in order.
@@ -83,7 +84,7 @@ class Timeline:
         stream, stamp = message.stream, message.stamp
         if stream in self._before:
             if self._is_straggler(message):
-                self.lost_masks += stream == _MASK
+                self.lost_masks += stream == MASK
                 return []
             del self._before[stream]
         newest = self._newest.setdefault(stream, stamp)
@@ -106,7 +107,7 @@ class Timeline:
         if max(self._newest.values(), default=stamp) < stamp + BEHIND_NS:
             return []
         before = [message for message in self._held if message.stamp >= stamp + BEHIND_NS]
-        self.lost_masks += sum(message.stream == _MASK for message in before)
+        self.lost_masks += sum(message.stream == MASK for message in before)
         self._held = [message for message in self._held if message.stamp < stamp + BEHIND_NS]
         return self._start_afresh(stamp)
 
@@ -128,6 +129,13 @@ class Timeline:
             return self._start_afresh()
         return self._all_late() if now_s - self._held_since >= 2 * self._wait_s else []
 
+    def forget_masks(self) -> int:
+        """Forget the masks that are held; return how many they were."""
+        forgotten = self.held_masks
+        self._held = [message for message in self._held if message.stream != MASK]
+        del self._behind[MASK]
+        return forgotten
+
     def _go_on(self, stream: str, stamp: int) -> list[Message]:
         """Note that a stream went on; return what of it is thereby late."""
         self._newest[stream] = stamp
@@ -139,7 +147,7 @@ class Timeline:
 
     def _judge(self) -> list[Message]:
         everywhere = len(self._newest) > 1 and all(self._behind[stream] for stream in self._newest)
-        in_a_row = any(count >= _IN_A_ROW for stream, count in self._behind.items() if stream != _MASK)
+        in_a_row = any(count >= _IN_A_ROW for stream, count in self._behind.items() if stream != MASK)
         full = len(self._held) > self._capacity
         if everywhere or in_a_row or (full and not self._went_on):
             return self._start_afresh()

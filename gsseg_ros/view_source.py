@@ -119,7 +119,7 @@ class RosSource:
         labels = np.full(len(self._scene), UNOBSERVED, np.int32)
         probabilities = np.zeros((len(self._scene), len(names)), np.float32)
         # ~/cloud has all objects; the background is in a cloud of its own.
-        topics = [f"{self._name}/cloud", *(s.topic for s in report.classes if s.class_id == 0 and s.num_gaussians)]
+        topics = [f"{self._name}/cloud", *(s.topic for s in report.classes if s.class_id == 0 and s.topic)]
         for topic in topics:
             self._listen(topic)
             cloud = self._cloud(topic, stamp_ns(report.header.stamp), before.get(topic))

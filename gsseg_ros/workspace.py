@@ -30,7 +30,7 @@ from gsseg_ros.errors import (
     PathNotAllowedError,
     UnknownClassError,
 )
-from gsseg_ros.jobs import JobSlot
+from gsseg_ros.jobs import JobSlot, Requests
 from gsseg_ros.parameters import Settings
 
 
@@ -43,19 +43,22 @@ class Run:
     job : str
         What runs.
     stamp : Time
-        When it began.
+        When it was given its number.
     revision : int
-        Its number, counted from 1.
+        Its number, counted from 1; 0 until it has one.
     dropped : Counter of str
+        As that of the workspace, when it was given its number.
+    era : object
         As that of the workspace, when it began.
     watch : Stopwatch
         Seconds of its stages.
     """
 
     job: str
-    stamp: Time
-    revision: int
-    dropped: Counter[str]
+    era: object
+    stamp: Time = field(default_factory=Time)
+    revision: int = 0
+    dropped: Counter[str] = field(default_factory=Counter)
     watch: Stopwatch = field(default_factory=Stopwatch)
     _started: float = field(default_factory=time.perf_counter)
 
@@ -74,6 +77,10 @@ class Workspace:
         As of now.
     slot : JobSlot
         Taken by whatever must not run beside a learn job.
+    requests : Requests
+        Those at work.
+    forget_waiting : callable
+        Drops the masks that wait to be fused.
     active : bool
         Whether the node's lifecycle state is active.
     last_job : str
@@ -83,7 +90,8 @@ class Workspace:
     """
 
     def __init__(self, settings: Settings, now: Callable[[], Time]) -> None:
-        self.settings, self.slot = settings, JobSlot()
+        self.settings, self.slot, self.requests = settings, JobSlot(), Requests()
+        self.forget_waiting: Callable[[], None] = lambda: None
         self.active = False
         self.last_job = "none"
         self.dropped: Counter[str] = Counter()
@@ -110,6 +118,12 @@ class Workspace:
             raise NoSceneError("no scene is loaded; expected the parameter scene_path, or a call of ~/load_scene")
         return self._session
 
+    @property
+    def era(self) -> object:
+        """Another one as soon as a scene is loaded, reset or given a saved state; a mask belongs to that it came in."""
+        session = self._session
+        return self if session is None else session.era
+
     def scene_path(self) -> Path:
         """Path of the parameter scene_path, which needs no data_root.
 
@@ -123,27 +137,57 @@ class Workspace:
             raise MissingFileError(f"parameter scene_path: {path} does not exist; expected a 3DGS PLY")
         return path
 
-    def load_scene(self, path: str | Path) -> None:
-        """Load a scene in place of the one there is, with all that was known of that; on any error nothing changes."""
+    def load_scene(self, path: str | Path, check: Callable[[], None] = lambda: None) -> None:
+        """Load a scene in place of the one there is, with all that was known of that; on any error nothing changes.
+
+        Parameters
+        ----------
+        path : path
+            A 3DGS PLY.
+        check : callable
+            Called last; what it raises ends the work.
+        """
         settings = self.settings
         scene = GaussianScene.load(path)
-        kept: dict[str, Any] = {"max_views": settings.max_views, "device": settings.device}
+        kept: dict[str, Any] = {
+            "max_views": settings.max_views, "device": settings.device, "max_classes": settings.max_classes,
+        }  # fmt: skip
         if settings.ids == PER_VIEW:
             session: LiveSession = PerViewSession(scene, **kept)
         else:
             session = LiveSession(scene, settings.names_by_id, **kept)
+        check()
+        self._replace(session)
         self.dropped = Counter()
+        self.forget_waiting()
         session.prepare(RefineSettings(k=settings.k))
-        self._session = session
+
+    def load_state(self, path: str | Path) -> int:
+        """Replace what is known of the scene by a saved state; return how many views are in it."""
+        loaded = self.session.load(path)
+        self.forget_waiting()
+        return loaded
 
     def reset(self) -> int:
         """Forget codes and views, if there is a scene; return how many views were forgotten."""
+        forgotten = self._session.reset() if self._session is not None else 0
         self.dropped = Counter()
-        return self._session.reset() if self._session is not None else 0
+        self.forget_waiting()
+        return forgotten
 
     def close(self) -> None:
         """Forget the scene."""
-        self._session = None
+        self._replace(None)
+
+    def retire(self) -> None:
+        """Let nothing that is still at work have any effect; what is known stays."""
+        if self._session is not None:
+            self._session.retire()
+
+    def _replace(self, session: LiveSession | None) -> None:
+        before, self._session = self._session, session
+        if before is not None:
+            before.retire()
 
     def require_active(self) -> None:
         """Raise `NotActiveError` unless the node is active."""
@@ -152,16 +196,24 @@ class Workspace:
 
     @contextmanager
     def run(self, job: str) -> Iterator[Run]:
-        """Give a run its number; if it fails, that number is skipped."""
-        with self._lock:
-            self._revision += 1
-            run = Run(job, self._now(), self._revision, Counter(self.dropped))
+        """Note how a run ends. It gets its number by `number`."""
+        run = Run(job, self.era)
         try:
             yield run
         except Exception as error:
             self.last_job = f"{job} failed: {error}"
             raise
         self.last_job = f"{job} done in {run.total_seconds:.2f} s"
+
+    def number(self, run: Run) -> None:
+        """Give a run its number and stamp, once it has what it goes by: to be long at work makes it no older."""
+        with self._lock:
+            self._revision += 1
+            run.stamp, run.revision, run.dropped = self._now(), self._revision, Counter(self.dropped)
+
+    def holds(self, run: Run) -> bool:
+        """Whether what a run goes by is still what is known, and the node has not been deactivated meanwhile."""
+        return run.era is self.era
 
     def path(self, request: str, default: str = "") -> Path:
         """Resolve a path of a request, absolute or relative to data_root.

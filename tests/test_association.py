@@ -29,7 +29,7 @@ from gsseg_core.association import AssociationSettings, associate
 from gsseg_core.cli import main
 from gsseg_core.dataset import Dataset, View
 from gsseg_core.em import EMLearner
-from gsseg_core.errors import SettingsError
+from gsseg_core.errors import SettingsError, UnknownLabelError
 from gsseg_core.live_ids import PerViewSession
 from gsseg_core.masks import UNKNOWN, read_mask, write_mask
 from gsseg_core.matching import Contingency, renamed
@@ -37,6 +37,7 @@ from gsseg_core.object_table import ObjectTable, find_objects
 from gsseg_core.operator import make_operator
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segments import Lifted
+from gsseg_core.state_file import Learnt
 
 SCENE, TRUTH = balls_on_a_table()
 VIEWS = clean_views(8)
@@ -264,6 +265,63 @@ def test_votes_of_views_that_are_gone_follow_their_object() -> None:
     session.repair()
     assert session.num_views == 5 and list(session._live.views) == [view.name for view in VIEWS[-5:]]
     np.testing.assert_array_equal(session.codes().any(axis=1), before)
+
+
+def test_a_repair_keeps_the_calibration_of_what_was_learnt() -> None:
+    session = PerViewSession(SCENE)
+    for view in [in_halves(VIEWS[0], 1), *VIEWS[1:]]:
+        session.fuse(shuffled(view))
+    session._learnt = Learnt("em", session.codes(), 5, temperature=1.7)
+    repair = session.repair()
+    assert (repair.heirs != np.arange(len(repair.heirs))).any(), "something was repaired"
+    assert session.learnt is not None and (session.learnt.temperature, session.learnt.num_views) == (1.7, 5)
+
+
+def test_in_a_live_session_a_view_of_a_name_that_is_kept_takes_its_place() -> None:
+    session = PerViewSession(SCENE)
+    for view in VIEWS[:5]:
+        session.fuse(shuffled(view))
+    before, names = session.codes(), session.class_names
+    for labels, reason in ((np.full((48, 64), UNKNOWN), "all_pixels_unknown"), (None, "no_mask")):
+        view = with_labels(VIEWS[0], labels) if labels is not None else View(VIEWS[0].camera)
+        rejection = session.fuse(view)
+        assert rejection is not None and rejection.reason == reason
+        np.testing.assert_array_equal(session.codes(), before)
+    assert session.fuse(shuffled(VIEWS[0])) is None
+    assert session.num_fused == session.num_views == 5 and session.class_names == names
+    session.repair()
+    assert session.num_fused == session.num_views == 5
+    np.testing.assert_array_equal(session.codes(), before)
+
+
+def test_a_view_of_too_many_objects_is_refused_and_uses_up_no_number() -> None:
+    session = PerViewSession(SCENE, max_classes=4)
+    for view in VIEWS[:3]:
+        assert session.fuse(shuffled(view)) is None
+    before = session.codes()
+    few = PerViewSession(SCENE, max_classes=3)
+    for _ in range(2):
+        rejection = few.fuse(shuffled(VIEWS[0]))
+        assert rejection is not None and rejection.reason == "unknown_label"
+        assert "would show the first of object 3; expected at most 2, as max_classes is 3" in rejection.message
+    assert few.fuse(with_labels(VIEWS[0], np.minimum(VIEWS[0].read_labels(), 1))) is None
+    assert few.class_names == {0: "background", 1: "object_001"}
+    session.repair()
+    np.testing.assert_array_equal(session.codes(), before)
+
+
+def test_a_repair_that_finds_too_many_objects_changes_nothing() -> None:
+    session = PerViewSession(SCENE, max_classes=2)
+    merged = [with_labels(view, np.minimum(view.read_labels(), 1)) for view in VIEWS[:2]]
+    for view in [*merged, *VIEWS[2:]]:
+        assert session.fuse(view) is None, "what was one object at first, a view cannot part by itself"
+    before = session.codes()
+    with pytest.raises(UnknownLabelError, match="expected at most 1, as max_classes is 2"):
+        session.repair()
+    np.testing.assert_array_equal(session.codes(), before)
+    assert session.num_views == session.num_fused == len(VIEWS)
+    session.max_classes = 256
+    assert session.repair().changed, "which has not been done yet"
 
 
 def test_objects_found_are_learnt_as_well_as_with_true_ids() -> None:

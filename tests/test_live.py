@@ -88,6 +88,68 @@ def test_only_the_last_views_are_kept_and_no_vote_is_dropped() -> None:
         LiveSession(SCENE, NAMES, max_views=0)
 
 
+def test_a_view_of_a_name_that_is_kept_takes_its_place_and_all_counts_agree(tmp_path: Path) -> None:
+    session = fed(LiveSession(SCENE, NAMES))
+    other = View.from_arrays(VIEWS[0].camera, wrong_views(1)[0].read_labels())
+    assert session.fuse(other) is None
+    assert session.num_fused == session.num_views == len(VIEWS)
+    np.testing.assert_array_equal(session.codes(), fed(LiveSession(SCENE, NAMES), [*VIEWS[1:], other]).codes())
+    assert session.save(tmp_path / "state.npz") == len(VIEWS)
+    again = LiveSession(SCENE, NAMES)
+    assert again.load(tmp_path / "state.npz") == again.num_fused == again.num_views == len(VIEWS)
+    assert session.fuse(blank(VIEWS[0])) is not None
+    assert session.num_fused == session.num_views == len(VIEWS)
+
+
+def test_a_name_that_is_not_kept_any_more_is_that_of_another_view() -> None:
+    session = fed(LiveSession(SCENE, NAMES, max_views=1), [VIEWS[0], VIEWS[1], VIEWS[0]])
+    assert (session.num_fused, session.num_views) == (3, 1)
+    once = fed(LiveSession(SCENE, NAMES), VIEWS[:2])._live._votes
+    twice = once + fed(LiveSession(SCENE, NAMES), VIEWS[:1])._live._votes
+    np.testing.assert_array_equal(session._live._votes, twice)
+
+
+@pytest.mark.parametrize("forget", ["reset", "load"])
+def test_a_view_of_before_is_not_fused_into_what_came_in_its_place(tmp_path: Path, forget: str) -> None:
+    session = fed(LiveSession(SCENE, NAMES), VIEWS[:2])
+    session.save(tmp_path / "state.npz")
+    era = session.era
+    assert session.fuse(VIEWS[2], era) is None
+    session.reset() if forget == "reset" else session.load(tmp_path / "state.npz")
+    known = session.num_fused
+    rejection = session.fuse(VIEWS[3], era)
+    assert rejection is not None and rejection.reason == "scene_changed" and VIEWS[3].name in rejection.message
+    assert not session.rejected and session.num_fused == session.num_views == known
+    assert session.fuse(VIEWS[3], session.era) is None
+
+
+def test_codes_of_views_that_were_forgotten_meanwhile_do_not_come_to_hold() -> None:
+    session = fed(LiveSession(SCENE, NAMES))
+    with pytest.raises(NoUsableViewsError, match="forgotten while they were learnt from"):
+        session.learn("votes", report=lambda *_: None if not session.has_codes else session.reset() and None)
+    assert session.learnt is None and not session.has_codes
+
+
+def test_no_more_classes_turn_up_than_are_allowed(tmp_path: Path) -> None:
+    session = fed(LiveSession(SCENE, max_classes=4))
+    before = session.codes()
+    rejection = session.fuse(blank(VIEWS[0], 4))
+    assert rejection is not None and rejection.reason == "unknown_label"
+    assert "mask holds the label 4; expected at most 3, as max_classes is 4, or class_names" in rejection.message
+    np.testing.assert_array_equal(session.codes(), before)
+    session.save(tmp_path / "state.npz")
+    few, data = LiveSession(SCENE, max_classes=3), Dataset(write_dataset(tmp_path / "data"))
+    with pytest.raises(StateFileError, match=r"holds 4 classes; expected at most 3 \(max_classes\)"):
+        few.load(tmp_path / "state.npz")
+    with pytest.raises(UnknownLabelError, match="has 4 classes; expected at most 3, as max_classes says"):
+        few.learn(dataset=data)
+    assert not few.has_codes
+    assert LiveSession(SCENE).fuse(blank(VIEWS[0], 256)) is not None
+    assert fed(LiveSession(SCENE, NAMES, max_classes=1)).num_fused == len(VIEWS), "names that were declared all count"
+    with pytest.raises(SettingsError, match="max_classes is 0; expected at least 1"):
+        LiveSession(SCENE, max_classes=0)
+
+
 def test_learning_gives_what_the_learner_gives_on_the_same_views() -> None:
     views = wrong_views(8)
     session, teacher = fed(LiveSession(SCENE, NAMES), views), taught(EMLearner(SCENE, NUM_CLASSES), views).fit()

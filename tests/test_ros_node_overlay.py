@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -30,6 +30,7 @@ from builtin_interfaces.msg import Time
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
+from gsseg_ros import live_outputs
 from gsseg_ros.color_images import color_from_image
 from gsseg_ros.conversions import picture_from_image, rgb_image
 from gsseg_ros.frames import Similarity
@@ -178,9 +179,11 @@ class Shown:
 
     def __init__(self) -> None:
         self.stamps: list[int] = []
+        self.wanted: list[Callable[[], bool]] = []
         self.go_on = threading.Event()
 
-    def publish_overlay(self, image: Image) -> None:
+    def publish_overlay(self, image: Image, wanted: Callable[[], bool]) -> None:
+        self.wanted.append(wanted)
         self.stamps.append(image.header.stamp.sec)
         self.go_on.wait(60)
 
@@ -193,7 +196,7 @@ def live() -> Iterator[tuple[LiveOutputs, Shown, dict[str, bool]]]:
         session.fuse(view)
     settings = SimpleNamespace(pose_source="topic", scene_to_map=Similarity(np.eye(3), np.zeros(3), 1.0))
     shown, state = Shown(), {"busy": False}
-    workspace: Any = SimpleNamespace(session=session, settings=settings)
+    workspace: Any = SimpleNamespace(session=session, settings=settings, era=session.era)
     outputs: Any = shown
     live = LiveOutputs(workspace, outputs, lambda: state["busy"], Time, lambda key, text: pytest.fail(text))
     yield live, shown, state
@@ -222,7 +225,10 @@ def test_whoever_fuses_never_waits_for_a_picture_and_only_the_newest_is_drawn(
     assert shown.stamps == [1, 49]
 
 
-def test_nothing_is_drawn_while_masks_wait(live: tuple[LiveOutputs, Shown, dict[str, bool]]) -> None:
+def test_nothing_is_drawn_while_masks_wait(
+    live: tuple[LiveOutputs, Shown, dict[str, bool]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live_outputs, "POSTPONED_SECONDS", 60.0)
     outputs, shown, state = live
     shown.go_on.set()
     state["busy"] = True
@@ -233,3 +239,29 @@ def test_nothing_is_drawn_while_masks_wait(live: tuple[LiveOutputs, Shown, dict[
     state["busy"] = False
     wait_until(lambda: shown.stamps, "the picture")
     assert shown.stamps == [2]
+
+
+def test_a_picture_is_drawn_within_a_second_though_masks_never_cease_to_wait(
+    live: tuple[LiveOutputs, Shown, dict[str, bool]],
+) -> None:
+    outputs, shown, state = live
+    shown.go_on.set()
+    state["busy"] = True
+    begun = time.monotonic()
+    outputs.fused(paired(1))
+    wait_until(lambda: shown.stamps, "the picture, in spite of the masks")
+    assert time.monotonic() - begun >= 0.9, "the masks go first, for a while"
+    outputs.fused(paired(2))
+    wait_until(lambda: shown.stamps == [1, 2], "the next one")
+
+
+def test_a_picture_that_was_begun_before_a_reset_is_not_published_after_it(
+    live: tuple[LiveOutputs, Shown, dict[str, bool]],
+) -> None:
+    outputs, shown, _ = live
+    shown.go_on.set()
+    outputs.fused(paired(1))
+    wait_until(lambda: shown.wanted, "a picture")
+    assert shown.wanted[0]()
+    outputs._workspace.era = object()
+    assert not shown.wanted[0]()

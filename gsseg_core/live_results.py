@@ -1,0 +1,72 @@
+"""What a live session answers: why a view could not be used, and what learning came to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gsseg_core.errors import (
+    GssegError,
+    IntrinsicsError,
+    MaskFormatError,
+    MaskSizeError,
+    PoseError,
+    UnknownLabelError,
+)
+from gsseg_core.state_file import Learnt
+
+SCENE_CHANGED = "scene_changed"
+"""Reason for a view of what has been forgotten since it was taken."""
+
+_REASONS: dict[type[GssegError], str] = {
+    MaskFormatError: "mask_format",
+    MaskSizeError: "size_mismatch",
+    UnknownLabelError: "unknown_label",
+    PoseError: "bad_pose",
+    IntrinsicsError: "bad_camera_info",
+}
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """Why a view could not be used.
+
+    Attributes
+    ----------
+    reason : str
+        A short name, to count by.
+    message : str
+        What was found and what was expected.
+    """
+
+    reason: str
+    message: str
+
+    @classmethod
+    def of(cls, error: GssegError) -> Rejection:
+        """Sort an error by its cause."""
+        return cls(_REASONS.get(type(error), "unusable"), str(error))
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What `LiveSession.learn` did.
+
+    Attributes
+    ----------
+    learnt : Learnt
+        The codes, in force from now on.
+    num_steps : int
+        Steps that were done; 0 for a learner that has none.
+    converged : bool
+        Whether it stopped because another step would have changed little.
+    loss : float
+        What the learner minimises, per labelled pixel, in nats, at the end; NaN where it has no such thing.
+    rejected : dict of str to str
+        Names of views that could not be used, and why.
+    """
+
+    learnt: Learnt
+    num_steps: int
+    converged: bool
+    loss: float
+    rejected: dict[str, str]

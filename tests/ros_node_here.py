@@ -1,0 +1,106 @@
+"""The segmentation node inside the test's own process, driven by hand, so that a test can stop it anywhere.
+
+Nothing spins it: no timer runs, no message comes but those that are handed to it, and requests are plain calls.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+from ros_helpers import Ros, wait_until
+from ros_robot import SECOND, SERVICES, STEP, messages
+
+pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
+
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.parameter import Parameter
+
+from gsseg_core.dataset import View
+from gsseg_ros.inputs import Inputs
+from gsseg_ros.outputs import Outputs
+from gsseg_ros.segment_node import SegmentNode
+
+
+class NodeHere:
+    """A node, active from the start.
+
+    Attributes
+    ----------
+    node : SegmentNode
+        The node itself.
+    stamp : int
+        Of the next view, in nanoseconds; it begins at the same time in every node, as in a simulator.
+    """
+
+    def __init__(self, ros: Ros, parameters: Mapping[str, Any]) -> None:
+        self.stamp = 1000 * SECOND
+        values = {name: value if isinstance(value, list | int) else str(value) for name, value in parameters.items()}
+        self.node = SegmentNode(
+            context=ros.context,
+            use_global_arguments=False,
+            parameter_overrides=[Parameter(name, value=value) for name, value in values.items()],
+        )
+        self.configure()
+
+    def configure(self) -> None:
+        """Configure and activate."""
+        assert self.node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+        assert self.node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+
+    @property
+    def inputs(self) -> Inputs:
+        assert self.node.inputs is not None
+        return self.node.inputs
+
+    @property
+    def outputs(self) -> Outputs:
+        assert self.node._outputs is not None
+        return self.node._outputs
+
+    def send(
+        self,
+        views: Iterable[View],
+        topics: Iterable[str] = ("camera_info", "pose", "mask"),
+        stamps: Iterable[int] | None = None,
+    ) -> list[int]:
+        """Hand it messages of some views; returns their stamps, which go on from the last one unless given."""
+        used = []
+        for view, stamp in zip(views, stamps or itertools.count(self.stamp, STEP), strict=False):
+            used.append(stamp)
+            self.stamp = max(self.stamp, stamp + STEP)
+            sent = messages(view, stamp)
+            for topic in topics:
+                getattr(self.inputs, f"_on_{topic}")(topic, sent[topic])
+                self.inputs._hand_over()
+        return used
+
+    def fuse(self, views: list[View]) -> None:
+        """Hand it some views, and wait until they are fused."""
+        before = self.inputs.accepted
+        self.send(views)
+        wait_until(lambda: self.inputs.accepted == before + len(views), f"{len(views)} views to be fused")
+
+    def ask(self, service: str, **fields: Any) -> Any:
+        """Call the handler of a service."""
+        handler = getattr(self.node._requests, service)
+        return handler(SERVICES[service].Request(**fields), SERVICES[service].Response())
+
+    def done(self, service: str, **fields: Any) -> Any:
+        """Call the handler of a service, which must work."""
+        response = self.ask(service, **fields)
+        assert response.error_code == 0, response.error_msg
+        return response
+
+
+@contextmanager
+def node_here(ros: Ros, parameters: Mapping[str, Any]) -> Iterator[NodeHere]:
+    """A node that is gone after the body."""
+    here = NodeHere(ros, parameters)
+    try:
+        yield here
+    finally:
+        here.node.close()

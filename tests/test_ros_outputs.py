@@ -1,0 +1,166 @@
+"""How the node publishes: whole runs one after the other, and without keeping other threads from their work."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from ros_fixtures import shared_fixture  # noqa: F401
+from ros_helpers import Ros
+from small_scenes import NAMES, balls_on_a_table, clean_views
+
+pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
+
+from gsseg_msgs.msg import ObjectArray, SegmentationReport
+from rclpy.lifecycle import LifecycleNode
+from sensor_msgs.msg import Image
+from std_msgs.msg import Header
+
+from gsseg_core.live import LiveSession
+from gsseg_ros import outputs as outputs_module
+from gsseg_ros.frames import Similarity
+from gsseg_ros.outputs import Outputs
+from gsseg_ros.reports import Selection
+
+SUBSCRIBER = """
+import rclpy, sys
+from rclpy.node import Node
+from sensor_msgs.msg import PointCloud2
+from gsseg_ros.qos import latched
+rclpy.init()
+node = Node("frozen")
+node.create_subscription(PointCloud2, "/publishing/cloud", lambda message: print("heard", flush=True), latched())
+rclpy.spin(node)
+"""
+
+
+def selection(*chosen: int) -> Selection:
+    session = LiveSession(balls_on_a_table()[0], NAMES)
+    for view in clean_views(2):
+        session.fuse(view)
+    return Selection(session, session.segmentation(), chosen, 0.0, Similarity(np.eye(3), np.zeros(3), 1.0))
+
+
+class Publisher:
+    """In the place of one of rclpy; somebody listens who never acknowledges."""
+
+    def __init__(self, topic: str) -> None:
+        self.topic_name, self.sent, self.asked = topic, [], []  # type: ignore[var-annotated]
+
+    def publish(self, message: Any) -> None:
+        self.sent.append(message)
+
+    def get_subscription_count(self) -> int:
+        return 1
+
+    def wait_for_all_acked(self, timeout: Any) -> bool:
+        self.asked.append(timeout.nanoseconds)
+        return False
+
+
+def outputs() -> tuple[Outputs, dict[str, Publisher]]:
+    """Outputs of no node, and the publishers that there are at present."""
+    publishers: dict[str, Publisher] = {}
+    node: Any = SimpleNamespace(
+        create_publisher=lambda kind, topic, *_, **__: publishers.setdefault(topic, Publisher(topic)),
+        destroy_publisher=lambda publisher: publishers.pop(publisher.topic_name),
+    )
+    return Outputs(node), publishers
+
+
+def test_who_waits_for_a_cloud_to_arrive_never_holds_the_interpreter_and_ends_in_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(outputs_module, "FLOW_SECONDS", 0.1)
+    ours, publishers = outputs()
+    begun = time.monotonic()
+    ours.publish_clouds(selection(0, 1, 2, 3), Header())
+    assert time.monotonic() - begun < 10
+    asked = [timeout for publisher in publishers.values() for timeout in publisher.asked]
+    assert asked and set(asked) == {0}
+
+
+def test_other_threads_go_on_while_a_frozen_subscriber_is_waited_for(shared: Ros) -> None:
+    node = LifecycleNode("publishing", context=shared.context, use_global_arguments=False)
+    ours, chosen = Outputs(node), selection(1)
+    command = [sys.executable, "-c", SUBSCRIBER]
+    with subprocess.Popen(command, env=shared.environment, stdout=subprocess.PIPE, text=True) as child:
+        try:
+            ours.publish_clouds(chosen, Header())
+            assert child.stdout is not None and child.stdout.readline() == "heard\n"
+            child.send_signal(signal.SIGSTOP)
+            gaps, done = [], threading.Event()
+
+            def tick() -> None:
+                while not done.is_set():
+                    begun = time.monotonic()
+                    time.sleep(0.01)
+                    gaps.append(time.monotonic() - begun)
+
+            ticking = threading.Thread(target=tick)
+            ticking.start()
+            begun = time.monotonic()
+            ours.publish_clouds(chosen, Header())
+            waited = time.monotonic() - begun
+            done.set()
+            ticking.join()
+            assert waited >= 0.9 * outputs_module.FLOW_SECONDS, "the subscriber does not acknowledge"
+            assert len(gaps) >= 10, f"{len(gaps)} ticks in {waited:.2f} s, the longest of {max(gaps):.2f} s"
+        finally:
+            child.kill()
+            ours.close()
+            node.destroy_node()
+
+
+def test_a_run_that_is_older_than_what_is_published_or_no_longer_holds_gets_no_turn() -> None:
+    ours, _ = outputs()
+    with ours.turn(2) as newest:
+        assert newest
+    for revision in (1, 2):
+        with ours.turn(revision) as newest:
+            assert not newest
+    with ours.turn(3, lambda: False) as newest:
+        assert not newest
+    with ours.turn(3) as newest:
+        assert newest
+
+
+def test_two_runs_do_not_publish_at_the_same_time() -> None:
+    ours, _ = outputs()
+    took: list[int] = []
+
+    def publish() -> None:
+        with ours.turn(2) as newest:
+            took.append(2 if newest else 0)
+
+    with ours.turn(1):
+        thread = threading.Thread(target=publish)
+        thread.start()
+        thread.join(0.2)
+        assert thread.is_alive() and not took
+    thread.join(30)
+    assert took == [2]
+
+
+def test_nothing_is_published_once_closed_and_no_topic_comes_back() -> None:
+    ours, publishers = outputs()
+    ours.announce(NAMES)
+    before = dict(publishers)
+    ours.close()
+    ours.close()
+    assert not publishers
+    with ours.turn(1) as newest:
+        assert not newest
+    assert ours.publish_objects(ObjectArray()) is False
+    ours.publish_overlay(Image())
+    ours.publish_report(SegmentationReport())
+    ours.clear(SegmentationReport(revision=2))
+    assert not publishers and not any(publisher.sent for publisher in before.values())
+    assert ours.topics(NAMES) == {}
