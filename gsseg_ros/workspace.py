@@ -14,6 +14,7 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 
+from gsseg_core.errors import PathNotAllowedError
 from gsseg_core.live import LiveSession
 from gsseg_core.live_ids import PerViewSession
 from gsseg_core.pipeline import PER_VIEW
@@ -25,7 +26,6 @@ from gsseg_ros.errors import (
     MissingFileError,
     NoSceneError,
     NotActiveError,
-    PathNotAllowedError,
     UnknownClassError,
 )
 from gsseg_ros.jobs import JobSlot
@@ -82,6 +82,7 @@ class Workspace:
 
     def __init__(self, settings: Settings, now: Callable[[], Time]) -> None:
         self.settings, self.slot = settings, JobSlot()
+        self._scene_at_start = settings.scene_path
         self.active = False
         self.last_job = "none"
         self.dropped: Counter[str] = Counter()
@@ -108,23 +109,41 @@ class Workspace:
             raise NoSceneError("no scene is loaded; expected the parameter scene_path, or a call of ~/load_scene")
         return self._session
 
-    def scene_path(self) -> Path:
-        """Path of the parameter scene_path, which needs no data_root.
+    def require_allowed_scene(self, path: str) -> None:
+        """Refuse what a peer may not set the parameter scene_path to.
+
+        Raises
+        ------
+        PathNotAllowedError
+            It is not what was given at the start, and no request could name it.
+        """
+        if path in ("", self._scene_at_start):
+            return
+        try:
+            self.path(os.path.abspath(path))
+        except (PathNotAllowedError, ValueError) as error:
+            raise PathNotAllowedError(f"parameter scene_path, set after the start: {error}") from error
+
+    def scene_path(self) -> tuple[Path, Path | None]:
+        """Path of the parameter scene_path, and the folder that it must not lead out of: none for that of the start.
 
         Raises
         ------
         MissingFileError
             There is no such file.
+        PathNotAllowedError
+            It was set later, and does not lie below data_root.
         """
         path = Path(self.settings.scene_path)
+        self.require_allowed_scene(str(path))
         if not path.is_file():
             raise MissingFileError(f"parameter scene_path: {path} does not exist; expected a 3DGS PLY")
-        return path
+        return path, None if self.settings.scene_path == self._scene_at_start else self.root
 
-    def load_scene(self, path: str | Path) -> None:
+    def load_scene(self, path: str | Path, within: Path | None = None) -> None:
         """Load a scene in place of the one there is, with all that was known of that; on any error nothing changes."""
         settings = self.settings
-        scene = GaussianScene.load(path)
+        scene = GaussianScene.load(path, within)
         kept: dict[str, Any] = {"max_views": settings.max_views, "device": settings.device}
         if settings.ids == PER_VIEW:
             session: LiveSession = PerViewSession(scene, **kept)
@@ -161,8 +180,16 @@ class Workspace:
             raise
         self.last_job = f"{job} done in {run.total_seconds:.2f} s"
 
+    @property
+    def root(self) -> Path:
+        """The folder data_root, links followed."""
+        return Path(self.settings.data_root).resolve()
+
     def path(self, request: str, default: str = "") -> Path:
         """Resolve a path of a request, absolute or relative to data_root.
+
+        Between this and the opening any part of it may become a link to elsewhere: open it as
+        `gsseg_core.confined_files` does.
 
         Raises
         ------
@@ -174,7 +201,7 @@ class Workspace:
                 f"path '{request or default}': the parameter data_root is empty, so no path is allowed; expected it to "
                 "be set to a folder"
             )
-        root = Path(self.settings.data_root).resolve()
+        root = self.root
         try:
             path = (root / (request or default)).resolve()
         except (OSError, RuntimeError, ValueError) as error:  # Links in a circle, or a NUL.

@@ -199,14 +199,19 @@ class Robot:
 
     def goal(self, **fields: Any) -> Goal:
         """Send a goal of `~/learn`, which is accepted."""
+        goal = self.offered(**fields)
+        assert goal is not None, "the goal was rejected"
+        return goal
+
+    def offered(self, **fields: Any) -> Goal | None:
+        """Send a goal of `~/learn`; returns None if it is rejected."""
         self.ros.wait_until(self._learner.server_is_ready, "the action")
         self._greet()
         feedback: list[Any] = []
         learner, goal = self._learner, Learn.Goal(**fields)
         sent = self.ros.run(lambda: learner.send_goal_async(goal, lambda message: feedback.append(message.feedback)))
-        handle = self.ros.result(sent, "the goal to be accepted")
-        assert handle.accepted
-        return Goal(handle, self.ros.run(handle.get_result_async), feedback)
+        handle = self.ros.result(sent, "the answer to the goal")
+        return Goal(handle, self.ros.run(handle.get_result_async), feedback) if handle.accepted else None
 
     def outcome(self, goal: Goal) -> tuple[int, Any]:
         """Wait for the end of a goal; returns status and result. To learn may take a busy machine long."""

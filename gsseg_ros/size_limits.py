@@ -1,0 +1,21 @@
+"""How large what peers send and ask for may be."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gsseg_ros.errors import TooManyPixelsError
+
+
+def require_size(message: Any, max_pixels: int, topic: str) -> None:
+    """Refuse an Image or a CameraInfo by its size, before anything of that size is made.
+
+    Raises
+    ------
+    TooManyPixelsError
+        It has more pixels than the parameter max_pixels allows.
+    """
+    if message.width * message.height > max_pixels:
+        raise TooManyPixelsError(
+            f"{topic}: is {message.width} x {message.height}; expected {max_pixels} pixels at most (parameter max_pixels)"
+        )
