@@ -111,7 +111,7 @@ def require_export_folder(folder: Path) -> None:
         strangers = sorted(found)
     if strangers:
         raise PathTakenError(
-            f"{folder}: holds {strangers[0]!r}, which is no export; expected a new or empty folder, or an earlier export"
+            f"{folder}: holds {strangers[0]!r}, which is no export; expected a new or empty folder, or an export"
         )
 
 

@@ -16,6 +16,5 @@ def require_size(message: Any, max_pixels: int, topic: str) -> None:
         It has more pixels than the parameter max_pixels allows.
     """
     if message.width * message.height > max_pixels:
-        raise TooManyPixelsError(
-            f"{topic}: is {message.width} x {message.height}; expected {max_pixels} pixels at most (parameter max_pixels)"
-        )
+        size = f"{message.width} x {message.height}"
+        raise TooManyPixelsError(f"{topic}: is {size}; expected {max_pixels} pixels at most (parameter max_pixels)")

@@ -37,6 +37,9 @@ def root_fixture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (root / "taken.npz").mkdir()
     (root / "taken").mkdir()
     (root / "taken" / "classes").write_text("in the way")
+    leaking = copied(data, root / "leaking") / "labels" / "view1.png"
+    leaking.rename(top / "view1.png")
+    leaking.symlink_to(top / "view1.png")
     broken = copied(data, root / "broken") / "labels" / "view1.png"
     broken.write_bytes(broken.read_bytes()[:60])
     for mask in (copied(data, root / "unlabelled") / "labels").iterdir():
