@@ -168,8 +168,10 @@ class SegmentNode(LifecycleNode):
         self.destroy_node()
 
     def _stop_and_forget(self) -> None:
-        self.stop()
-        self._forget()
+        try:
+            self.stop()
+        finally:
+            self._forget()
 
     def _forget(self) -> None:
         self.workspace.close()
