@@ -26,6 +26,11 @@ def latched() -> QoSProfile:
     return QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
+def requests() -> QoSProfile:
+    """Make a profile for services: as is usual, but deep enough that in a burst, too, every request gets an answer."""
+    return QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
+
+
 @contextmanager
 def clear_overrides(topic: str) -> Iterator[None]:
     """Make what rclpy raises in the body for a parameter qos_overrides that cannot be used one clear error.

@@ -27,6 +27,7 @@ from gsseg_core.report import build_report
 from gsseg_ros.errors import InvalidRequestError, error_code
 from gsseg_ros.jobs import Turns
 from gsseg_ros.outputs import Outputs
+from gsseg_ros.qos import requests
 from gsseg_ros.reports import Selection, finish, report_message, stage_timings
 from gsseg_ros.viewpoints import Lookup, draw, viewpoint
 from gsseg_ros.workspace import Run, Workspace, checked_confidence, chosen_classes
@@ -151,7 +152,7 @@ class Services:
             (Export, "export", self.export),
             (Reset, "reset", self.reset),
         ):
-            node.create_service(interface, f"~/{name}", handler, callback_group=group)
+            node.create_service(interface, f"~/{name}", handler, qos_profile=requests(), callback_group=group)
 
     @answered
     @in_turn

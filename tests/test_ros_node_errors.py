@@ -150,7 +150,7 @@ MORE_CASES = [
         "viewpoint_camera": nowhere()["viewpoint_camera"],
         "viewpoint_pose": PoseStamped(pose=Pose(orientation=Quaternion(w=0.0))),
     }),
-    Case("segment", "INVALID_VIEWPOINT", "main", "pixels; expected", nowhere(width=100_000, height=100_000)),
+    Case("segment", "INVALID_VIEWPOINT", "main", "expected 16777216 pixels", nowhere(width=100_000, height=100_000)),
     Case("save_state", "PATH_TAKEN", "main", "taken.npz: is there and is no saved state", {"path": "taken.npz"}),
     Case("export", "PATH_TAKEN", "main", "data: holds 'cameras.json', which is no export", {"directory": "data"}),
     Case("learn", "PATH_NOT_ALLOWED", "main", "labels/view1.png: leads out of", {"dataset_path": "leaking"}),
@@ -218,8 +218,8 @@ def answer(robot: Robot, case: Case) -> Any:
 @contextmanager
 def crowded(robot: Robot) -> Iterator[None]:
     """The node has as many large requests as it takes, for seconds."""
-    large = nowhere(width=3000, height=3000)
-    requests = [robot.send("render_view", **large) for _ in range(12)]
+    large = nowhere(width=2000, height=2000)
+    requests = [robot.send("render_view", **large) for _ in range(10)]
     robot.ros.wait_until(lambda: any(request.done() for request in requests), "a request that is refused")
     yield
     answers = [robot.ros.result(request) for request in requests]

@@ -4,38 +4,25 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from ros_fixtures import parameters_fixture, root_fixture  # noqa: F401
-from ros_helpers import PATIENCE, Ros, ros_fixture  # noqa: F401
+from ros_fixtures import node_fixture, parameters_fixture, root_fixture, spun  # noqa: F401
+from ros_helpers import Ros, ros_fixture  # noqa: F401
 from ros_robot import Robot
 from small_scenes import clean_views
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from lifecycle_msgs.msg import Transition
-from rclpy.executors import MultiThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
-from rclpy.parameter import Parameter
 
-from gsseg_ros import diagnostics, segment_node
-from gsseg_ros.segment_node import THREADS, SegmentNode
+from gsseg_ros import diagnostics
+from gsseg_ros.segment_node import SegmentNode
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 CONFIGURE = Transition(id=Transition.TRANSITION_CONFIGURE)
-
-
-@pytest.fixture
-def node(ros: Ros, parameters: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> Iterator[SegmentNode]:
-    """A node in this process, not configured, that does not compile anything and that nobody spins."""
-    monkeypatch.setattr(segment_node, "warm_up", lambda *_: None)
-    overrides = [Parameter(name, value=str(v) if isinstance(v, Path) else v) for name, v in parameters.items()]
-    node = SegmentNode(context=ros.context, parameter_overrides=overrides)
-    yield node
-    node.close()
 
 
 @pytest.fixture
@@ -130,7 +117,7 @@ def test_a_misspelt_quality_of_service_is_one_clear_error(
     robot = Robot(ros)
     topic, _, policy = override.split(".")
     process = robot.start({**parameters, f"qos_overrides.{override}": "relible"}, lossless=False)
-    process.wait_for(f"cannot be {step}")
+    process.wait_for(f"cannot be {step}", timeout=120)
     assert robot.state == state
     (line,) = (line for line in process.output.splitlines() if "[ERROR]" in line)
     assert f"cannot be {step}: parameters qos_overrides of the topic " in line and topic.split("/")[-1] in line
@@ -151,11 +138,7 @@ def test_the_state_is_told_and_changed_while_the_session_is_locked(
         return make(*arguments)
 
     monkeypatch.setattr(diagnostics, "diagnostic_array", make_and_tell)
-    executor = MultiThreadedExecutor(THREADS, context=ros.context)
-    executor.add_node(node)
-    spinning, stop = threading.Thread(target=lambda: spin(executor, stop)), threading.Event()
-    spinning.start()
-    try:
+    with spun(node, ros):
         robot.brought_to("inactive")
         assert robot.change("activate")
         with node.workspace.session._lock:
@@ -164,15 +147,6 @@ def test_the_state_is_told_and_changed_while_the_session_is_locked(
             assert robot.state == "active"
             assert robot.change("deactivate") and robot.state == "inactive"
             assert robot.change("activate") and robot.state == "active"
-    finally:
-        stop.set()
-        spinning.join(PATIENCE)
-        executor.shutdown(PATIENCE)
-
-
-def spin(executor: MultiThreadedExecutor, stop: threading.Event) -> None:
-    while not stop.is_set():
-        executor.spin_once(timeout_sec=0.1)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -186,7 +160,7 @@ def test_a_signal_is_heard_while_kernels_compile_and_so_are_questions(
     if how == "change_state":
         process.wait_for("autostart is false")
         robot.send("change_state", transition=CONFIGURE)
-    process.wait_for("compiling kernels")
+    process.wait_for("compiling kernels", timeout=120)
     assert robot.state == "configuring"
     process.send(number)
     assert process.wait(5) == 0, process.output
