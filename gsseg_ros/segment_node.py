@@ -48,8 +48,8 @@ class SegmentNode(LifecycleNode):
     """Wires topics, services and the action to a `Workspace`.
 
     configure: reads the parameters, loads the scene. activate: listens. deactivate: stops a running job and listening,
-    keeps what was learnt. cleanup: forgets it. Services and the action are there from the start and answer NOT_ACTIVE
-    until then.
+    keeps what was learnt. cleanup: forgets it. Services and the action are there from the start; until then services
+    answer NOT_ACTIVE, and goals are rejected.
     """
 
     def __init__(self, **kwargs: Any) -> None:
