@@ -135,7 +135,7 @@ class Workspace:
             It was set later, and does not lie below data_root.
         """
         path = Path(self.settings.scene_path)
-        self.require_allowed_scene(str(path))
+        self.require_allowed_scene(self.settings.scene_path)
         if not path.is_file():
             raise MissingFileError(f"parameter scene_path: {path} does not exist; expected a 3DGS PLY")
         return path, None if self.settings.scene_path == self._scene_at_start else self.root

@@ -149,8 +149,7 @@ def test_the_state_is_told_and_changed_while_the_session_is_locked(
             assert robot.change("activate") and robot.state == "active"
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("how", ["autostart", "change_state"])
+@pytest.mark.parametrize(("how", "number"), [("autostart", signal.SIGINT), ("change_state", signal.SIGTERM)])
 def test_a_signal_is_heard_while_kernels_compile_and_so_are_questions(
     ros: Ros, parameters: dict[str, Any], tmp_path: Path, how: str, number: signal.Signals
 ) -> None:
@@ -185,7 +184,7 @@ def test_a_home_folder_is_understood_in_the_paths_of_parameters(
     ros: Ros, parameters: dict[str, Any], root: Path
 ) -> None:
     ros.environment["HOME"] = str(root)
-    robot = Robot(ros).started({**parameters, "scene_path": "~/data/scene.ply", "data_root": "~"})
+    robot = Robot(ros).started({**parameters, "scene_path": "~/data/./scene.ply", "data_root": "~"})
     robot.fuse(clean_views(1))
     assert robot.done("save_state", path="home.npz").path == str(root / "home.npz")
     assert robot.done("load_scene").path == str(root / "data" / "scene.ply")
