@@ -7,6 +7,7 @@ import os
 import struct
 import tempfile
 from collections import Counter
+from contextlib import ExitStack
 from pathlib import Path, PureWindowsPath
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.cameras import Camera
+from gsseg_core.confined_files import input_name, open_input
 from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError
 from gsseg_core.json_files import kind_of, read_json
 from gsseg_core.layout import camera_hint
@@ -29,7 +31,7 @@ _NERFSTUDIO_MODELS = {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "PERSPECTIVE"}
 _NERFSTUDIO_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
-def read_cameras(folder: str | os.PathLike[str]) -> list[Camera]:
+def read_cameras(folder: str | os.PathLike[str], within: Path | None = None) -> list[Camera]:
     """Read the cameras of a dataset folder.
 
     They come from the first that is there of `cameras.json` (3DGS), `transforms.json` (nerfstudio), `sparse/0` and
@@ -39,6 +41,8 @@ def read_cameras(folder: str | os.PathLike[str]) -> list[Camera]:
     ----------
     folder : path
         The dataset.
+    within : pathlib.Path, optional
+        A folder below which the files must lie, links followed.
 
     Returns
     -------
@@ -51,14 +55,16 @@ def read_cameras(folder: str | os.PathLike[str]) -> list[Camera]:
         No cameras are there, or a file is broken, or two images share a stem.
     PoseError, IntrinsicsError
         A camera is unusable; only undistorted images are supported.
+    PathNotAllowedError
+        A file lies outside `within`.
     """
     folder = Path(folder)
     if (folder / "cameras.json").is_file():
         path = folder / "cameras.json"
-        cameras = _read_3dgs(path)
+        cameras = _read_3dgs(path, within)
     elif (folder / "transforms.json").is_file():
         path = folder / "transforms.json"
-        cameras = _read_nerfstudio(path)
+        cameras = _read_nerfstudio(path, within)
     else:
         models = [
             model
@@ -66,13 +72,14 @@ def read_cameras(folder: str | os.PathLike[str]) -> list[Camera]:
             if (model / "cameras.bin").is_file() or (model / "cameras.txt").is_file()
         ]
         if not models:
+            hint = camera_hint(folder) if within is None else ""  # It looks around, wherever links lead.
             what = "has no cameras" if folder.is_dir() else "is not a folder"
             raise CameraFileError(
                 f"{folder}: {what}; looked for cameras.json (3DGS), transforms.json (nerfstudio), and cameras.bin or "
-                f"cameras.txt in sparse/0 or sparse (COLMAP){camera_hint(folder)}"
+                f"cameras.txt in sparse/0 or sparse (COLMAP){hint}"
             )
         path = models[0]
-        cameras = _read_colmap(path)
+        cameras = _read_colmap(path, within)
     if not cameras:
         raise CameraFileError(f"{path}: holds no camera; expected at least one")
     for camera in cameras:
@@ -84,10 +91,10 @@ def read_cameras(folder: str | os.PathLike[str]) -> list[Camera]:
     return cameras
 
 
-def _read_3dgs(path: Path) -> list[Camera]:
+def _read_3dgs(path: Path, within: Path | None) -> list[Camera]:
     """Read camera-to-world poses in OpenCV axes; the principal point is the image's centre."""
     cameras = []
-    for where, entry in _entries(path, read_json(path, CameraFileError), "a list of cameras"):
+    for where, entry in _entries(path, read_json(path, CameraFileError, within), "a list of cameras"):
         width, height = _size(where, entry, "width"), _size(where, entry, "height")
         K = _intrinsics(_number(where, entry, "fx"), _number(where, entry, "fy"), width / 2, height / 2)
         pose = _inverse(_array(where, entry, "rotation", (3, 3)), _array(where, entry, "position", (3,)))
@@ -95,9 +102,9 @@ def _read_3dgs(path: Path) -> list[Camera]:
     return cameras
 
 
-def _read_nerfstudio(path: Path) -> list[Camera]:
+def _read_nerfstudio(path: Path, within: Path | None) -> list[Camera]:
     """Read camera-to-world poses in OpenGL axes (y up, z backward), intrinsics per file or per frame."""
-    content = read_json(path, CameraFileError)
+    content = read_json(path, CameraFileError, within)
     if not isinstance(content, dict):
         raise CameraFileError(f"{path}: holds {kind_of(content)}; expected an object with 'frames'")
     shared = {key: value for key, value in content.items() if key != "frames"}
@@ -151,9 +158,9 @@ def _focal(where: str, entry: dict[str, Any], key: str, angle_key: str, size: in
     return None
 
 
-def _read_colmap(path: Path) -> list[Camera]:
+def _read_colmap(path: Path, within: Path | None) -> list[Camera]:
     """Read a COLMAP model; its poses are world-to-camera in OpenCV axes, its pixel centres at +0.5, as ours."""
-    model = _load_colmap(path)
+    model = _load_colmap(path, within)
     cameras = []
     for image_id, image in sorted(model.images.items()):
         try:
@@ -176,7 +183,7 @@ def _read_colmap(path: Path) -> list[Camera]:
     return cameras
 
 
-def _load_colmap(path: Path) -> pycolmap.Reconstruction:
+def _load_colmap(path: Path, within: Path | None) -> pycolmap.Reconstruction:
     """Load the cameras and images of a COLMAP model, without its points.
 
     The points are not needed and take long to read, and pycolmap does not return from a truncated list of them. Nor
@@ -190,11 +197,11 @@ def _load_colmap(path: Path) -> pycolmap.Reconstruction:
     cameras, images = (path / f"{name}{suffix}" for name in ("cameras", "images"))
     if not images.is_file():
         raise CameraFileError(f"{path}: COLMAP model has {cameras.name} but no {images.name}")
-    if suffix == ".bin" and (cameras.stat().st_size < 8 or not _is_whole(images)):
+    if suffix == ".bin" and (cameras.stat().st_size < 8 or not _is_whole(images, within)):
         raise CameraFileError(f"{path}: {cameras.name} or {images.name} is truncated; expected a whole COLMAP model")
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as opened:
         for file in (cameras, images):
-            (Path(folder) / file.name).symlink_to(file.resolve())
+            (Path(folder) / file.name).symlink_to(opened.enter_context(input_name(file.resolve(), within)))
         (Path(folder) / f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
         try:
             model = pycolmap.Reconstruction(folder)
@@ -206,9 +213,10 @@ def _load_colmap(path: Path) -> pycolmap.Reconstruction:
     return model
 
 
-def _is_whole(images: Path) -> bool:
+def _is_whole(images: Path, within: Path | None) -> bool:
     """Walk through a binary list of images to see whether it ends too early."""
-    data = images.read_bytes()
+    with open_input(images, within) as file:
+        data = file.read()
     try:
         (count,) = struct.unpack_from("<Q", data)
         end = 8

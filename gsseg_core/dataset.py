@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from gsseg_core.camera_files import read_cameras
 from gsseg_core.cameras import Camera
+from gsseg_core.confined_files import require_folder_below
 from gsseg_core.errors import MaskFormatError, MaskSizeError, SettingsError, SplitFileError, UnknownLabelError
 from gsseg_core.json_files import read_json
 from gsseg_core.masks import BACKGROUND_NAME, MAX_LABEL, UNKNOWN, mask_bits, read_classes, read_mask
@@ -41,6 +42,8 @@ class View:
         If given, labels must be among its ids.
     supervised : tuple of int, or None
         If given, the label image says something of these classes only: its 0 means "none of these".
+    within : pathlib.Path or None
+        If given, the folder below which the mask must lie, links followed.
     """
 
     camera: Camera
@@ -48,6 +51,7 @@ class View:
     image_path: Path | None = None
     class_names: Mapping[int, str] | None = field(default=None, repr=False)
     supervised: tuple[int, ...] | None = None
+    within: Path | None = None
     _mask: PackedMask | None = field(default=None, repr=False)
 
     @classmethod
@@ -173,7 +177,7 @@ class View:
     def mask_bits(self) -> int | None:
         """Bits per label of a label image, 8 or 16 (of other masks: as many as labels need); None without a mask."""
         if self.mask_path is not None and self.mask_path.suffix.lower() == ".png":
-            return mask_bits(self.mask_path)
+            return mask_bits(self.mask_path, self.within)
         return (8 if self.largest_label < 255 else 16) if self.has_mask else None
 
     @property
@@ -224,8 +228,8 @@ class View:
 
     def _read_file(self, path: Path) -> SeenLabels:
         if path.suffix.lower() != ".png":
-            return read_soft_mask(path, self.class_names)
-        labels = read_mask(path).labels
+            return read_soft_mask(path, self.class_names, self.within)
+        labels = read_mask(path, self.within).labels
         return SeenLabels(labels) if self.supervised is None else restrict(labels, self.supervised, str(path))
 
     def _check_seen(self, seen: SeenLabels, source: str) -> None:
@@ -271,6 +275,8 @@ class Dataset:
         The folder.
     labels : str
         Sub-folder of the masks.
+    within : path, optional
+        If given, nothing is read that lies outside this folder once all links are followed.
 
     Attributes
     ----------
@@ -285,20 +291,31 @@ class Dataset:
         A file is missing or broken. A mask that is missing is no error here.
     MaskFormatError
         A view has masks of two kinds.
+    PathNotAllowedError
+        A file or folder lies outside `within`; of a mask that is found out when it is read.
     """
 
-    def __init__(self, root: str | os.PathLike[str], labels: str = "labels") -> None:
+    def __init__(
+        self, root: str | os.PathLike[str], labels: str = "labels", *, within: str | os.PathLike[str] | None = None
+    ) -> None:
         self.root = Path(root)
-        self.cameras = read_cameras(self.root)
+        self._within = None if within is None else Path(within)
+        self.cameras = read_cameras(self.root, self._within)
         classes = self.root / "classes.json"
-        self._declared = read_classes(classes) if classes.is_file() else None
+        self._declared = read_classes(classes, self._within) if classes.is_file() else None
         stems = [camera.name for camera in self.cameras]
-        masks = mask_files(self.root / labels, stems)
-        supervised = read_supervises(self.root / labels / SUPERVISES, masks, stems, self._declared)
-        images = _files_by_stem(self.root / "images", _IMAGE_SUFFIXES)
+        masks = mask_files(self.root / labels, stems, self._within)
+        supervises = self.root / labels / SUPERVISES
+        supervised = read_supervises(supervises, masks, stems, self._declared, self._within)
+        images = _files_by_stem(self.root / "images", _IMAGE_SUFFIXES, self._within)
         self._views = {
             camera.name: View(
-                camera, masks.get(camera.name), images.get(camera.name), self._declared, supervised.get(camera.name)
+                camera,
+                masks.get(camera.name),
+                images.get(camera.name),
+                self._declared,
+                supervised.get(camera.name),
+                self._within,
             )
             for camera in self.cameras
         }
@@ -329,7 +346,7 @@ class Dataset:
         path = self.root / "split.json"
         if not path.is_file():
             return {"train": list(self._views), "test": []}
-        content = read_json(path, SplitFileError)
+        content = read_json(path, SplitFileError, self._within)
         if not isinstance(content, dict) or "train" not in content:
             raise SplitFileError(f'{path}: no "train" in it; expected {{"train": [stems], "test": [stems]}}')
         split = {name: content.get(name, []) for name in ("train", "test")}
@@ -363,7 +380,8 @@ def spread(views: Sequence[View], count: int | None) -> list[View]:
     return [views[i] for i in np.linspace(0, len(views) - 1, count).round().astype(int)]
 
 
-def _files_by_stem(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
+def _files_by_stem(folder: Path, suffixes: tuple[str, ...], within: Path | None) -> dict[str, Path]:
     if not folder.is_dir():
         return {}
+    require_folder_below(folder, within)
     return {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in suffixes}

@@ -74,6 +74,10 @@ class PathTakenError(WriteError):
     """What lies where something should be written is not ours to replace; nothing was written."""
 
 
+class PathNotAllowedError(GssegError):
+    """A path leads outside the folder below which it must lie."""
+
+
 class StateFileError(GssegError):
     """A saved state or segmentation is missing or broken."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from gsseg_core.confined_files import open_input
 from gsseg_core.errors import GssegError
 
 _KINDS = {
@@ -18,11 +19,12 @@ def kind_of(content: object) -> str:
     return _KINDS[type(content)]
 
 
-def read_json(path: Path, error: type[GssegError]) -> object:
-    """Read a JSON file; raise `error` with one clear line if it is missing or broken."""
+def read_json(path: Path, error: type[GssegError], within: Path | None = None) -> object:
+    """Read a JSON file, below `within` if given; raise `error` with one clear line if it is missing or broken."""
     try:
         # Editors on Windows write a byte order mark, which "utf-8" would hand to the parser.
-        return json.loads(path.read_text(encoding="utf-8-sig"))
+        with open_input(path, within) as file:
+            return json.loads(file.read().decode("utf-8-sig"))
     except OSError as cause:
         raise error(f"{path}: cannot be read ({cause.strerror or cause})") from cause
     except (ValueError, RecursionError) as cause:

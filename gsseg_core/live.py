@@ -6,6 +6,7 @@ import os
 import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
+from pathlib import Path
 
 import numpy as np
 
@@ -294,6 +295,8 @@ class LiveSession:
         ------
         NoCodesError
             There is nothing to save.
+        PathTakenError
+            Something is there that is no saved state; it is unchanged.
         WriteError
             The file cannot be written; an earlier one is unchanged.
         """
@@ -305,7 +308,7 @@ class LiveSession:
         State(state.votes, state.views, fused, names, learnt).save(path, self.scene.digest)
         return learnt.num_views if learnt is not None else fused
 
-    def load(self, path: str | os.PathLike[str]) -> int:
+    def load(self, path: str | os.PathLike[str], within: Path | None = None) -> int:
         """Replace all that is known by a saved state; return the number of views in its votes or codes.
 
         Raises
@@ -315,8 +318,10 @@ class LiveSession:
             `max_classes`. Nothing has changed.
         StateMismatchError
             It belongs to another scene. Nothing has changed.
+        PathNotAllowedError
+            The file lies outside the folder `within`, links followed. Nothing has changed.
         """
-        state = State.load(path, self.scene.digest, len(self.scene))
+        state = State.load(path, self.scene.digest, len(self.scene), within)
         width = max(state.votes.shape[1], 0 if state.learnt is None else state.learnt.codes.shape[1])
         if self._declared and width > len(self._names):
             raise StateFileError(f"{path}: holds {width} classes; expected at most {len(self._names)}, as were named")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -113,10 +114,10 @@ class PerViewSession(LiveSession):
         self.repair()
         return super().learn(learner, None, **settings)
 
-    def load(self, path: str | os.PathLike[str]) -> int:
+    def load(self, path: str | os.PathLike[str], within: Path | None = None) -> int:
         """Replace all that is known by a saved state, as `LiveSession.load` does; its labels are numbers of objects."""
         with self._lock:
-            loaded = super().load(path)
+            loaded = super().load(path, within)
             for view in self._live.views.values():
                 self._table.adopt(view)
             self._table.reserve(self._live.num_classes - 1)

@@ -20,6 +20,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from gsseg_core.atomic import write_atomically
+from gsseg_core.confined_files import open_input
 from gsseg_core.errors import ClassesFileError, MaskFormatError, SettingsError
 from gsseg_core.json_files import kind_of, read_json
 from gsseg_core.names import flaw_of_class_name
@@ -39,8 +40,15 @@ class Mask(NamedTuple):
     bits: int
 
 
-def read_mask(path: str | os.PathLike[str]) -> Mask:
+def read_mask(path: str | os.PathLike[str], within: Path | None = None) -> Mask:
     """Read a label image: a PNG with 8- or 16-bit gray values, or palette indices, as labels.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    within : pathlib.Path, optional
+        A folder below which it must lie, links followed.
 
     Returns
     -------
@@ -51,11 +59,13 @@ def read_mask(path: str | os.PathLike[str]) -> Mask:
     ------
     MaskFormatError
         The file is missing, broken, or another kind of image (RGB, alpha, 1-bit, not a PNG).
+    PathNotAllowedError
+        It lies elsewhere.
     """
-    bits = mask_bits(path)
+    bits = mask_bits(path, within)
     try:
         # Other formats are lossy or ambiguous about integers, whatever the file is named.
-        with Image.open(path, formats=["PNG"]) as image:
+        with open_input(path, within) as file, Image.open(file, formats=["PNG"]) as image:
             labels = np.array(image).astype(np.int32)
     except (OSError, SyntaxError, ValueError, EOFError, struct.error) as error:
         raise MaskFormatError(f"{path}: broken PNG ({error}); expected a whole label image") from error
@@ -63,10 +73,10 @@ def read_mask(path: str | os.PathLike[str]) -> Mask:
     return Mask(labels, bits)
 
 
-def mask_bits(path: str | os.PathLike[str]) -> int:
-    """Bits per label of a PNG, 8 or 16, from its header alone; raises `MaskFormatError` as `read_mask` does."""
+def mask_bits(path: str | os.PathLike[str], within: Path | None = None) -> int:
+    """Bits per label of a PNG, 8 or 16, from its header alone; raises as `read_mask` does."""
     try:
-        with open(path, "rb") as file:
+        with open_input(path, within) as file:
             header = file.read(26)
     except OSError as error:
         raise MaskFormatError(f"{path}: cannot be read ({error.strerror or error}); expected a label image") from error
@@ -147,8 +157,10 @@ class PackedLabels:
         return np.frombuffer(zlib.decompress(self._data), self._dtype).reshape(self._shape).astype(np.int32)
 
 
-def read_classes(path: str | os.PathLike[str]) -> dict[int, str]:
+def read_classes(path: str | os.PathLike[str], within: Path | None = None) -> dict[int, str]:
     """Read `classes.json`, an object from id to name; sorted by id, 0 being "background" unless named otherwise.
+
+    With `within`, the file must lie below that folder, links followed (else `PathNotAllowedError`).
 
     Raises
     ------
@@ -157,7 +169,7 @@ def read_classes(path: str | os.PathLike[str]) -> dict[int, str]:
         of at most 200 characters.
     """
     path = Path(path)
-    content = read_json(path, ClassesFileError)
+    content = read_json(path, ClassesFileError, within)
     if not isinstance(content, dict):
         raise ClassesFileError(f'{path}: holds {kind_of(content)}; expected an object such as {{"1": "chair"}}')
     names = {0: BACKGROUND_NAME}

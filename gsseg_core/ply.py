@@ -11,17 +11,20 @@ import numpy.typing as npt
 import plyfile
 
 from gsseg_core.atomic import write_atomically
+from gsseg_core.confined_files import input_name
 from gsseg_core.errors import SceneFileError, ScenePropertyError
 from gsseg_core.layout import scene_hint
 
 
-def read_vertices(path: str | os.PathLike[str]) -> npt.NDArray[np.void]:
+def read_vertices(path: str | os.PathLike[str], within: Path | None = None) -> npt.NDArray[np.void]:
     """Read the `vertex` element of a PLY file, ascii or binary of either byte order.
 
     Parameters
     ----------
     path : path
         The PLY file. Elements other than `vertex` are ignored.
+    within : pathlib.Path, optional
+        A folder below which the file must lie, links followed.
 
     Returns
     -------
@@ -34,13 +37,17 @@ def read_vertices(path: str | os.PathLike[str]) -> npt.NDArray[np.void]:
         The file is missing, truncated, not a PLY, or has no `vertex` element.
     ScenePropertyError
         A vertex property is a list.
+    PathNotAllowedError
+        The file lies outside `within`.
     """
     path = Path(path)
     try:
-        ply = plyfile.PlyData.read(str(path))
+        with input_name(path, within) as name:
+            ply = plyfile.PlyData.read(name)
     except OSError as error:
+        hint = scene_hint(path) if within is None else ""  # It looks around, wherever links lead.
         raise SceneFileError(
-            f"{path}: cannot be read ({error.strerror or error}); expected a 3DGS PLY{scene_hint(path)}"
+            f"{path}: cannot be read ({error.strerror or error}); expected a 3DGS PLY{hint}"
         ) from error
     except (plyfile.PlyParseError, ValueError, OverflowError, MemoryError) as error:
         raise SceneFileError(f"{path}: truncated or not a PLY file ({error}); expected a whole 3DGS PLY") from error

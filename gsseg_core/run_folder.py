@@ -115,6 +115,25 @@ def settle(folder: str | os.PathLike[str]) -> None:
         raise _unfinished(folder, error) from error
 
 
+def require_own_folder(out: Path, kind: str, earlier: Earlier) -> None:
+    """Refuse a folder that holds anything but holds no results of this kind.
+
+    Raises
+    ------
+    PathTakenError
+        It is such a folder.
+    """
+    if not out.is_dir():
+        return
+    there = (path.name for path in out.iterdir() if path.name not in (RUN_FILE, LOCK_FILE))
+    strangers = sorted(name for name in there if not _STAGING.fullmatch(name))
+    if strangers and not _own(out, kind, earlier):
+        raise PathTakenError(
+            f"{out}: holds {strangers[0][:60]!r}, and no results of gsseg {kind}; expected a folder that is new, "
+            "empty, or holds such results"
+        )
+
+
 class StagedRun:
     """A run that is being written; made by `staged_run`.
 
@@ -147,7 +166,7 @@ class StagedRun:
                 _finish(self.out)
                 _remove_dead(self.out)
                 if only_own:
-                    self._refuse_other_folders()
+                    require_own_folder(self.out, self._kind, self._earlier)
                 self._staging.mkdir()
                 self._lock = os.open(self._staging / "lock", os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
                 try_lock(self._lock)
@@ -171,7 +190,7 @@ class StagedRun:
         PathTakenError
             There is one.
         """
-        own = self._own(Manifest.read(self.out / RUN_FILE))
+        own = _own(self.out, self._kind, self._earlier)
         for place in places:
             _refuse_stranger(self.out, place, own, self._kind)
 
@@ -185,7 +204,7 @@ class StagedRun:
             with _locked(self.out):
                 _finish(self.out)
                 before = Manifest.read(self.out / RUN_FILE)
-                own = self._own(before)
+                own = _own(self.out, self._kind, self._earlier)
                 for place in records:
                     _refuse_stranger(self.out, place, own, self._kind)
                 replaced = {
@@ -222,22 +241,6 @@ class StagedRun:
             if self._lock >= 0:
                 os.close(self._lock)
 
-    def _refuse_other_folders(self) -> None:
-        hidden = (RUN_FILE, LOCK_FILE)
-        there = (path.name for path in self.out.iterdir() if path.name not in hidden)
-        strangers = sorted(name for name in there if not _STAGING.fullmatch(name))
-        if strangers and not self._own(Manifest.read(self.out / RUN_FILE)):
-            raise PathTakenError(
-                f"{self.out}: holds {strangers[0][:60]!r}, and no results of gsseg {self._kind}; expected a folder "
-                "that is new, empty, or holds such results"
-            )
-
-    def _own(self, manifest: Manifest) -> dict[str, FileRecord | None]:
-        """Files in `out` that are results of this kind; None where what they should hold is not known."""
-        if self._kind in manifest.runs:
-            return dict(manifest.runs[self._kind].files)
-        return dict.fromkeys(self._earlier(self.out))
-
     def _is_committed(self) -> bool:
         try:
             return Manifest.read(self.out / COMMIT_FILE).staging == self._staging.name
@@ -250,6 +253,12 @@ class StagedRun:
         for i, place in enumerate(places):
             with contextlib.suppress(OSError):
                 os.link(self.out / place, self._staging / "old" / str(i))
+
+
+def _own(out: Path, kind: str, earlier: Earlier) -> dict[str, FileRecord | None]:
+    """Files in a folder that are results of a kind; None where what they should hold is not known."""
+    runs = Manifest.read(out / RUN_FILE).runs
+    return dict(runs[kind].files) if kind in runs else dict.fromkeys(earlier(out))
 
 
 def _finish(out: Path) -> None:

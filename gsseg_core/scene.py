@@ -72,8 +72,10 @@ class GaussianScene:
     path: Path | None = None
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> GaussianScene:
+    def load(cls, path: str | os.PathLike[str], within: Path | None = None) -> GaussianScene:
         """Load a 3DGS PLY: SH degree 0 to 3, ascii or binary, float or double, properties in any order.
+
+        With `within`, the file must lie below that folder, links followed.
 
         Raises
         ------
@@ -85,9 +87,11 @@ class GaussianScene:
             Values are NaN or infinite, or quaternions are zero.
         EmptySceneError
             There is no Gaussian.
+        PathNotAllowedError
+            The file lies outside `within`.
         """
         path = Path(path)
-        return cls._from_vertices(read_vertices(path), path)
+        return cls._from_vertices(read_vertices(path, within), path)
 
     @classmethod
     def from_arrays(

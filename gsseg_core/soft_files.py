@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image, UnidentifiedImageError
 
+from gsseg_core.confined_files import open_input, require_folder_below
 from gsseg_core.errors import MaskFormatError, MaskSizeError, SupervisesFileError, UnknownLabelError
 from gsseg_core.json_files import kind_of, read_json
 from gsseg_core.masks import MAX_LABEL
@@ -32,16 +33,19 @@ _DAMAGED = (OSError, ValueError, TypeError, EOFError, KeyError, RuntimeError, Me
             zipfile.BadZipFile, zlib.error)  # fmt: skip
 
 
-def mask_files(folder: Path, stems: Iterable[str]) -> dict[str, Path]:
+def mask_files(folder: Path, stems: Iterable[str], within: Path | None = None) -> dict[str, Path]:
     """Find the masks of views: `<stem>.png`, `<stem>.npz` or the folder `<stem>`.
 
     Raises
     ------
     MaskFormatError
         A view has masks of two kinds.
+    PathNotAllowedError
+        The folder lies outside `within`.
     """
     if not folder.is_dir():
         return {}
+    require_folder_below(folder, within)
     found: dict[str, Path] = {}
     wanted = set(stems)
     for path in sorted(folder.iterdir()):
@@ -62,6 +66,7 @@ def read_supervises(
     masks: Mapping[str, Path],
     stems: Iterable[str],
     class_names: Mapping[int, str] | None,
+    within: Path | None = None,
 ) -> dict[str, tuple[int, ...]]:
     """Read which classes each label image says something of: `{"*": [1, 3], "frame_0007": [2]}`; none if there is none.
 
@@ -72,10 +77,12 @@ def read_supervises(
     SupervisesFileError
         The file is broken, or names a view without a camera, a mask that is no label image, or a class that there is
         not.
+    PathNotAllowedError
+        It lies outside `within`.
     """
     if not path.is_file():
         return {}
-    content = read_json(path, SupervisesFileError)
+    content = read_json(path, SupervisesFileError, within)
     if not isinstance(content, dict):
         raise SupervisesFileError(f'{path}: holds {kind_of(content)}; expected {{"*": [ids]}} or stems and ids')
     known, entries = set(stems), {}
@@ -96,7 +103,7 @@ def read_supervises(
     return {stem: entries.get(stem, entries.get(_ANY, ())) for stem in pngs if stem in entries or _ANY in entries}
 
 
-def read_soft_mask(path: Path, class_names: Mapping[int, str] | None = None) -> SeenLabels:
+def read_soft_mask(path: Path, class_names: Mapping[int, str] | None = None, within: Path | None = None) -> SeenLabels:
     """Read probabilities (.npz) or a folder of detections.
 
     Parameters
@@ -105,20 +112,24 @@ def read_soft_mask(path: Path, class_names: Mapping[int, str] | None = None) -> 
         The file or folder.
     class_names : mapping from id to name, optional
         If given, an npz without `classes` must have a probability for each id up to the largest.
+    within : pathlib.Path, optional
+        A folder below which it must lie, links followed.
 
     Raises
     ------
     MaskFormatError, MaskSizeError, UnknownLabelError
         It is missing or broken, or holds something else; see docs/masks.md.
+    PathNotAllowedError
+        It lies elsewhere.
     """
-    return _read_detections(path) if path.is_dir() else _read_probabilities(path, class_names)
+    return _read_detections(path, within) if path.is_dir() else _read_probabilities(path, class_names, within)
 
 
-def _read_probabilities(path: Path, class_names: Mapping[int, str] | None) -> SeenLabels:
+def _read_probabilities(path: Path, class_names: Mapping[int, str] | None, within: Path | None) -> SeenLabels:
     arrays: dict[str, npt.NDArray[np.generic]] = {}
     try:
         # Opened here, since np.load leaves a file open that it cannot read.
-        with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
+        with open_input(path, within) as opened, np.load(opened, allow_pickle=False) as file:
             names = list(file.files)
             for name in (_PROBABILITIES, _CLASSES, _UNKNOWN):
                 if name in names:
@@ -140,30 +151,31 @@ def _read_probabilities(path: Path, class_names: Mapping[int, str] | None) -> Se
     return quantise(probabilities, classes, unknown=arrays.get(_UNKNOWN), source=str(path))  # type: ignore[arg-type]
 
 
-def _read_detections(folder: Path) -> SeenLabels:
+def _read_detections(folder: Path, within: Path | None) -> SeenLabels:
+    require_folder_below(folder, within)
     detections: dict[int, npt.NDArray[np.generic]] = {}
     unknown = None
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() not in _IMAGES:
             continue
         if path.stem == _UNKNOWN:
-            unknown = _read_image(path) > 0
+            unknown = _read_image(path, within) > 0
             continue
         if not re.fullmatch(r"0|[1-9][0-9]{0,4}", path.stem) or int(path.stem) > MAX_LABEL:
             raise UnknownLabelError(f"{path}: is named {path.stem!r}; expected the id of a class, as in '12.png'")
         if int(path.stem) in detections:
             raise MaskFormatError(f"{folder}: has two images of class {path.stem}; expected one")
-        detections[int(path.stem)] = _read_image(path)
+        detections[int(path.stem)] = _read_image(path, within)
     shapes = {array.shape for array in detections.values()}
     if unknown is not None and len(shapes) == 1 and unknown.shape not in shapes:
         raise MaskSizeError(f"{folder}: unknown has shape {unknown.shape}; expected {shapes.pop()}, as the others")
     return combine_detections(detections, unknown=unknown, source=str(folder))
 
 
-def _read_image(path: Path) -> npt.NDArray[np.float32]:
+def _read_image(path: Path, within: Path | None) -> npt.NDArray[np.float32]:
     """Read an image of one class, as probabilities (H, W) float32."""
     try:
-        with Image.open(path, formats=["PNG", "TIFF"]) as image:
+        with open_input(path, within) as file, Image.open(file, formats=["PNG", "TIFF"]) as image:
             mode, values = image.mode, np.array(image)
     except (*_DAMAGED, UnidentifiedImageError) as error:
         raise MaskFormatError(f"{path}: broken image ({error}); expected probabilities of one class") from error

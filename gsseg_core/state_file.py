@@ -13,9 +13,9 @@ import numpy as np
 from gsseg_core.atomic import write_atomically
 from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
-from gsseg_core.errors import StateFileError
+from gsseg_core.errors import PathTakenError, StateFileError
 from gsseg_core.meaning import Meaning
-from gsseg_core.npz_files import open_npz
+from gsseg_core.npz_files import npz_format, open_npz
 from gsseg_core.soft_masks import SeenLabels
 
 FORMAT = "gsseg-state-1"
@@ -72,9 +72,13 @@ class State:
 
         Raises
         ------
+        PathTakenError
+            Something is there that is no saved state; it is unchanged.
         WriteError
             The file cannot be written; an earlier one is unchanged.
         """
+        path = Path(path)
+        _require_replaceable(path)
         seen = np.flatnonzero(self.votes.any(axis=1))
         header: dict[str, Any] = {
             "format": FORMAT,
@@ -101,10 +105,11 @@ class State:
             arrays[f"pose_{i}"] = np.stack([np.pad(view.camera.K, (0, 1)), view.camera.world_to_camera])
         with write_atomically(path, suffix=".npz") as temporary, open(temporary, "wb") as file:
             np.savez_compressed(file, allow_pickle=False, header=np.array(json.dumps(header)), **arrays)
+            _require_replaceable(path)  # To save takes long.
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], digest: str, num_gaussians: int) -> State:
-        """Read what was saved for the same scene.
+    def load(cls, path: str | os.PathLike[str], digest: str, num_gaussians: int, within: Path | None = None) -> State:
+        """Read what was saved for the same scene; with `within`, from below that folder, links followed.
 
         Raises
         ------
@@ -112,9 +117,11 @@ class State:
             The file is missing or damaged.
         StateMismatchError
             It belongs to another scene.
+        PathNotAllowedError
+            The file lies outside `within`.
         """
         path = Path(path)
-        with open_npz(path, "a saved state", FORMAT, digest) as (file, header):
+        with open_npz(path, "a saved state", FORMAT, digest, within) as (file, header):
             n, k = (int(size) for size in header["shape"])
             if n != num_gaussians:
                 raise StateFileError(f"{path}: holds {n} Gaussians; expected {num_gaussians}, as the scene has")
@@ -134,6 +141,11 @@ class State:
                 {int(k): str(name) for k, name in header["class_names"].items()},
                 learnt,
             )
+
+
+def _require_replaceable(path: Path) -> None:
+    if os.path.lexists(path) and npz_format(path) != FORMAT:
+        raise PathTakenError(f"{path}: is there and is no saved state; expected a new file, or a state to replace")
 
 
 def _read_view(file: np.lib.npyio.NpzFile, i: int, entry: dict[str, Any]) -> View:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from typing import Any
 
@@ -14,7 +15,7 @@ from gsseg_ros.conversions import stamp_ns
 from gsseg_ros.live_outputs import LiveOutputs
 from gsseg_ros.outputs import Outputs
 from gsseg_ros.pairing import Pairing, PoseSource
-from gsseg_ros.qos import sensor_data
+from gsseg_ros.qos import clear_overrides, sensor_data
 
 
 class CameraImages:
@@ -33,6 +34,11 @@ class CameraImages:
     group : CallbackGroup
         Of the other inputs.
 
+    Raises
+    ------
+    SettingsError
+        Its quality of service is overridden by something impossible.
+
     Attributes
     ----------
     pairing : Pairing
@@ -45,27 +51,37 @@ class CameraImages:
         self._node, self._outputs, self._live, self._group = node, outputs, live, group
         self.pairing = Pairing(poses)
         self._subscription: Any = None
+        self._lock, self._closed = threading.Lock(), False
+        self._listen(True)  # Only to have an override that cannot be used refused now, and not when somebody looks.
+        self._listen(False)
 
     def tick(self) -> None:
         """Begin or stop to listen, and hand over what has found its pose; call it some ten times a second."""
-        wanted = self._outputs.wants_overlay
-        if wanted and self._subscription is None:
-            self._subscription = self._node.create_subscription(
-                Image,
-                "image",
-                self._arrived,
-                sensor_data(),
-                callback_group=self._group,
-                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-            )
-        elif not wanted:
-            self.close()
+        with self._lock:
+            if self._closed:
+                return
+            self._listen(self._outputs.wants_overlay)
         self.pairing.expire(time.monotonic())
         self._hand_over()
 
     def close(self) -> None:
-        """Stop to listen."""
-        if self._subscription is not None:
+        """Stop to listen, for good."""
+        with self._lock:
+            self._closed = True
+            self._listen(False)
+
+    def _listen(self, wanted: bool) -> None:
+        if wanted and self._subscription is None:
+            with clear_overrides("image"):
+                self._subscription = self._node.create_subscription(
+                    Image,
+                    "image",
+                    self._arrived,
+                    sensor_data(),
+                    callback_group=self._group,
+                    qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+                )
+        elif not wanted and self._subscription is not None:
             self._node.destroy_subscription(self._subscription)
             self._subscription = None
 

@@ -135,7 +135,7 @@ class SegmentationClient:
         if not self._spinner.wait_for(client.service_is_ready, timeout):
             raise self._calls.absent(f"service {client.srv_name}", timeout)
         while time.monotonic() < deadline:
-            # A node that starts up does not answer before it is active; asked again, for it may have been started anew.
+            # Asked again and again, for the node may have been started anew meanwhile.
             asked = self._spinner.run(lambda: client.call_async(GetState.Request()))
             if self._spinner.wait_for(asked.done, min(ASK_SECONDS, deadline - time.monotonic())):
                 state = asked.result().current_state.label

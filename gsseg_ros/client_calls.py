@@ -112,6 +112,10 @@ class LearnGoal:
             self._calls.spinner.run(self._send)
             self._settle(self._accepting.done, deadline)
             handle = self._accepting.result()
+            if not handle.accepted:
+                self._accepting = None  # There is nothing to give up.
+                why = f"{self._calls.node_name} rejected the goal: it is not active"
+                raise SegmentationError(Learn.Result.NOT_ACTIVE, "NOT_ACTIVE", why)
             result = self._calls.spinner.run(handle.get_result_async)
             while self._feedback or not result.done():
                 self._settle(lambda: result.done() or self._feedback or self._to_be_canceled, deadline)

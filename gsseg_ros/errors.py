@@ -8,6 +8,7 @@ from gsseg_core.errors import (
     GssegError,
     NoCodesError,
     NoUsableViewsError,
+    PathNotAllowedError,
     PathTakenError,
     SettingsError,
     StateMismatchError,
@@ -40,7 +41,7 @@ class NotActiveError(GssegError):
 
 
 class BusyError(GssegError):
-    """Another job is running that cannot run beside this one."""
+    """Another job is running that cannot run beside this one, or too many requests are."""
 
 
 class CanceledError(GssegError):
@@ -67,8 +68,8 @@ class NoTransformError(GssegError):
     """A pose is in a frame that cannot be transformed to the map frame."""
 
 
-class PathNotAllowedError(GssegError):
-    """A path of a request is not below data_root."""
+class TooManyPixelsError(GssegError):
+    """An image or a camera is larger than the parameter max_pixels allows."""
 
 
 class MissingFileError(GssegError):

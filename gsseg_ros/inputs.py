@@ -7,6 +7,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
@@ -24,13 +25,14 @@ from gsseg_core.live_results import SCENE_CHANGED, Rejection
 from gsseg_ros.camera_images import CameraImages
 from gsseg_ros.complaints import LIVE, PERIOD, REFUSED_POSE, Complaints
 from gsseg_ros.conversions import camera_from_messages, labels_from_image, matrix_from_pose, stamp_ns
-from gsseg_ros.errors import NoSceneError
+from gsseg_ros.errors import NoSceneError, TooManyPixelsError
 from gsseg_ros.jobs import Worker
 from gsseg_ros.live_outputs import LiveOutputs
 from gsseg_ros.outputs import Outputs
 from gsseg_ros.pairing import ExactPoses, InterpolatedPoses, Paired, Pairing, PoseSource
-from gsseg_ros.qos import sensor_data
+from gsseg_ros.qos import clear_overrides, sensor_data
 from gsseg_ros.sim_time import on_set_back
+from gsseg_ros.size_limits import require_size
 from gsseg_ros.tf_poses import TfPoses
 from gsseg_ros.workspace import Workspace
 
@@ -66,7 +68,6 @@ class Inputs:
     """
 
     def __init__(self, node: LifecycleNode, workspace: Workspace, outputs: Outputs, complaints: Complaints) -> None:
-        settings = workspace.settings
         self._node, self._workspace, self._complaints = node, workspace, complaints
         self.accepted = 0
         self.rejected: Counter[str] = Counter()
@@ -82,45 +83,53 @@ class Inputs:
         self.logged: Counter[str] = Counter()
         self._told: Counter[str] = Counter()
         self._group = MutuallyExclusiveCallbackGroup()
+        with ExitStack() as built:
+            self._build(outputs, built)
+            self._built = built.pop_all()
+
+    def _build(self, outputs: Outputs, built: ExitStack) -> None:
+        """Begin to listen; the stack takes away what was made, at the end or where the next step fails."""
+        node, workspace = self._node, self._workspace
+        settings = workspace.settings
         self.tf = TfPoses(node, settings.map_frame) if settings.pose_source == "tf" else None
         poses: PoseSource = self.tf or (InterpolatedPoses() if settings.pose_source == "odometry" else ExactPoses())
+        if self.tf is not None:
+            built.callback(self.tf.close)
         # A simulator's stamps repeat, and views of an earlier activation may come back with a saved state.
         self.pairing = Pairing(poses, prefix=f"{secrets.token_hex(4)}_")
         self.worker: Worker[Paired] = Worker(self._fuse, settings.queue_size)
+        built.callback(self.worker.stop)
         self.live = LiveOutputs(
             workspace,
             outputs,
             lambda: self.worker.waiting > 0,
             lambda: node.get_clock().now().to_msg(),
-            lambda _, message: complaints.add(LIVE, message),
+            lambda _, message: self._complaints.add(LIVE, message),
         )
+        built.callback(self.live.close)
         self._images = CameraImages(node, outputs, self.live, self.tf or type(poses)(), self._group)
-        self._subscriptions = [
-            self._listen(Image, "mask", self._on_mask),
-            self._listen(CameraInfo, "camera_info", self._on_camera_info),
+        built.callback(self._images.close)
+        wanted: list[tuple[Any, str, Callable[[str, Any], None]]] = [
+            (Image, "mask", self._on_mask),
+            (CameraInfo, "camera_info", self._on_camera_info),
         ]
         if settings.pose_source == "topic":
-            self._subscriptions.append(self._listen(PoseStamped, "pose", self._on_pose))
+            wanted.append((PoseStamped, "pose", self._on_pose))
         elif settings.pose_source == "odometry":
-            self._subscriptions.append(self._listen(Odometry, "odometry", self._on_odometry))
+            wanted.append((Odometry, "odometry", self._on_odometry))
+        for kind, topic, callback in wanted:
+            built.callback(node.destroy_subscription, self._listen(kind, topic, callback))
         # Not by /clock, which may stand still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._timer = node.create_timer(EXPIRE_PERIOD, self._expire, callback_group=self._group, clock=steady)
-        self._jumps = on_set_back(node, self._set_back)
+        timer = node.create_timer(EXPIRE_PERIOD, self._expire, callback_group=self._group, clock=steady)
+        built.callback(node.destroy_timer, timer)
+        built.callback(on_set_back(node, self._set_back).unregister)
         workspace.forget_waiting = self._forget_waiting
+        built.callback(setattr, workspace, "forget_waiting", lambda: None)
 
     def close(self) -> None:
         """Stop listening; a mask that is being fused is finished."""
-        self._workspace.forget_waiting = lambda: None
-        self._jumps.unregister()
-        self._node.destroy_timer(self._timer)
-        for subscription in self._subscriptions:
-            self._node.destroy_subscription(subscription)
-        self._images.close()
-        if self.tf is not None:
-            self.tf.close()
-        self.worker.stop()
-        self.live.close()
+        self._built.close()
 
     def publishers_of(self, topic: str) -> int:
         """How many publish on an input."""
@@ -136,14 +145,15 @@ class Inputs:
             self._hand_over()
 
         quality = sensor_data()
-        subscription = self._node.create_subscription(
-            kind,
-            topic,
-            arrived,
-            quality,
-            callback_group=self._group,
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-        )
+        with clear_overrides(topic):
+            subscription = self._node.create_subscription(
+                kind,
+                topic,
+                arrived,
+                quality,
+                callback_group=self._group,
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            )
         self.arrivals[subscription.topic_name] = (0, self.started)
         self.roles[subscription.topic_name] = topic
         policies = f"{quality.reliability.short_key}, {quality.durability.short_key}"
@@ -214,6 +224,8 @@ class Inputs:
             rejection = self._fused(paired)
         except NoSceneError as error:
             rejection = Rejection("no_scene", str(error))
+        except TooManyPixelsError as error:
+            rejection = self._workspace.session.reject(Rejection("too_large", str(error)))
         except GssegError as error:
             rejection = self._workspace.session.reject(Rejection.of(error))
         except Exception as error:
@@ -233,6 +245,7 @@ class Inputs:
             return Rejection(SCENE_CHANGED, f"mask {paired.name} came before the scene was loaded or reset")
         session = workspace.session
         (topic, mask), (info_topic, info) = paired.mask, paired.camera_info
+        require_size(mask, workspace.settings.max_pixels, topic)
         labels = labels_from_image(mask, topic)
         settings, pose = workspace.settings, paired.pose
         if settings.pose_source == "odometry":

@@ -104,6 +104,36 @@ class Requests:
             return self._changed.wait_for(lambda: not self._count, timeout_s)
 
 
+class Turns:
+    """Lets some requests work at a time and a few more wait for their turn.
+
+    Parameters
+    ----------
+    at_work, waiting : int
+        How many of each; one thread is held by each of them.
+    """
+
+    def __init__(self, at_work: int, waiting: int) -> None:
+        self._places, self._turns = threading.Semaphore(at_work + waiting), threading.Semaphore(at_work)
+
+    @contextmanager
+    def take(self, name: str) -> Iterator[None]:
+        """Wait for a turn, and work in the body.
+
+        Raises
+        ------
+        BusyError
+            As many as may already wait; this is found at once.
+        """
+        if not self._places.acquire(blocking=False):
+            raise BusyError(f"{name}: too many requests are at work or wait already; expected to be asked again later")
+        try:
+            with self._turns:
+                yield
+        finally:
+            self._places.release()
+
+
 class Worker(Generic[T]):
     """Handles items one after the other, in a thread of its own; of too many that wait, the oldest are dropped.
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from gsseg_msgs.action import Learn
 from gsseg_msgs.msg import SegmentationReport
-from rclpy.action.server import ActionServer, CancelResponse, ServerGoalHandle
+from rclpy.action.server import ActionServer, CancelResponse, GoalResponse, ServerGoalHandle
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.lifecycle import LifecycleNode
 from std_msgs.msg import Header
@@ -18,7 +18,7 @@ from gsseg_core.live import LiveSession
 from gsseg_core.live_results import Outcome
 from gsseg_core.pipeline import LEARNERS
 from gsseg_core.refine_settings import RefineSettings
-from gsseg_ros.errors import CanceledError, InvalidRequestError, error_code
+from gsseg_ros.errors import CanceledError, InvalidRequestError, NotActiveError, error_code
 from gsseg_ros.jobs import Job
 from gsseg_ros.outputs import Outputs
 from gsseg_ros.reports import Selection, finish, report_message
@@ -34,6 +34,8 @@ RAW = RefineSettings(cluster=False, filter=False)
 class LearnAction:
     """Runs one learn job at a time; a second goal is aborted with BUSY. Canceled or failed, it changes nothing.
 
+    A goal is rejected while the node is not active.
+
     When it is done, the objects of the learnt codes are published, before refinement as in its report.
     """
 
@@ -44,6 +46,7 @@ class LearnAction:
             Learn,
             "~/learn",
             self._execute,
+            goal_callback=self._welcome,
             cancel_callback=lambda goal: CancelResponse.ACCEPT,
             callback_group=ReentrantCallbackGroup(),
         )
@@ -51,6 +54,14 @@ class LearnAction:
     def close(self) -> None:
         """Take the action away."""
         self._server.destroy()
+
+    def _welcome(self, goal: Learn.Goal) -> GoalResponse:
+        try:
+            self._workspace.require_active()
+        except NotActiveError as error:
+            self._node.get_logger().warning(f"a goal of learn is rejected: {error}")
+            return GoalResponse.REJECT
+        return GoalResponse.ACCEPT
 
     def _execute(self, goal: ServerGoalHandle) -> Learn.Result:
         result = Learn.Result()
@@ -75,7 +86,8 @@ class LearnAction:
         dataset = None
         if request.dataset_path:
             with run.watch.stage("load"):
-                dataset = Dataset(self._workspace.existing(request.dataset_path))
+                folder = self._workspace.existing(request.dataset_path)
+                dataset = Dataset(folder, within=self._workspace.root)
         outcome = session.learn(
             learner,
             dataset,

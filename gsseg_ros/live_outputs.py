@@ -26,6 +26,7 @@ from gsseg_ros.conversions import camera_from_messages, rgb_image
 from gsseg_ros.outputs import Outputs
 from gsseg_ros.pairing import Paired
 from gsseg_ros.reports import Selection
+from gsseg_ros.size_limits import require_size
 from gsseg_ros.workspace import Workspace
 
 RAW = RefineSettings(cluster=False, filter=False)
@@ -147,6 +148,8 @@ class LiveOutputs:
         if not session.has_codes:
             return
         (topic, image), (info_topic, info) = paired.mask, paired.camera_info
+        for message, source in ((image, topic), (info, info_topic)):
+            require_size(message, settings.max_pixels, source)
         pose = paired.pose @ settings.camera_in_base if settings.pose_source == "odometry" else paired.pose
         camera = camera_from_messages(paired.name, info, pose, settings.scene_to_map, info_topic)
         result = self._current()

@@ -21,7 +21,7 @@ from visualization_msgs.msg import MarkerArray
 
 from gsseg_ros.conversions import cloud, topic_tokens
 from gsseg_ros.object_messages import object_markers
-from gsseg_ros.qos import latched
+from gsseg_ros.qos import clear_overrides, latched
 from gsseg_ros.reports import Selection
 
 InvalidHandle = rclpy_implementation.InvalidHandle
@@ -50,15 +50,20 @@ class Outputs:
         self._lock = threading.RLock()
         self._revision, self._closed = 0, False
         self.objects_count = 0
-        self._cloud = self._overridable(PointCloud2, "~/cloud")
-        self._report = self._overridable(SegmentationReport, "~/report")
-        self._overlay = self._overridable(Image, "~/overlay")
-        self._objects = self._overridable(ObjectArray, "~/objects")
-        self._markers = self._overridable(MarkerArray, "~/object_markers")
+        self._always: list[Publisher] = []
         self._classes: dict[str, Publisher] = {}
         self._announced: set[str] = set()
         self._filled: set[str] = set()
         self._shown = False  # whether an overlay is latched
+        try:
+            self._cloud = self._overridable(PointCloud2, "~/cloud")
+            self._report = self._overridable(SegmentationReport, "~/report")
+            self._overlay = self._overridable(Image, "~/overlay")
+            self._objects = self._overridable(ObjectArray, "~/objects")
+            self._markers = self._overridable(MarkerArray, "~/object_markers")
+        except Exception:
+            self.close()
+            raise
 
     @property
     def wants_overlay(self) -> bool:
@@ -160,9 +165,9 @@ class Outputs:
             if self._closed:
                 return
             self._closed = True
-            ours = (self._cloud, self._report, self._overlay, self._objects, self._markers)
-            for publisher in (*ours, *self._classes.values()):
+            for publisher in (*self._always, *self._classes.values()):
                 self._node.destroy_publisher(publisher)
+            self._always.clear()
             self._classes.clear()
 
     def _heard(self, *publishers: Publisher) -> bool:
@@ -183,9 +188,10 @@ class Outputs:
             self._node.destroy_publisher(publisher)
 
     def _overridable(self, kind: Any, topic: str) -> Publisher:
-        return self._node.create_publisher(
-            kind, topic, latched(), qos_overriding_options=QoSOverridingOptions.with_default_policies()
-        )
+        overridable = QoSOverridingOptions.with_default_policies()
+        with clear_overrides(topic):
+            self._always.append(self._node.create_publisher(kind, topic, latched(), qos_overriding_options=overridable))
+        return self._always[-1]
 
     def _class(self, token: str) -> Publisher:
         if token not in self._classes:

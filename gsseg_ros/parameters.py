@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,8 @@ class Declaration:
         Least and largest value.
     at_once : bool
         Whether a change takes effect at once; others are accepted only while the node is unconfigured.
+    at_start : bool
+        Whether it is given at the start of the process, once for all: it bounds what peers may reach.
     """
 
     name: str
@@ -49,11 +52,32 @@ class Declaration:
     low: float | None = None
     high: float | None = None
     at_once: bool = False
+    at_start: bool = False
 
+
+MAX_PIXELS = 1 << 24
 
 DECLARATIONS = (
-    Declaration("scene_path", "", "3DGS PLY to load when the node is configured; empty: wait for ~/load_scene"),
-    Declaration("data_root", "", "folder below which paths in requests must lie; empty: no request may name a path"),
+    Declaration(
+        "scene_path",
+        "",
+        "3DGS PLY to load when the node is configured; empty: wait for ~/load_scene; set later, it must lie below "
+        "data_root",
+    ),
+    Declaration(
+        "data_root",
+        "",
+        "folder below which paths in requests must lie; empty: no request may name a path; set at the start only",
+        at_start=True,
+    ),
+    Declaration(
+        "max_pixels",
+        MAX_PIXELS,
+        "pixels of a mask, an image or a viewpoint; larger ones are refused; set at the start only [count]",
+        1,
+        2**31 - 1,
+        at_start=True,
+    ),
     Declaration(
         "class_names",
         [],
@@ -113,6 +137,7 @@ class Settings:
 
     scene_path: str
     data_root: str
+    max_pixels: int
     class_names: tuple[str, ...]
     ids: str
     pose_source: str
@@ -158,6 +183,8 @@ class Settings:
         similarity = Similarity.from_parameters(*_triple(values, "scene_to_map", with_scale=True))
         camera = pose_from_parameters("camera_in_base", *_triple(values, "camera_in_base"))
         plain = {f.name: values[f.name] for f in fields(cls) if f.name in values}
+        for name in ("scene_path", "data_root"):
+            plain[name] = os.path.expanduser(plain[name])
         plain["class_names"] = tuple(values["class_names"] or ())
         return cls(**plain, scene_to_map=similarity, camera_in_base=camera)
 
@@ -187,8 +214,10 @@ def declare(node: Node) -> None:
         node.declare_parameter(declaration.name, default, _descriptor(declaration))
 
 
-def check(node: Node, changed: Sequence[Parameter], configured: bool) -> SetParametersResult:
-    """Decide whether a node's parameters may change, and say why not."""
+def check(
+    node: Node, changed: Sequence[Parameter], configured: bool, require_allowed_scene: Callable[[str], object]
+) -> SetParametersResult:
+    """Decide whether a node's parameters may change, and say why not; rclpy itself refuses those of the start."""
     known = {declaration.name for declaration in DECLARATIONS}
     for parameter in changed:
         if configured and parameter.name in known - AT_ONCE:
@@ -197,14 +226,14 @@ def check(node: Node, changed: Sequence[Parameter], configured: bool) -> SetPara
             )
             return SetParametersResult(successful=False, reason=reason)
     try:
-        Settings.read(node, changed)
+        require_allowed_scene(Settings.read(node, changed).scene_path)
     except GssegError as error:
         return SetParametersResult(successful=False, reason=str(error))
     return SetParametersResult(successful=True)
 
 
 def _descriptor(declaration: Declaration) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(description=declaration.description)
+    descriptor = ParameterDescriptor(description=declaration.description, read_only=declaration.at_start)
     if declaration.low is not None and declaration.high is not None:
         if isinstance(declaration.default, int):
             limits = IntegerRange(from_value=int(declaration.low), to_value=int(declaration.high), step=0)

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rclpy.exceptions import ParameterException
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from gsseg_core.errors import SettingsError
 
 
 def sensor_data() -> QoSProfile:
@@ -18,6 +24,29 @@ def sensor_data() -> QoSProfile:
 def latched() -> QoSProfile:
     """Make a profile for what those who come late get too."""
     return QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def requests() -> QoSProfile:
+    """Make a profile for services: as is usual, but deep enough that in a burst, too, every request gets an answer."""
+    return QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
+
+
+@contextmanager
+def clear_overrides(topic: str) -> Iterator[None]:
+    """Make what rclpy raises in the body for a parameter qos_overrides that cannot be used one clear error.
+
+    Raises
+    ------
+    SettingsError
+        In its place.
+    """
+    try:
+        yield
+    except (RuntimeError, ValueError, ParameterException) as error:
+        raise SettingsError(
+            f"parameters qos_overrides of the topic {topic}: {error}; expected reliability reliable or best_effort, "
+            "history keep_last or keep_all, and depth a number of messages"
+        ) from error
 
 
 def all_clouds() -> QoSProfile:

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
 import time
-import traceback
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from lifecycle_msgs.srv import ChangeState
+from lifecycle_msgs.srv import ChangeState, GetAvailableStates, GetAvailableTransitions, GetState
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.executors import MultiThreadedExecutor
@@ -21,7 +22,6 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
-from gsseg_core.errors import GssegError
 from gsseg_core.freed_memory import keep_freed_memory
 from gsseg_core.warm_up import warm_up
 from gsseg_ros import diagnostics, parameters
@@ -30,16 +30,19 @@ from gsseg_ros.inputs import Inputs
 from gsseg_ros.learn_action import LearnAction
 from gsseg_ros.outputs import Outputs
 from gsseg_ros.parameters import Settings
-from gsseg_ros.services import Services
+from gsseg_ros.services import AT_WORK, WAITING, Services, describe
 from gsseg_ros.sim_time import SimTime
 from gsseg_ros.viewpoints import Lookup
 from gsseg_ros.workspace import Workspace
 
-THREADS = 6
-"""Of the executor: one learn job, some requests at once, and always one left for messages and parameters."""
+THREADS = AT_WORK + WAITING + 6
+"""Of the executor: those that requests hold that take long, one for a learn job, one for a transition, and always some
+for messages, parameters, diagnostics, the lifecycle state, and requests that are refused at once."""
 
 STOP_SECONDS = 3.0
 """How long a job gets to stop when the node is deactivated or shut down."""
+
+SUCCESS = TransitionCallbackReturn.SUCCESS
 
 ANSWER_SECONDS, CANCEL_SECONDS = 0.3, 2.0
 """At the end of the node, for answers under way, and for that to a job that it has canceled."""
@@ -49,15 +52,21 @@ class SegmentNode(LifecycleNode):
     """Wires topics, services and the action to a `Workspace`.
 
     configure: reads the parameters, loads the scene. activate: listens. deactivate: stops a running job and listening,
-    keeps what was learnt. cleanup: forgets it. Services and the action are there from the start and answer NOT_ACTIVE
-    until then.
+    keeps what was learnt. cleanup: forgets it. Services and the action are there from the start; until then services
+    answer NOT_ACTIVE, and goals are rejected.
     """
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("gsseg", **kwargs)
+        # The state can be asked for whatever goes on, also while it changes.
+        lifecycle = ReentrantCallbackGroup()
         for service in self.services:
+            if service.srv_type in (ChangeState, GetState, GetAvailableStates, GetAvailableTransitions):
+                service.callback_group = lifecycle
+                lifecycle.add_entity(service)
             if service.srv_type is ChangeState:
                 service.callback = self._answered(service.callback)
+        self.configuring = False
         parameters.declare(self)
         self.workspace = Workspace(Settings.read(self), lambda: self.get_clock().now().to_msg())
         self.inputs: Inputs | None = None
@@ -67,8 +76,10 @@ class SegmentNode(LifecycleNode):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._complaints = Complaints(self.get_logger().warning)
         self._sim_time = SimTime(self)
-        # Not by /clock: that it does not come is what there may be to tell.
-        self.create_timer(1.0, self._tell, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        # In a group of its own, since it may wait for the session; and not by /clock: that it does not come is what
+        # there may be to tell.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(1.0, self._tell, callback_group=MutuallyExclusiveCallbackGroup(), clock=steady)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
 
@@ -76,19 +87,62 @@ class SegmentNode(LifecycleNode):
         """Configure and activate, unless the parameter says not to; what fails is logged and can be tried again."""
         if not self.workspace.settings.autostart:
             self.get_logger().info("waiting to be configured and activated (autostart is false)")
-        elif self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
-            self.trigger_activate()
+            return
+        try:
+            if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+                self.trigger_activate()
+        except RuntimeError as error:
+            self.get_logger().warning(f"autostart gives way to somebody else's transition: {error}")
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Read the parameters and load the scene."""
+        """Read the parameters and load the scene; where that fails all is as it was before."""
+        self.configuring = True
         try:
-            self.workspace.settings = settings = Settings.read(self)
-            warm_up(settings.device, self.get_logger().info)
-            if settings.scene_path:
-                self.workspace.load_scene(self.workspace.scene_path())
-        except GssegError as error:
-            self.get_logger().error(f"cannot be configured: {error}")
-            return TransitionCallbackReturn.FAILURE
+            return self._attempt("configured", self._configure, undo=self._forget)
+        finally:
+            self.configuring = False
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Begin to listen; where that fails all is as it was before."""
+        return self._attempt("activated", self._activate, undo=self.stop)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop a running job, and listening."""
+        return self._attempt("deactivated", self.stop)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Forget the scene and all that was learnt."""
+        return self._attempt("cleaned up", self._forget)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop, from any state."""
+        return self._attempt("shut down", self._stop_and_forget)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Go back to unconfigured after an error in a transition."""
+        return self._attempt("brought back to unconfigured", self._stop_and_forget)
+
+    def _attempt(
+        self, what: str, step: Callable[[], object], undo: Callable[[], object] | None = None
+    ) -> TransitionCallbackReturn:
+        """Take a step of a transition and log why it fails, since rclpy drops what a transition raises.
+
+        `undo` takes away what is half built, so that the node stays in the state it was in; without, it is an error.
+        """
+        try:
+            step()
+        except Exception as error:
+            self.get_logger().error(f"cannot be {what}: {describe(error)}")
+            if undo is not None and self._attempt("left as it was before", undo) == SUCCESS:
+                return TransitionCallbackReturn.FAILURE
+            return TransitionCallbackReturn.ERROR
+        return SUCCESS
+
+    def _configure(self) -> None:
+        self.workspace.settings = settings = Settings.read(self)
+        warm_up(settings.device, self.get_logger().info)
+        if settings.scene_path:
+            self.workspace.load_scene(*self.workspace.scene_path())
         self._outputs = Outputs(self)
         self._outputs.announce(settings.names_by_id)
         if self.workspace.has_scene:
@@ -96,43 +150,14 @@ class SegmentNode(LifecycleNode):
             self.get_logger().info(f"loaded {session.scene.path}: {len(session.scene):,} Gaussians")
         else:
             self.get_logger().warning("no scene yet: set the parameter scene_path, or call ~/load_scene")
-        return TransitionCallbackReturn.SUCCESS
 
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Begin to listen."""
-        try:
-            self.inputs = Inputs(self, self.workspace, self._require_outputs(), self._complaints)
-        except GssegError as error:
-            self.get_logger().error(f"cannot be activated: {error}")
-            return TransitionCallbackReturn.FAILURE
+    def _activate(self) -> None:
+        self.inputs = Inputs(self, self.workspace, self._require_outputs(), self._complaints)
         self.workspace.active = True
         topics = ", ".join(self.inputs.arrivals)
         self.get_logger().info(
             f"active: listening to {topics}; services and the action are below {self.get_fully_qualified_name()}/"
         )
-        return super().on_activate(state)
-
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop a running job, and listening."""
-        self.stop()
-        return super().on_deactivate(state)
-
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Forget the scene and all that was learnt."""
-        self._forget()
-        return TransitionCallbackReturn.SUCCESS
-
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Stop, from any state."""
-        self.stop()
-        self._forget()
-        return TransitionCallbackReturn.SUCCESS
-
-    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Go back to unconfigured after an error in a transition."""
-        self.stop()
-        self._forget()
-        return TransitionCallbackReturn.SUCCESS
 
     def stop(self) -> None:
         """Stop a running job, wait for the requests at work, and stop listening."""
@@ -151,6 +176,12 @@ class SegmentNode(LifecycleNode):
         self.stop()
         self._learn.close()
         self.destroy_node()
+
+    def _stop_and_forget(self) -> None:
+        try:
+            self.stop()
+        finally:
+            self._forget()
 
     def _forget(self) -> None:
         self.workspace.close()
@@ -180,7 +211,8 @@ class SegmentNode(LifecycleNode):
         return self.inputs.tf.look_up if self.inputs is not None and self.inputs.tf is not None else None
 
     def _check_parameters(self, changed: Sequence[Parameter]) -> SetParametersResult:
-        return parameters.check(self, changed, configured=self._outputs is not None)
+        configured = self._outputs is not None
+        return parameters.check(self, changed, configured, self.workspace.require_allowed_scene)
 
     def _take_parameters(self, changed: Sequence[Parameter]) -> None:
         if {parameter.name for parameter in changed} & parameters.AT_ONCE:
@@ -198,7 +230,7 @@ def _spin_once(executor: MultiThreadedExecutor, node: SegmentNode) -> None:
         executor.spin_once(timeout_sec=0.2)
     except Exception as error:
         # An error in one callback is raised here, where it would end all the others.
-        node.get_logger().error(f"unexpected {type(error).__name__}: {error}\n{traceback.format_exc()}")
+        node.get_logger().error(describe(error))
 
 
 def main(args: list[str] | None = None) -> int:
@@ -216,11 +248,18 @@ def main(args: list[str] | None = None) -> int:
         return 2
     executor = MultiThreadedExecutor(THREADS)
     executor.add_node(node)
+    # Not here: signals are heard in this thread, and to compile kernels takes minutes.
+    starting = threading.Thread(target=node.autostart, name="autostart", daemon=True)
+    starting.start()
     try:
-        node.autostart()
         while not stop.is_set():
             _spin_once(executor, node)
     finally:
+        if node.configuring:
+            # There is nothing yet that could be lost, and no way to stop a compiler.
+            node.destroy_node()
+            os._exit(0)
+        starting.join(STOP_SECONDS)
         # A canceled job is still answered: rclpy sends that from the executor.
         seconds = CANCEL_SECONDS if node.workspace.slot.busy else ANSWER_SECONDS
         node.stop()

@@ -8,6 +8,7 @@ import traceback
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any, TypeVar
 
 from geometry_msgs.msg import Point
@@ -16,19 +17,25 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.lifecycle import LifecycleNode
 from std_msgs.msg import Header
 
+from gsseg_core.confined_files import pinned_folder
 from gsseg_core.earlier_outputs import earlier_segment
 from gsseg_core.errors import GssegError
 from gsseg_core.export import write_classes, write_json
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.report import build_report
-from gsseg_core.run_folder import staged_run
+from gsseg_core.run_folder import require_own_folder, staged_run
 from gsseg_ros.errors import InvalidRequestError, error_code
+from gsseg_ros.jobs import Turns
 from gsseg_ros.outputs import Outputs
+from gsseg_ros.qos import requests
 from gsseg_ros.reports import Selection, empty_report, finish, report_message, stage_timings
 from gsseg_ros.viewpoints import Lookup, draw, viewpoint
 from gsseg_ros.workspace import Run, Workspace, checked_confidence, chosen_classes
 
 STATE_FILE, EXPORT_FOLDER = "gsseg_state.npz", "gsseg_export"
+
+AT_WORK, WAITING = 2, 4
+"""Requests that take long: how many work at a time, and how many more wait; each holds a thread of the executor."""
 
 Handler = TypeVar("Handler", bound=Callable[..., Any])
 
@@ -51,13 +58,32 @@ def answered(handler: Handler) -> Handler:
     return answer  # type: ignore[return-value]
 
 
+def in_turn(handler: Handler) -> Handler:
+    """Make a handler wait until few others are at work; where many wait already it raises `BusyError` at once."""
+
+    @functools.wraps(handler)
+    def work(self: Services, request: Any, response: Any) -> None:
+        with self.turns.take(handler.__name__):
+            self.workspace.require_active()  # It may have waited for long.
+            handler(self, request, response)
+
+    return work  # type: ignore[return-value]
+
+
 def explain(node: LifecycleNode, error: Exception) -> str:
     """Log what went wrong, and say it in one line; what was not foreseen is logged with its traceback."""
     if isinstance(error, GssegError):
         node.get_logger().warning(str(error))
         return str(error)
-    node.get_logger().error(f"unexpected {type(error).__name__}: {error}\n{traceback.format_exc()}")
+    node.get_logger().error(describe(error))
     return f"unexpected {type(error).__name__}: {error}; the node's log has the details"
+
+
+def describe(error: Exception) -> str:
+    """Describe an error in one line if it was foreseen, with its traceback if not."""
+    if isinstance(error, GssegError):
+        return str(error)
+    return f"unexpected {type(error).__name__}: {error}\n{traceback.format_exc()}"
 
 
 def refinement(request: Any, workspace: Workspace) -> RefineSettings:
@@ -94,6 +120,7 @@ class Services:
         lookup: Callable[[], Lookup | None],
     ) -> None:
         self.node, self.workspace = node, workspace
+        self.turns = Turns(AT_WORK, WAITING)
         self._outputs, self._lookup = outputs, lookup
         # Reentrant: a request must not wait for another one to be answered.
         group = ReentrantCallbackGroup()
@@ -106,9 +133,10 @@ class Services:
             (Export, "export", self.export),
             (Reset, "reset", self.reset),
         ):
-            node.create_service(interface, f"~/{name}", handler, callback_group=group)
+            node.create_service(interface, f"~/{name}", handler, qos_profile=requests(), callback_group=group)
 
     @answered
+    @in_turn
     def segment(self, request: Segment.Request, response: Segment.Response) -> None:
         """Segment the scene, publish clouds and objects, and draw the viewpoint if there is one."""
         settings, outputs = self.workspace.settings, self._outputs()
@@ -138,6 +166,7 @@ class Services:
                     outputs.publish_report(response.report)
 
     @answered
+    @in_turn
     def render_view(self, request: RenderView.Request, response: RenderView.Response) -> None:
         """Draw a viewpoint."""
         session, settings = self.workspace.session, self.workspace.settings
@@ -158,10 +187,11 @@ class Services:
     def load_scene(self, request: LoadScene.Request, response: LoadScene.Response) -> None:
         """Load another scene, and drop what was known of the earlier one."""
         workspace, started = self.workspace, time.perf_counter()
+        within: Path | None = None
         if request.path:
-            path = workspace.existing(request.path)
+            path, within = workspace.existing(request.path), workspace.root
         elif workspace.settings.scene_path:
-            path = workspace.scene_path()
+            path, within = workspace.scene_path()
         else:
             raise InvalidRequestError("path and the parameter scene_path are both empty; expected a 3DGS PLY in either")
         with workspace.slot.take("load_scene") as job, workspace.run("load_scene") as run:
@@ -170,7 +200,7 @@ class Services:
                 workspace.require_active()
                 job.check()
 
-            workspace.load_scene(path, check)
+            workspace.load_scene(path, within, check)
             self._clear(run)
             session = workspace.session
         corners = workspace.settings.scene_to_map.points_to_map(session.scene.means)
@@ -180,26 +210,29 @@ class Services:
         response.seconds = time.perf_counter() - started
 
     @answered
+    @in_turn
     def save_state(self, request: SaveState.Request, response: SaveState.Response) -> None:
         """Save votes, views and codes."""
         path, session = self.workspace.path(request.path, STATE_FILE), self.workspace.session
-        with self.workspace.run("save_state"):
-            response.num_views = session.save(path)
-        response.path, response.num_bytes = str(path), path.stat().st_size
+        with self.workspace.run("save_state"), pinned_folder(path.parent, self.workspace.root) as folder:
+            response.num_views = session.save(folder / path.name)
+            response.path, response.num_bytes = str(path), (folder / path.name).stat().st_size
 
     @answered
     def load_state(self, request: LoadState.Request, response: LoadState.Response) -> None:
         """Load what was saved, in place of what is known."""
         session, path = self.workspace.session, self.workspace.existing(request.path, STATE_FILE)
         with self.workspace.slot.take("load_state"), self.workspace.run("load_state") as run:
-            response.num_views = self.workspace.load_state(path)
+            response.num_views = self.workspace.load_state(path, self.workspace.root)
             self._clear(run)
         response.path, response.class_names = str(path), list(session.class_names.values())
 
     @answered
+    @in_turn
     def export(self, request: Export.Request, response: Export.Response) -> None:
         """Write the files that the command line writes."""
-        folder, settings = self.workspace.path(request.directory, EXPORT_FOLDER), self.workspace.settings
+        directory, settings = self.workspace.path(request.directory, EXPORT_FOLDER), self.workspace.settings
+        require_own_folder(directory, "segment", earlier_segment)  # Before the work, and again below.
         with self.workspace.run("export") as run:
             selection, refine = self._select(request, run)
             self.workspace.number(run)
@@ -207,6 +240,7 @@ class Services:
             result = selection.result.selected(selection.chosen, selection.min_confidence)
             with (
                 run.watch.stage("write"),
+                pinned_folder(directory, self.workspace.root) as folder,
                 staged_run(folder, "segment", earlier=earlier_segment, only_own=True) as staged,
             ):
                 result.save(staged.folder / "segmentation.npz", staged.id)
@@ -223,7 +257,7 @@ class Services:
                 )
                 write_json(staged.folder / "report.json", {**content, "run": staged.id})
         response.report = finish(report, run)
-        response.directory, response.files = str(folder), ["segmentation.npz", *names.values(), "report.json"]
+        response.directory, response.files = str(directory), ["segmentation.npz", *names.values(), "report.json"]
 
     @answered
     def reset(self, request: Reset.Request, response: Reset.Response) -> None:

@@ -24,15 +24,13 @@ from gsseg_ros.conversions import (
     rgb_image,
     stamp_ns,
 )
-from gsseg_ros.errors import NoTransformError, ViewpointError
+from gsseg_ros.errors import NoTransformError, TooManyPixelsError, ViewpointError
 from gsseg_ros.parameters import Settings
 from gsseg_ros.reports import Selection
+from gsseg_ros.size_limits import require_size
 
 Lookup: TypeAlias = Callable[[str, int], "npt.NDArray[np.float64] | None"]
 """Pose (4, 4) of a frame in the map frame at a stamp in ns, 0 being the latest; None where there is none."""
-
-MAX_PIXELS = 1 << 26
-"""A viewpoint of more pixels is taken for a mistake."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,14 +48,13 @@ def viewpoint(request: Any, settings: Settings, lookup: Lookup | None) -> Camera
     Raises
     ------
     ViewpointError
-        Pose or camera cannot be used.
+        Pose or camera cannot be used, or it has more pixels than the parameter max_pixels allows.
     NoTransformError
         The pose is in a frame that is not the map and cannot be looked up.
     """
     pose, info = request.viewpoint_pose, request.viewpoint_camera
-    if info.width * info.height > MAX_PIXELS:
-        raise ViewpointError(f"viewpoint_camera: {info.width} x {info.height} pixels; expected {MAX_PIXELS} at most")
     try:
+        require_size(info, settings.max_pixels, "viewpoint_camera")
         matrix = matrix_from_pose(pose.pose, "viewpoint_pose")
         frame = pose.header.frame_id
         if frame and frame != settings.map_frame:
@@ -69,7 +66,7 @@ def viewpoint(request: Any, settings: Settings, lookup: Lookup | None) -> Camera
                 )
             matrix = found @ matrix
         return camera_from_messages("viewpoint", info, matrix, settings.scene_to_map, "viewpoint_camera")
-    except (PoseError, IntrinsicsError) as error:
+    except (PoseError, IntrinsicsError, TooManyPixelsError) as error:
         raise ViewpointError(str(error)) from error
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 
-from gsseg_core.errors import SettingsError
+from gsseg_core.errors import PathNotAllowedError, SettingsError
 from gsseg_core.live import LiveSession
 from gsseg_core.live_ids import PerViewSession
 from gsseg_core.names import class_ids
@@ -27,7 +27,6 @@ from gsseg_ros.errors import (
     MissingFileError,
     NoSceneError,
     NotActiveError,
-    PathNotAllowedError,
     UnknownClassError,
 )
 from gsseg_ros.jobs import JobSlot, Requests
@@ -92,6 +91,7 @@ class Workspace:
     def __init__(self, settings: Settings, now: Callable[[], Time]) -> None:
         self.settings, self.slot, self.requests = settings, JobSlot(), Requests()
         self.forget_waiting: Callable[[], None] = lambda: None
+        self._scene_at_start = settings.scene_path
         self.active = False
         self.last_job = "none"
         self.dropped: Counter[str] = Counter()
@@ -124,31 +124,53 @@ class Workspace:
         session = self._session
         return self if session is None else session.era
 
-    def scene_path(self) -> Path:
-        """Path of the parameter scene_path, which needs no data_root.
+    def require_allowed_scene(self, path: str) -> None:
+        """Refuse what a peer may not set the parameter scene_path to.
+
+        Raises
+        ------
+        PathNotAllowedError
+            It is not what was given at the start, and no request could name it.
+        """
+        if path in ("", self._scene_at_start):
+            return
+        try:
+            self.path(os.path.abspath(path))
+        except (PathNotAllowedError, ValueError) as error:
+            raise PathNotAllowedError(f"parameter scene_path, set after the start: {error}") from error
+
+    def scene_path(self) -> tuple[Path, Path | None]:
+        """Path of the parameter scene_path, and the folder that it must not lead out of: none for that of the start.
 
         Raises
         ------
         MissingFileError
             There is no such file.
+        PathNotAllowedError
+            It was set later, and does not lie below data_root.
         """
         path = Path(self.settings.scene_path)
+        self.require_allowed_scene(self.settings.scene_path)
         if not path.is_file():
             raise MissingFileError(f"parameter scene_path: {path} does not exist; expected a 3DGS PLY")
-        return path
+        return path, None if self.settings.scene_path == self._scene_at_start else self.root
 
-    def load_scene(self, path: str | Path, check: Callable[[], None] = lambda: None) -> None:
+    def load_scene(
+        self, path: str | Path, within: Path | None = None, check: Callable[[], None] = lambda: None
+    ) -> None:
         """Load a scene in place of the one there is, with all that was known of that; on any error nothing changes.
 
         Parameters
         ----------
         path : path
             A 3DGS PLY.
+        within : pathlib.Path, optional
+            A folder that its links must not lead out of.
         check : callable
             Called last; what it raises ends the work.
         """
         settings = self.settings
-        scene = GaussianScene.load(path)
+        scene = GaussianScene.load(path, within)
         kept: dict[str, Any] = {
             "max_views": settings.max_views, "device": settings.device, "max_classes": settings.max_classes,
         }  # fmt: skip
@@ -162,9 +184,9 @@ class Workspace:
         self.forget_waiting()
         session.prepare(RefineSettings(k=settings.k))
 
-    def load_state(self, path: str | Path) -> int:
+    def load_state(self, path: str | Path, within: Path | None = None) -> int:
         """Replace what is known of the scene by a saved state; return how many views are in it."""
-        loaded = self.session.load(path)
+        loaded = self.session.load(path, within)
         self.forget_waiting()
         return loaded
 
@@ -215,8 +237,16 @@ class Workspace:
         """Whether what a run goes by is still what is known, and the node has not been deactivated meanwhile."""
         return run.era is self.era
 
+    @property
+    def root(self) -> Path:
+        """The folder data_root, links followed."""
+        return Path(self.settings.data_root).resolve()
+
     def path(self, request: str, default: str = "") -> Path:
         """Resolve a path of a request, absolute or relative to data_root.
+
+        Between this and the opening any part of it may become a link to elsewhere: open it as
+        `gsseg_core.confined_files` does.
 
         Raises
         ------
@@ -228,7 +258,7 @@ class Workspace:
                 f"path '{request or default}': the parameter data_root is empty, so no path is allowed; expected it to "
                 "be set to a folder"
             )
-        root = Path(self.settings.data_root).resolve()
+        root = self.root
         try:
             path = (root / (request or default)).resolve()
         except (OSError, RuntimeError, ValueError) as error:  # Links in a circle, or a NUL.

@@ -7,16 +7,26 @@ A test file imports those that its tests take:
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
-from ros_helpers import Ros
+from ros_helpers import PATIENCE, Ros
 from ros_robot import CLASSES, copied, core_session, private_ros, write_long_dataset
 from small_scenes import balls_on_a_table, clean_views, write_dataset
 
 from gsseg_core.scene import GaussianScene
+
+pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
+
+from rclpy.executors import MultiThreadedExecutor
+from rclpy.parameter import Parameter
+
+from gsseg_ros import segment_node
+from gsseg_ros.segment_node import THREADS, SegmentNode
 
 
 @pytest.fixture(name="root", scope="module")
@@ -37,6 +47,9 @@ def root_fixture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (root / "taken.npz").mkdir()
     (root / "taken").mkdir()
     (root / "taken" / "classes").write_text("in the way")
+    leaking = copied(data, root / "leaking") / "labels" / "view1.png"
+    leaking.rename(top / "view1.png")
+    leaking.symlink_to(top / "view1.png")
     broken = copied(data, root / "broken") / "labels" / "view1.png"
     broken.write_bytes(broken.read_bytes()[:60])
     for mask in (copied(data, root / "unlabelled") / "labels").iterdir():
@@ -61,3 +74,33 @@ def shared_fixture(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ros]:
     """A context for the nodes of a whole test file; `ros` is one for a single test."""
     with private_ros(tmp_path_factory.mktemp("ros")) as ros:
         yield ros
+
+
+@pytest.fixture(name="node")
+def node_fixture(ros: Ros, parameters: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> Iterator[SegmentNode]:
+    """A node in this process, not configured, that does not compile anything and that nobody spins yet."""
+    monkeypatch.setattr(segment_node, "warm_up", lambda *_: None)
+    overrides = [Parameter(name, value=str(v) if isinstance(v, Path) else v) for name, v in parameters.items()]
+    node = SegmentNode(context=ros.context, parameter_overrides=overrides)
+    yield node
+    node.close()
+
+
+@contextmanager
+def spun(node: SegmentNode, ros: Ros) -> Iterator[None]:
+    """Spin a node of this process as its program does."""
+    executor, stop = MultiThreadedExecutor(THREADS, context=ros.context), threading.Event()
+    executor.add_node(node)
+
+    def spin() -> None:
+        while not stop.is_set():
+            executor.spin_once(timeout_sec=0.1)
+
+    spinning = threading.Thread(target=spin)
+    spinning.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        spinning.join(PATIENCE)
+        executor.shutdown(PATIENCE)

@@ -200,13 +200,20 @@ class Robot:
 
     def goal(self, **fields: Any) -> Goal:
         """Send a goal of `~/learn`, which is accepted."""
+        goal = self.offered(**fields)
+        assert goal is not None, "the goal was rejected"
+        return goal
+
+    def offered(self, **fields: Any) -> Goal | None:
+        """Send a goal of `~/learn`; returns None if it is rejected."""
         self.ros.wait_until(self._learner.server_is_ready, "the action")
         self._greet()
         feedback: list[Any] = []
         learner, goal = self._learner, Learn.Goal(**fields)
         sent = self.ros.run(lambda: learner.send_goal_async(goal, lambda message: feedback.append(message.feedback)))
-        handle = self.ros.result(sent, "the goal to be accepted")
-        assert handle.accepted
+        handle = self.ros.result(sent, "the answer to the goal")
+        if not handle.accepted:
+            return None
         self.goals.append(Goal(handle, self.ros.run(handle.get_result_async), feedback))
         return self.goals[-1]
 

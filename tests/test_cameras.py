@@ -17,7 +17,7 @@ from PIL import Image
 
 from gsseg_core.camera_files import read_cameras
 from gsseg_core.cameras import Camera
-from gsseg_core.errors import CameraFileError, GssegError, IntrinsicsError, PoseError
+from gsseg_core.errors import CameraFileError, GssegError, IntrinsicsError, PathNotAllowedError, PoseError
 from gsseg_core.scene import GaussianScene
 
 # A camera at POSITION looks along the world's +x, the world's +z being up. POINT lies 2 before it, 0.5 to its right and
@@ -313,6 +313,17 @@ def test_colmap_models_without_rigs_and_points_are_read(tmp_path: Path, text: bo
     for name in ("rigs", "frames", "points3D"):
         (model / name).with_suffix(".txt" if text else ".bin").unlink()
     assert_lands(read_cameras(tmp_path)[0], 55, 35)
+
+
+def test_a_colmap_model_that_leads_out_of_its_bounds_is_refused(tmp_path: Path) -> None:
+    data = tmp_path / "root" / "data"
+    images = write_colmap(data / "sparse" / "0") / "images.bin"
+    names = [camera.name for camera in read_cameras(data, within=tmp_path / "root")]
+    images.rename(tmp_path / "images.bin")
+    images.symlink_to(tmp_path / "images.bin")
+    assert [camera.name for camera in read_cameras(data)] == names
+    with pytest.raises(PathNotAllowedError, match=r"images\.bin: leads out of"):
+        read_cameras(data, within=tmp_path / "root")
 
 
 @pytest.mark.parametrize(

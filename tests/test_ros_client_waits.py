@@ -136,7 +136,7 @@ def test_a_node_that_is_not_active_is_waited_for_and_its_state_named(ros: Ros, t
     with SegmentationClient(domain_id=ros.domain) as client:
         with pytest.raises(NodeUnavailableError, match="/gsseg is unconfigured after 1 s; expected active"):
             client.wait_until_active(1.0)
-        assert failure(client.segment).name == "NOT_ACTIVE"
+        assert failure(client.segment).name == failure(client.learn).name == "NOT_ACTIVE"
 
 
 def test_a_node_in_a_namespace_is_found_under_its_name(ros: Ros, tmp_path: Path) -> None:

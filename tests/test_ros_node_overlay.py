@@ -194,7 +194,8 @@ def live() -> Iterator[tuple[LiveOutputs, Shown, dict[str, bool]]]:
     session = LiveSession(scene, dict(enumerate(CLASSES)))
     for view in clean_views(2):
         session.fuse(view)
-    settings = SimpleNamespace(pose_source="topic", scene_to_map=Similarity(np.eye(3), np.zeros(3), 1.0))
+    similarity = Similarity(np.eye(3), np.zeros(3), 1.0)
+    settings = SimpleNamespace(pose_source="topic", scene_to_map=similarity, max_pixels=1 << 24)
     shown, state = Shown(), {"busy": False}
     workspace: Any = SimpleNamespace(session=session, settings=settings, era=session.era)
     outputs: Any = shown

@@ -214,10 +214,16 @@ def test_colcon_finds_both_packages() -> None:
 def test_security_policy_keeps_to_the_schema() -> None:
     policy = ElementTree.parse(ROOT / "sros2" / "policy.xml").getroot()
     assert (policy.tag, policy.get("version")) == ("policy", "0.2.0")
-    (enclave,) = policy.findall("enclaves/enclave")
-    assert enclave.attrib == {"path": "/gsseg"}
-    (profile,) = enclave.findall("profiles/profile")
-    assert profile.attrib == {"ns": "/", "node": "gsseg"}
+    enclaves = {"/gsseg": "gsseg", "/gsseg_replay": "replay", "/gsseg_client": "gsseg_client"}
+    enclaves["/gsseg_viewer"] = "gsseg_view"
+    assert [enclave.attrib for enclave in policy.findall("enclaves/enclave")] == [{"path": path} for path in enclaves]
+    for enclave in policy.findall("enclaves/enclave"):
+        (profile,) = enclave.findall("profiles/profile")
+        assert profile.attrib == {"ns": "/", "node": enclaves[enclave.attrib["path"]]}
+        assert_rules_are_clean(profile)
+
+
+def assert_rules_are_clean(profile: ElementTree.Element) -> None:
     for group in profile:
         assert set(group.attrib) <= ALLOWED[group.tag]
         assert set(group.attrib.values()) == {"ALLOW"}

@@ -8,22 +8,25 @@ from xml.etree import ElementTree
 
 import pytest
 from ros_helpers import REPOSITORY, Ros, ros_fixture  # noqa: F401
-from small_scenes import balls_on_a_table
+from small_scenes import balls_on_a_table, write_dataset
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
-from rclpy.action import get_action_server_names_and_types_by_node
+from rclpy.action import get_action_client_names_and_types_by_node, get_action_server_names_and_types_by_node
+
+from gsseg_core.scene import GaussianScene
+from gsseg_ros.client import SegmentationClient
+from gsseg_ros.view_source import RosSource
 
 # Of the kinds of pose source one is there at a time, a clock only with use_sim_time, and images while they are shown.
 ONE_OF = {"/pose", "/odometry", "/tf", "/tf_static", "/clock", "/image"}
 
 
-def listed(kind: str, permission: str) -> set[str]:
-    """Full names that the policy allows."""
-    profile = ElementTree.parse(REPOSITORY / "sros2/policy.xml").find("enclaves/enclave/profiles/profile")
-    assert profile is not None
+def listed(kind: str, permission: str, node: str = "gsseg") -> set[str]:
+    """Full names that the policy allows a node."""
+    (profile,) = ElementTree.parse(REPOSITORY / "sros2/policy.xml").findall(f".//profile[@node='{node}']")
     names = [entry.text or "" for group in profile.findall(f"{kind}s[@{permission}='ALLOW']") for entry in group]
-    return {name.replace("~/", "/gsseg/") if name[0] in "~/" else f"/{name}" for name in names}
+    return {name.replace("~/", f"/{node}/") if name[0] in "~/" else f"/{name}" for name in names}
 
 
 def uncovered(found: set[str], policy: set[str]) -> set[str]:
@@ -53,3 +56,49 @@ def test_the_policy_lists_exactly_what_the_running_node_has(ros: Ros, tmp_path: 
         assert not uncovered(names(ask), policy), f"{permission}: the node has more than the policy"
     actions = {name for name, _ in get_action_server_names_and_types_by_node(graph, "gsseg", "/")}
     assert actions == listed("action", "execute")
+
+
+def assert_listed(ros: Ros, node: str, unused_allowed: set[str]) -> None:
+    """A node of this domain has what the policy lists for it, but for what it may do and does not do now."""
+    graph = ros.node
+    ros.wait_until(lambda: node in graph.get_node_names(), "the node")
+    for ask, kind, permission in (
+        (graph.get_publisher_names_and_types_by_node, "topic", "publish"),
+        (graph.get_subscriber_names_and_types_by_node, "topic", "subscribe"),
+        (graph.get_service_names_and_types_by_node, "service", "reply"),
+        (graph.get_client_names_and_types_by_node, "service", "request"),
+    ):
+
+        def names(ask=ask) -> set[str]:  # type: ignore[no-untyped-def]
+            return {name for name, _ in ask(node, "/") if "/_action/" not in name}
+
+        policy = listed(kind, permission, node)
+        ros.wait_until(
+            lambda names=names, policy=policy: unused(names(), policy) <= unused_allowed,
+            f"what the policy allows {node} to {permission}: {sorted(policy)}, and it has {sorted(names())}",
+        )
+        assert not uncovered(names(), policy), f"{permission}: {node} has more than the policy"
+    actions = {name for name, _ in get_action_client_names_and_types_by_node(graph, node, "/")}
+    assert actions == listed("action", "call", node)
+
+
+def test_the_policy_lists_exactly_what_replay_client_and_viewer_have(ros: Ros, tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data")
+    ros.start("segment_node", {"scene_path": data / "scene.ply"}).wait_for("active: listening", timeout=120)
+    ros.start("replay_node", {"data": data, "rate": 0.1})
+    assert_listed(ros, "replay", {"/clock"})
+    with SegmentationClient(domain_id=ros.domain) as client:
+        with pytest.raises(Exception, match="of 1000 views"):
+            client.wait_for_views(1000, timeout=3.0)
+        assert_listed(ros, "gsseg_client", set())
+    viewer = RosSource(GaussianScene.load(data / "scene.ply"), domain_id=ros.domain)
+    try:
+        assert_listed(ros, "gsseg_view", {"/gsseg/classes/*"})
+    finally:
+        viewer.close()
+
+
+def test_only_the_node_itself_has_to_do_with_its_parameters_and_its_state() -> None:
+    for node in ("replay", "gsseg_client", "gsseg_view"):
+        asked = {name.rsplit("/", 1)[-1] for name in listed("service", "request", node)}
+        assert not asked & {"set_parameters", "set_parameters_atomically", "change_state"}

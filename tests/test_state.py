@@ -10,7 +10,7 @@ import pytest
 from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, taught
 
 from gsseg_core import state_file
-from gsseg_core.errors import StateFileError, StateMismatchError, WriteError
+from gsseg_core.errors import PathTakenError, StateFileError, StateMismatchError, WriteError
 from gsseg_core.learner import Learner
 from gsseg_core.votes import VoteLearner
 
@@ -115,3 +115,20 @@ def test_a_failed_save_leaves_the_earlier_state_whole(saved: Path, monkeypatch: 
     with pytest.raises(WriteError):
         learner.save(saved / "below" / "a_file.npz")
     fresh().restore(saved)
+
+
+def test_a_state_replaces_a_state_and_nothing_else(saved: Path, tmp_path: Path) -> None:
+    learner = taught(fresh(), VIEWS[:1])
+    learner.save(saved)
+    assert fresh().restore(saved) is None
+    for name in ("scene.ply", "other.npz", "empty.npz"):
+        (tmp_path / name).write_bytes(b"of the user" * (name != "empty.npz"))
+    np.savez_compressed(tmp_path / "foreign.npz", header=np.array('{"format": "something"}'), votes=np.ones(3))
+    (tmp_path / "folder.npz").mkdir()
+    (tmp_path / "dangling.npz").symlink_to("nowhere")
+    for name in ("scene.ply", "other.npz", "empty.npz", "foreign.npz", "folder.npz", "dangling.npz"):
+        path = tmp_path / name
+        before = path.read_bytes() if path.is_file() else None
+        with pytest.raises(PathTakenError, match=f"{name}: is there and is no saved state; expected a new file"):
+            learner.save(path)
+        assert before is None or path.read_bytes() == before

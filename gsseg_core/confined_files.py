@@ -1,0 +1,121 @@
+"""Files that must lie below one folder, whatever links say and whoever moves them meanwhile (Linux).
+
+A path is only a question: between the look at it and the opening, any part of it can become a link to somewhere else.
+Here what was looked at is what is opened.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from gsseg_core.errors import GssegError, PathNotAllowedError, WriteError
+
+_OPENED = "/proc/self/fd"
+"""Where the kernel names what a descriptor stands for; to open it there opens that, and no path."""
+
+
+def open_input(path: str | os.PathLike[str], within: Path | None = None) -> BinaryIO:
+    """Open a file for reading.
+
+    Parameters
+    ----------
+    path : path
+        The file; links are followed.
+    within : pathlib.Path, optional
+        A folder below which the file must lie in the end. It must then be a regular file, too.
+
+    Raises
+    ------
+    OSError
+        It cannot be opened.
+    PathNotAllowedError
+        It lies elsewhere; it has not been opened.
+    """
+    if within is None:
+        return open(path, "rb")
+    found = os.open(path, os.O_PATH | os.O_CLOEXEC)  # opens nothing yet, and so never waits for the end of a FIFO
+    try:
+        _require_below(os.readlink(f"{_OPENED}/{found}"), path, within)
+        mode = os.fstat(found).st_mode
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise OSError("neither a file nor a folder")
+        return open(f"{_OPENED}/{found}", "rb")
+    finally:
+        os.close(found)
+
+
+@contextlib.contextmanager
+def input_name(path: str | os.PathLike[str], within: Path | None = None) -> Iterator[str]:
+    """Give a name of a file for libraries that open files by name; raises as `open_input` does."""
+    if within is None:
+        yield os.fspath(path)
+    else:
+        with open_input(path, within) as file:
+            yield f"{_OPENED}/{file.fileno()}"
+
+
+def require_folder_below(path: Path, within: Path | None) -> None:
+    """Refuse to list a folder that lies elsewhere; what it lists is still to be opened with `open_input`.
+
+    Raises
+    ------
+    PathNotAllowedError
+        Its links lead out of `within`.
+    """
+    if within is not None:
+        _require_below(os.path.realpath(path), path, within)
+
+
+@contextlib.contextmanager
+def pinned_folder(folder: Path, within: Path) -> Iterator[Path]:
+    """Give a second name of a folder, under which it stays the same folder whatever becomes of its path.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        Below `within` or that itself, without links; it is made where it is missing.
+    within : pathlib.Path
+        A folder, without links.
+
+    Yields
+    ------
+    pathlib.Path
+        The second name. In the errors of gsseg that the body raises the first one stands in its place.
+
+    Raises
+    ------
+    PathNotAllowedError
+        The folder is not below `within`.
+    WriteError
+        It cannot be made, or a part of its path is a file, or has become a link.
+    """
+    if folder != within and within not in folder.parents:
+        raise PathNotAllowedError(f"{folder}: does not lie below {within}; expected a path below it")
+    kind = os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+    with contextlib.ExitStack() as opened:
+        try:
+            descriptor = os.open(within, kind)
+            opened.callback(os.close, descriptor)
+            for part in folder.relative_to(within).parts:
+                with contextlib.suppress(FileExistsError):
+                    os.mkdir(part, dir_fd=descriptor)
+                descriptor = os.open(part, kind, dir_fd=descriptor)
+                opened.callback(os.close, descriptor)
+        except OSError as error:
+            raise WriteError(f"{folder}: cannot be written ({error.strerror or error})") from error
+        pinned = Path(_OPENED, str(descriptor))
+        try:
+            yield pinned
+        except GssegError as error:
+            raise type(error)(str(error).replace(str(pinned), str(folder))) from error
+
+
+def _require_below(place: str, path: str | os.PathLike[str], within: Path) -> None:
+    root = os.path.realpath(within)
+    if place != root and not place.startswith(root.rstrip("/") + "/"):
+        raise PathNotAllowedError(f"{path}: leads out of {within}; expected what lies below it, links followed")

@@ -1,0 +1,190 @@
+"""Transitions of the segmentation node that fail or are interrupted: said in the log, and nothing half built stays."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ros_fixtures import node_fixture, parameters_fixture, root_fixture, spun  # noqa: F401
+from ros_helpers import Ros, ros_fixture  # noqa: F401
+from ros_robot import Robot
+from small_scenes import clean_views
+
+pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
+
+from lifecycle_msgs.msg import Transition
+from rclpy.lifecycle import TransitionCallbackReturn
+
+from gsseg_ros import diagnostics
+from gsseg_ros.segment_node import SegmentNode
+
+SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+CONFIGURE = Transition(id=Transition.TRANSITION_CONFIGURE)
+
+
+@pytest.fixture
+def errors(node: SegmentNode, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What the node logs as an error."""
+    lines: list[str] = []
+    monkeypatch.setattr(node.get_logger(), "error", lines.append)
+    logger = node.get_logger()
+    monkeypatch.setattr(node, "get_logger", lambda: logger)
+    return lines
+
+
+def entities(node: SegmentNode) -> tuple[int, int, int, int]:
+    """Publishers, subscriptions and timers of a node, and threads of the process."""
+    counts = (len(list(found)) for found in (node.publishers, node.subscriptions, node.timers))
+    return (*counts, sum(thread.name != "neighbours" for thread in threading.enumerate()))  # type: ignore[return-value]
+
+
+def fails_at(node: SegmentNode, monkeypatch: pytest.MonkeyPatch, method: str, topic: str) -> None:
+    """Have the making of a publisher or subscription fail, of one topic."""
+    make = getattr(node, method)
+
+    def broken(kind: Any, name: str, *arguments: Any, **settings: Any) -> Any:
+        if name == topic:
+            raise MemoryError("none left")
+        return make(kind, name, *arguments, **settings)
+
+    monkeypatch.setattr(node, method, broken)
+
+
+@pytest.mark.parametrize("topic", ["~/cloud", "~/objects", "~/classes/box"])
+def test_a_configure_that_breaks_off_leaves_nothing_behind_and_works_afterwards(
+    node: SegmentNode, errors: list[str], monkeypatch: pytest.MonkeyPatch, topic: str
+) -> None:
+    before = entities(node)
+    with monkeypatch.context() as patch:
+        fails_at(node, patch, "create_publisher", topic)
+        assert node.trigger_configure() == FAILURE
+    (line,) = errors
+    assert line.startswith("cannot be configured: unexpected MemoryError: none left\nTraceback")
+    assert entities(node) == before and not node.workspace.has_scene
+    assert node.trigger_configure() == SUCCESS
+
+
+@pytest.mark.parametrize("topic", ["image", "mask", "camera_info", "pose"])
+def test_an_activate_that_breaks_off_leaves_nothing_behind_and_works_afterwards(
+    node: SegmentNode, errors: list[str], monkeypatch: pytest.MonkeyPatch, topic: str
+) -> None:
+    assert node.trigger_configure() == SUCCESS
+    before = entities(node)
+    with monkeypatch.context() as patch:
+        fails_at(node, patch, "create_subscription", topic)
+        assert node.trigger_activate() == FAILURE
+    assert "cannot be activated: unexpected MemoryError: none left\nTraceback" in errors[0] and len(errors) == 1
+    assert entities(node) == before and node.inputs is None and not node.workspace.active
+    assert node.trigger_activate() == SUCCESS
+    assert node.trigger_deactivate() == SUCCESS
+    assert entities(node) == before
+
+
+def test_a_deactivate_that_fails_is_said_and_brings_it_back_to_unconfigured(
+    node: SegmentNode, errors: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = entities(node)
+    assert node.trigger_configure() == node.trigger_activate() == SUCCESS
+    cancel, results = node.workspace.slot.cancel, iter([MemoryError("none left")])
+
+    def broken_once(seconds: float) -> bool:
+        for error in results:
+            raise error
+        return cancel(seconds)
+
+    monkeypatch.setattr(node.workspace.slot, "cancel", broken_once)
+    assert node.trigger_deactivate() == TransitionCallbackReturn.ERROR
+    (line,) = errors
+    assert line.startswith("cannot be deactivated: unexpected MemoryError: none left\nTraceback")
+    assert entities(node) == before
+    assert node.trigger_configure() == node.trigger_activate() == SUCCESS
+
+
+@pytest.mark.parametrize(
+    ("override", "step", "state"),
+    [
+        ("/gsseg/objects.publisher.reliability", "configured", "unconfigured"),
+        ("/mask.subscription.reliability", "activated", "inactive"),
+        ("/image.subscription.history", "activated", "inactive"),
+    ],
+)
+def test_a_misspelt_quality_of_service_is_one_clear_error(
+    ros: Ros, parameters: dict[str, Any], override: str, step: str, state: str
+) -> None:
+    robot = Robot(ros)
+    topic, _, policy = override.split(".")
+    process = robot.start({**parameters, f"qos_overrides.{override}": "relible"}, lossless=False)
+    process.wait_for(f"cannot be {step}", timeout=120)
+    assert robot.state == state
+    (line,) = (line for line in process.output.splitlines() if "[ERROR]" in line)
+    assert f"cannot be {step}: parameters qos_overrides of the topic " in line and topic.split("/")[-1] in line
+    assert f"`{policy}`: `relible`; expected reliability reliable or best_effort" in line
+    assert "Traceback" not in process.output
+    assert not ros.node.count_publishers("/gsseg/cloud") or state == "inactive"
+    assert not robot.publishers["mask"].get_subscription_count()
+
+
+def test_the_state_is_told_and_changed_while_the_session_is_locked(
+    ros: Ros, node: SegmentNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot, asked = Robot(ros), threading.Event()
+    make = diagnostics.diagnostic_array
+
+    def make_and_tell(*arguments: Any) -> Any:
+        asked.set()
+        return make(*arguments)
+
+    monkeypatch.setattr(diagnostics, "diagnostic_array", make_and_tell)
+    with spun(node, ros):
+        robot.brought_to("inactive")
+        assert robot.change("activate")
+        with node.workspace.session._lock:
+            asked.clear()
+            ros.wait_until(asked.is_set, "diagnostics, which want the lock")
+            assert robot.state == "active"
+            assert robot.change("deactivate") and robot.state == "inactive"
+            assert robot.change("activate") and robot.state == "active"
+
+
+@pytest.mark.parametrize(("how", "number"), [("autostart", signal.SIGINT), ("change_state", signal.SIGTERM)])
+def test_a_signal_is_heard_while_kernels_compile_and_so_are_questions(
+    ros: Ros, parameters: dict[str, Any], tmp_path: Path, how: str, number: signal.Signals
+) -> None:
+    ros.environment["NUMBA_CACHE_DIR"] = str(tmp_path / "cache")
+    robot = Robot(ros)
+    process = robot.start({**parameters, "autostart": how == "autostart"})
+    if how == "change_state":
+        process.wait_for("autostart is false")
+        robot.send("change_state", transition=CONFIGURE)
+    process.wait_for("compiling kernels", timeout=120)
+    assert robot.state == "configuring"
+    process.send(number)
+    assert process.wait(5) == 0, process.output
+    assert "Traceback" not in process.output and "[ERROR]" not in process.output, process.output
+
+
+def test_images_are_not_subscribed_to_again_by_a_timer_that_runs_while_listening_ends(
+    node: SegmentNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert node.trigger_configure() == node.trigger_activate() == SUCCESS
+    assert node.inputs is not None and node._outputs is not None
+    images = node.inputs._images
+    monkeypatch.setattr(type(node._outputs), "wants_overlay", property(lambda _: True))
+    images.tick()
+    assert any(subscription.topic_name == "/image" for subscription in node.subscriptions)
+    assert node.trigger_deactivate() == SUCCESS
+    images.tick()
+    assert not any(subscription.topic_name == "/image" for subscription in node.subscriptions)
+
+
+def test_a_home_folder_is_understood_in_the_paths_of_parameters(
+    ros: Ros, parameters: dict[str, Any], root: Path
+) -> None:
+    ros.environment["HOME"] = str(root)
+    robot = Robot(ros).started({**parameters, "scene_path": "~/data/./scene.ply", "data_root": "~"})
+    robot.fuse(clean_views(1))
+    assert robot.done("save_state", path="home.npz").path == str(root / "home.npz")
+    assert robot.done("load_scene").path == str(root / "data" / "scene.ply")
