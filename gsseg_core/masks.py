@@ -18,8 +18,9 @@ import numpy.typing as npt
 from PIL import Image
 
 from gsseg_core.atomic import write_atomically
-from gsseg_core.errors import ClassesFileError, MaskFormatError, SettingsError
-from gsseg_core.json_files import read_json
+from gsseg_core.errors import ClassesFileError, MaskFormatError, SettingsError, quoted
+from gsseg_core.input_files import check_pixels, open_image, open_input, reason
+from gsseg_core.json_files import kind_of, read_json
 
 UNKNOWN = -1
 MAX_LABEL = 65534
@@ -50,35 +51,45 @@ def read_mask(path: str | os.PathLike[str]) -> Mask:
         The file is missing, broken, or another kind of image (RGB, alpha, 1-bit, not a PNG).
     """
     bits = mask_bits(path)
-    try:
-        # Other formats are lossy or ambiguous about integers, whatever the file is named.
-        with Image.open(path, formats=["PNG"]) as image:
-            labels = np.array(image).astype(np.int32)
-    except (OSError, SyntaxError, ValueError, EOFError, struct.error) as error:
-        raise MaskFormatError(f"{path}: broken PNG ({error}); expected a whole label image") from error
+    # Other formats are lossy or ambiguous about integers, whatever the file is named.
+    with open_image(path, MaskFormatError, "PNG", "a whole label image", ("PNG",)) as image:
+        labels = np.array(image).astype(np.int32)
     labels[labels == 2**bits - 1] = UNKNOWN
     return Mask(labels, bits)
 
 
+class MaskHeader(NamedTuple):
+    """What the header of a label image says: bits per label, 8 or 16, and its size in pixels."""
+
+    bits: int
+    width: int
+    height: int
+
+
 def mask_bits(path: str | os.PathLike[str]) -> int:
     """Bits per label of a PNG, 8 or 16, from its header alone; raises `MaskFormatError` as `read_mask` does."""
+    return mask_header(path).bits
+
+
+def mask_header(path: str | os.PathLike[str]) -> MaskHeader:
+    """Read the header of a label image; raises `MaskFormatError` as `read_mask` does."""
     try:
-        with open(path, "rb") as file:
+        with open_input(path) as file:
             header = file.read(26)
     except OSError as error:
-        raise MaskFormatError(f"{path}: cannot be read ({error.strerror or error}); expected a label image") from error
+        raise MaskFormatError(f"{path}: cannot be read ({reason(error)}); expected a label image") from error
     if len(header) < 26 or not header.startswith(b"\x89PNG\r\n\x1a\n"):
         raise MaskFormatError(f"{path}: not a PNG; expected a one-channel 8- or 16-bit PNG of labels")
     # The header chunk comes first: 8 bytes of signature, 8 of chunk, width, height, bit depth, colour type.
+    width, height = struct.unpack(">II", header[16:24])
     depth, kind = header[24], _PNG_KINDS.get(header[25], "unknown")
-    if kind == "palette":
-        return 8
-    if kind == "gray" and depth in (8, 16):
-        return depth
-    fix = "; a photo is no mask, and of ids drawn in colours save the ids themselves" if "RGB" in kind else ""
-    raise MaskFormatError(
-        f"{path}: is {kind} of {depth} bits per channel; expected a one-channel 8- or 16-bit PNG of labels{fix}"
-    )
+    if kind != "palette" and (kind != "gray" or depth not in (8, 16)):
+        fix = "; a photo is no mask, and of ids drawn in colours save the ids themselves" if "RGB" in kind else ""
+        raise MaskFormatError(
+            f"{path}: is {kind} of {depth} bits per channel; expected a one-channel 8- or 16-bit PNG of labels{fix}"
+        )
+    check_pixels(width, height, str(path), MaskFormatError)
+    return MaskHeader(8 if kind == "palette" else depth, width, height)
 
 
 def write_mask(
@@ -144,12 +155,12 @@ def read_classes(path: str | os.PathLike[str]) -> dict[int, str]:
     path = Path(path)
     content = read_json(path, ClassesFileError)
     if not isinstance(content, dict):
-        raise ClassesFileError(f'{path}: holds {type(content).__name__}; expected an object such as {{"1": "chair"}}')
+        raise ClassesFileError(f'{path}: holds {kind_of(content)}; expected an object such as {{"1": "chair"}}')
     names = {0: BACKGROUND_NAME}
     for key, name in content.items():
         if not re.fullmatch(r"0|[1-9][0-9]{0,4}", key) or int(key) >= 2**16 - 1:
-            raise ClassesFileError(f"{path}: id {key[:60]!r} is unusable; expected whole numbers from 0 to 65534")
+            raise ClassesFileError(f"{path}: id {quoted(key)} is unusable; expected whole numbers from 0 to 65534")
         if not isinstance(name, str) or not name.strip():
-            raise ClassesFileError(f"{path}: id {key} has the name {name!r}; expected text")
+            raise ClassesFileError(f"{path}: id {key} has the name {quoted(name)}; expected text")
         names[int(key)] = name
     return dict(sorted(names.items()))

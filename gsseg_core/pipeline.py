@@ -178,7 +178,9 @@ def segment(
 
                 client = stack.enter_context(connected(scheduler))
             scene = GaussianScene.load(scene_path)
-            dataset = Dataset(data, labels)
+            dataset, class_ids = Dataset(data, labels), None
+            if ids != PER_VIEW:
+                dataset, class_ids = dataset.numbered(), dataset.class_ids
             train = spread(dataset.views("train"), views)
             class_names = {} if ids == PER_VIEW else dataset.class_names
         if ids == PER_VIEW:
@@ -232,9 +234,10 @@ def segment(
         with watch.stage("carve"):
             cameras = [view.camera for view in spread(train, refine.carve_views)]
             result = carved(scene, result, cameras, device)
+    named = result if class_ids is None else result.with_ids(class_ids)
     with watch.stage("export"):
-        result.save(out / "segmentation.npz")
-        plys = export_classes(scene, result, out / "classes")
+        named.save(out / "segmentation.npz")
+        plys = export_classes(scene, named, out / "classes")
     with watch.stage("pictures"):
         chosen = spread(dataset.views("all"), PICTURED_VIEWS)
         images = ViewImages(scene, device)
@@ -247,7 +250,7 @@ def segment(
             save_png(pictures[-1], worst)
     report = build_report(
         scene,
-        result,
+        named,
         **learnt,
         settings={
             "learner": learner, "labels": labels, "views": views, "device": device, "memory_budget": memory_budget,
@@ -289,20 +292,21 @@ def render(
     scene = GaussianScene.load(scene_path)
     dataset = Dataset(data)
     result = Segmentation.load(segmentation_path, scene)
+    ids, numbered = result.class_ids, result.numbered()
     views = dataset.views(split)
     if not views:
         raise NoUsableViewsError(f"{data}: split {split!r} has no views; expected at least one to render")
     out = Path(out)
     bits = 16 if result.num_classes > 255 else max((view.mask_bits or 8 for view in views), default=8)
     paths, overlays = [], []
-    for done, (view, labels, image, _) in enumerate(draw_views(scene, result, views, device=device)):
+    for done, (view, labels, image, _) in enumerate(draw_views(scene, numbered, views, device=device)):
         progress("render", done, len(views))
         paths.append(out / f"{view.name}.png")
-        write_mask(paths[-1], labels, bits)
+        write_mask(paths[-1], ids[labels], bits)
         overlays.append(image)
         save_png(out / "overlays" / f"{view.name}.png", image)
     progress("render", len(views), len(views))
-    write_overview(result, overlays, [view.name for view in views], out / "overlays")
+    write_overview(numbered, overlays, [view.name for view in views], out / "overlays")
     return paths
 
 

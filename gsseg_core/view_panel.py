@@ -168,7 +168,7 @@ class Panel:
         label, probabilities = int(model.labelling.labels[i]), model.labelling.probabilities[i]
         best = [k for k in np.argsort(-probabilities, kind="stable")[:MOST_CLASSES].tolist() if probabilities[k] > 0]
         lines = [
-            f"**{model.name(label)}**" + (f", class {label}" if label >= 0 else ""),
+            f"**{model.name(label)}**" + (f", class {model.ids()[label]}" if label >= 0 else ""),
             f"Gaussian {i}, {100 * picked.weight:.0f} % of the pixel",
             "probabilities: " + (", ".join(f"{model.name(k)} {probabilities[k]:.2f}" for k in best) or "none"),
         ]

@@ -202,7 +202,7 @@ def test_names_are_stems_of_image_names(tmp_path: Path, name: str, stem: str) ->
     ("content", "error", "words"),
     [
         ([], CameraFileError, ("holds no camera",)),
-        ({"cameras": []}, CameraFileError, ("holds dict", "expected a list of cameras")),
+        ({"cameras": []}, CameraFileError, ("holds an object", "expected a list of cameras")),
         ([entry_3dgs(), 7], CameraFileError, ("expected a list of cameras, each an object",)),
         ([entry_3dgs(), entry_3dgs()], CameraFileError, ("2 images have the stem '0001'",)),
         ([entry_3dgs("a/1.jpg"), entry_3dgs("b/1.png")], CameraFileError, ("2 images have the stem '1'",)),
@@ -278,7 +278,7 @@ def test_poses_of_three_rows_and_lenses_without_distortion_are_accepted(tmp_path
         (transforms(frame={"p2": -0.1}), IntrinsicsError, ("distortion (p2 = -0.1)",)),
         (transforms(camera_model="OPENCV_FISHEYE"), IntrinsicsError, ("OPENCV_FISHEYE", "expected a pinhole")),
         (transforms(is_fisheye=True), IntrinsicsError, ("expected a pinhole",)),
-        (transforms(frames=None), CameraFileError, ("holds NoneType", "expected a list 'frames'")),
+        (transforms(frames=None), CameraFileError, ("holds null", "expected a list 'frames'")),
         (transforms(frames=[]), CameraFileError, ("holds no camera",)),
         (transforms(frames=[{}]), CameraFileError, ("entry 0", "lacks 'file_path'")),
         ([], CameraFileError, ("holds a list; expected an object with 'frames'",)),

@@ -112,7 +112,7 @@ def test_classes_are_sorted_and_have_a_background(tmp_path: Path) -> None:
         ("", "not valid JSON"),
         (b"\xff\xfe", "not valid JSON"),
         ("[" * 100_000, "not valid JSON"),
-        ('["chair"]', "holds list; expected an object"),
+        ('["chair"]', "holds a list; expected an object"),
         ('{"chair": 1}', "id 'chair' is unusable; expected whole numbers from 0 to 65534"),
         ('{"-1": "chair"}', "id '-1' is unusable"),
         ('{"1.5": "chair"}', "id '1.5' is unusable"),

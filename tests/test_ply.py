@@ -115,7 +115,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 
 
 def test_a_folder_is_no_scene(tmp_path: Path) -> None:
-    with pytest.raises(SceneFileError, match=r"cannot be read \(Is a directory\)"):
+    with pytest.raises(SceneFileError, match=r"cannot be read \(is a folder\)"):
         read_vertices(tmp_path)
 
 
