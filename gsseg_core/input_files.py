@@ -6,11 +6,12 @@ import errno
 import os
 import stat
 import struct
+import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO
 
 from PIL import Image, UnidentifiedImageError
 
@@ -26,7 +27,7 @@ _DAMAGED = (OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, E
             RuntimeError, struct.error, zlib.error, Image.DecompressionBombError)  # fmt: skip
 
 
-def open_input(path: str | os.PathLike[str]) -> BinaryIO:
+def open_input(path: str | os.PathLike[str]) -> BufferedReader:
     """Open a file for reading; links are followed.
 
     Raises
@@ -114,10 +115,16 @@ def open_image(
     except OSError as cause:
         raise error(f"{path}: cannot be read ({reason(cause)}); expected {expected}") from cause
     try:
-        with file, Image.open(file, formats=formats) as image:
+        with file, _opened(file, formats) as image:
             check_pixels(*image.size, str(path), error)
             yield image
     except _DAMAGED as cause:
         # Of what it does not know, Pillow tells nothing but the address of the object that it was handed.
         why = "of no known format" if isinstance(cause, UnidentifiedImageError) else reason(cause)
         raise error(f"{path}: broken {kind} ({why}); expected {expected}") from cause
+
+
+def _opened(file: BufferedReader, formats: tuple[str, ...] | None) -> Image.Image:
+    with warnings.catch_warnings():  # Pillow warns of images that are within our own limit.
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        return Image.open(file, formats=formats)
