@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import os
-from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -20,16 +19,13 @@ from gsseg_core.errors import (
     ClassesFileError,
     MaskFormatError,
     SettingsError,
-    SplitFileError,
     UnknownLabelError,
-    clipped,
-    quoted,
 )
 from gsseg_core.input_files import is_there
-from gsseg_core.json_files import kind_of, read_json
 from gsseg_core.masks import BACKGROUND_NAME, MAX_LABEL, UNKNOWN, mask_bits, mask_header, read_classes, read_mask
 from gsseg_core.soft_files import SUPERVISES, mask_files, read_soft_mask, read_supervises
 from gsseg_core.soft_masks import PackedMask, SeenLabels, combine_detections, quantise, restrict
+from gsseg_core.split_file import read_split
 
 _IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 
@@ -314,7 +310,7 @@ class Dataset:
             )
             for camera in self.cameras
         }
-        self._split = self._read_split()
+        self._split = read_split(self.root / "split.json", self._views)
 
     def views(self, split: str = "all") -> list[View]:
         """List the views of a split, "train", "test" or "all"; without `split.json` all views are for training."""
@@ -364,32 +360,6 @@ class Dataset:
         other.__dict__["class_names"] = names
         other._views = {stem: replace(view, class_names=told, numbering=ids) for stem, view in self._views.items()}
         return other
-
-    def _read_split(self) -> dict[str, list[str]]:
-        path = self.root / "split.json"
-        if not is_there(path, SplitFileError):
-            return {"train": list(self._views), "test": []}
-        content = read_json(path, SplitFileError)
-        if not isinstance(content, dict):
-            raise SplitFileError(f'{path}: holds {kind_of(content)}; expected {{"train": [stems], "test": [stems]}}')
-        if "train" not in content:
-            raise SplitFileError(f'{path}: no "train" in it; expected {{"train": [stems], "test": [stems]}}')
-        split = {name: content.get(name, []) for name in ("train", "test")}
-        for name, stems in split.items():
-            if not isinstance(stems, list) or not all(isinstance(stem, str) for stem in stems):
-                raise SplitFileError(f'{path}: "{name}" is {clipped(stems)}; expected a list of image stems')
-            strangers = [stem for stem in stems if stem not in self._views]
-            if strangers:
-                raise SplitFileError(
-                    f'{path}: "{name}" names views without a camera ({len(strangers)}, the first '
-                    f"{quoted(strangers[0])}); expected stems such as {quoted(next(iter(self._views)))}"
-                )
-        stem, count = Counter(split["train"] + split["test"] or [""]).most_common(1)[0]
-        if count > 1:
-            raise SplitFileError(
-                f"{path}: stem {quoted(stem)} occurs {count} times; expected each stem once, in one split"
-            )
-        return split
 
 
 def spread(views: Sequence[View], count: int | None) -> list[View]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 import struct
@@ -9,6 +10,7 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 from small_scenes import NAMES, balls_on_a_table, ring, write_dataset
@@ -158,3 +160,38 @@ def test_foreign_text_in_a_message_is_short_printable_and_on_one_line(tmp_path: 
 
 def test_a_missing_file_is_named_with_what_was_expected(tmp_path: Path) -> None:
     refused(lambda: State.load(tmp_path / "no.npz", "", 1), StateFileError, "no.npz: does not exist; expected a saved")
+
+
+@pytest.mark.parametrize(
+    ("entry", "parts"),
+    [
+        ({"width": 60_000, "height": 60_000}, ("60000 x 60000 pixels", "max_pixels")),
+        ({"width": 1e300}, ("pixels", "max_pixels")),
+        ({"width": float("inf")}, ("'width' is inf",)),
+        ({"height": float("nan")}, ("'height' is nan",)),
+        ({"width": 10**400}, ("'width' is 1000",)),
+        ({"img_name": "n" * 5000, "fx": -1}, ("nnn...",)),
+    ],
+)
+def test_sizes_that_no_camera_has_are_refused_before_memory_is_taken(
+    tmp_path: Path, entry: dict[str, object], parts: tuple[str, ...]
+) -> None:
+    camera = {
+        "img_name": "a", "width": 64, "height": 48, "fx": 50.0, "fy": 50.0,
+        "position": [0, 0, 0], "rotation": np.eye(3).tolist(),
+    }  # fmt: skip
+    (tmp_path / "cameras.json").write_text(json.dumps([{**camera, **entry}]))
+    with pytest.raises(GssegError) as caught:
+        read_cameras(tmp_path)
+    message = str(caught.value)
+    assert len(message) < 500 and all(part in message for part in (str(tmp_path / "cameras.json"), *parts))
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin"])
+def test_a_colmap_count_beyond_the_file_is_refused_at_once(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / "sparse"
+    folder.mkdir()
+    for file in ("cameras.bin", "images.bin"):
+        (folder / file).write_bytes((2**60 if file == name else 0).to_bytes(8, "little"))
+    with pytest.raises(CameraFileError, match=rf"{name}: is truncated; expected a whole COLMAP model"):
+        read_cameras(tmp_path)
