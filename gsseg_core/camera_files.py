@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import math
 import os
+import shutil
 import struct
 import tempfile
 from collections import Counter
-from contextlib import ExitStack
 from pathlib import Path, PureWindowsPath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.cameras import Camera
-from gsseg_core.confined_files import input_name, open_input
-from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError
+from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError, clipped, quoted
+from gsseg_core.input_files import is_there, open_input, reason
 from gsseg_core.json_files import kind_of, read_json
 from gsseg_core.layout import camera_hint
 from gsseg_core.names import flaw_of_view_name
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 _IMAGE_SUFFIXES = {".bmp", ".exr", ".heic", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}
 # COLMAP models that are a pinhole once their distortion is zero; a fisheye is not.
 _COLMAP_MODELS = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
+_LEAST_CAMERA = 48
+"""Bytes of a camera in a binary model, of three parameters."""
 _NERFSTUDIO_MODELS = {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "PERSPECTIVE"}
 _NERFSTUDIO_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
@@ -59,17 +61,17 @@ def read_cameras(folder: str | os.PathLike[str], within: Path | None = None) -> 
         A file lies outside `within`.
     """
     folder = Path(folder)
-    if (folder / "cameras.json").is_file():
+    if is_there(folder / "cameras.json", CameraFileError):
         path = folder / "cameras.json"
         cameras = _read_3dgs(path, within)
-    elif (folder / "transforms.json").is_file():
+    elif is_there(folder / "transforms.json", CameraFileError):
         path = folder / "transforms.json"
         cameras = _read_nerfstudio(path, within)
     else:
         models = [
             model
             for model in (folder / "sparse" / "0", folder / "sparse")
-            if (model / "cameras.bin").is_file() or (model / "cameras.txt").is_file()
+            if is_there(model / "cameras.bin", CameraFileError) or is_there(model / "cameras.txt", CameraFileError)
         ]
         if not models:
             hint = camera_hint(folder) if within is None else ""  # It looks around, wherever links lead.
@@ -87,7 +89,9 @@ def read_cameras(folder: str | os.PathLike[str], within: Path | None = None) -> 
             raise CameraFileError(f"{path}: an image has the name {flaw}")
     stem, count = Counter(camera.name for camera in cameras).most_common(1)[0]
     if count > 1:
-        raise CameraFileError(f"{path}: {count} images have the stem '{stem}'; expected another stem for each image")
+        raise CameraFileError(
+            f"{path}: {count} images have the stem {quoted(stem)}; expected another stem for each image"
+        )
     return cameras
 
 
@@ -137,11 +141,13 @@ def _read_nerfstudio(path: Path, within: Path | None) -> list[Camera]:
 def _refuse_nerfstudio_lens(where: str, entry: dict[str, Any]) -> None:
     model = str(entry.get("camera_model", "PINHOLE")).upper()
     if model not in _NERFSTUDIO_MODELS or entry.get("is_fisheye"):
-        raise IntrinsicsError(f"{where}: camera model is {model}; expected a pinhole: undistort the images first")
+        raise IntrinsicsError(
+            f"{where}: camera model is {clipped(model)}; expected a pinhole: undistort the images first"
+        )
     bent = [key for key in _NERFSTUDIO_DISTORTION if entry.get(key)]
     if bent:
         raise IntrinsicsError(
-            f"{where}: the lens has distortion ({', '.join(f'{key} = {entry[key]}' for key in bent)}); "
+            f"{where}: the lens has distortion ({', '.join(f'{key} = {clipped(entry[key])}' for key in bent)}); "
             "expected none: undistort the images first"
         )
 
@@ -167,12 +173,12 @@ def _read_colmap(path: Path, within: Path | None) -> list[Camera]:
             name = image.name
         except UnicodeDecodeError as error:
             raise CameraFileError(f"{path}, image {image_id}: its name is not UTF-8 text") from error
-        where = f"{path}, image '{name}'"
+        where = f"{path}, image '{clipped(name)}'"
         lens = model.cameras[image.camera_id]
         if lens.model_name not in _COLMAP_MODELS or any(lens.params[i] for i in lens.extra_params_idxs()):
             raise IntrinsicsError(
-                f"{where}: camera is {lens.model_name} ({lens.params_info}: {lens.params_to_string()}); expected one "
-                "without distortion: undistort the images first"
+                f"{where}: camera is {lens.model_name} ({lens.params_info}: {clipped(lens.params_to_string())}); "
+                "expected one without distortion: undistort the images first"
             )
         K = _intrinsics(lens.focal_length_x, lens.focal_length_y, lens.principal_point_x, lens.principal_point_y)
         motion = image.cam_from_world()
@@ -187,7 +193,7 @@ def _load_colmap(path: Path, within: Path | None) -> pycolmap.Reconstruction:
     """Load the cameras and images of a COLMAP model, without its points.
 
     The points are not needed and take long to read, and pycolmap does not return from a truncated list of them. Nor
-    does it notice that a binary file ends too early, so that is found out here.
+    does it notice that a binary file ends too early, or a count is impossible, so that is found out here.
     """
     try:
         import pycolmap
@@ -195,38 +201,56 @@ def _load_colmap(path: Path, within: Path | None) -> pycolmap.Reconstruction:
         raise CameraFileError(f"{path}: to read a COLMAP model, install pycolmap") from error
     suffix = ".bin" if (path / "cameras.bin").is_file() else ".txt"
     cameras, images = (path / f"{name}{suffix}" for name in ("cameras", "images"))
-    if not images.is_file():
+    if not is_there(images, CameraFileError):
         raise CameraFileError(f"{path}: COLMAP model has {cameras.name} but no {images.name}")
-    if suffix == ".bin" and (cameras.stat().st_size < 8 or not _is_whole(images, within)):
-        raise CameraFileError(f"{path}: {cameras.name} or {images.name} is truncated; expected a whole COLMAP model")
-    with tempfile.TemporaryDirectory() as folder, ExitStack() as opened:
-        for file in (cameras, images):
-            (Path(folder) / file.name).symlink_to(opened.enter_context(input_name(file.resolve(), within)))
+    with tempfile.TemporaryDirectory() as folder:
+        # What was checked is what pycolmap reads, so it gets a copy.
+        for file, copy in ((cameras, _copy_cameras), (images, _copy_images)):
+            try:
+                with open_input(file, within) as source, open(Path(folder) / file.name, "wb") as target:
+                    (copy if suffix == ".bin" else shutil.copyfileobj)(source, target)
+            except OSError as error:
+                raise CameraFileError(f"{file}: cannot be read ({reason(error)})") from error
+            except (struct.error, ValueError) as error:
+                raise CameraFileError(f"{file}: is truncated; expected a whole COLMAP model") from error
         (Path(folder) / f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
         try:
             model = pycolmap.Reconstruction(folder)
         except Exception as error:  # whatever its C++ parser makes of a broken file
-            raise CameraFileError(f"{path}: not a readable COLMAP model ({str(error).strip()})") from error
+            why = clipped(str(error).strip().replace(folder, str(path)), 300)
+            raise CameraFileError(f"{path}: not a readable COLMAP model ({why})") from error
     size = 8 + sum(24 + 8 * len(lens.params) for lens in model.cameras.values())
     if suffix == ".bin" and cameras.stat().st_size < size:
-        raise CameraFileError(f"{cameras}: truncated; expected at least {size} bytes")
+        raise CameraFileError(f"{cameras}: is truncated; expected at least {size} bytes")
     return model
 
 
-def _is_whole(images: Path, within: Path | None) -> bool:
-    """Walk through a binary list of images to see whether it ends too early."""
-    with open_input(images, within) as file:
-        data = file.read()
-    try:
-        (count,) = struct.unpack_from("<Q", data)
-        end = 8
-        for _ in range(count):
-            # id, quaternion, translation and camera id; the name up to its 0; the number of points, and the points
-            end = data.index(0, end + 64) + 1
-            end += 8 + 24 * struct.unpack_from("<Q", data, end)[0]
-    except (struct.error, ValueError):
-        return False
-    return end <= len(data)
+def _copy_cameras(source: BinaryIO, target: BinaryIO) -> None:
+    """Copy a binary list of cameras; `ValueError` if it is shorter than its count says."""
+    content = source.read()
+    (count,) = struct.unpack_from("<Q", content)
+    if len(content) < 8 + _LEAST_CAMERA * count:
+        raise ValueError(f"{count} cameras")
+    target.write(content)
+
+
+def _copy_images(source: BinaryIO, target: BinaryIO) -> None:
+    """Copy a binary list of images without their points; `ValueError` or `struct.error` if it ends too early."""
+    size = os.fstat(source.fileno()).st_size
+    count = source.read(8)
+    target.write(count)
+    for _ in range(struct.unpack("<Q", count)[0]):
+        # Id, quaternion, translation and camera id; the name up to its 0; the number of points, and the points.
+        pose, name = source.read(64), bytearray()
+        while (letter := source.read(1)) != b"\0":
+            if not letter:
+                raise ValueError("no end of a name")
+            name += letter
+        (points,) = struct.unpack("<Q", source.read(8))
+        if source.tell() + 24 * points > size:
+            raise ValueError(f"{points} points")
+        source.seek(24 * points, os.SEEK_CUR)
+        target.write(pose + bytes(name) + bytes(9))
 
 
 def _camera(
@@ -261,13 +285,14 @@ def _inverse(
 def _entries(path: Path, content: object, expected: str) -> list[tuple[str, dict[str, Any]]]:
     """Objects of a JSON list, each with words that say where it stands."""
     if not isinstance(content, list) or not all(isinstance(entry, dict) for entry in content):
-        raise CameraFileError(f"{path}: holds {kind_of(content)}; expected {expected}, each an object")
+        found = kind_of(content) + (" with entries of other kinds" if isinstance(content, list) else "")
+        raise CameraFileError(f"{path}: holds {found}; expected {expected}, each an object")
     return [(f"{path}, entry {i}", entry) for i, entry in enumerate(content)]
 
 
 def _get(where: str, entry: dict[str, Any], key: str) -> Any:
     if key not in entry:
-        raise CameraFileError(f"{where}: lacks '{key}' (has {', '.join(entry) or 'nothing'})")
+        raise CameraFileError(f"{where}: lacks '{key}' (has {clipped(', '.join(entry)) or 'nothing'})")
     return entry[key]
 
 
@@ -286,18 +311,18 @@ def _array(where: str, entry: dict[str, Any], key: str, *shapes: tuple[int, ...]
     value = _get(where, entry, key)
     try:
         array = np.array(value, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = None
     if array is None or array.shape not in shapes:
         expected = " or ".join(" x ".join(map(str, shape)) + " numbers" if shape else "a number" for shape in shapes)
-        raise CameraFileError(f"{where}: '{key}' is {str(value)[:60]}; expected {expected}")
+        raise CameraFileError(f"{where}: '{key}' is {clipped(value)}; expected {expected}")
     return array
 
 
 def _stem(where: str, entry: dict[str, Any], key: str) -> str:
     name = _get(where, entry, key)
     if not isinstance(name, str) or not _stem_of(name):
-        raise CameraFileError(f"{where}: '{key}' is {name!r}; expected the name of an image")
+        raise CameraFileError(f"{where}: '{key}' is {quoted(name)}; expected the name of an image")
     return _stem_of(name)
 
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.errors import IntrinsicsError, PoseError
+from gsseg_core.errors import IntrinsicsError, MaskSizeError, PoseError, clipped
+from gsseg_core.input_files import check_pixels
 
 # Poses come from text files of few digits; a deviation this small moves no point by a pixel.
 _RIGID_TOLERANCE = 1e-3
@@ -31,7 +32,7 @@ class Camera:
     Raises
     ------
     IntrinsicsError
-        Size or `K` is not that of a pinhole camera.
+        Size or `K` is not that of a pinhole camera, or the picture would be larger than `Limits.max_pixels`.
     PoseError
         `world_to_camera` is NaN, not invertible, or not a rigid motion.
     """
@@ -97,21 +98,38 @@ class Camera:
         divisor = np.where(depth > 0, depth, np.nan)[:, None]
         return local[:, :2] / divisor * self.K[[0, 1], [0, 1]] + self.K[:2, 2], depth
 
+    def check_mask_size(self, width: int, height: int, source: str) -> None:
+        """Raise `MaskSizeError` if a mask has another size in pixels than this camera."""
+        if (width, height) != (self.width, self.height):
+            raise MaskSizeError(
+                f"{source}: mask is {width} x {height} pixels; expected {self.width} x {self.height}, the size of "
+                f"{self._who} (masks are never resized)"
+            )
+
+    @property
+    def _who(self) -> str:
+        return f"camera '{clipped(self.name)}'"
+
     def _check_intrinsics(self) -> None:
-        who = f"camera '{self.name}'"
+        who = self._who
         for side, size in (("width", self.width), ("height", self.height)):
             if not isinstance(size, (int, np.integer)) or size < 1:
-                raise IntrinsicsError(f"{who}: {side} is {size!r}; expected a whole number of pixels, at least 1")
+                raise IntrinsicsError(
+                    f"{who}: {side} is {clipped(size)}; expected a whole number of pixels, at least 1"
+                )
+        check_pixels(self.width, self.height, who, IntrinsicsError)
         K = self.K
         if K.shape != (3, 3) or not np.isfinite(K).all():
-            raise IntrinsicsError(f"{who}: K is {K.tolist()}; expected 3 x 3 finite numbers")
+            raise IntrinsicsError(f"{who}: K is {clipped(K.tolist())}; expected 3 x 3 finite numbers")
         if self.fx <= 0 or self.fy <= 0:
             raise IntrinsicsError(f"{who}: focal lengths are {self.fx:g} and {self.fy:g}; expected positive pixels")
         if K[0, 1] or K[1, 0] or K[2].tolist() != [0, 0, 1]:
-            raise IntrinsicsError(f"{who}: K is {K.tolist()}; expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+            raise IntrinsicsError(
+                f"{who}: K is {clipped(K.tolist(), 160)}; expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+            )
 
     def _check_pose(self) -> None:
-        who = f"camera '{self.name}'"
+        who = self._who
         pose = self.world_to_camera
         if pose.shape != (4, 4):
             raise PoseError(f"{who}: pose has shape {pose.shape}; expected (4, 4)")

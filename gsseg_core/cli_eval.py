@@ -28,7 +28,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Score, and print a table."""
     from gsseg_core.atomic import check_writable
+    from gsseg_core.errors import ClassesFileError
     from gsseg_core.export import write_json
+    from gsseg_core.input_files import is_there
     from gsseg_core.masks import read_classes
     from gsseg_core.metrics import evaluate_folders
     from gsseg_core.tables import evaluation_summary
@@ -36,7 +38,7 @@ def run(options: argparse.Namespace) -> int:
     if options.json:
         check_writable(options.json)
     classes = Path(options.truth).parent / "classes.json"
-    names = read_classes(classes) if classes.is_file() else None
+    names = read_classes(classes) if is_there(classes, ClassesFileError) else None
     scores = evaluate_folders(options.pred, options.truth).as_dict(names)
     if options.json:
         write_json(options.json, scores)

@@ -73,16 +73,22 @@ def _show(options: argparse.Namespace, listener: Listener, viewer_module: Module
 
     load_kernels(options.quiet, options.device)
     scene = GaussianScene.load(options.scene)
+    segmentation = Segmentation.load(options.segmentation, scene) if options.segmentation else None
+    class_ids = segmentation.class_ids.tolist() if segmentation else None
     dataset = Dataset(options.data) if options.data else None
+    if dataset and not options.ros:  # The node's ids are as they are.
+        class_ids = class_ids or list(dataset.class_ids)
+        dataset = dataset.numbered(class_ids)
     views = [view for view in dataset.views("train") if view.has_mask] if dataset else []
     reliability: dict[str, float] = {}
-    if options.segmentation:
-        labelling = Labelling.of(Segmentation.load(options.segmentation, scene))
+    if segmentation:
+        labelling = Labelling.of(segmentation.numbered())
         reliability = read_reliability(Path(options.segmentation).parent / "report.json")
     else:
         labelling = Labelling.unknown(len(scene), dataset.class_names if dataset else None)
     source = open_source("ros", scene) if options.ros else None
-    model = ViewModel(scene, labelling, mode=BY_CLASS if options.segmentation or options.ros else TRUE_COLOURS)
+    mode = BY_CLASS if options.segmentation or options.ros else TRUE_COLOURS
+    model = ViewModel(scene, labelling, mode=mode, class_ids=tuple(class_ids or ()))
     viewer = viewer_module.Viewer(
         model,
         views,

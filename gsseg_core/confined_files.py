@@ -8,55 +8,26 @@ from __future__ import annotations
 
 import contextlib
 import os
-import stat
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
 
 from gsseg_core.errors import GssegError, PathNotAllowedError, WriteError
 
-_OPENED = "/proc/self/fd"
+OPENED = "/proc/self/fd"
 """Where the kernel names what a descriptor stands for; to open it there opens that, and no path."""
 
 
-def open_input(path: str | os.PathLike[str], within: Path | None = None) -> BinaryIO:
-    """Open a file for reading.
-
-    Parameters
-    ----------
-    path : path
-        The file; links are followed.
-    within : pathlib.Path, optional
-        A folder below which the file must lie in the end. It must then be a regular file, too.
+def require_below(place: str, path: str | os.PathLike[str], within: Path) -> None:
+    """Refuse a place, without links, that is not below a folder; `path` is what the message names.
 
     Raises
     ------
-    OSError
-        It cannot be opened.
     PathNotAllowedError
-        It lies elsewhere; it has not been opened.
+        It is elsewhere.
     """
-    if within is None:
-        return open(path, "rb")
-    found = os.open(path, os.O_PATH | os.O_CLOEXEC)  # opens nothing yet, and so never waits for the end of a FIFO
-    try:
-        _require_below(os.readlink(f"{_OPENED}/{found}"), path, within)
-        mode = os.fstat(found).st_mode
-        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-            raise OSError("neither a file nor a folder")
-        return open(f"{_OPENED}/{found}", "rb")
-    finally:
-        os.close(found)
-
-
-@contextlib.contextmanager
-def input_name(path: str | os.PathLike[str], within: Path | None = None) -> Iterator[str]:
-    """Give a name of a file for libraries that open files by name; raises as `open_input` does."""
-    if within is None:
-        yield os.fspath(path)
-    else:
-        with open_input(path, within) as file:
-            yield f"{_OPENED}/{file.fileno()}"
+    root = os.path.realpath(within)
+    if place != root and not place.startswith(root.rstrip("/") + "/"):
+        raise PathNotAllowedError(f"{path}: leads out of {within}; expected what lies below it, links followed")
 
 
 def require_folder_below(path: Path, within: Path | None) -> None:
@@ -68,7 +39,7 @@ def require_folder_below(path: Path, within: Path | None) -> None:
         Its links lead out of `within`.
     """
     if within is not None:
-        _require_below(os.path.realpath(path), path, within)
+        require_below(os.path.realpath(path), path, within)
 
 
 @contextlib.contextmanager
@@ -108,14 +79,8 @@ def pinned_folder(folder: Path, within: Path) -> Iterator[Path]:
                 opened.callback(os.close, descriptor)
         except OSError as error:
             raise WriteError(f"{folder}: cannot be written ({error.strerror or error})") from error
-        pinned = Path(_OPENED, str(descriptor))
+        pinned = Path(OPENED, str(descriptor))
         try:
             yield pinned
         except GssegError as error:
             raise type(error)(str(error).replace(str(pinned), str(folder))) from error
-
-
-def _require_below(place: str, path: str | os.PathLike[str], within: Path) -> None:
-    root = os.path.realpath(within)
-    if place != root and not place.startswith(root.rstrip("/") + "/"):
-        raise PathNotAllowedError(f"{path}: leads out of {within}; expected what lies below it, links followed")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import copy
 import os
-from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -16,11 +16,17 @@ import numpy.typing as npt
 from gsseg_core.camera_files import read_cameras
 from gsseg_core.cameras import Camera
 from gsseg_core.confined_files import require_folder_below
-from gsseg_core.errors import MaskFormatError, MaskSizeError, SettingsError, SplitFileError, UnknownLabelError
-from gsseg_core.json_files import read_json
-from gsseg_core.masks import BACKGROUND_NAME, MAX_LABEL, UNKNOWN, mask_bits, read_classes, read_mask
+from gsseg_core.errors import (
+    ClassesFileError,
+    MaskFormatError,
+    SettingsError,
+    UnknownLabelError,
+)
+from gsseg_core.input_files import is_there
+from gsseg_core.masks import BACKGROUND_NAME, MAX_LABEL, UNKNOWN, mask_bits, mask_header, read_classes, read_mask
 from gsseg_core.soft_files import SUPERVISES, mask_files, read_soft_mask, read_supervises
 from gsseg_core.soft_masks import PackedMask, SeenLabels, combine_detections, quantise, restrict
+from gsseg_core.split_file import read_split
 
 _IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 
@@ -44,6 +50,9 @@ class View:
         If given, the label image says something of these classes only: its 0 means "none of these".
     within : pathlib.Path or None
         If given, the folder below which the mask must lie, links followed.
+    numbering : tuple of int, or None
+        If given, the mask holds these ids, ascending, and labels are read as places among them; see
+        `Dataset.numbered`. `class_names` are by place.
     """
 
     camera: Camera
@@ -52,6 +61,7 @@ class View:
     class_names: Mapping[int, str] | None = field(default=None, repr=False)
     supervised: tuple[int, ...] | None = None
     within: Path | None = None
+    numbering: tuple[int, ...] | None = None
     _mask: PackedMask | None = field(default=None, repr=False)
 
     @classmethod
@@ -88,7 +98,7 @@ class View:
             )
         source = f"view '{camera.name}'"
         view = cls(camera, class_names=class_names)
-        view._check_size(array.shape, source)
+        camera.check_mask_size(array.shape[1], array.shape[0], source)
         view._check_ids(array, source)
         if supervised is None:
             return replace(view, _mask=PackedMask(SeenLabels(array)))
@@ -217,6 +227,10 @@ class View:
             As `read_labels`.
         """
         source = str(self.mask_path or f"view '{self.name}'")
+        if self.numbering is not None:
+            names = dict(zip(self.numbering, self.class_names.values(), strict=True)) if self.class_names else None
+            by_id = replace(self, class_names=names, numbering=None)
+            return by_id.read_seen().numbered(np.array(self.numbering, np.int32), source)
         if self._mask is not None:
             seen = self._mask.unpack()
         elif self.mask_path is not None:
@@ -228,21 +242,15 @@ class View:
 
     def _read_file(self, path: Path) -> SeenLabels:
         if path.suffix.lower() != ".png":
-            return read_soft_mask(path, self.class_names, self.within)
+            return read_soft_mask(path, self.class_names, self.camera, self.within)
+        header = mask_header(path, self.within)  # Before any pixel is read.
+        self.camera.check_mask_size(header.width, header.height, str(path))
         labels = read_mask(path, self.within).labels
         return SeenLabels(labels) if self.supervised is None else restrict(labels, self.supervised, str(path))
 
     def _check_seen(self, seen: SeenLabels, source: str) -> None:
-        self._check_size(seen.labels.shape, source)
+        self.camera.check_mask_size(seen.labels.shape[1], seen.labels.shape[0], source)
         self._check_ids(seen.labels if seen.meaning is None else seen.meaning.concerned, source)
-
-    def _check_size(self, shape: tuple[int, ...], source: str) -> None:
-        size, expected = shape[::-1], (self.camera.width, self.camera.height)
-        if size != expected:
-            raise MaskSizeError(
-                f"{source}: mask is {size[0]} x {size[1]} pixels; expected {expected[0]} x {expected[1]}, the size of "
-                f"camera '{self.name}' (masks are never resized)"
-            )
 
     def _check_ids(self, labels: npt.NDArray[np.integer[Any]], source: str) -> None:
         if labels.size and self._knows_all(int(labels.min()), int(labels.max())):
@@ -302,7 +310,7 @@ class Dataset:
         self._within = None if within is None else Path(within)
         self.cameras = read_cameras(self.root, self._within)
         classes = self.root / "classes.json"
-        self._declared = read_classes(classes, self._within) if classes.is_file() else None
+        self._declared = read_classes(classes, self._within) if is_there(classes, ClassesFileError) else None
         stems = [camera.name for camera in self.cameras]
         masks = mask_files(self.root / labels, stems, self._within)
         supervises = self.root / labels / SUPERVISES
@@ -319,7 +327,7 @@ class Dataset:
             )
             for camera in self.cameras
         }
-        self._split = self._read_split()
+        self._split = read_split(self.root / "split.json", self._views, self._within)
 
     def views(self, split: str = "all") -> list[View]:
         """List the views of a split, "train", "test" or "all"; without `split.json` all views are for training."""
@@ -342,27 +350,33 @@ class Dataset:
         """Largest id + 1."""
         return max(self.class_names) + 1
 
-    def _read_split(self) -> dict[str, list[str]]:
-        path = self.root / "split.json"
-        if not path.is_file():
-            return {"train": list(self._views), "test": []}
-        content = read_json(path, SplitFileError, self._within)
-        if not isinstance(content, dict) or "train" not in content:
-            raise SplitFileError(f'{path}: no "train" in it; expected {{"train": [stems], "test": [stems]}}')
-        split = {name: content.get(name, []) for name in ("train", "test")}
-        for name, stems in split.items():
-            if not isinstance(stems, list) or not all(isinstance(stem, str) for stem in stems):
-                raise SplitFileError(f'{path}: "{name}" is {str(stems)[:60]}; expected a list of image stems')
-            strangers = [stem for stem in stems if stem not in self._views]
-            if strangers:
-                raise SplitFileError(
-                    f'{path}: "{name}" names views without a camera ({len(strangers)}, the first {strangers[0]!r}); '
-                    f"expected stems such as {next(iter(self._views))!r}"
-                )
-        stem, count = Counter(split["train"] + split["test"] or [""]).most_common(1)[0]
-        if count > 1:
-            raise SplitFileError(f"{path}: stem {stem!r} occurs {count} times; expected each stem once, in one split")
-        return split
+    @property
+    def class_ids(self) -> tuple[int, ...]:
+        """Ids of the classes, ascending, 0 included."""
+        return tuple(self.class_names)
+
+    def numbered(self, ids: Collection[int] | None = None) -> Dataset:
+        """Give the classes numbers without gaps, so that one large id costs no more memory than any other.
+
+        Parameters
+        ----------
+        ids : collection of int, optional
+            Ids that the masks may hold, ascending from 0; `class_ids` by default.
+
+        Returns
+        -------
+        Dataset
+            The same, with labels, names and number of classes by place among the ids; itself if they have no gaps.
+        """
+        ids = self.class_ids if ids is None else tuple(int(i) for i in ids)
+        if ids == tuple(range(len(ids))):
+            return self
+        names = dict(enumerate(self.class_names.get(i, f"class_{i:02d}") for i in ids))
+        told = None if self._declared is None else names
+        other = copy.copy(self)
+        other.__dict__["class_names"] = names
+        other._views = {stem: replace(view, class_names=told, numbering=ids) for stem, view in self._views.items()}
+        return other
 
 
 def spread(views: Sequence[View], count: int | None) -> list[View]:

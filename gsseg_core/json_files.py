@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from gsseg_core.confined_files import open_input
-from gsseg_core.errors import GssegError
+from gsseg_core.errors import GssegError, clipped
+from gsseg_core.input_files import open_input, reason
+from gsseg_core.limits import LIMITS
 
 _KINDS = {
     dict: "an object", list: "a list", str: "text", bool: "true or false", int: "a number", float: "a number",
@@ -14,18 +15,22 @@ _KINDS = {
 }  # fmt: skip
 
 
-def kind_of(content: object) -> str:
-    """Name the kind of something read from a JSON file, in the words of JSON."""
-    return _KINDS[type(content)]
-
-
 def read_json(path: Path, error: type[GssegError], within: Path | None = None) -> object:
-    """Read a JSON file, below `within` if given; raise `error` with one clear line if it is missing or broken."""
+    """Read a JSON file, below `within` if given; raise `error` if it is missing, broken, or larger than any is."""
+    try:
+        with open_input(path, within) as file:
+            content = file.read(LIMITS.max_json_bytes + 1)
+    except OSError as cause:
+        raise error(f"{path}: cannot be read ({reason(cause)})") from cause
+    if len(content) > LIMITS.max_json_bytes:
+        raise error(f"{path}: is too large; expected at most {LIMITS.max_json_bytes:,} bytes (limit max_json_bytes)")
     try:
         # Editors on Windows write a byte order mark, which "utf-8" would hand to the parser.
-        with open_input(path, within) as file:
-            return json.loads(file.read().decode("utf-8-sig"))
-    except OSError as cause:
-        raise error(f"{path}: cannot be read ({cause.strerror or cause})") from cause
+        return json.loads(content.decode("utf-8-sig"))
     except (ValueError, RecursionError) as cause:
-        raise error(f"{path}: not valid JSON ({cause})") from cause
+        raise error(f"{path}: not valid JSON ({clipped(cause, 160)})") from cause
+
+
+def kind_of(content: object) -> str:
+    """Name what a JSON file holds, in the words of JSON."""
+    return _KINDS[type(content)]

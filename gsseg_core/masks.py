@@ -6,7 +6,6 @@ encoding, 255 or 65535, stands for unknown.
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import struct
@@ -20,8 +19,8 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from gsseg_core.atomic import write_atomically
-from gsseg_core.confined_files import open_input
-from gsseg_core.errors import ClassesFileError, MaskFormatError, SettingsError
+from gsseg_core.errors import ClassesFileError, MaskFormatError, SettingsError, quoted
+from gsseg_core.input_files import check_pixels, open_image, open_input, reason
 from gsseg_core.json_files import kind_of, read_json
 from gsseg_core.names import flaw_of_class_name
 
@@ -63,35 +62,45 @@ def read_mask(path: str | os.PathLike[str], within: Path | None = None) -> Mask:
         It lies elsewhere.
     """
     bits = mask_bits(path, within)
-    try:
-        # Other formats are lossy or ambiguous about integers, whatever the file is named.
-        with open_input(path, within) as file, Image.open(file, formats=["PNG"]) as image:
-            labels = np.array(image).astype(np.int32)
-    except (OSError, SyntaxError, ValueError, EOFError, struct.error) as error:
-        raise MaskFormatError(f"{path}: broken PNG ({error}); expected a whole label image") from error
+    # Other formats are lossy or ambiguous about integers, whatever the file is named.
+    with open_image(path, MaskFormatError, "PNG", "a whole label image", ("PNG",), within) as image:
+        labels = np.array(image).astype(np.int32)
     labels[labels == 2**bits - 1] = UNKNOWN
     return Mask(labels, bits)
 
 
+class MaskHeader(NamedTuple):
+    """What the header of a label image says: bits per label, 8 or 16, and its size in pixels."""
+
+    bits: int
+    width: int
+    height: int
+
+
 def mask_bits(path: str | os.PathLike[str], within: Path | None = None) -> int:
     """Bits per label of a PNG, 8 or 16, from its header alone; raises as `read_mask` does."""
+    return mask_header(path, within).bits
+
+
+def mask_header(path: str | os.PathLike[str], within: Path | None = None) -> MaskHeader:
+    """Read the header of a label image; raises as `read_mask` does."""
     try:
         with open_input(path, within) as file:
             header = file.read(26)
     except OSError as error:
-        raise MaskFormatError(f"{path}: cannot be read ({error.strerror or error}); expected a label image") from error
+        raise MaskFormatError(f"{path}: cannot be read ({reason(error)}); expected a label image") from error
     if len(header) < 26 or not header.startswith(b"\x89PNG\r\n\x1a\n"):
         raise MaskFormatError(f"{path}: not a PNG; expected a one-channel 8- or 16-bit PNG of labels")
     # The header chunk comes first: 8 bytes of signature, 8 of chunk, width, height, bit depth, colour type.
+    width, height = struct.unpack(">II", header[16:24])
     depth, kind = header[24], _PNG_KINDS.get(header[25], "unknown")
-    if kind == "palette":
-        return 8
-    if kind == "gray" and depth in (8, 16):
-        return depth
-    fix = "; a photo is no mask, and of ids drawn in colours save the ids themselves" if "RGB" in kind else ""
-    raise MaskFormatError(
-        f"{path}: is {kind} of {depth} bits per channel; expected a one-channel 8- or 16-bit PNG of labels{fix}"
-    )
+    if kind != "palette" and (kind != "gray" or depth not in (8, 16)):
+        fix = "; a photo is no mask, and of ids drawn in colours save the ids themselves" if "RGB" in kind else ""
+        raise MaskFormatError(
+            f"{path}: is {kind} of {depth} bits per channel; expected a one-channel 8- or 16-bit PNG of labels{fix}"
+        )
+    check_pixels(width, height, str(path), MaskFormatError)
+    return MaskHeader(8 if kind == "palette" else depth, width, height)
 
 
 def write_mask(
@@ -175,9 +184,9 @@ def read_classes(path: str | os.PathLike[str], within: Path | None = None) -> di
     names = {0: BACKGROUND_NAME}
     for key, name in content.items():
         if not re.fullmatch(r"0|[1-9][0-9]{0,4}", key) or int(key) >= 2**16 - 1:
-            raise ClassesFileError(f"{path}: id {key[:60]!r} is unusable; expected whole numbers from 0 to 65534")
+            raise ClassesFileError(f"{path}: id {quoted(key)} is unusable; expected whole numbers from 0 to 65534")
         if not isinstance(name, str):
-            raise ClassesFileError(f"{path}: id {key} has the name {json.dumps(name)[:60]}; expected text")
+            raise ClassesFileError(f"{path}: id {key} has the name {quoted(name)}; expected text")
         if flaw := flaw_of_class_name(name):
             raise ClassesFileError(f"{path}: id {key} has the name {flaw}")
         names[int(key)] = name

@@ -1,8 +1,9 @@
-"""Reading what belongs to one scene from an npz: anything wrong with the file is one clear error."""
+"""Arrays out of an npz that anybody may have written: each is checked by its header before it is inflated."""
 
 from __future__ import annotations
 
 import json
+import math
 import struct
 import tokenize
 import zipfile
@@ -10,27 +11,205 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from gsseg_core.confined_files import open_input
-from gsseg_core.errors import GssegError, StateFileError, StateMismatchError
+from gsseg_core.errors import GssegError, StateFileError, StateMismatchError, clipped, quoted
+from gsseg_core.input_files import open_input, reason
+from gsseg_core.limits import LIMITS
+from gsseg_core.masks import MAX_LABEL
 
 # What NumPy, zipfile and zlib raise on damaged bytes; RuntimeError where a flipped bit says "encrypted".
 _DAMAGED = (
     OSError, KeyError, IndexError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
-    struct.error, zipfile.BadZipFile, zlib.error, SyntaxError, tokenize.TokenError,
+    ArithmeticError, struct.error, zipfile.BadZipFile, zlib.error, SyntaxError, tokenize.TokenError,
 )  # fmt: skip
+SHARES_TOLERANCE = 0.01
+"""Probabilities of a row may sum to so much more or less than 1."""
+
+_SUFFIX = ".npy"
+_PIECE = 1 << 20
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+
+
+class UnfitError(ValueError):
+    """What is in a file can be read, but not used; the message says what was found, and what was expected."""
+
+
+class Header(NamedTuple):
+    """What an array claims to be."""
+
+    shape: tuple[int, ...]
+    fortran: bool
+    dtype: np.dtype[Any]
+
+    def __str__(self) -> str:
+        """Type and shape, for messages."""
+        return clipped(f"{self.dtype} of shape {self.shape}")
+
+
+class NpzArrays:
+    """The arrays of an npz; nothing that is wrong with one of them takes more memory than was asked for.
+
+    Parameters
+    ----------
+    archive : zipfile.ZipFile
+        The open file.
+
+    Attributes
+    ----------
+    names : list of str
+        Of the arrays.
+
+    Raises
+    ------
+    UnfitError
+        The arrays claim more than `Limits.max_npz_bytes`.
+    """
+
+    def __init__(self, archive: zipfile.ZipFile) -> None:
+        self._archive = archive
+        self.names = [name[: -len(_SUFFIX)] for name in archive.namelist() if name.endswith(_SUFFIX)]
+        total = sum(member.file_size for member in archive.infolist())
+        if total > LIMITS.max_npz_bytes:
+            raise UnfitError(
+                f"claims {total:,} bytes of arrays; expected at most {LIMITS.max_npz_bytes:,} (limit max_npz_bytes)"
+            )
+
+    def header(self, name: str) -> Header:
+        """Read what an array claims to be; `ValueError` if there is none of this name, or it is none."""
+        if name not in self.names:
+            raise ValueError(f"there is no array {name!r}")
+        with self._archive.open(name + _SUFFIX) as member:
+            return _read_header(member, name)
+
+    def expect(self, name: str, dtype: npt.DTypeLike, shape: tuple[int | None, ...]) -> npt.NDArray[Any]:
+        """Read an array of a type and shape, None being any length; `UnfitError` if it is another."""
+        header = self.header(name)
+        matches = len(header.shape) == len(shape) and all(
+            want in (None, size) for want, size in zip(shape, header.shape, strict=True)
+        )
+        if header.dtype != np.dtype(dtype) or not matches:
+            sizes = ", ".join("any" if size is None else str(size) for size in shape) + "," * (len(shape) == 1)
+            raise UnfitError(f"array {name} is {header}; expected {np.dtype(dtype)} of shape ({sizes})")
+        return self.read(name)
+
+    def read(self, name: str) -> npt.NDArray[Any]:
+        """Read an array; whoever calls has looked at its `header`."""
+        with self._archive.open(name + _SUFFIX) as member:
+            header = _read_header(member, name)
+            array = np.empty(header.shape, header.dtype, order="F" if header.fortran else "C")
+            target = array.reshape(-1, order="A").view(np.uint8) if array.size else np.empty(0, np.uint8)
+            done = 0
+            while done < len(target):
+                piece = member.read(min(_PIECE, len(target) - done))
+                if not piece:
+                    raise ValueError(f"array {name!r} ends after {done:,} of {len(target):,} bytes")
+                target[done : done + len(piece)] = np.frombuffer(piece, np.uint8)
+                done += len(piece)
+            if member.read(1):  # and so the checksum has been compared, too
+                raise ValueError(f"array {name!r} is longer than its header says")
+            return array
+
+    def text(self, name: str) -> str:
+        """Read an array that is one text, of `Limits.max_json_bytes` at most."""
+        header = self.header(name)
+        if header.dtype.kind != "U" or header.shape != () or header.dtype.itemsize > 4 * LIMITS.max_json_bytes:
+            raise ValueError(f"array {name!r} is {header}; expected one text")
+        return str(self.read(name))
+
+
+def _read_header(member: Any, name: str) -> Header:
+    try:
+        version = np.lib.format.read_magic(member)
+        if version not in _HEADERS:
+            raise ValueError(f"version {version}")
+        header = Header(*_HEADERS[version](member))
+    except (ValueError, SyntaxError, TypeError, tokenize.TokenError) as error:
+        raise ValueError(f"array {name!r} is none of NumPy's ({clipped(error)})") from error
+    # Of Python objects, NumPy would say how to load them all the same, which is what an attacker wants.
+    if header.dtype.hasobject or header.dtype.kind == "V" or any(size < 0 for size in header.shape):
+        raise ValueError(f"array {name!r} is {header}; expected numbers")
+    if math.prod(header.shape) * header.dtype.itemsize > LIMITS.max_npz_bytes:
+        raise ValueError(f"array {name!r} is {header}; expected at most {LIMITS.max_npz_bytes:,} bytes")
+    return header
+
+
+def whole_number(value: object, what: str, least: int, most: int) -> int:
+    """Check a number of a JSON header; `UnfitError` unless it is whole, and from `least` to `most`."""
+    if type(value) is not int or not least <= value <= most:
+        raise UnfitError(f"{what} is {quoted(value)}; expected a whole number from {least} to {most}")
+    return value
+
+
+def temperature_of(header: dict[str, Any]) -> float:
+    """Read the temperature of probabilities from a JSON header; 1 where there is none, as in files of old."""
+    value = header.get("temperature", 1.0)
+    if type(value) not in (int, float) or not 0 < value < math.inf:
+        raise UnfitError(f"temperature is {quoted(value)}; expected a finite number above 0")
+    return float(value)
+
+
+def class_names_of(header: dict[str, Any]) -> dict[int, str]:
+    """Read the names of classes by id from a JSON header, ascending."""
+    names = header["class_names"]
+    if not isinstance(names, dict) or not all(isinstance(name, str) for name in names.values()):
+        raise UnfitError(f"class_names are {quoted(names)}; expected names by id")
+    by_id = {whole_number(int(k), "id of a class", 0, MAX_LABEL): name for k, name in names.items()}
+    return dict(sorted(by_id.items()))
+
+
+def check_shares(name: str, rows: npt.NDArray[np.float32]) -> None:  # (N, K)
+    """Raise `UnfitError` unless every row holds probabilities that sum to 1, or zeros."""
+    sums, low = rows.sum(axis=1, dtype=np.float64), rows.min(axis=1, initial=0)
+    bad = np.flatnonzero(~((low >= 0) & ((sums == 0) | (np.abs(sums - 1) <= SHARES_TOLERANCE))))
+    if bad.size:
+        i = int(bad[0])
+        found = f"sum to {sums[i]:.4g}" if low[i] >= 0 and np.isfinite(sums[i]) else "are NaN, infinite or negative"
+        raise UnfitError(
+            f"values of array {name} {found} in row {i} ({bad.size:,} of {len(rows):,} rows are unusable); expected "
+            "probabilities that sum to 1, or zeros"
+        )
+
 
 _BEGINNING = 1024
 """Bytes of a header that are enough to tell its format."""
 
 
 @contextmanager
+def open_arrays(path: Path, expected: str, error: type[GssegError], within: Path | None = None) -> Iterator[NpzArrays]:
+    """Open an npz; whatever goes wrong with its arrays in the body counts as damage to the file.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        The file.
+    expected : str
+        What it should be, for messages: "a saved state".
+    error : subclass of GssegError
+        What is raised: the file is missing or damaged, or no regular file.
+    within : pathlib.Path, optional
+        A folder below which it must lie, links followed.
+    """
+    try:
+        with open_input(path, within) as opened, zipfile.ZipFile(opened) as archive:
+            yield NpzArrays(archive)
+    except GssegError:
+        raise
+    except UnfitError as cause:
+        raise error(f"{path}: {cause}") from cause
+    except FileNotFoundError as cause:
+        raise error(f"{path}: does not exist; expected {expected}") from cause
+    except _DAMAGED as cause:
+        raise error(f"{path}: is not {expected}, or is damaged ({reason(cause)})") from cause
+
+
+@contextmanager
 def open_npz(
     path: Path, what: str, file_format: str, digest: str, within: Path | None = None
-) -> Iterator[tuple[np.lib.npyio.NpzFile, Any]]:
+) -> Iterator[tuple[NpzArrays, Any]]:
     """Open an npz with a JSON header, of a given format and scene.
 
     Parameters
@@ -46,7 +225,7 @@ def open_npz(
 
     Yields
     ------
-    NpzFile, dict
+    NpzArrays, dict
         The arrays and the header. Whatever goes wrong with them in the body counts as damage to the file.
 
     Raises
@@ -58,23 +237,18 @@ def open_npz(
     PathNotAllowedError
         The file lies outside `within`.
     """
-    try:
-        # Opened here, since np.load leaves a file open that it cannot read.
-        with open_input(path, within) as opened, np.load(opened, allow_pickle=False) as file:
-            header = json.loads(str(file["header"]))
-            if header["format"] != file_format:
-                raise StateFileError(f"{path}: format is {header['format']!r}; expected {file_format!r}")
-            if header["scene"] != digest:
-                raise StateMismatchError(
-                    f"{path}: belongs to the scene {header['scene'][:12]}; expected {digest[:12]}, the scene in use"
-                )
-            yield file, header
-    except GssegError:
-        raise
-    except FileNotFoundError as error:
-        raise StateFileError(f"{path}: does not exist; expected {what}") from error
-    except _DAMAGED as error:
-        raise StateFileError(f"{path}: is not {what}, or is damaged ({error})") from error
+    with open_arrays(path, what, StateFileError, within) as arrays:
+        header = json.loads(arrays.text("header"))
+        if not isinstance(header, dict):
+            raise ValueError("its header is no JSON object")
+        if header.get("format") != file_format:
+            raise StateFileError(f"{path}: format is {quoted(header.get('format'))}; expected {file_format!r}")
+        if header.get("scene") != digest:
+            raise StateMismatchError(
+                f"{path}: belongs to the scene {clipped(str(header.get('scene'))[:12])}; expected {digest[:12]}, the "
+                "scene in use"
+            )
+        yield arrays, header
 
 
 def npz_format(path: Path) -> str:

@@ -226,7 +226,9 @@ def _segment(
 
                 client = stack.enter_context(connected(scheduler))
             scene = GaussianScene.load(scene_path)
-            dataset = Dataset(data, labels)
+            dataset, class_ids = Dataset(data, labels), None
+            if ids != PER_VIEW:
+                dataset, class_ids = dataset.numbered(), dataset.class_ids
             train = spread(dataset.views("train"), views)
             class_names = {} if ids == PER_VIEW else dataset.class_names
         if ids == PER_VIEW:
@@ -281,9 +283,10 @@ def _segment(
         with watch.stage("carve"):
             cameras = [view.camera for view in spread(train, refine.carve_views)]
             result = carved(scene, result, cameras, device)
+    named = result if class_ids is None else result.with_ids(class_ids)
     with watch.stage("export"):
-        result.save(run.folder / "segmentation.npz", run.id)
-        plys = write_classes(scene, result, run.folder / "classes", run.id)
+        named.save(run.folder / "segmentation.npz", run.id)
+        plys = write_classes(scene, named, run.folder / "classes", run.id)
     with watch.stage("pictures"):
         images = ViewImages(scene, device)
         drawn = draw_views(scene, result, chosen, device=device)
@@ -295,7 +298,7 @@ def _segment(
             save_png(pictures[-1], worst, run.id)
     report = build_report(
         scene,
-        result,
+        named,
         **learnt,
         settings={
             "learner": learner, "labels": labels, "views": views, "device": device, "memory_budget": memory_budget,
@@ -340,6 +343,7 @@ def render(
     scene = GaussianScene.load(scene_path)
     dataset = Dataset(data)
     result = Segmentation.load(segmentation_path, scene)
+    ids, numbered = result.class_ids, result.numbered()
     views = dataset.views(split)
     if not views:
         raise NoUsableViewsError(f"{data}: split {split!r} has no views; expected at least one to render")
@@ -348,13 +352,13 @@ def render(
     overlays = []
     places = [*names, *(f"overlays/{name}" for name in (*names, "contact_sheet.png", "legend.png"))]
     with staged_run(out, "render", earlier=earlier_render, places=places) as run:
-        for done, (_, labels, image, _) in enumerate(draw_views(scene, result, views, device=device)):
+        for done, (_, labels, image, _) in enumerate(draw_views(scene, numbered, views, device=device)):
             progress("render", done, len(views))
-            write_mask(run.folder / names[done], labels, bits, run.id)
+            write_mask(run.folder / names[done], ids[labels], bits, run.id)
             overlays.append(image)
             save_png(run.folder / "overlays" / names[done], image, run.id)
         progress("render", len(views), len(views))
-        write_overview(result, overlays, [view.name for view in views], run.folder / "overlays", run.id)
+        write_overview(numbered, overlays, [view.name for view in views], run.folder / "overlays", run.id)
     return [Path(out) / name for name in names]
 
 

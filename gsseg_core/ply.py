@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import io
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 import plyfile
 
 from gsseg_core.atomic import write_atomically
-from gsseg_core.confined_files import input_name
-from gsseg_core.errors import SceneFileError, ScenePropertyError
+from gsseg_core.errors import SceneFileError, ScenePropertyError, clipped, quoted
+from gsseg_core.input_files import open_input, reason
 from gsseg_core.layout import scene_hint
+
+_MAX_HEADER = 1 << 20
 
 
 def read_vertices(path: str | os.PathLike[str], within: Path | None = None) -> npt.NDArray[np.void]:
@@ -42,25 +45,55 @@ def read_vertices(path: str | os.PathLike[str], within: Path | None = None) -> n
     """
     path = Path(path)
     try:
-        with input_name(path, within) as name:
-            ply = plyfile.PlyData.read(name)
+        # Text is wrapped here, since plyfile would leave its own wrapper open.
+        with open_input(path, within) as file, io.TextIOWrapper(file, "ascii") if _is_text(file) else file as stream:
+            ply = plyfile.PlyData.read(stream)
     except OSError as error:
         hint = scene_hint(path) if within is None else ""  # It looks around, wherever links lead.
+        raise SceneFileError(f"{path}: cannot be read ({reason(error)}); expected a 3DGS PLY{hint}") from error
+    except (plyfile.PlyParseError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError) as error:
         raise SceneFileError(
-            f"{path}: cannot be read ({error.strerror or error}); expected a 3DGS PLY{hint}"
+            f"{path}: truncated or not a PLY file ({reason(error)}); expected a whole 3DGS PLY"
         ) from error
-    except (plyfile.PlyParseError, ValueError, OverflowError, MemoryError) as error:
-        raise SceneFileError(f"{path}: truncated or not a PLY file ({error}); expected a whole 3DGS PLY") from error
     if "vertex" not in ply:
         found = ", ".join(element.name for element in ply) or "none"
-        raise SceneFileError(f"{path}: PLY has no element 'vertex' (elements found: {found})")
+        raise SceneFileError(f"{path}: PLY has no element 'vertex' (elements found: {clipped(found)})")
     element = ply["vertex"]
     lists = [prop.name for prop in element.properties if isinstance(prop, plyfile.PlyListProperty)]
     if lists:
-        raise ScenePropertyError(f"{path}: vertex properties {', '.join(lists)} are lists; expected one number each")
+        raise ScenePropertyError(
+            f"{path}: vertex properties {clipped(', '.join(lists))} are lists; expected one number each"
+        )
     # A copy, so that the scene outlives changes to the memory-mapped file.
     data = element.data
     return np.array(data, dtype=data.dtype.newbyteorder("="), subok=False)
+
+
+def _is_text(file: BinaryIO) -> bool:
+    """Read the header, and go back; raises `ValueError` if the file is too short for what is counted there."""
+    if b"end_header" not in file.read(_MAX_HEADER):
+        raise ValueError(f"no end of its header in the first {_MAX_HEADER:,} bytes")
+    file.seek(0)
+    ply = plyfile.PlyData._parse_header(file)
+    left = os.fstat(file.fileno()).st_size - file.tell()
+    for element in ply:
+        if ply.text:
+            least = 2 * len(element.properties) * element.count - 1  # a digit and what follows it
+        else:
+            least = element.count * sum(_least_bytes(prop) for prop in element.properties)
+        if least > left:
+            raise ValueError(
+                f"element {quoted(element.name)} of {element.count:,} rows takes {least:,} bytes, and {left:,} are left"
+            )
+        left -= max(least, 0)
+    file.seek(0)
+    return bool(ply.text)
+
+
+def _least_bytes(prop: Any) -> int:
+    """Bytes of a property in one row; of a list, those of its length."""
+    kind = prop.list_dtype("<")[0] if isinstance(prop, plyfile.PlyListProperty) else prop.dtype("<")
+    return int(np.dtype(kind).itemsize)
 
 
 def write_vertices(path: str | os.PathLike[str], vertices: npt.NDArray[Any], run: str | None = None) -> None:

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from PIL import Image
 
 from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
 from gsseg_core.errors import CameraFileError, MaskFormatError, MaskSizeError
+from gsseg_core.input_files import open_image
 from gsseg_core.masks import UNKNOWN
 from gsseg_core.metrics import Evaluation
 
@@ -240,10 +240,7 @@ def _only(folder: Path, pattern: str, what: str) -> Path:
 
 def _read_binary(path: Path) -> np.ndarray:
     """Read an image of two values, of any kind: 1 where it is brighter than half of the largest, (H, W) int32."""
-    try:
-        with Image.open(path) as image:
-            values = np.asarray(image.convert("L"), np.int32)
-    except (OSError, SyntaxError, ValueError) as error:
-        raise MaskFormatError(f"{path}: cannot be read ({error}); expected a black and white image") from error
+    with open_image(path, MaskFormatError, "image", "a black and white image") as image:
+        values = np.asarray(image.convert("L"), np.int32)
     mine: np.ndarray = 2 * values > max(int(values.max(initial=0)), 1)
     return mine.astype(np.int32)

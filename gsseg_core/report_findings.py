@@ -113,7 +113,7 @@ def warnings_of(
     report : mapping
         What `report.json` holds.
     ious : (K,) array, optional
-        IoU of each class with the masks, NaN where there is none.
+        IoU of each class with the masks, in the order of the report, NaN where there is none.
     """
     views, gaussians = report["views"], report["gaussians"]
     warnings = []
@@ -133,7 +133,7 @@ def warnings_of(
             f"{100 - round(100 * TRUSTED)} % of {'their' if len(doubtful) > 1 else 'its'} pixels: "
             f"{_some([view['name'] for view in doubtful])}. Wrong ids, a wrong pose, or a mask of another image?"
         )
-    names = {entry["id"]: entry["name"] for entry in report["classes"]}
+    names = dict(enumerate(entry["name"] for entry in report["classes"]))
     empty = [entry["name"] for entry in report["classes"] if entry["id"] and not entry["gaussians"]]
     if empty:
         warnings.append(f"{_count(len(empty), 'class', 'classes')} got no Gaussian: {_some(empty)}.")

@@ -105,12 +105,12 @@ def class_table(
     num_views: int,
     ious: np.ndarray | None,  # (K,)
 ) -> str:
-    """Make one row a class; `thumbnails` are (view, data URI)."""
+    """Make one row a class, in the order of the arrays; `thumbnails` are (view, data URI) by place in it."""
     header = ["", "class", "Gaussians", "mean confidence", "views that show it", "IoU with the masks", "file"]
     head = "".join(f'<th scope="col">{name}</th>' for name in header)
     rows = []
-    for entry in classes:
-        k, confidence = entry["id"], entry["mean_confidence"]
+    for k, entry in enumerate(classes):
+        confidence = entry["mean_confidence"]
         if k == 0 and not entry["gaussians"]:
             continue  # Masks need not show any background.
         iou = None if ious is None or np.isnan(ious[k]) else float(ious[k])
@@ -119,7 +119,7 @@ def class_table(
         link = f'<a href="{quote(entry["ply"])}">PLY</a>' if entry["ply"] else "-"
         cells = [
             ("thumbnail", "", picture),
-            ("name", "", f"{swatch(colors[k].tolist())}<bdi>{text(entry['name'])}</bdi> <small>{k}</small>"),
+            ("name", "", f"{swatch(colors[k].tolist())}<bdi>{text(entry['name'])}</bdi> <small>{entry['id']}</small>"),
             ("number", header[2], f"{entry['gaussians']:,}"),
             ("share", header[3], _share(confidence)),
             ("number", header[4], "-" if views is None else f"{int(views[k])} <small>of {num_views}</small>"),

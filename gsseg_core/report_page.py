@@ -225,8 +225,9 @@ def _triples(evidence: Evidence, images: ViewImages, colors: np.ndarray, report:
 def _classes(
     report: Mapping[str, Any], evidence: Evidence, images: ViewImages, colors: np.ndarray, ious: np.ndarray | None
 ) -> str:
-    largest = sorted(report["classes"], key=lambda entry: -entry["gaussians"])[:MOST_THUMBNAILS]
-    found = thumbnails([entry["id"] for entry in largest], evidence, images, colors)
+    sizes = [entry["gaussians"] for entry in report["classes"]]
+    largest = sorted(range(len(sizes)), key=lambda k: -sizes[k])[:MOST_THUMBNAILS]
+    found = thumbnails(largest, evidence, images, colors)
     pictures = {k: (view, jpeg_uri(image, THUMBNAIL_PX)) for k, (view, image) in found.items()}
     views = evidence.views_showing(len(colors)) if evidence.checks else None
     source = "the other views predict" if evidence.held_out else "was learnt predicts"

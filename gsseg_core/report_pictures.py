@@ -11,7 +11,9 @@ import numpy as np
 from PIL import Image
 
 from gsseg_core.dataset import View
+from gsseg_core.errors import MaskFormatError
 from gsseg_core.export import background_image
+from gsseg_core.input_files import open_image
 from gsseg_core.masks import UNKNOWN, PackedLabels
 from gsseg_core.operator import make_operator
 from gsseg_core.pictures import outline, overlay
@@ -209,8 +211,8 @@ def _read_photo(view: View) -> np.ndarray | None:
     if view.image_path is None:
         return None
     try:
-        with Image.open(view.image_path) as photo:
-            image = np.asarray(photo.convert("RGB"))
-    except (OSError, SyntaxError, ValueError):  # A picture for people is not worth an error.
+        with open_image(view.image_path, MaskFormatError, "image", "a photo") as photo:
+            fits = photo.size == (view.camera.width, view.camera.height)
+            return np.asarray(photo.convert("RGB")) if fits else None
+    except MaskFormatError:  # A picture for people is not worth an error.
         return None
-    return image if image.shape[:2] == (view.camera.height, view.camera.width) else None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,9 +14,9 @@ import numpy as np
 
 from gsseg_core.atomic import write_atomically
 from gsseg_core.calibration import tempered
-from gsseg_core.errors import StateFileError
+from gsseg_core.errors import clipped
 from gsseg_core.neighbours import neighbours_of
-from gsseg_core.npz_files import open_npz
+from gsseg_core.npz_files import UnfitError, check_shares, class_names_of, open_npz, temperature_of
 from gsseg_core.operator import ViewOperator
 from gsseg_core.refine import cluster, statistical_filter
 from gsseg_core.refine_settings import RefineSettings
@@ -52,11 +52,12 @@ class Segmentation:
     Attributes
     ----------
     labels : (N,) int32
-        Class, or `UNOBSERVED` (-1), or `REMOVED` (-2).
+        Class id, or `UNOBSERVED` (-1), or `REMOVED` (-2).
     probabilities : (N, K) float32
         Rows sum to 1; zeros where unobserved. Removed Gaussians keep theirs. Once calibrated, they mean what they say.
+        Columns are the classes in the order of `class_names`: column k is class k, unless ids have gaps.
     class_names : dict of int to str
-        Names by class id.
+        Names by class id, ascending, one for each of the K columns.
     scene_digest : str
         Which scene it belongs to.
     clustered : (N,) bool
@@ -145,9 +146,36 @@ class Segmentation:
         return replace(self, labels=np.where(kept | (self.labels < 0), self.labels, np.int32(REMOVED)))
 
     @property
+    def class_ids(self) -> np.ndarray:
+        """Id of the class of each column, (K,) int32 ascending; the first is 0, the background."""
+        return np.fromiter(self.class_names, np.int32)
+
+    @property
     def num_classes(self) -> int:
-        """K, the background included."""
-        return int(self.probabilities.shape[1])
+        """Largest id + 1; K, unless ids have gaps."""
+        return max(self.class_names) + 1
+
+    def numbered(self) -> Segmentation:
+        """Give the classes numbers without gaps, in the order of their ids, so that column k is class k."""
+        ids = self.class_ids
+        if self.num_classes == len(ids):
+            return self
+        labels = np.where(self.labels >= 0, np.searchsorted(ids, self.labels).astype(np.int32), self.labels)
+        return replace(self, labels=labels, class_names=dict(enumerate(self.class_names.values())))
+
+    def with_ids(self, ids: Sequence[int]) -> Segmentation:
+        """Give classes that are numbered without gaps ids of their own, (K,) different ones in any order."""
+        labels = np.where(self.labels >= 0, np.array(ids, np.int32)[np.maximum(self.labels, 0)], self.labels)
+        order, names = np.argsort(ids).tolist(), list(self.class_names.values())
+        if order == list(range(len(ids))):
+            return replace(self, labels=labels, class_names=dict(zip(ids, names, strict=True)))
+        return replace(
+            self,
+            labels=labels,
+            probabilities=self.probabilities[:, order],
+            class_names={ids[k]: names[k] for k in order},
+            learnt=self.learnt[:, order],
+        )
 
     @property
     def confidence(self) -> np.ndarray:
@@ -156,7 +184,7 @@ class Segmentation:
         return confidence
 
     def counts(self) -> np.ndarray:
-        """Count the Gaussians of each class, (K,) int64."""
+        """Count the Gaussians of each class by id, (num_classes,) int64."""
         counts: np.ndarray = np.bincount(self.labels[self.labels >= 0], minlength=self.num_classes)
         return counts
 
@@ -169,7 +197,7 @@ class Segmentation:
         nothing.
         """
         image = self.blend(operator)
-        return LabelMap(image.argmax(axis=2).astype(np.int32), tempered(image, self.temperature).max(axis=2))
+        return LabelMap(self.class_ids[image.argmax(axis=2)], tempered(image, self.temperature).max(axis=2))
 
     def blend(self, operator: ViewOperator) -> np.ndarray:
         """Blend what was learnt into a view, (H, W, K) float32, not calibrated; rows sum to what is known of a pixel.
@@ -192,7 +220,7 @@ class Segmentation:
         return bool(self._blended[:, 0].any())
 
     def save(self, path: str | os.PathLike[str], run: str | None = None) -> None:
-        """Write labels, probabilities, confidence and class names as one npz, atomically.
+        """Write labels, probabilities, confidence, class ids and names as one npz, atomically.
 
         `run` is the id of the run that it belongs to, for the header.
 
@@ -209,6 +237,7 @@ class Segmentation:
                 allow_pickle=False,
                 labels=self.labels,
                 probabilities=self.probabilities,
+                class_ids=self.class_ids,
                 confidence=self.confidence,
                 clustered=self.clustered,
                 learnt=self.learnt,
@@ -217,12 +246,13 @@ class Segmentation:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], scene: GaussianScene) -> Segmentation:
-        """Read a segmentation of `scene`.
+        """Read a segmentation of `scene`; all that is in it is checked.
 
         Raises
         ------
         StateFileError
-            The file is missing or damaged.
+            The file is missing or damaged, or holds what no segmentation holds: probabilities that do not sum to 1,
+            labels without a class, and the like.
         StateMismatchError
             It belongs to another scene.
         WriteError
@@ -231,11 +261,22 @@ class Segmentation:
         path = Path(path)
         settle(path.parent)
         with open_npz(path, "a segmentation.npz", FORMAT, scene.digest) as (file, header):
-            names = {int(k): str(name) for k, name in header["class_names"].items()}
-            temperature = float(header.get("temperature", 1.0))
-            arrays = (file[name] for name in ("labels", "probabilities", "clustered", "learnt"))
-            labels, probabilities, clustered, learnt = arrays
-        result = cls(labels, probabilities, names, scene.digest, clustered, learnt, temperature)
-        if result.labels.shape != (len(scene),) or result.probabilities.shape != (len(scene), len(names)):
-            raise StateFileError(f"{path}: arrays of shape {result.probabilities.shape}; expected ({len(scene)}, K)")
-        return result
+            names, temperature = class_names_of(header), temperature_of(header)
+            if 0 not in names:
+                raise UnfitError(f"class_names lack 0, the background; found {clipped(list(names))}")
+            n, k = len(scene), len(names)
+            labels = file.expect("labels", np.int32, (n,))
+            probabilities = file.expect("probabilities", np.float32, (n, k))
+            clustered = file.expect("clustered", bool, (n,))
+            learnt = file.expect("learnt", np.float32, (int(clustered.sum()), k))
+            strangers = np.setdiff1d(labels, [REMOVED, UNOBSERVED, *names])
+            if strangers.size:
+                raise UnfitError(
+                    f"array labels holds {clipped(strangers[:9].tolist())}; expected ids of its {k} classes, or "
+                    f"{UNOBSERVED} (unobserved) or {REMOVED} (removed)"
+                )
+            if "class_ids" in file.names and file.expect("class_ids", np.int32, (k,)).tolist() != list(names):
+                raise UnfitError("array class_ids holds other ids than class_names of its header; expected the same")
+            check_shares("probabilities", probabilities)
+            check_shares("learnt", learnt)
+        return cls(labels, probabilities, names, scene.digest, clustered, learnt, temperature)

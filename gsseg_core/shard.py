@@ -22,6 +22,7 @@ from gsseg_core.dataset import View
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.error_model import ErrorModel
 from gsseg_core.errors import GssegError
+from gsseg_core.input_files import open_input
 from gsseg_core.learner import UNITS
 from gsseg_core.rows import Rows
 from gsseg_core.scene import DC, GaussianScene
@@ -70,7 +71,8 @@ def geometry(scene: GaussianScene) -> GaussianScene:
 def digest_of(path: Path) -> str | None:
     """SHA-256 of a file, None if it cannot be read."""
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
+        with open_input(path) as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError:
         return None
 

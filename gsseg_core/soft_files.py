@@ -7,30 +7,25 @@
 from __future__ import annotations
 
 import re
-import struct
-import zipfile
-import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image, UnidentifiedImageError
 
-from gsseg_core.confined_files import open_input, require_folder_below
-from gsseg_core.errors import MaskFormatError, MaskSizeError, SupervisesFileError, UnknownLabelError
+from gsseg_core.cameras import Camera
+from gsseg_core.confined_files import require_folder_below
+from gsseg_core.errors import MaskFormatError, MaskSizeError, SupervisesFileError, UnknownLabelError, clipped, quoted
+from gsseg_core.input_files import check_pixels, is_there, open_image
 from gsseg_core.json_files import kind_of, read_json
 from gsseg_core.masks import MAX_LABEL
+from gsseg_core.npz_files import NpzArrays, open_arrays
 from gsseg_core.soft_masks import SeenLabels, combine_detections, quantise
 
 SUPERVISES = "supervises.json"
 _PROBABILITIES, _CLASSES, _UNKNOWN = "probabilities", "classes", "unknown"
 _IMAGES = (".png", ".tif", ".tiff")
 _ANY = "*"
-
-# What NumPy, zipfile and zlib raise on damaged bytes; RuntimeError where a flipped bit says "encrypted".
-_DAMAGED = (OSError, ValueError, TypeError, EOFError, KeyError, RuntimeError, MemoryError, SyntaxError, struct.error,
-            zipfile.BadZipFile, zlib.error)  # fmt: skip
 
 
 def mask_files(folder: Path, stems: Iterable[str], within: Path | None = None) -> dict[str, Path]:
@@ -80,7 +75,7 @@ def read_supervises(
     PathNotAllowedError
         It lies outside `within`.
     """
-    if not path.is_file():
+    if not is_there(path, SupervisesFileError):
         return {}
     content = read_json(path, SupervisesFileError, within)
     if not isinstance(content, dict):
@@ -88,22 +83,33 @@ def read_supervises(
     known, entries = set(stems), {}
     for stem, ids in content.items():
         if stem != _ANY and stem not in known:
-            raise SupervisesFileError(f"{path}: names the view {stem!r}, which has no camera; expected stems, or '*'")
+            raise SupervisesFileError(
+                f"{path}: names the view {quoted(stem)}, which has no camera; expected stems, or '*'"
+            )
         if stem in masks and masks[stem].suffix.lower() != ".png":
             raise SupervisesFileError(
                 f"{path}: names {masks[stem].name}, which says itself what it supervises; expected label images (.png)"
             )
         if not isinstance(ids, list) or not ids or any(type(i) is not int or not 0 <= i <= MAX_LABEL for i in ids):
-            raise SupervisesFileError(f"{path}: {stem!r} has {str(ids)[:60]}; expected a list of ids 0 to {MAX_LABEL}")
+            raise SupervisesFileError(
+                f"{path}: {quoted(stem)} has {clipped(ids)}; expected a list of ids 0 to {MAX_LABEL}"
+            )
         strangers = [i for i in ids if class_names is not None and i not in class_names]
         if strangers:
-            raise SupervisesFileError(f"{path}: {stem!r} has the class {strangers[0]}; expected ids of classes.json")
+            raise SupervisesFileError(
+                f"{path}: {quoted(stem)} has the class {strangers[0]}; expected ids of classes.json"
+            )
         entries[stem] = tuple(sorted(set(ids)))
     pngs = [stem for stem, mask in masks.items() if mask.suffix.lower() == ".png"]
     return {stem: entries.get(stem, entries.get(_ANY, ())) for stem in pngs if stem in entries or _ANY in entries}
 
 
-def read_soft_mask(path: Path, class_names: Mapping[int, str] | None = None, within: Path | None = None) -> SeenLabels:
+def read_soft_mask(
+    path: Path,
+    class_names: Mapping[int, str] | None = None,
+    camera: Camera | None = None,
+    within: Path | None = None,
+) -> SeenLabels:
     """Read probabilities (.npz) or a folder of detections.
 
     Parameters
@@ -112,6 +118,8 @@ def read_soft_mask(path: Path, class_names: Mapping[int, str] | None = None, wit
         The file or folder.
     class_names : mapping from id to name, optional
         If given, an npz without `classes` must have a probability for each id up to the largest.
+    camera : Camera, optional
+        Whose size it must have, which is found out before any pixel is read.
     within : pathlib.Path, optional
         A folder below which it must lie, links followed.
 
@@ -122,36 +130,55 @@ def read_soft_mask(path: Path, class_names: Mapping[int, str] | None = None, wit
     PathNotAllowedError
         It lies elsewhere.
     """
-    return _read_detections(path, within) if path.is_dir() else _read_probabilities(path, class_names, within)
+    return (
+        _read_detections(path, camera, within)
+        if path.is_dir()
+        else _read_probabilities(path, class_names, camera, within)
+    )
 
 
-def _read_probabilities(path: Path, class_names: Mapping[int, str] | None, within: Path | None) -> SeenLabels:
-    arrays: dict[str, npt.NDArray[np.generic]] = {}
-    try:
-        # Opened here, since np.load leaves a file open that it cannot read.
-        with open_input(path, within) as opened, np.load(opened, allow_pickle=False) as file:
-            names = list(file.files)
-            for name in (_PROBABILITIES, _CLASSES, _UNKNOWN):
-                if name in names:
-                    arrays[name] = file[name]
-    except FileNotFoundError as error:
-        raise MaskFormatError(f"{path}: does not exist; expected an npz with probabilities (K, H, W)") from error
-    except (*_DAMAGED, AttributeError) as error:
-        raise MaskFormatError(
-            f"{path}: broken npz ({error}); expected a whole one with probabilities (K, H, W)"
-        ) from error
-    if _PROBABILITIES not in arrays:
-        raise MaskFormatError(f"{path}: holds {', '.join(names)[:60] or 'nothing'}; expected an array 'probabilities'")
-    probabilities, classes = arrays[_PROBABILITIES], arrays.get(_CLASSES)
-    if classes is None and class_names is not None and len(probabilities) != max(class_names) + 1:
-        raise UnknownLabelError(
-            f"{path}: holds probabilities of {len(probabilities)} classes; expected {max(class_names) + 1}, up to the "
-            "largest id of classes.json, or an array 'classes' with their ids"
+def _read_probabilities(
+    path: Path, class_names: Mapping[int, str] | None, camera: Camera | None, within: Path | None
+) -> SeenLabels:
+    with open_arrays(path, "an npz with probabilities (K, H, W)", MaskFormatError, within) as arrays:
+        if _PROBABILITIES not in arrays.names:
+            found = clipped(", ".join(arrays.names)) or "nothing"
+            raise MaskFormatError(f"{path}: holds {found}; expected an array 'probabilities'")
+        _check_claims(path, arrays, class_names, camera)
+        probabilities = arrays.read(_PROBABILITIES)
+        classes, unknown = (arrays.read(name) if name in arrays.names else None for name in (_CLASSES, _UNKNOWN))
+    return quantise(probabilities, classes, unknown=unknown, source=str(path))  # type: ignore[arg-type]
+
+
+def _check_claims(path: Path, arrays: NpzArrays, class_names: Mapping[int, str] | None, camera: Camera | None) -> None:
+    """Refuse arrays for what their headers say, before they are read."""
+    claimed = arrays.header(_PROBABILITIES)
+    if len(claimed.shape) != 3 or claimed.dtype.kind != "f":
+        raise MaskFormatError(f"{path}: probabilities are {claimed}; expected float16 or float32 (K, H, W)")
+    count, height, width = claimed.shape
+    if camera is not None:
+        size = (camera.height, camera.width)
+        if (height, width) != size and claimed.shape[:2] == size:
+            raise MaskFormatError(
+                f"{path}: probabilities are {claimed}, the classes last; expected (K, H, W), the classes first"
+            )
+        camera.check_mask_size(width, height, str(path))
+    check_pixels(width, height, str(path), MaskFormatError)
+    if _UNKNOWN in arrays.names and arrays.header(_UNKNOWN).shape != (height, width):
+        raise MaskSizeError(
+            f"{path}: unknown has shape {arrays.header(_UNKNOWN).shape}; expected {(height, width)}, as the maps"
         )
-    return quantise(probabilities, classes, unknown=arrays.get(_UNKNOWN), source=str(path))  # type: ignore[arg-type]
+    if _CLASSES in arrays.names:
+        if arrays.header(_CLASSES).shape != (count,):
+            raise UnknownLabelError(f"{path}: classes are {arrays.header(_CLASSES)}; expected {count} ids, one per map")
+    elif class_names is not None and count != max(class_names) + 1:
+        raise UnknownLabelError(
+            f"{path}: holds probabilities of {count} classes; expected {max(class_names) + 1}, up to the largest id of "
+            "classes.json, or an array 'classes' with their ids"
+        )
 
 
-def _read_detections(folder: Path, within: Path | None) -> SeenLabels:
+def _read_detections(folder: Path, camera: Camera | None, within: Path | None) -> SeenLabels:
     require_folder_below(folder, within)
     detections: dict[int, npt.NDArray[np.generic]] = {}
     unknown = None
@@ -159,26 +186,25 @@ def _read_detections(folder: Path, within: Path | None) -> SeenLabels:
         if path.suffix.lower() not in _IMAGES:
             continue
         if path.stem == _UNKNOWN:
-            unknown = _read_image(path, within) > 0
+            unknown = _read_image(path, camera, within) > 0
             continue
         if not re.fullmatch(r"0|[1-9][0-9]{0,4}", path.stem) or int(path.stem) > MAX_LABEL:
             raise UnknownLabelError(f"{path}: is named {path.stem!r}; expected the id of a class, as in '12.png'")
         if int(path.stem) in detections:
             raise MaskFormatError(f"{folder}: has two images of class {path.stem}; expected one")
-        detections[int(path.stem)] = _read_image(path, within)
+        detections[int(path.stem)] = _read_image(path, camera, within)
     shapes = {array.shape for array in detections.values()}
     if unknown is not None and len(shapes) == 1 and unknown.shape not in shapes:
         raise MaskSizeError(f"{folder}: unknown has shape {unknown.shape}; expected {shapes.pop()}, as the others")
     return combine_detections(detections, unknown=unknown, source=str(folder))
 
 
-def _read_image(path: Path, within: Path | None) -> npt.NDArray[np.float32]:
+def _read_image(path: Path, camera: Camera | None, within: Path | None) -> npt.NDArray[np.float32]:
     """Read an image of one class, as probabilities (H, W) float32."""
-    try:
-        with open_input(path, within) as file, Image.open(file, formats=["PNG", "TIFF"]) as image:
-            mode, values = image.mode, np.array(image)
-    except (*_DAMAGED, UnidentifiedImageError) as error:
-        raise MaskFormatError(f"{path}: broken image ({error}); expected probabilities of one class") from error
+    with open_image(path, MaskFormatError, "image", "probabilities of one class", ("PNG", "TIFF"), within) as image:
+        if camera is not None:
+            camera.check_mask_size(*image.size, str(path))
+        mode, values = image.mode, np.array(image)
     if mode == "L":
         return values.astype(np.float32) / np.float32(2**8 - 1)
     if mode.startswith("I;16") or (mode == "I" and path.suffix.lower() == ".png"):

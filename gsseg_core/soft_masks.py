@@ -14,7 +14,7 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.errors import MaskFormatError, MaskSizeError, UnknownLabelError
+from gsseg_core.errors import MaskFormatError, MaskSizeError, UnknownLabelError, clipped
 from gsseg_core.masks import MAX_LABEL, UNKNOWN, PackedLabels
 from gsseg_core.meaning import Meaning
 
@@ -41,6 +41,28 @@ class SeenLabels(NamedTuple):
         if self.meaning is None:
             return self.labels
         return np.append(self.meaning.named(), np.int32(UNKNOWN))[self.labels]
+
+    def numbered(self, ids: npt.NDArray[np.int32], source: str) -> SeenLabels:
+        """Put the place of each class among some ids, ascending, where its id is.
+
+        Raises
+        ------
+        UnknownLabelError
+            A class is not among them.
+        """
+        table = np.full(MAX_LABEL + 2, len(ids), np.int32)  # The last one is for unknown pixels.
+        table[ids], table[UNKNOWN] = np.arange(len(ids)), UNKNOWN
+        concerned = self.labels if self.meaning is None else self.meaning.concerned
+        numbers = table[concerned]
+        if (numbers == len(ids)).any():
+            raise UnknownLabelError(
+                f"{source}: mask holds the labels {clipped(np.unique(concerned[numbers == len(ids)]).tolist())}; "
+                f"expected ids of the {len(ids)} classes in use"
+            )
+        if self.meaning is None:
+            return SeenLabels(numbers)
+        classes, mass, supervised = self.meaning.classes, self.meaning.mass, self.meaning.supervised
+        return SeenLabels(self.labels, Meaning(table[classes], mass, None if supervised is None else table[supervised]))
 
 
 class PackedMask:

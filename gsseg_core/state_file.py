@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,28 @@ import numpy as np
 from gsseg_core.atomic import write_atomically
 from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
-from gsseg_core.errors import PathTakenError, StateFileError
+from gsseg_core.errors import GssegError, PathTakenError, clipped, quoted
+from gsseg_core.limits import LIMITS
+from gsseg_core.masks import MAX_LABEL, UNKNOWN
 from gsseg_core.meaning import Meaning
-from gsseg_core.npz_files import npz_format, open_npz
-from gsseg_core.soft_masks import SeenLabels
+from gsseg_core.npz_files import (
+    NpzArrays,
+    UnfitError,
+    check_shares,
+    class_names_of,
+    npz_format,
+    open_npz,
+    temperature_of,
+    whole_number,
+)
+from gsseg_core.soft_masks import TOLERANCE, SeenLabels
 
 FORMAT = "gsseg-state-1"
+
+_MOST_VIEWS = 2**31 - 1
+_MOST_VOTES = 2.0**62
+_VIEW_VOTES = 2.0**24 * LIMITS.max_pixels
+"""Votes of one view for one Gaussian, at most, in units of `VOTE_UNIT`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,12 +126,12 @@ class State:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], digest: str, num_gaussians: int, within: Path | None = None) -> State:
-        """Read what was saved for the same scene; with `within`, from below that folder, links followed.
+        """Read what was saved for the same scene, below `within` if given, links followed; all of it is checked.
 
         Raises
         ------
         StateFileError
-            The file is missing or damaged.
+            The file is missing or damaged, or holds what no state holds.
         StateMismatchError
             It belongs to another scene.
         PathNotAllowedError
@@ -122,25 +139,26 @@ class State:
         """
         path = Path(path)
         with open_npz(path, "a saved state", FORMAT, digest, within) as (file, header):
-            n, k = (int(size) for size in header["shape"])
+            n, k = header["shape"]
             if n != num_gaussians:
-                raise StateFileError(f"{path}: holds {n} Gaussians; expected {num_gaussians}, as the scene has")
-            votes = np.zeros((n, k), np.int64)
-            votes[file["seen"]] = file["votes"]
+                raise UnfitError(f"holds {clipped(n)} Gaussians; expected {num_gaussians}, as the scene has")
+            k = whole_number(k, "number of classes", 1, MAX_LABEL + 1)
+            views = [_read_view(file, i, entry, k) for i, entry in enumerate(header["views"])]
+            twice = [name for name, count in Counter(view.name for view in views).items() if count > 1]
+            if twice:
+                raise UnfitError(f"has two views of the name {quoted(twice[0])}; expected one of each name")
+            num_fused = whole_number(header["num_fused"], "num_fused", len(views), _MOST_VIEWS)
+            votes = _read_votes(file, (n, k), len(views), num_fused)
             learnt = None
             if "learnt" in header:
                 entry = header["learnt"]
-                temperature = float(entry.get("temperature", 1.0))  # earlier files have none
-                learnt = Learnt(str(entry["learner"]), file["codes"], int(entry["num_views"]), temperature)
-                if learnt.codes.ndim != 2 or len(learnt.codes) != n:
-                    raise StateFileError(f"{path}: codes have shape {learnt.codes.shape}; expected ({n}, K)")
-            return cls(
-                votes,
-                [_read_view(file, i, entry) for i, entry in enumerate(header["views"])],
-                int(header["num_fused"]),
-                {int(k): str(name) for k, name in header["class_names"].items()},
-                learnt,
-            )
+                codes = file.expect("codes", np.float32, (n, None))
+                if not 1 <= codes.shape[1] <= k:
+                    raise UnfitError(f"array codes is of {codes.shape[1]} classes; expected 1 to {k}")
+                check_shares("codes", codes)
+                num_views = whole_number(entry["num_views"], "num_views of what was learnt", 0, _MOST_VIEWS)
+                learnt = Learnt(str(entry["learner"]), codes, num_views, temperature_of(entry))
+            return cls(votes, views, num_fused, class_names_of(header), learnt)
 
 
 def _require_replaceable(path: Path) -> None:
@@ -148,15 +166,59 @@ def _require_replaceable(path: Path) -> None:
         raise PathTakenError(f"{path}: is there and is no saved state; expected a new file, or a state to replace")
 
 
-def _read_view(file: np.lib.npyio.NpzFile, i: int, entry: dict[str, Any]) -> View:
-    width, height = (int(side) for side in entry["size"])
-    pose = file[f"pose_{i}"]
-    camera = Camera(str(entry["name"]), width, height, pose[0, :3, :3], pose[1])
-    labels = file[f"labels_{i}"]
-    if f"mass_{i}" not in file.files:
-        return View.from_arrays(camera, labels)
-    supervised = file[f"supervised_{i}"] if f"supervised_{i}" in file.files else None
-    meaning = Meaning(file[f"classes_{i}"], file[f"mass_{i}"], supervised)
-    if meaning.mass is None or meaning.mass.shape != (labels.max() + 1, len(meaning.classes)):
-        raise StateFileError(f"view '{camera.name}': mask and what it means do not fit; expected one row per label")
-    return View.from_seen(camera, SeenLabels(labels, meaning))
+def _read_votes(file: NpzArrays, shape: tuple[int, int], num_kept: int, num_fused: int) -> np.ndarray:
+    """Read votes, (N, K) int64; of a Gaussian they cannot be more than the pixels of all views."""
+    seen = file.expect("seen", np.int64, (None,))
+    if np.any(np.diff(seen) <= 0) or np.any((seen < 0) | (seen >= shape[0])):
+        raise UnfitError(f"array seen holds no Gaussians; expected ascending numbers from 0 to {shape[0] - 1}")
+    given = file.expect("votes", np.int64, (len(seen), shape[1]))
+    # Only masks that tell what is not there vote against a class; of views that were not kept, nobody knows.
+    may_oppose = num_fused > num_kept or any(name.startswith("supervised_") for name in file.names)
+    if not may_oppose and given.min(initial=0) < 0:
+        raise UnfitError(f"array votes holds {given.min()}; expected none below 0")
+    most = np.abs(given, dtype=np.float64).sum(axis=1).max(initial=0)
+    possible = min(num_fused * _VIEW_VOTES * (shape[1] if may_oppose else 1), _MOST_VOTES)
+    if most > possible:
+        raise UnfitError(
+            f"array votes sums to {most:.3g} in a row; expected at most {possible:.3g} of {num_fused} views"
+        )
+    votes = np.zeros(shape, np.int64)
+    votes[seen] = given
+    return votes
+
+
+def _read_view(file: NpzArrays, i: int, entry: dict[str, Any], num_classes: int) -> View:
+    width, height = (whole_number(side, "size of a view", 1, LIMITS.max_pixels) for side in entry["size"])
+    pose = file.expect(f"pose_{i}", np.float64, (2, 4, 4))
+    try:
+        camera = Camera(str(entry["name"]), width, height, pose[0, :3, :3], pose[1])
+        labels = file.expect(f"labels_{i}", np.int32, (height, width))
+        if f"mass_{i}" in file.names:
+            view = View.from_seen(camera, SeenLabels(labels, _read_meaning(file, i, labels)))
+        else:
+            view = View.from_arrays(camera, labels)
+    except GssegError as error:
+        raise UnfitError(str(error)) from error
+    if view.largest_label >= num_classes:
+        raise UnfitError(f"view {quoted(view.name)} holds the label {view.largest_label}; expected below {num_classes}")
+    return view
+
+
+def _read_meaning(
+    file: NpzArrays,
+    i: int,
+    labels: np.ndarray,  # (H, W)
+) -> Meaning:
+    classes = file.expect(f"classes_{i}", np.int32, (None,))
+    mass = file.expect(f"mass_{i}", np.float32, (int(labels.max()) + 1, len(classes)))
+    supervised = file.expect(f"supervised_{i}", np.int32, (None,)) if f"supervised_{i}" in file.names else None
+    for name, ids in (("classes", classes), ("supervised", supervised)):
+        if ids is not None and (np.any(np.diff(ids) <= 0) or np.any((ids < 0) | (ids > MAX_LABEL))):
+            raise UnfitError(f"array {name}_{i} holds {clipped(ids.tolist())}; expected ascending ids of classes")
+    if supervised is not None and not np.isin(classes, supervised).all():
+        raise UnfitError(f"array classes_{i} holds other ids than supervised_{i}; expected some of those")
+    if labels.min() < UNKNOWN:
+        raise UnfitError(f"array labels_{i} holds {labels.min()}; expected {UNKNOWN} for unknown pixels, or more")
+    if not np.all((mass >= 0) & (mass <= 1)) or not np.all(mass.sum(axis=1) <= 1 + TOLERANCE):
+        raise UnfitError(f"array mass_{i} holds no probabilities; expected rows from 0 that sum to 1 at most")
+    return Meaning(classes, mass, supervised)

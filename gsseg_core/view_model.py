@@ -13,6 +13,7 @@ import numpy as np
 from gsseg_core.errors import StateFileError, UnknownLabelError
 from gsseg_core.json_files import read_json
 from gsseg_core.masks import BACKGROUND_NAME
+from gsseg_core.npz_files import SHARES_TOLERANCE
 from gsseg_core.pictures import palette
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
@@ -92,6 +93,8 @@ class ViewModel:
         If above 0, a Gaussian is shown not for its label, but for having at least this probability of a shown class.
     hidden, removed : set of int
         Labels that are switched off; and those that are off the list, too.
+    class_ids : tuple of int
+        Ids by label, for as many labels as ids were given: labels are numbers without gaps, ids need not be.
     """
 
     scene: GaussianScene
@@ -102,6 +105,12 @@ class ViewModel:
     min_probability: float = 0.0
     hidden: set[int] = field(default_factory=set)
     removed: set[int] = field(default_factory=set)
+    class_ids: tuple[int, ...] = ()
+
+    def ids(self) -> list[int]:
+        """Ids of all classes, by label; those that were added in the viewer have the smallest free ones."""
+        free = (i for i in range(len(self.class_ids) + len(self.labelling.class_names)) if i not in self.class_ids)
+        return [*self.class_ids, *free][: len(self.labelling.class_names)]
 
     def relabel(self, labelling: Labelling) -> None:
         """Show what is known now; what was switched off stays so."""
@@ -205,6 +214,18 @@ class ViewModel:
         if label not in self.labels_in_use:
             raise UnknownLabelError(f"class {label} is not in the list; expected one of {self.labels_in_use}")
         return label
+
+
+def completed(
+    probabilities: np.ndarray,  # (N, K)
+) -> np.ndarray:
+    """Have rows sum to 1, (N, K) float32: what a source did not tell is shared out among the classes it left at 0."""
+    rest = 1 - probabilities.sum(axis=1, dtype=np.float64)
+    known = probabilities.max(axis=1) > 0
+    untold = (probabilities == 0) & (known & (rest > SHARES_TOLERANCE))[:, None]
+    share = rest / np.maximum(untold.sum(axis=1), 1)
+    out: np.ndarray = np.where(untold, share[:, None], probabilities).astype(np.float32)
+    return out
 
 
 def ramp(

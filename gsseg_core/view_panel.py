@@ -178,7 +178,7 @@ class Panel:
         label, probabilities = int(model.labelling.labels[i]), model.labelling.probabilities[i]
         best = [k for k in np.argsort(-probabilities, kind="stable")[:MOST_CLASSES].tolist() if probabilities[k] > 0]
         lines = [
-            f", class {label}" if label >= 0 else "",
+            f", class {model.ids()[label]}" if label >= 0 else "",
             f"Gaussian {i}, {100 * picked.weight:.0f} % of the pixel",
             "probabilities: " + (", ".join(f"{_shown(model.name(k))} {probabilities[k]:.2f}" for k in best) or "none"),
         ]

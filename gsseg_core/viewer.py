@@ -24,7 +24,7 @@ from gsseg_core.segmentation import Segmentation
 from gsseg_core.view_access import Listener, listen
 from gsseg_core.view_corrections import Corrections
 from gsseg_core.view_live import LiveSource
-from gsseg_core.view_model import BY_RELIABILITY, MODES, ViewModel
+from gsseg_core.view_model import BY_RELIABILITY, MODES, ViewModel, completed
 from gsseg_core.view_nodes import cut
 from gsseg_core.view_panel import Panel
 from gsseg_core.view_picking import Evidence, pick, scene_camera
@@ -200,8 +200,8 @@ class Viewer:
         """Write what is known of each Gaussian, corrections included, as a `segmentation.npz`."""
         labels, probabilities, names = self.model.labelling
         nothing, none = np.zeros(len(labels), bool), np.empty((0, probabilities.shape[1]), np.float32)
-        result = Segmentation(labels, probabilities, names, self.model.scene.digest, nothing, none)
-        return _as_file(result.save, "segmentation.npz")
+        result = Segmentation(labels, completed(probabilities), names, self.model.scene.digest, nothing, none)
+        return _as_file(result.with_ids(self.model.ids()).save, "segmentation.npz")
 
     def undo(self) -> bool:
         """Take the last correction back; return whether there was one."""

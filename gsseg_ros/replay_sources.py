@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 from geometry_msgs.msg import PoseStamped
-from PIL import Image as Picture
 from std_msgs.msg import Header
 
 from gsseg_core.dataset import Dataset, View
 from gsseg_core.errors import GssegError, NoUsableViewsError
+from gsseg_core.input_files import open_image
 from gsseg_ros.conversions import camera_info, mask_image, pose_from_matrix, rgb_image
 
 if TYPE_CHECKING:
@@ -248,8 +248,5 @@ def _choose(path: Path, connections: list[Connection], role: str, wanted: str) -
 
 
 def _read_photo(path: Path) -> npt.NDArray[np.uint8]:  # (H, W, 3)
-    try:
-        with Picture.open(path) as picture:
-            return np.array(picture.convert("RGB"))
-    except (OSError, SyntaxError, ValueError) as error:
-        raise PhotoFileError(f"{path}: unreadable ({error}); expected a photo, JPEG or PNG") from error
+    with open_image(path, PhotoFileError, "image", "a photo, JPEG or PNG") as picture:
+        return np.array(picture.convert("RGB"))

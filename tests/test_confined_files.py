@@ -12,9 +12,10 @@ from PIL import Image
 from small_scenes import write_dataset
 
 from gsseg_core import confined_files
-from gsseg_core.confined_files import open_input, pinned_folder
+from gsseg_core.confined_files import pinned_folder
 from gsseg_core.dataset import Dataset
 from gsseg_core.errors import CameraFileError, PathNotAllowedError, WriteError
+from gsseg_core.input_files import open_input
 from gsseg_core.scene import GaussianScene
 
 

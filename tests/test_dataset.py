@@ -185,7 +185,7 @@ def test_a_split_is_followed_in_its_order(tmp_path: Path) -> None:
     ("content", "message"),
     [
         ("{", "not valid JSON"),
-        ("[]", 'no "train" in it; expected'),
+        ("[]", "holds a list; expected"),
         ('{"test": []}', 'no "train" in it; expected'),
         ('{"train": "a"}', '"train" is a; expected a list of image stems'),
         ('{"train": [1]}', r'"train" is \[1\]; expected a list of image stems'),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -115,7 +116,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 
 
 def test_a_folder_is_no_scene(tmp_path: Path) -> None:
-    with pytest.raises(SceneFileError, match=r"cannot be read \(Is a directory\)"):
+    with pytest.raises(SceneFileError, match=r"cannot be read \(is a folder\)"):
         read_vertices(tmp_path)
 
 
@@ -132,4 +133,24 @@ def test_list_properties_are_refused_by_name(tmp_path: Path) -> None:
     element = plyfile.PlyElement.describe(vertices, "vertex")
     plyfile.PlyData([element]).write(str(tmp_path / "scene.ply"))
     with pytest.raises(ScenePropertyError, match="neighbours are lists; expected one number each"):
+        read_vertices(tmp_path / "scene.ply")
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("count", [10**6, 10**12, 2**63])
+def test_a_count_beyond_the_file_is_refused_before_memory_is_taken(tmp_path: Path, encoding: str, count: int) -> None:
+    path = write_ply(tmp_path / "scene.ply", some_vertices(), encoding)
+    path.write_bytes(path.read_bytes().replace(b"vertex 5", b"vertex %d" % count))
+    tracemalloc.start()
+    try:
+        with pytest.raises(SceneFileError, match=rf"'vertex' of {count:,} rows takes .* bytes, and \d+ are left"):
+            read_vertices(path)
+        assert tracemalloc.get_traced_memory()[1] < 8 << 20
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_file_without_the_end_of_a_header_is_not_read_through(tmp_path: Path) -> None:
+    (tmp_path / "scene.ply").write_bytes(b"ply\nformat ascii 1.0\ncomment " + b"x" * (2 << 20))
+    with pytest.raises(SceneFileError, match=r"no end of its header in the first 1,048,576 bytes"):
         read_vertices(tmp_path / "scene.ply")

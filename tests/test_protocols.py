@@ -111,5 +111,5 @@ def test_a_layout_that_is_not_whole_is_refused(tmp_path: Path, data: Path) -> No
         spin_nerf(tmp_path / "wide", cameras)
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken/view0.png").write_text("no image")
-    with pytest.raises(MaskFormatError, match="cannot be read"):
+    with pytest.raises(MaskFormatError, match="broken image"):
         spin_nerf(tmp_path / "broken", cameras)

@@ -1,0 +1,154 @@
+"""Opening what users hand in: regular files only, and images by their header first."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+import struct
+import warnings
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BufferedReader
+from pathlib import Path
+
+from PIL import Image, UnidentifiedImageError
+
+from gsseg_core.confined_files import OPENED, require_below
+from gsseg_core.errors import GssegError, clipped
+from gsseg_core.limits import LIMITS
+
+_KINDS = {
+    stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device", stat.S_IFBLK: "a device",
+}  # fmt: skip
+# What Pillow and zlib raise on damaged bytes.
+_DAMAGED = (OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError, OverflowError, MemoryError,
+            RuntimeError, struct.error, zlib.error, Image.DecompressionBombError)  # fmt: skip
+
+
+def open_input(path: str | os.PathLike[str], within: Path | None = None) -> BufferedReader:
+    """Open a file for reading; links are followed.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    within : pathlib.Path, optional
+        A folder below which the file must lie in the end.
+
+    Raises
+    ------
+    PathNotAllowedError
+        It lies elsewhere; it has not been opened.
+    OSError
+        There is none, it cannot be read, or it is no regular file: a named pipe might never have anything to read, and
+        a device never an end. `strerror` says which.
+    """
+    try:
+        # Without O_NONBLOCK, a named pipe would keep us waiting for a writer right here.
+        flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC
+        number = os.open(path, flags) if within is None else _open_below(path, within, flags)
+    except ValueError as error:  # a NUL in the path
+        raise OSError(errno.EINVAL, str(error), str(path)) from error
+    except OSError as error:
+        if error.errno == errno.ENXIO:
+            raise OSError(errno.ENXIO, "is a socket or a device", str(path)) from error
+        raise
+    mode = os.fstat(number).st_mode
+    if not stat.S_ISREG(mode):
+        os.close(number)
+        kind = _KINDS.get(stat.S_IFMT(mode), "no file")
+        raise OSError(errno.EINVAL, f"is {kind}", str(path))
+    return os.fdopen(number, "rb")
+
+
+def _open_below(path: str | os.PathLike[str], within: Path, flags: int) -> int:
+    """Open what a path leads to now, and nothing that takes its place meanwhile."""
+    found = os.open(path, os.O_PATH | os.O_CLOEXEC)  # opens nothing yet
+    try:
+        require_below(os.readlink(f"{OPENED}/{found}"), path, within)
+        return os.open(f"{OPENED}/{found}", flags)
+    finally:
+        os.close(found)
+
+
+def is_there(path: Path, error: type[GssegError]) -> bool:
+    """Tell whether an optional file is there; whatever else has its name is refused.
+
+    Raises
+    ------
+    GssegError
+        Of the given class: a link that leads nowhere, which was meant to be there; a folder; a named pipe.
+    """
+    try:
+        mode = path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError) as cause:
+        if path.is_symlink():
+            raise error(f"{path}: is a link to {os.readlink(path)}, which does not exist; expected a file") from cause
+        return False
+    except OSError as cause:
+        raise error(f"{path}: cannot be read ({cause.strerror or cause})") from cause
+    if not stat.S_ISREG(mode):
+        raise error(f"{path}: is {_KINDS.get(stat.S_IFMT(mode), 'no file')}; expected a regular file, or nothing")
+    return True
+
+
+def reason(error: BaseException) -> str:
+    """Say on one line why a file cannot be read."""
+    said = getattr(error, "strerror", None) or str(error) or type(error).__name__
+    return clipped(f"lacks {said}" if isinstance(error, KeyError) else said, 160)
+
+
+def check_pixels(width: int, height: int, source: str, error: type[GssegError]) -> None:
+    """Raise `error` if an image claims to have more pixels than any camera takes."""
+    if width * height > LIMITS.max_pixels:
+        raise error(
+            f"{source}: claims {clipped(width, 24)} x {clipped(height, 24)} pixels; expected at most "
+            f"{LIMITS.max_pixels:,} in all (limit max_pixels)"
+        )
+
+
+@contextmanager
+def open_image(
+    path: str | os.PathLike[str],
+    error: type[GssegError],
+    kind: str,
+    expected: str,
+    formats: tuple[str, ...] | None = None,
+    within: Path | None = None,
+) -> Iterator[Image.Image]:
+    """Open an image whose header claims no more pixels than any camera takes; its pixels are not read yet.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    error : subclass of GssegError
+        What is raised, also for pixels that the body finds to be damaged.
+    kind, expected : str
+        What it is called, and what it should be, for messages.
+    formats : tuple of str, optional
+        Of Pillow; all by default.
+    within : pathlib.Path, optional
+        A folder below which it must lie, links followed.
+    """
+    try:
+        file = open_input(path, within)
+    except OSError as cause:
+        raise error(f"{path}: cannot be read ({reason(cause)}); expected {expected}") from cause
+    try:
+        with file, _opened(file, formats) as image:
+            check_pixels(*image.size, str(path), error)
+            yield image
+    except _DAMAGED as cause:
+        # Of what it does not know, Pillow tells nothing but the address of the object that it was handed.
+        why = "of no known format" if isinstance(cause, UnidentifiedImageError) else reason(cause)
+        raise error(f"{path}: broken {kind} ({why}); expected {expected}") from cause
+
+
+def _opened(file: BufferedReader, formats: tuple[str, ...] | None) -> Image.Image:
+    with warnings.catch_warnings():  # Pillow warns of images that are within our own limit.
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        return Image.open(file, formats=formats)
