@@ -17,7 +17,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-os.environ.update(NUMBA_THREADING_LAYER="workqueue", NUMBA_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
+THREADS = {"NUMBA_THREADING_LAYER": "workqueue", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+"""Variables that are set for this process; one that is no fork of it must not inherit them."""
+
+os.environ.update(THREADS)
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))  # Small scenes and the robot are there.
 

@@ -11,6 +11,7 @@ from typing import Any
 
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
+from forked import THREADS
 from kills import state_faults
 from ros_helpers import Ros
 from ros_robot import CLASSES, Robot, core_session, renamed
@@ -36,6 +37,8 @@ class NodeVictim:
             views = renamed(clean_views(6) * (count // 6 or 1))[:count]
             session = core_session(self.scene, views if name == "first" else [turned(view) for view in views])
             session.save(self.root / f"{name}.npz")
+        for name in THREADS:  # A node has threads of its own.
+            os.environ.pop(name, None)
         self._ros = Ros(folder)
         self._robot = Robot(self._ros)
         self._parameters = {"scene_path": folder / "scene.ply", "data_root": self.root, "class_names": CLASSES}
