@@ -40,8 +40,8 @@ class Ended:
         Whether it ended by itself.
     seconds : float
         How long it ran.
-    grown : int
-        Most memory that it had beyond what its parent held, in bytes.
+    peak : int
+        Most memory that it had, with what it shares with its parent, in bytes.
     output, errors : str
         What it wrote.
     """
@@ -49,7 +49,7 @@ class Ended:
     code: int
     in_time: bool
     seconds: float
-    grown: int
+    peak: int
     output: str
     errors: str
 
@@ -69,7 +69,7 @@ def in_child(job: Callable[[], int | None], folder: Path, seconds: float) -> End
     paths = folder / "stdout", folder / "stderr"
     sys.stdout.flush()
     sys.stderr.flush()
-    held, started = _status("VmRSS"), time.perf_counter()
+    started = time.perf_counter()
     child = os.fork()
     if child == 0:
         os._exit(_do(job, paths))
@@ -80,7 +80,7 @@ def in_child(job: Callable[[], int | None], folder: Path, seconds: float) -> End
     took = time.perf_counter() - started
     output, errors = (path.read_text(errors="replace") if path.is_file() else "" for path in paths)
     code = os.waitstatus_to_exitcode(status)
-    return Ended(code, in_time, took, max(0, usage.ru_maxrss * 1024 - held), output, errors)
+    return Ended(code, in_time, took, usage.ru_maxrss << 10, output, errors)
 
 
 def run_command(arguments: list[str]) -> int:

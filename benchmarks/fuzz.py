@@ -160,7 +160,7 @@ def judge(ended: Ended) -> str:
         return f"traceback: {raised.split(':')[0]} at {':'.join(frames[-1]) if frames else 'no line of gsseg'}"
     if ended.code < 0:
         return f"ended by signal {-ended.code}"
-    if ended.grown > MOST_MEMORY or _NO_MEMORY.search(ended.errors):
+    if ended.peak > MOST_MEMORY or _NO_MEMORY.search(ended.errors):
         return "memory: more than 2 GiB"
     if ended.code == 0:
         return f"warning: {_without_paths(lines[0])[:90]}" if lines else "done"
@@ -189,7 +189,7 @@ def fuzz_files(what: str, files: Files, options: argparse.Namespace) -> Tally:
     files.dataset(kind)
     for number in range(options.first, options.first + options.count):
         outcome, ended, done, data = files.broken(kind, f"{options.seed} {what} {number}", options.patience)
-        tally.most_memory, tally.longest = max(tally.most_memory, ended.grown), max(tally.longest, ended.seconds)
+        tally.most_memory, tally.longest = max(tally.most_memory, ended.peak), max(tally.longest, ended.seconds)
         if outcome not in COLUMNS and len(tally.causes.get(outcome, [])) < 3:
             _keep(options.out / what.replace(" ", "_") / str(number), outcome, done, ended, data)
         tally.add(number, outcome)
@@ -216,7 +216,7 @@ def replay(what: str, files: Files, options: argparse.Namespace) -> int:
     name = f"{options.seed} {what} {options.replay}"
     outcome, ended, done, data = files.broken(kind, name, options.patience)
     _keep(options.out / what.replace(" ", "_") / str(options.replay), outcome, done, ended, data)
-    print(f"{done}\n{outcome} (code {ended.code}, {ended.seconds:.2f} s, {ended.grown >> 20} MiB)\n{ended.errors}")
+    print(f"{done}\n{outcome} (code {ended.code}, {ended.seconds:.2f} s, {ended.peak >> 20} MiB)\n{ended.errors}")
     return int(outcome not in COLUMNS)
 
 
@@ -258,7 +258,7 @@ def main() -> int:
 
 def print_summary(tallies: list[Tally]) -> None:
     """Print the table, and each cause of findings with its first input."""
-    header = ["inputs of", "inputs", "done", "refused", "findings", "longest [s]", "memory beyond its own [MiB]"]
+    header = ["inputs of", "inputs", "done", "refused", "findings", "longest [s]", "peak memory [MiB]"]
     print("\n" + table(header, [tally.row() for tally in tallies]) + "\n")
     for tally in tallies:
         for cause, numbers in sorted(tally.causes.items(), key=lambda found: -len(found[1])):

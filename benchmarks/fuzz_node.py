@@ -86,8 +86,6 @@ class FuzzedNode:
         self.robot.started(self._parameters)
         self._read = 0
         self.reload()
-        assert self.robot.process is not None
-        self._held = self._memory("VmRSS")
 
     def reload(self) -> None:
         """Have the node know again what it knew at first."""
@@ -119,12 +117,13 @@ class FuzzedNode:
         with np.load(self.root / "check" / "segmentation.npz") as file:
             return np.array(file["labels"])
 
-    def grown(self) -> int:
-        """Most memory that the node has had beyond what it held at first, since the last time that this was asked."""
-        grown = self._memory("VmHWM") - self._held
+    def peak(self) -> int:
+        """Most memory that the node has had since the last time that this was asked, in bytes."""
         assert self.robot.process is not None
-        Path(f"/proc/{self.robot.process.pid}/clear_refs").write_text("5")
-        return max(grown, 0)
+        place = Path(f"/proc/{self.robot.process.pid}")
+        peak = int((place / "status").read_text().split("VmHWM:")[1].split()[0]) << 10
+        (place / "clear_refs").write_text("5")
+        return peak
 
     def complaints(self) -> list[str]:
         """Findings in what the node has logged since the last time that this was asked."""
@@ -159,11 +158,6 @@ class FuzzedNode:
         """Take everything down."""
         self._ros.close()
 
-    def _memory(self, field: str) -> int:
-        assert self.robot.process is not None
-        status = Path(f"/proc/{self.robot.process.pid}/status").read_text()
-        return int(status.split(f"{field}:")[1].split()[0]) << 10
-
 
 def fuzz_node(wanted: list[str], folder: Path, options: argparse.Namespace) -> list[Tally]:
     """Send broken messages and requests of some kinds."""
@@ -183,7 +177,7 @@ def fuzz_node(wanted: list[str], folder: Path, options: argparse.Namespace) -> l
 def _fuzzed(kind: str, node: FuzzedNode, options: argparse.Namespace) -> Tally:
     tally, started, overlays = Tally(kind), time.monotonic(), None
     node.reload()
-    node.grown()
+    node.peak()
     if kind == "image":  # Pictures are heard while somebody looks at what is made of them.
         overlays = node.robot.ros.node.create_subscription(Image, f"{node.robot.name}/overlay", lambda _: None, 10)
     one = _message if kind in KINDS else _request
@@ -271,9 +265,9 @@ def _checked(kind: str, node: FuzzedNode, tally: Tally) -> list[str]:
             findings.append(f"{node.known[0]} views were known, now {known[0]}")
         if kind not in KINDS and known != node.known:
             findings.append("requests that were refused, or change nothing, changed what is known")
-        grown = node.grown()
-        tally.most_memory = max(tally.most_memory, grown)
-        if grown > MOST_MEMORY:
+        peak = node.peak()
+        tally.most_memory = max(tally.most_memory, peak)
+        if peak > MOST_MEMORY:
             findings.append("memory: more than 2 GiB")
         node.reload()
         if not np.array_equal(node.exported(), node.labels):
