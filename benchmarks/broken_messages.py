@@ -11,13 +11,15 @@ from typing import Any
 import numpy as np
 from mutations import ODD_STRINGS
 
-BITS = {"int8": (-7, 7), "uint8": (0, 8), "int16": (-15, 15), "uint16": (0, 16), "int32": (-31, 31), "uint32": (0, 32),
-        "int64": (-63, 63), "uint64": (0, 64), "octet": (0, 8)}  # fmt: skip
+BITS = {
+    "int8": (-7, 7), "uint8": (0, 8), "int16": (-15, 15), "uint16": (0, 16), "int32": (-31, 31), "uint32": (0, 32),
+    "int64": (-63, 63), "uint64": (0, 64), "octet": (0, 8),
+}  # fmt: skip
 FLOATS = (0.0, -0.0, 1.0, -1.0, 0.5, 1e-30, 1e30, -1e30, float("nan"), float("inf"), float("-inf"))
 PATHS = (
-    "data", "data/scene.ply", "data/cameras.json", "data/labels", "data/mine.json", "state.npz", "other.ply", "other.npz",
-    "broken.ply", "broken.npz", "link/outside.ply", "../outside.ply", "loop", "mine", "mine/notes.txt", "new/a/b.npz",
-    "data/scene.ply/x", "fifo", "/", "/dev/zero", "/proc/self/mem", "~", "kept", "x" * 5000, "é.npz",
+    "data", "data/scene.ply", "data/cameras.json", "data/labels", "data/mine.json", "state.npz", "other.ply",
+    "other.npz", "broken.ply", "broken.npz", "link/outside.ply", "../outside.ply", "loop", "mine",
+    "mine/notes.txt", "new/a/b.npz", "data/scene.ply/x", "fifo", "/", "/dev/zero", "/proc/self/mem", "~", "kept", "x" * 5000, "é.npz",
 )  # fmt: skip
 WORDS = (
     "em", "votes", "gradient", "EM", "red ball", "cup/mug", "background", "1", "-1", "99", "mono8", "mono16", "8UC1",
@@ -98,7 +100,7 @@ def _sequence(kind: str, old: Any, rng: random.Random) -> Any:
 
 
 def _other_image(image: Any, rng: random.Random) -> Any:
-    """An image of another size or encoding, its fields in agreement or nearly so."""
+    """Make it an image of another size or encoding, its fields in agreement or nearly so."""
     encoding, width = rng.choice(
         (("mono8", 1), ("8UC1", 1), ("mono16", 2), ("16UC1", 2), ("32SC1", 4), ("rgb8", 3), ("rgba8", 4), ("64FC1", 8))
     )

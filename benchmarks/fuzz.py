@@ -81,11 +81,19 @@ class Files:
         plain(self._base)
         skip_warm_up()
         with contextlib.redirect_stdout(io.StringIO()):  # In this process: children then have all that it loads.
-            command = ["segment", self._base / "scene.ply", "--data", self._base, "--out", self._base / "out", "--quiet"]
+            command = [
+                "segment",
+                self._base / "scene.ply",
+                "--data",
+                self._base,
+                "--out",
+                self._base / "out",
+                "--quiet",
+            ]
             assert run_command([str(word) for word in command]) == 0
 
     def dataset(self, kind: Kind) -> Path:
-        """A good dataset with such a file, on which its commands work; made once."""
+        """Make a good dataset with such a file, once, and see that its commands work on it."""
         folder = self._folder / kind.name.replace(" ", "_")
         if not folder.exists():
             shutil.copytree(self._base, folder)
@@ -125,7 +133,11 @@ class Files:
         return judge(ended), ended
 
     def _run(self, data: Path, command: list[str], patience: float) -> Ended:
-        job = functools.partial(load_state, data) if command == ["load_state"] else functools.partial(run_command, command)
+        job = (
+            functools.partial(load_state, data)
+            if command == ["load_state"]
+            else functools.partial(run_command, command)
+        )
         return in_child(job, self._folder, patience)
 
 
@@ -156,7 +168,9 @@ def judge(ended: Ended) -> str:
         return "hang"
     if "Traceback (most recent call last)" in ended.errors:
         frames = _FRAME.findall(ended.errors)
-        raised = next((line for line in reversed(lines) if re.match(r"[\w.]+(Error|Exception|Warning|Interrupt)", line)), "")
+        raised = next(
+            (line for line in reversed(lines) if re.match(r"[\w.]+(Error|Exception|Warning|Interrupt)", line)), ""
+        )
         return f"traceback: {raised.split(':')[0]} at {':'.join(frames[-1]) if frames else 'no line of gsseg'}"
     if ended.code < 0:
         return f"ended by signal {-ended.code}"
@@ -194,7 +208,9 @@ def fuzz_files(what: str, files: Files, options: argparse.Namespace) -> Tally:
             _keep(options.out / what.replace(" ", "_") / str(number), outcome, done, ended, data)
         tally.add(number, outcome)
         if tally.inputs % 200 == 0:
-            print(f"{what}: {tally.inputs} inputs, {time.monotonic() - started:.0f} s, {dict(tally.counts)}", flush=True)
+            print(
+                f"{what}: {tally.inputs} inputs, {time.monotonic() - started:.0f} s, {dict(tally.counts)}", flush=True
+            )
     return tally
 
 

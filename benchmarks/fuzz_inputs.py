@@ -193,6 +193,11 @@ def break_one(kind: Kind, data: Path, rng: random.Random) -> str:
 
 def command_of(kind: Kind, data: Path, rng: random.Random) -> list[str]:
     """Draw a command that reads such a file."""
-    places = {"scene": data / "scene.ply", "data": data, "out": data / "out", "npz": data / SEGMENTATION, "new": data / "new"}
+    places = {
+        "scene": data / "scene.ply",
+        "data": data,
+        "out": data / "out",
+        "npz": data / SEGMENTATION,
+        "new": data / "new",
+    }
     return [word.format(**places) for word in rng.choice(kind.commands)]
-

@@ -93,7 +93,7 @@ class FuzzedNode:
         self.robot.done("load_state", path=KEPT)
 
     def knows(self) -> list[int]:
-        """Views and Gaussians of each class, as `~/segment` reports them."""
+        """Ask for views and Gaussians of each class, as `~/segment` reports them."""
         report = self._ros.result(self.robot.send("segment"), "segment", self._patience).report
         return [report.num_views, *(summary.num_gaussians for summary in report.classes)]
 
@@ -126,7 +126,7 @@ class FuzzedNode:
         return peak
 
     def complaints(self) -> list[str]:
-        """Findings in what the node has logged since the last time that this was asked."""
+        """Look for findings in what the node has logged since the last time that this was asked."""
         assert self.robot.process is not None
         said, self._read = self.robot.process.output[self._read :], len(self.robot.process.output)
         if "Traceback" in said:
@@ -193,7 +193,9 @@ def _fuzzed(kind: str, node: FuzzedNode, options: argparse.Namespace) -> Tally:
         for more in findings[1:]:
             tally.causes.setdefault(more, []).append(number)
         if tally.inputs % 200 == 0:
-            print(f"{kind}: {tally.inputs} inputs, {time.monotonic() - started:.0f} s, {dict(tally.counts)}", flush=True)
+            print(
+                f"{kind}: {tally.inputs} inputs, {time.monotonic() - started:.0f} s, {dict(tally.counts)}", flush=True
+            )
     if overlays is not None:
         node.robot.ros.node.destroy_subscription(overlays)
     return tally
@@ -254,7 +256,7 @@ def _checked(kind: str, node: FuzzedNode, tally: Tally) -> list[str]:
     assert process is not None
     findings = node.changed_files()
     if not process.running:
-        findings += node.complaints() + [DEAD]
+        findings += [*node.complaints(), DEAD]
         node.start()
         return findings
     try:
@@ -281,5 +283,3 @@ def _checked(kind: str, node: FuzzedNode, tally: Tally) -> list[str]:
 
 def _fields(message: Any) -> dict[str, Any]:
     return {name: getattr(message, name) for name in message.get_fields_and_field_types()}
-
-

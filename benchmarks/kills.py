@@ -33,9 +33,8 @@ KINDS = ("segment", "state", "save", "export", "learn")
 AFTER = "then "
 ATTEMPTS = 5
 """To hit a job before it ends, whose duration varies."""
-COLUMNS = (
-    "lost", "broken", "mixed", "unmarked", *(AFTER + kind for kind in ("lost", "broken", "mixed", "refused")), "leftover"
-)  # fmt: skip
+THEN = tuple(AFTER + kind for kind in ("lost", "broken", "mixed", "refused"))
+COLUMNS = ("lost", "broken", "mixed", "unmarked", *THEN, "leftover")
 PATIENCE = 60.0  # s
 
 
@@ -51,15 +50,15 @@ class Victim(Protocol):
         ...
 
     def faults(self) -> list[Fault]:
-        """What is wrong with the files as they are."""
+        """Say what is wrong with the files as they are."""
         ...
 
     def faults_after(self) -> list[Fault]:
-        """What is wrong once the next command, or node, has read them."""
+        """Say what is wrong once the next command, or node, has read them."""
         ...
 
     def leftovers(self) -> list[Fault]:
-        """What lies about once the job has been done again."""
+        """Say what lies about once the job has been done again."""
         ...
 
     def close(self) -> None:

@@ -48,7 +48,7 @@ class NodeVictim:
         """Do the job undisturbed, for comparison."""
 
     def robot(self) -> Robot:
-        """The robot of a node that runs; it is started if the last one was killed."""
+        """Return the robot of a node that runs; it is started if the last one was killed."""
         process = self._robot.process
         if process is None or not process.running:
             self._robot.started(self._parameters)
@@ -95,7 +95,7 @@ class NodeVictim:
         self._ros.close()
 
     def state_faults(self, name: str, views: set[int]) -> list[Fault]:
-        """What is wrong with a saved state."""
+        """Say what is wrong with a saved state."""
         return state_faults(self.root / f"{name}.npz", self.scene, views)
 
 
@@ -190,7 +190,7 @@ class NodeLearning(NodeVictim):
 
 
 def turned(view: View) -> View:
-    """The same view, its mask with other ids."""
+    """Give the mask of a view other ids."""
     labels = view.read_labels()
     for before, after in enumerate(TURNED):
         labels[view.read_labels() == before] = after

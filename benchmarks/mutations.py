@@ -196,14 +196,14 @@ def _zipped(members: dict[str, bytes]) -> bytes:
 
 @functools.cache
 def _bomb() -> list[bytes]:
-    """An array of zeros in pieces; all but the first are one piece, many times."""
+    """Pack an array of zeros in pieces; all but the first are one piece, many times."""
     start = _npy(np.zeros(0))
     header = start.replace(b"(0,)", f"({BOMB // 8},)".encode())[: len(start)]
     return [header, *([bytes(1 << 22)] * (BOMB >> 22))]
 
 
 def png_chunks(data: bytes, rng: random.Random) -> bytes:
-    """A PNG with another header, other pixels, or other chunks; the check sums hold."""
+    """Make a PNG with another header, other pixels, or other chunks; the check sums hold."""
     if rng.random() < 0.4:
         return _other_pixels(data, rng)
     chunks, at = [], 8
@@ -242,7 +242,9 @@ def _other_pixels(data: bytes, rng: random.Random) -> bytes:
     packed = io.BytesIO()
     if kind == "label":
         limit = np.iinfo(pixels.dtype).max if pixels.dtype.kind in "iu" else 1
-        pixels.reshape(-1)[rng.randrange(pixels.size)] = min(rng.choice((4, 9, 99, 254, 255, 1500, 65534, 65535)), limit)
+        pixels.reshape(-1)[rng.randrange(pixels.size)] = min(
+            rng.choice((4, 9, 99, 254, 255, 1500, 65534, 65535)), limit
+        )
         Image.fromarray(pixels).save(packed, "PNG")
     elif kind == "mode":
         mode = rng.choice(("1", "L", "LA", "P", "RGB", "RGBA", "I;16"))
@@ -255,7 +257,7 @@ def _other_pixels(data: bytes, rng: random.Random) -> bytes:
 
 
 def ply_header(data: bytes, rng: random.Random) -> bytes:
-    """A PLY with another header, or other numbers in its body."""
+    """Make a PLY with another header, or other numbers in its body."""
     header, end, body = data.partition(b"end_header\n")
     if rng.random() < 0.4:
         return header + end + _odd_floats(body, rng)
@@ -275,7 +277,19 @@ def ply_header(data: bytes, rng: random.Random) -> bytes:
         lines[first:] = rest
     else:
         words = lines[at].split(b" ")
-        odd = (b"float", b"double", b"uchar", b"list", b"int", b"ascii", b"binary_big_endian", b"face", b"x", b"", b"\xff")
+        odd = (
+            b"float",
+            b"double",
+            b"uchar",
+            b"list",
+            b"int",
+            b"ascii",
+            b"binary_big_endian",
+            b"face",
+            b"x",
+            b"",
+            b"\xff",
+        )
         words[rng.randrange(len(words))] = rng.choice(odd)
         lines[at] = b" ".join(words)
     return b"\n".join(lines) + b"\n" + end + body
@@ -290,7 +304,7 @@ def _odd_floats(body: bytes, rng: random.Random) -> bytes:
 
 
 def words(data: bytes, rng: random.Random) -> bytes:
-    """A text with words of it replaced, dropped or repeated."""
+    """Make a text with words of it replaced, dropped or repeated."""
     lines = [line.split(" ") for line in data.decode().split("\n")]
     for _ in range(rng.choice((1, 1, 3))):
         line = rng.choice(lines)

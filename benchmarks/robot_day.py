@@ -239,7 +239,7 @@ class Day:
         if learn:
             self._client.learn(timeout=60)
         self._client.save_state("end.npz")
-        self._client.export("end", skip_refinement=True)
+        self._client.export("end", refine=False)
         scene = GaussianScene.load(self._root / self._scene / "scene.ply")
         state = State.load(self._root / "end.npz", scene.digest, len(scene))
         found = Segmentation.load(self._root / "end" / "segmentation.npz", scene)
@@ -249,7 +249,7 @@ class Day:
         if learn:
             fresh.learn()
         self._client.load_state("end.npz")
-        self._client.export("again", skip_refinement=True)
+        self._client.export("again", refine=False)
         again = Segmentation.load(self._root / "again" / "segmentation.npz", scene)
         labels = fresh.codes().argmax(axis=1)
         seen = fresh.codes().any(axis=1)
@@ -329,7 +329,7 @@ class Day:
 
 
 def write_noisy_dataset(folder: Path, number: int, seed: int) -> None:
-    """A dataset whose masks have some objects missed or swapped, so that every view counts in the labels."""
+    """Write a dataset whose masks have some objects missed or swapped, so that every view counts in the labels."""
     scene, truth = balls_on_a_table(seed=number)
     if number:
         truth = np.array([0, 2, 3, 1])[truth]

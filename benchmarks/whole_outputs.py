@@ -1,4 +1,4 @@
-"""Whether the files of a folder of results are whole, of which run each is, and what lies about that belongs to none."""
+"""Whether the files of a folder of results are whole, of which run each is, and what lies about beside them."""
 
 from __future__ import annotations
 
@@ -124,7 +124,8 @@ def hash_of(*parts: bytes) -> str:
 
 
 def _npz(path: Path) -> Read:
-    with np.load(path, allow_pickle=False) as file:
+    # Opened here, since np.load leaves a file open that it cannot read.
+    with open(path, "rb") as opened, np.load(opened, allow_pickle=False) as file:
         header = json.loads(str(file["header"]))
         arrays = [(name, file[name]) for name in sorted(file.files) if name != "header"]
     content = hash_of(*(f"{name}{array.shape}{array.dtype}".encode() + array.tobytes() for name, array in arrays))
