@@ -18,8 +18,8 @@ BITS = {
 FLOATS = (0.0, -0.0, 1.0, -1.0, 0.5, 1e-30, 1e30, -1e30, float("nan"), float("inf"), float("-inf"))
 PATHS = (
     "data", "data/scene.ply", "data/cameras.json", "data/labels", "data/mine.json", "state.npz", "other.ply",
-    "other.npz", "broken.ply", "broken.npz", "link/outside.ply", "../outside.ply", "loop", "mine",
-    "mine/notes.txt", "new/a/b.npz", "data/scene.ply/x", "fifo", "/", "/dev/zero", "/proc/self/mem", "~", "kept", "x" * 5000, "é.npz",
+    "other.npz", "broken.ply", "broken.npz", "link/outside.ply", "../outside.ply", "loop", "mine", "mine/notes.txt",
+    "new/a/b.npz", "data/scene.ply/x", "fifo", "/", "/dev/zero", "/proc/self/mem", "~", "kept", "x" * 5000, "é.npz",
 )  # fmt: skip
 WORDS = (
     "em", "votes", "gradient", "EM", "red ball", "cup/mug", "background", "1", "-1", "99", "mono8", "mono16", "8UC1",

@@ -185,10 +185,12 @@ def _zipped(members: dict[str, bytes]) -> bytes:
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as file:
         for name, content in members.items():
+            info = zipfile.ZipInfo(name)  # With no time of its own: the same draw gives the same bytes.
+            info.compress_type = zipfile.ZIP_DEFLATED
             if content != b"<bomb>":
-                file.writestr(name, content)
+                file.writestr(info, content)
                 continue
-            with file.open(name, "w", force_zip64=True) as member:
+            with file.open(info, "w", force_zip64=True) as member:
                 for piece in _bomb():
                     member.write(piece)
     return packed.getvalue()

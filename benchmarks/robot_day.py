@@ -45,7 +45,9 @@ from gsseg_ros.client import SegmentationClient
 from gsseg_ros.errors import SegmentationError
 
 SCENES = ("table", "other")
-VIEWS, MAX_VIEWS = 12, 200
+VIEWS, MAX_VIEWS, TAUGHT = 12, 200, 24
+"""Of the datasets; kept by the node; learnt from."""
+PATIENCE = 120.0  # s
 FLAT = 0.05
 WARM_UP = 0.15
 """Share of the day that does not count for memory."""
@@ -131,8 +133,8 @@ class Day:
         if replay is None:
             return
         if "replaying" not in replay.output:
-            replay.wait_for("replaying", 60)
-        assert replay.stop(60) == 0, replay.output
+            replay.wait_for("replaying", PATIENCE)
+        assert replay.stop(PATIENCE) == 0, replay.output
         said = re.search(r"published (\d+) mask", replay.output)
         self.found.published += int(said[1]) if said else 0
         self._ros._processes.remove(replay)
@@ -178,11 +180,11 @@ class Day:
         self._client.segment()
 
     def learn(self) -> None:
-        self._client.learn(timeout=60)
+        self._client.learn(num_views=TAUGHT, timeout=PATIENCE)
 
     def cancel(self) -> None:
         with ThreadPoolExecutor(1) as beside:
-            learning = beside.submit(self._client.learn, timeout=60)
+            learning = beside.submit(self._client.learn, num_views=TAUGHT, timeout=PATIENCE)
             time.sleep(self._rng.uniform(0, 0.5))
             self._client.cancel()
             learning.result()
@@ -237,7 +239,7 @@ class Day:
         self._wait(1.5 * MAX_VIEWS / self._rate if learn else 0.5 * MAX_VIEWS / self._rate)
         self.stop_playing()
         if learn:
-            self._client.learn(timeout=60)
+            self._client.learn(num_views=TAUGHT, timeout=PATIENCE)
         self._client.save_state("end.npz")
         self._client.export("end", refine=False)
         scene = GaussianScene.load(self._root / self._scene / "scene.ply")
@@ -247,7 +249,7 @@ class Day:
         for view in state.views:
             fresh.fuse(view)
         if learn:
-            fresh.learn()
+            fresh.learn(num_views=TAUGHT)
         self._client.load_state("end.npz")
         self._client.export("again", refine=False)
         again = Segmentation.load(self._root / "again" / "segmentation.npz", scene)
