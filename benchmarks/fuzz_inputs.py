@@ -1,0 +1,203 @@
+"""A good input of every kind of file that gsseg reads, what can be broken about it, and the commands that read it."""
+
+from __future__ import annotations
+
+import json
+import random
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import mutations
+import numpy as np
+from mutations import Mutation
+from small_scenes import NAMES, balls_on_a_table, look_at, ring, write_dataset
+
+from gsseg_core.cameras import Camera
+from gsseg_core.dataset import Dataset
+from gsseg_core.live import LiveSession
+from gsseg_core.masks import read_mask
+
+WIDTH, HEIGHT = 16, 12
+STATE, SEGMENTATION = "state.npz", "out/segmentation.npz"
+JSON = (mutations.json_values, mutations.json_values, mutations.json_values, mutations.any_bytes)
+NPZ = (mutations.npz_members, mutations.npz_members, mutations.npz_members, mutations.any_bytes)
+PNG = (mutations.png_chunks, mutations.png_chunks, mutations.any_bytes)
+PLY = (mutations.ply_header, mutations.ply_header, mutations.any_bytes)
+TEXT = (mutations.words, mutations.words, mutations.any_bytes)
+BINARY = (mutations.numbers, mutations.numbers, mutations.any_bytes)
+
+SEGMENT = ("segment", "{scene}", "--data", "{data}", "--out", "{out}", "--quiet")
+VOTES = (*SEGMENT, "--learner", "votes")
+PER_VIEW = (*SEGMENT, "--ids", "per-view")
+RENDER = ("render", "{scene}", "--data", "{data}", "--segmentation", "{npz}", "--out", "{new}", "--quiet")
+CLICK = ("pick", "{scene}", "--data", "{data}", "--view", "view0", "--click", "8", "6", "--out", "{new}", "--quiet")
+MASK = (*CLICK[:6], "--mask", "{data}/labels/view0.png", *CLICK[-3:])
+REMOVE = ("remove", "{scene}", "--segmentation", "{npz}", "--class", "red ball", "--out", "{new}/rest.ply")
+EVAL = ("eval", "--pred", "{data}/labels", "--truth", "{data}/truth/labels")
+LOAD_STATE = ("load_state",)
+"""No command: what the node does with a state."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of file.
+
+    Attributes
+    ----------
+    name : str
+        As `--what` knows it.
+    make : callable
+        Turns the plain dataset into one that has such a file.
+    files : tuple of str
+        One of these is broken.
+    mutations : tuple of Mutation
+        One of these breaks it.
+    commands : tuple of tuple of str
+        One of these reads it.
+    """
+
+    name: str
+    make: Callable[[Path], None]
+    files: tuple[str, ...]
+    mutations: tuple[Mutation, ...]
+    commands: tuple[tuple[str, ...], ...]
+
+
+def plain(folder: Path) -> None:
+    """Write the dataset that all others are made from, with a mask of one object beside it."""
+    scene, truth = balls_on_a_table()
+    cameras = [look_at(camera.name, camera.center, WIDTH, HEIGHT, 14.0) for camera in ring(3)]
+    write_dataset(folder, scene, truth, cameras, NAMES)
+    write_dataset(folder / "truth", scene, truth, cameras, NAMES)
+    session = LiveSession(scene, NAMES)
+    for view in Dataset(folder).views("train"):
+        session.fuse(view)
+    session.learn("votes")
+    session.save(folder / STATE)
+
+
+def _as_it_is(folder: Path) -> None:
+    pass
+
+
+def _cameras(folder: Path) -> list[Camera]:
+    cameras = list(Dataset(folder).cameras)
+    (folder / "cameras.json").unlink()
+    return cameras
+
+
+def _nerfstudio(folder: Path) -> None:
+    frames = []
+    for camera in _cameras(folder):
+        pose = np.linalg.inv(camera.world_to_camera) @ np.diag([1.0, -1, -1, 1])
+        frames.append({"file_path": f"images/{camera.name}.png", "transform_matrix": pose.tolist()})
+    shared = {"w": WIDTH, "h": HEIGHT, "fl_x": 14.0, "fl_y": 14.0, "cx": WIDTH / 2, "cy": HEIGHT / 2}
+    (folder / "transforms.json").write_text(json.dumps({**shared, "k1": 0.0, "frames": frames}))
+
+
+def _colmap_poses(folder: Path) -> list[tuple[str, list[float]]]:
+    from scipy.spatial.transform import Rotation
+
+    found = []
+    for camera in _cameras(folder):
+        quat = Rotation.from_matrix(camera.world_to_camera[:3, :3]).as_quat(scalar_first=True)
+        found.append((f"{camera.name}.png", [*quat.tolist(), *camera.world_to_camera[:3, 3].tolist()]))
+    (folder / "sparse" / "0").mkdir(parents=True)
+    return found
+
+
+def _colmap_txt(folder: Path) -> None:
+    poses, model = _colmap_poses(folder), folder / "sparse" / "0"
+    (model / "cameras.txt").write_text(f"# cameras\n1 PINHOLE {WIDTH} {HEIGHT} 14.0 14.0 {WIDTH / 2} {HEIGHT / 2}\n")
+    lines = [f"{i} {' '.join(map(repr, pose))} 1 {name}\n1.0 2.0 -1" for i, (name, pose) in enumerate(poses, 1)]
+    (model / "images.txt").write_text("# images\n" + "\n".join(lines) + "\n")
+    (model / "points3D.txt").write_text("")
+
+
+def _colmap_bin(folder: Path) -> None:
+    poses, model = _colmap_poses(folder), folder / "sparse" / "0"
+    lens = struct.pack("<IiQQ4d", 1, 1, WIDTH, HEIGHT, 14.0, 14.0, WIDTH / 2, HEIGHT / 2)
+    (model / "cameras.bin").write_bytes(struct.pack("<Q", 1) + lens)
+    images = [
+        struct.pack("<I7dI", i, *pose, 1) + name.encode() + b"\0" + struct.pack("<Qddq", 1, 1.0, 2.0, -1)
+        for i, (name, pose) in enumerate(poses, 1)
+    ]
+    (model / "images.bin").write_bytes(struct.pack("<Q", len(images)) + b"".join(images))
+    (model / "points3D.bin").write_bytes(bytes(8))
+
+
+def _sixteen_bits(folder: Path) -> None:
+    from gsseg_core.masks import write_mask
+
+    for path in (folder / "labels").iterdir():
+        write_mask(path, read_mask(path).labels, 16)
+
+
+def _soft(folder: Path) -> None:
+    path = folder / "labels" / "view0.png"
+    labels = np.maximum(read_mask(path).labels, 0)
+    probabilities = np.eye(len(NAMES), dtype=np.float32)[labels].transpose(2, 0, 1) * np.float32(0.9)
+    unknown = np.zeros(labels.shape, bool)
+    classes = np.arange(len(NAMES))
+    np.savez_compressed(path.with_suffix(".npz"), probabilities=probabilities, classes=classes, unknown=unknown)
+    path.unlink()
+
+
+def _detections(folder: Path) -> None:
+    from PIL import Image
+
+    path = folder / "labels" / "view0.png"
+    labels = read_mask(path).labels
+    path.with_suffix("").mkdir()
+    for k in (1, 2):
+        Image.fromarray(np.uint8(255 * (labels == k))).save(path.with_suffix("") / f"{k}.png")
+    Image.fromarray(np.uint16(65535 * (labels == 3))).save(path.with_suffix("") / "3.png")
+    path.unlink()
+
+
+def _supervises(folder: Path) -> None:
+    (folder / "labels" / "supervises.json").write_text(json.dumps({"*": [1, 2, 3], "view0": [0, 1, 2, 3]}))
+
+
+_LABELS = ("labels/view0.png",)
+_ALL_CAMERAS = (SEGMENT, VOTES, CLICK, CLICK, RENDER)
+KINDS = (
+    Kind("scene.ply", _as_it_is, ("scene.ply",), PLY, (SEGMENT, CLICK, CLICK, REMOVE, RENDER)),
+    Kind("cameras.json", _as_it_is, ("cameras.json",), JSON, _ALL_CAMERAS),
+    Kind("transforms.json", _nerfstudio, ("transforms.json",), JSON, _ALL_CAMERAS),
+    Kind("colmap bin", _colmap_bin, ("sparse/0/cameras.bin", "sparse/0/images.bin"), BINARY, _ALL_CAMERAS),
+    Kind("colmap txt", _colmap_txt, ("sparse/0/cameras.txt", "sparse/0/images.txt"), TEXT, _ALL_CAMERAS),
+    Kind("labels 8 bit", _as_it_is, _LABELS, PNG, (SEGMENT, VOTES, PER_VIEW, MASK, EVAL)),
+    Kind("labels 16 bit", _sixteen_bits, _LABELS, PNG, (SEGMENT, VOTES, PER_VIEW, MASK, EVAL)),
+    Kind("soft npz", _soft, ("labels/view0.npz",), NPZ, (SEGMENT, VOTES)),
+    Kind("mask folder", _detections, ("labels/view0/1.png", "labels/view0/3.png"), PNG, (SEGMENT, VOTES)),
+    Kind("classes.json", _as_it_is, ("classes.json", "truth/classes.json"), JSON, (SEGMENT, VOTES, RENDER, EVAL)),
+    Kind("split.json", _as_it_is, ("split.json",), JSON, (SEGMENT, VOTES, RENDER)),
+    Kind("supervises.json", _supervises, ("labels/supervises.json",), JSON, (SEGMENT, VOTES)),
+    Kind("segmentation.npz", _as_it_is, (SEGMENTATION,), NPZ, (RENDER, REMOVE)),
+    Kind("state", _as_it_is, (STATE,), NPZ, (LOAD_STATE,)),
+)  # fmt: skip
+
+
+def break_one(kind: Kind, data: Path, rng: random.Random) -> str:
+    """Break one file of a dataset; returns what was done."""
+    path = data / rng.choice(kind.files)
+    if rng.random() < 0.01:
+        return f"{path.name}: {mutations.not_a_file(path, rng)} in its place"
+    mutation = rng.choice(kind.mutations)
+    path.write_bytes(mutation(path.read_bytes(), rng))
+    return f"{path.name}: {mutation.__name__}"
+
+
+def command_of(kind: Kind, data: Path, rng: random.Random) -> list[str]:
+    """Draw a command that reads such a file."""
+    places = {
+        "scene": data / "scene.ply",
+        "data": data,
+        "out": data / "out",
+        "npz": data / SEGMENTATION,
+        "new": data / "new",
+    }
+    return [word.format(**places) for word in rng.choice(kind.commands)]
