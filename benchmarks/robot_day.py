@@ -236,7 +236,9 @@ class Day:
             self._client.reset()
         if self._replay is None:
             self.play(self._scene)
-        self._wait(1.5 * MAX_VIEWS / self._rate if learn else 0.5 * MAX_VIEWS / self._rate)
+        if self._replay is not None:
+            self._replay.wait_for("replaying", PATIENCE)
+        self._wait((1.5 if learn else 0.5) * MAX_VIEWS / self._rate)
         self.stop_playing()
         if learn:
             self._client.learn(num_views=TAUGHT, timeout=PATIENCE)
