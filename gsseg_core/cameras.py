@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.errors import IntrinsicsError, MaskSizeError, PoseError, clipped
+from gsseg_core.errors import IntrinsicsError, MaskSizeError, PoseError
 from gsseg_core.input_files import check_pixels
+from gsseg_core.printable import clipped
 
 # Poses come from text files of few digits; a deviation this small moves no point by a pixel.
 _RIGID_TOLERANCE = 1e-3

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gsseg_core.names import class_ids, clipped, listed
-from gsseg_core.printable import printable
+from gsseg_core.names import class_ids, listed
+from gsseg_core.printable import clipped
 from gsseg_core.tables import counted
 from gsseg_core.terminal import tell
 
@@ -51,6 +51,6 @@ def run(options: argparse.Namespace) -> int:
     chosen = class_ids(options.classes, segmentation.class_names)
     rest = without_objects(scene, segmentation, chosen)
     rest.save(Path(options.out))
-    removed = listed(f"{k} ({printable(clipped(segmentation.class_names[k]))})" for k in chosen)
+    removed = listed(f"{k} ({clipped(segmentation.class_names[k])})" for k in chosen)
     tell(f"without {removed}: {len(rest):,} of {counted(len(scene), 'Gaussian')} in {options.out}")
     return 0

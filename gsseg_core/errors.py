@@ -96,15 +96,3 @@ class SchedulerError(GssegError):
 
 class NoCodesError(GssegError):
     """Nothing has been learnt or fused yet that could be shown or saved."""
-
-
-def clipped(value: object, most: int = 80) -> str:
-    """Give foreign text, a name or a value out of a file, as it goes into a message: short, printable, on one line."""
-    text = str(value)
-    text = text if len(text) <= most else text[: most - 3] + "..."
-    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
-
-
-def quoted(value: object) -> str:
-    """Give a foreign value as Python writes it, in quotes if it is text, as it goes into a message."""
-    return clipped(repr(value))

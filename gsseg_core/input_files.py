@@ -16,8 +16,9 @@ from pathlib import Path
 from PIL import Image, UnidentifiedImageError
 
 from gsseg_core.confined_files import OPENED, require_below
-from gsseg_core.errors import GssegError, clipped
+from gsseg_core.errors import GssegError
 from gsseg_core.limits import LIMITS
+from gsseg_core.printable import clipped
 
 _KINDS = {
     stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket",

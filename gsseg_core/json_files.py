@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from gsseg_core.errors import GssegError, clipped
+from gsseg_core.errors import GssegError
 from gsseg_core.input_files import open_input, reason
 from gsseg_core.limits import LIMITS
+from gsseg_core.printable import clipped
 
 _KINDS = {
     dict: "an object", list: "a list", str: "text", bool: "true or false", int: "a number", float: "a number",

@@ -10,6 +10,7 @@ import unicodedata
 from collections.abc import Iterable, Mapping
 
 from gsseg_core.errors import SettingsError
+from gsseg_core.printable import clipped, quoted
 
 MAX_CLASS_NAME = 200
 """Characters of a class name."""
@@ -17,15 +18,15 @@ MAX_CLASS_NAME = 200
 MAX_VIEW_NAME = 240
 """Bytes of a view's name, in UTF-8: files are called after it, and a file name has 255 at most."""
 
-_SHOWN, _LISTED = 60, 20
+_LISTED = 20
 
 
 def flaw_of_class_name(name: str) -> str:
     """Say what is wrong with the name of a class, as the end of "has the name ...", or "" if it is usable."""
     if not name.strip():
-        return f"{name[:_SHOWN]!r}; expected text"
+        return f"{quoted(name)}; expected text"
     return _flaw(name) or (
-        f"{clipped(name)!r} of {len(name):,} characters; expected at most {MAX_CLASS_NAME}"
+        f"{quoted(name)} of {len(name):,} characters; expected at most {MAX_CLASS_NAME}"
         if len(name) > MAX_CLASS_NAME
         else ""
     )
@@ -36,15 +37,10 @@ def flaw_of_view_name(name: str) -> str:
     flaw = _flaw(name)
     size = 0 if flaw else len(name.encode())
     return flaw or (
-        f"{clipped(name)!r} of {size:,} bytes; expected at most {MAX_VIEW_NAME}, since files are called after it"
+        f"{quoted(name)} of {size:,} bytes; expected at most {MAX_VIEW_NAME}, since files are called after it"
         if size > MAX_VIEW_NAME
         else ""
     )
-
-
-def clipped(name: str, most: int = _SHOWN) -> str:
-    """Shorten a name for a message or a table."""
-    return name if len(name) <= most else name[: most - 3] + "..."
 
 
 def listed(names: Iterable[str]) -> str:
@@ -77,10 +73,10 @@ def class_ids(wanted: Iterable[str], class_names: Mapping[int, str]) -> list[int
         meant = [number] if number in class_names else [k for k, known in class_names.items() if known == name]
         if not meant:
             known = listed(f"{k} ({clipped(known)})" for k, known in class_names.items())
-            raise SettingsError(f"class {clipped(name)!r} does not exist; expected one of {known}")
+            raise SettingsError(f"class {quoted(name)} does not exist; expected one of {known}")
         if len(meant) > 1:
             raise SettingsError(
-                f"{len(meant)} classes have the name {clipped(name)!r}; expected one of their ids, "
+                f"{len(meant)} classes have the name {quoted(name)}; expected one of their ids, "
                 f"{listed(map(str, meant))}"
             )
         ids += meant
@@ -90,4 +86,4 @@ def class_ids(wanted: Iterable[str], class_names: Mapping[int, str]) -> list[int
 def _flaw(name: str) -> str:
     # Cc: control characters; Cs: halves of characters, which no file can hold; Zl, Zp: ends of lines.
     unusable = next((c for c in name if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp")), "")
-    return f"{clipped(name)!r}, with the character {unusable!a}; expected one line of text" if unusable else ""
+    return f"{quoted(name)}, with the character {unusable!a}; expected one line of text" if unusable else ""

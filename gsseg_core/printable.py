@@ -26,6 +26,17 @@ def printable(text: str) -> str:
     return "".join(c if _stays(c) else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
+def clipped(value: object, most: int = 80) -> str:
+    """Give a foreign name or value as it goes into a message or a table: printable, and not long."""
+    text = str(value)
+    return printable(text if len(text) <= most else text[: most - 3] + "...")
+
+
+def quoted(value: object) -> str:
+    """Give a foreign value as Python writes it, in quotes if it is text, as it goes into a message."""
+    return clipped(repr(value))
+
+
 def html_text(value: object) -> str:
     """Make anything harmless between tags and in quoted attributes: `printable`, without markup."""
     return escape(printable(str(value)))

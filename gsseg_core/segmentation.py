@@ -14,10 +14,10 @@ import numpy as np
 
 from gsseg_core.atomic import write_atomically
 from gsseg_core.calibration import tempered
-from gsseg_core.errors import clipped
 from gsseg_core.neighbours import neighbours_of
 from gsseg_core.npz_files import UnfitError, check_shares, class_names_of, open_npz, temperature_of
 from gsseg_core.operator import ViewOperator
+from gsseg_core.printable import clipped
 from gsseg_core.refine import cluster, statistical_filter
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.rows import largest

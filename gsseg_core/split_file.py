@@ -6,9 +6,10 @@ from collections import Counter
 from collections.abc import Collection
 from pathlib import Path
 
-from gsseg_core.errors import SplitFileError, clipped, quoted
+from gsseg_core.errors import SplitFileError
 from gsseg_core.input_files import is_there
 from gsseg_core.json_files import kind_of, read_json
+from gsseg_core.printable import clipped, quoted
 
 
 def read_split(path: Path, views: Collection[str], within: Path | None = None) -> dict[str, list[str]]:

@@ -14,7 +14,7 @@ import numpy as np
 from gsseg_core.atomic import write_atomically
 from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
-from gsseg_core.errors import GssegError, PathTakenError, clipped, quoted
+from gsseg_core.errors import GssegError, PathTakenError
 from gsseg_core.limits import LIMITS
 from gsseg_core.masks import MAX_LABEL, UNKNOWN
 from gsseg_core.meaning import Meaning
@@ -28,6 +28,7 @@ from gsseg_core.npz_files import (
     temperature_of,
     whole_number,
 )
+from gsseg_core.printable import clipped, quoted
 from gsseg_core.soft_masks import TOLERANCE, SeenLabels
 
 FORMAT = "gsseg-state-1"

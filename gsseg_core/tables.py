@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gsseg_core.names import clipped
-from gsseg_core.printable import printable
+from gsseg_core.printable import clipped
 
 LEAST = 3
 """Views that are named as those that agree least with the others."""
@@ -14,7 +13,7 @@ LEAST = 3
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Lay out rows in columns: the first flush left, the others flush right; long cells are shortened."""
-    lines = [[clipped(printable(cell)) for cell in row] for row in (header, *rows)]
+    lines = [[clipped(cell, 60) for cell in row] for row in (header, *rows)]
     widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
     lines.insert(1, ["-" * width for width in widths])
     return "\n".join(
@@ -47,9 +46,7 @@ def segment_summary(report: Mapping[str, Any], out: str) -> str:
     views, gaussians = report["views"], report["gaussians"]
     rejected = ", ".join(f"{count} {why}" for why, count in views["rejected"].items())
     checked = [view for view in views.get("reliability", []) if view["reliability"] is not None]
-    worst = ", ".join(
-        f"{printable(clipped(view['name']))} ({percent(view['reliability'])})" for view in checked[:LEAST]
-    )
+    worst = ", ".join(f"{clipped(view['name'])} ({percent(view['reliability'])})" for view in checked[:LEAST])
     return "\n\n".join(
         [
             table(["class", "Gaussians", "confidence"], classes),

@@ -20,7 +20,7 @@ NASTY = {
     0: "background",
     1: "<script>document.title='pwned'</script>",
     2: "\"'><img src=https://example.org/x onerror=\"document.title='pwned'\">",
-    3: "</script></td>&amp; \u202e\u05d1\x00\x1b",
+    3: "</script></td>&amp; \u202e\u05d1",
 }
 
 

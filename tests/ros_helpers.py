@@ -36,7 +36,7 @@ try:
     os.environ.setdefault("ROS_PYTHON_CHECK_FIELDS", "1")
     from rclpy.context import Context
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-    from rclpy.handle import InvalidHandle
+    from rclpy.impl.implementation_singleton import rclpy_implementation
     from rclpy.node import Node
 
     with warnings.catch_warnings():
@@ -212,7 +212,8 @@ class Ros:
         # Not executor.spin(): its end, asked for from another thread, races with its own clean-up.
         try:
             while not self._closing:
-                with suppress(InvalidHandle):  # A client or subscription that the test took away in this moment.
+                # Of a client or subscription that the test took away in this moment.
+                with suppress(rclpy_implementation.InvalidHandle):
                     self.executor.spin_once(timeout_sec=0.5)
         except ExternalShutdownException:
             pass

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from small_scenes import write_dataset
 
-from gsseg_core import confined_files
+from gsseg_core import input_files
 from gsseg_core.confined_files import pinned_folder
 from gsseg_core.dataset import Dataset
 from gsseg_core.errors import CameraFileError, PathNotAllowedError, WriteError
@@ -84,9 +84,9 @@ def test_a_fifo_in_a_dataset_is_an_error_and_is_not_waited_for(root: Path) -> No
     (root / "data" / "cameras.json").symlink_to(root / "fifo")
     with pytest.raises(PathNotAllowedError):
         open_input(root / "data" / "cameras.json", root / "data")
-    with pytest.raises(OSError, match="neither a file nor a folder"):
+    with pytest.raises(OSError, match="is a named pipe"):
         open_input(root / "fifo", root)
-    with pytest.raises(CameraFileError, match="has no cameras"):
+    with pytest.raises(CameraFileError, match="is a named pipe; expected a regular file"):
         Dataset(root / "data", within=root)
 
 
@@ -94,14 +94,14 @@ def test_a_link_that_is_swapped_after_the_check_does_not_lead_out(root: Path, mo
     path, secret = root / "note.txt", root.parent / "secret.txt"
     path.write_text("mine")
     secret.write_text("secret")
-    check = confined_files._require_below
+    check = input_files.require_below
 
     def check_and_swap(*arguments: object) -> None:
         check(*arguments)  # type: ignore[arg-type]
         path.unlink()
         path.symlink_to(secret)
 
-    monkeypatch.setattr(confined_files, "_require_below", check_and_swap)
+    monkeypatch.setattr(input_files, "require_below", check_and_swap)
     with open_input(path, root) as file:
         assert file.read() == b"mine"
 

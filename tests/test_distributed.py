@@ -240,7 +240,7 @@ def test_the_command_gives_the_same_files_with_a_scheduler(address: str, data: P
     assert main(segment(data, "there", "--learner", learner, "--scheduler", address)) == 0
     here, there = data.parent / "here", data.parent / "there"
     with np.load(here / "segmentation.npz") as one, np.load(there / "segmentation.npz") as other:
-        for name in one.files:
+        for name in set(one.files) - {"header"}:  # It names the run.
             np.testing.assert_array_equal(one[name], other[name])
     reports = [json.loads((out / "report.json").read_text()) for out in (here, there)]
     assert reports[1]["settings"]["scheduler"] == address

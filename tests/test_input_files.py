@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from small_scenes import NAMES, balls_on_a_table, ring, write_dataset
+from small_scenes import balls_on_a_table, ring, write_dataset
 
 from gsseg_core import input_files, json_files
 from gsseg_core.camera_files import read_cameras
@@ -26,13 +26,12 @@ from gsseg_core.errors import (
     SplitFileError,
     StateFileError,
     SupervisesFileError,
-    clipped,
-    quoted,
 )
 from gsseg_core.input_files import open_input
 from gsseg_core.json_files import read_json
 from gsseg_core.limits import Limits
 from gsseg_core.masks import read_classes, read_mask
+from gsseg_core.printable import clipped, quoted
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.soft_files import read_soft_mask
@@ -152,8 +151,7 @@ def test_a_mask_of_another_size_than_its_camera_is_refused_before_its_pixels_are
 def test_foreign_text_in_a_message_is_short_printable_and_on_one_line(tmp_path: Path) -> None:
     assert clipped("a\nb\x1b[31m\u202e") == r"a\nb\x1b[31m\u202e" and clipped("käse") == "käse"
     assert len(clipped("x" * 5000)) == len(quoted("y" * 5000)) == 80
-    names = {**NAMES, 1: "x" * 5000}
-    write_dataset(tmp_path, names=names, scene=SCENE, truth=balls_on_a_table()[1])
+    write_dataset(tmp_path, scene=SCENE, truth=balls_on_a_table()[1])
     (tmp_path / "split.json").write_text('{"train": ["' + "z" * 5000 + '"]}')
     refused(lambda: Dataset(tmp_path), SplitFileError, "zzz...")
 

@@ -76,7 +76,7 @@ def test_markup_in_names_is_text(outline: Outline) -> None:
     assert not any("onerror" in attributes for _, attributes in outline.elements)
     said = "".join(outline.said)
     assert NASTY[1] in said and NASTY[2] in said
-    assert "</script></td>&amp; \\u202e\u05d1\\x00\\x1b" in said
+    assert "</script></td>&amp; \\u202e\u05d1" in said
 
 
 def test_page_is_small_and_tells_what_report_json_tells(out: Path, outline: Outline) -> None:
