@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from gsseg_core.cli_shared import add_quiet, load_kernels
 from gsseg_core.errors import SettingsError
+from gsseg_core.terminal import tell
 
 if TYPE_CHECKING:
     from gsseg_core.view_access import Listener
@@ -99,9 +100,9 @@ def _show(options: argparse.Namespace, listener: Listener, viewer_module: Module
         device=options.device,
     )
     with closing(viewer), suppress(KeyboardInterrupt):  # How it is meant to end.
-        print(f"gsseg: {len(scene):,} Gaussians at {viewer.url} (Ctrl-C ends it)", flush=True)
+        tell(f"gsseg: {len(scene):,} Gaussians at {viewer.url} (Ctrl-C ends it)")
         if listener.everywhere:
-            print("gsseg: from elsewhere, put a name or address of this machine in place of localhost", flush=True)
+            tell("gsseg: from elsewhere, put a name or address of this machine in place of localhost")
         # Without a screen, that would start a browser of text in this very terminal.
         if options.open and any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
             webbrowser.open(viewer.url)
