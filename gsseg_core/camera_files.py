@@ -279,7 +279,8 @@ def _inverse(
     """World-to-camera (4, 4) of a camera-to-world rotation and position; not rigid where the rotation is none."""
     pose = np.eye(4)
     pose[:3, :3] = rotation.T
-    pose[:3, 3] = -rotation.T @ position
+    with np.errstate(all="ignore"):  # A camera refuses what is NaN or too large.
+        pose[:3, 3] = -rotation.T @ position
     return pose
 
 

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from gsseg_core.errors import IntrinsicsError, MaskSizeError, PoseError
 from gsseg_core.input_files import check_pixels
+from gsseg_core.limits import LIMITS
 from gsseg_core.printable import clipped
 
 # Poses come from text files of few digits; a deviation this small moves no point by a pixel.
@@ -136,6 +137,10 @@ class Camera:
             raise PoseError(f"{who}: pose has shape {pose.shape}; expected (4, 4)")
         if not np.isfinite(pose).all():
             raise PoseError(f"{who}: pose holds NaN or infinite numbers; expected a rigid motion")
+        if np.abs(pose).max() > LIMITS.max_value:
+            raise PoseError(
+                f"{who}: pose holds {np.abs(pose).max():.3g}; expected at most {LIMITS.max_value:g} (limit max_value)"
+            )
         rotation = pose[:3, :3]
         determinant = np.linalg.det(rotation)
         if abs(determinant) < 1e-9:

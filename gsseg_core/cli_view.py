@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import threading
+import warnings
 import webbrowser
 from contextlib import closing, suppress
 from pathlib import Path
@@ -99,6 +100,7 @@ def _show(options: argparse.Namespace, listener: Listener, viewer_module: Module
         draw=options.draw,
         device=options.device,
     )
+    warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # A browser may leave at any moment.
     with closing(viewer), suppress(KeyboardInterrupt):  # How it is meant to end.
         tell(f"gsseg: {len(scene):,} Gaussians at {viewer.url} (Ctrl-C ends it)")
         if listener.everywhere:

@@ -11,6 +11,9 @@ class Limits:
 
     Attributes
     ----------
+    max_value : float
+        Of any number of a Gaussian, and of the position of a camera, in scene units: squares of larger ones are none
+        that float32 can hold.
     max_pixels : int
         Of a mask, a photo, or the picture of a camera: 134 million, as many as 11,585 x 11,585.
     max_npz_bytes : int
@@ -20,6 +23,7 @@ class Limits:
         Of a JSON file, or of the header of an npz: 64 MiB. In memory, JSON takes up to 20 times as much.
     """
 
+    max_value: float = 1e12
     max_pixels: int = 2**27
     max_npz_bytes: int = 2**34
     max_json_bytes: int = 2**26

@@ -123,8 +123,10 @@ def require_own_folder(out: Path, kind: str, earlier: Earlier) -> None:
     PathTakenError
         It is such a folder.
     """
-    if not out.is_dir():
+    if not os.path.lexists(out):
         return
+    if not out.is_dir():
+        raise PathTakenError(f"{out}: is not a folder; expected one, or nothing")
     there = (path.name for path in out.iterdir() if path.name not in (RUN_FILE, LOCK_FILE))
     strangers = sorted(name for name in there if not _STAGING.fullmatch(name))
     if strangers and not _own(out, kind, earlier):

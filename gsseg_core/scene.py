@@ -15,6 +15,7 @@ from numpy.lib.recfunctions import structured_to_unstructured
 
 from gsseg_core import spherical_harmonics
 from gsseg_core.errors import EmptySceneError, ScenePropertyError, SceneValueError
+from gsseg_core.limits import LIMITS
 from gsseg_core.ply import read_vertices, write_vertices
 
 _MEANS = ("x", "y", "z")
@@ -288,10 +289,10 @@ def _check_finite(
     what: str,
     source: str,
 ) -> None:
-    finite = np.isfinite(values)
-    if not finite.all():
-        bad = np.flatnonzero(~finite.all(axis=1))
+    most = LIMITS.max_value
+    if values.size and not (values.min() >= -most and values.max() <= most):
+        bad = np.flatnonzero(~(np.abs(values) <= most).all(axis=1))
         raise SceneValueError(
-            f"{source}: {bad.size} of {len(values)} Gaussians have NaN or infinite {what} "
-            f"(first at index {bad[0]}); expected finite numbers"
+            f"{source}: {bad.size} of {len(values)} Gaussians have NaN, infinite or too large {what} "
+            f"(first at index {bad[0]}); expected finite numbers, at most {most:g} in size (limit max_value)"
         )

@@ -75,7 +75,8 @@ class Frames:
             if self._picture is None:
                 continue
             changing = time.monotonic() - self._changed < RESTS
-            with suppress(GssegError):  # A window may be so small that nothing can be seen in it.
+            # A window may be so small that nothing can be seen in it; and viser warns of a browser that has just left.
+            with suppress(GssegError, UserWarning):
                 self._send(self._picture, QUICK_ROWS if changing else FINE_ROWS)
             if changing and not self._stale.wait(RESTS):
                 self._stale.set()

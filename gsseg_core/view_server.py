@@ -11,7 +11,6 @@ import inspect
 import io
 import math
 import threading
-import warnings
 from collections.abc import Callable, Iterator
 from http import HTTPStatus
 from typing import Any
@@ -52,8 +51,6 @@ def start_server(listener: Listener) -> viser.ViserServer:
     SettingsError
         This version of viser does not let itself be guarded.
     """
-    # A browser may leave while something is on its way to it.
-    warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
     # viser draws a box with its address whatever `verbose` says.
     with _guarding(listener) as guarded, contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host="127.0.0.1", port=listener.port, label="gsseg", verbose=False)

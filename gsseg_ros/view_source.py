@@ -96,7 +96,10 @@ class RosSource:
         try:
             report = self._calls.call(self._segment, Segment.Request(), ANSWER_SECONDS).report
         except SegmentationError as error:
-            if error.name == "NO_CODES":
+            if error.name == "BUSY":  # Many ask; this one can wait.
+                self._spinner.wait_for(lambda: False, timeout)
+                return None
+            if error.name in ("NOT_ACTIVE", "NO_CODES"):
                 self._shown = said
                 return None
             raise

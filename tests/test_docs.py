@@ -26,7 +26,7 @@ from gsseg_core.cli import main
 from gsseg_core.cli_parser import COMMANDS
 from gsseg_core.dataset import Dataset
 
-MOST_NOT_RUN = 4
+MOST_NOT_RUN = 7
 PROGRAMS = {
     "gsseg": "gsseg_core.cli", "segment_node": "gsseg_ros.segment_node", "replay_node": "gsseg_ros.replay_node",
     "dask": "dask", "python": "", "python3": "",

@@ -15,7 +15,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import ROSClock
 from rclpy.time import Time
 
-from gsseg_core import live
+from gsseg_core import live_results
 from gsseg_ros import diagnostics
 from gsseg_ros.complaints import KINDS, REASONS, REFUSED_POSE, Complaints
 from gsseg_ros.sim_time import SimTime, on_set_back
@@ -69,7 +69,7 @@ def test_kinds_do_not_keep_each_other_silent_and_their_number_does_not_grow(stea
 
 
 def test_every_reason_of_the_core_is_a_kind_of_its_own() -> None:
-    assert {*live._REASONS.values(), "unusable"} <= set(REASONS)
+    assert {*live_results._REASONS.values(), "unusable"} <= set(REASONS)
 
 
 # The clock

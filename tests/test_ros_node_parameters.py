@@ -71,7 +71,7 @@ def test_every_parameter_is_typed_described_and_ranged(robot: Robot) -> None:
         ("max_pixels", 2**31 - 1, "read-only"),
         ("scene_path", "/etc/passwd", "parameter scene_path, set after the start: path '/etc/passwd' is not below"),
         ("class_names", ["background", "a", "a"], "parameter class_names: 'a' occurs more than once"),
-        ("class_names", ["background", ""], "parameter class_names: name 1 is empty"),
+        ("class_names", ["background", ""], "parameter class_names: label 1 has the name ''"),
         ("scene_to_map.scale", 0.0, "scene_to_map.scale"),
         ("scene_to_map.translation", [1.0, 2.0], "scene_to_map.translation is [1.0, 2.0]; expected 3 finite numbers"),
         ("scene_to_map.rotation", [0.0] * 4, "scene_to_map.rotation is all zeros"),

@@ -129,10 +129,10 @@ def test_opacities_of_zero_and_one_are_kept_just_inside(tmp_path: Path) -> None:
         ({"sh": np.zeros((2, 2, 3))}, r"sh has shape \(2, 2, 3\); expected \(2, 1, 3\) or \(2, 4, 3\)"),
         ({"scales": np.zeros((2, 3))}, "scales hold values that are NaN or not positive"),
         ({"scales": np.full((2, 3), np.nan)}, "scales hold values that are NaN or not positive"),
-        ({"scales": np.full((2, 3), np.inf)}, "2 of 2 Gaussians have NaN or infinite scales"),
+        ({"scales": np.full((2, 3), np.inf)}, "2 of 2 Gaussians have NaN, infinite or too large scales"),
         ({"opacities": np.array([0.5, 1.5])}, r"opacities hold values that are NaN or outside \[0, 1\]"),
         ({"opacities": np.array([0.5, np.nan])}, r"opacities hold values that are NaN or outside \[0, 1\]"),
-        ({"means": np.full((2, 3), 1e300)}, "2 of 2 Gaussians have NaN or infinite positions"),
+        ({"means": np.full((2, 3), 1e300)}, "2 of 2 Gaussians have NaN, infinite or too large positions"),
         ({"quats": np.zeros((2, 4))}, "2 of 2 Gaussians have a rotation quaternion of zero"),
     ],
 )
@@ -252,8 +252,8 @@ def test_nan_and_infinity_are_refused_with_count_and_place(
     with pytest.raises(SceneValueError) as caught:
         GaussianScene.load(write_ply(tmp_path / "in.ply", vertices, encoding))
     assert str(caught.value) == (
-        f"{tmp_path / 'in.ply'}: 2 of 6 Gaussians have NaN or infinite {what} (first at index 2); "
-        "expected finite numbers"
+        f"{tmp_path / 'in.ply'}: 2 of 6 Gaussians have NaN, infinite or too large {what} (first at index 2); "
+        "expected finite numbers, at most 1e+12 in size (limit max_value)"
     )
 
 
@@ -261,7 +261,9 @@ def test_doubles_beyond_float32_count_as_infinite(tmp_path: Path) -> None:
     vertices = random_vertices(3, kind="f8")
     vertices["z"][1] = 1e200
     for encoding in ENCODINGS:
-        with pytest.raises(SceneValueError, match=r"1 of 3 Gaussians have NaN or infinite positions \(first at"):
+        with pytest.raises(
+            SceneValueError, match="1 of 3 Gaussians have NaN, infinite or too large"
+        ):
             GaussianScene.load(write_ply(tmp_path / "in.ply", vertices, encoding))
 
 
