@@ -12,8 +12,8 @@ class Limits:
     Attributes
     ----------
     max_value : float
-        Of any number of a Gaussian, and of the position of a camera, in scene units: squares of larger ones are none
-        that float32 can hold.
+        Of the position of a Gaussian or a camera, in scene units, and of a coefficient of spherical harmonics: float32
+        cannot hold the square of much larger ones.
     max_pixels : int
         Of a mask, a photo, or the picture of a camera: 134 million, as many as 11,585 x 11,585.
     max_npz_bytes : int

@@ -27,6 +27,7 @@ _REST_COUNTS = tuple(3 * (d + 1) ** 2 - 3 for d in range(spherical_harmonics.MAX
 
 # Logits and log scales beyond these change nothing that can be seen, but the activated values would leave (0, 1), or
 # their squares the range of float32.
+_ANY = float(np.finfo(np.float32).max)
 _MAX_LOGIT = 16.0
 _MAX_LOG_SCALE = 40.0
 
@@ -172,9 +173,9 @@ class GaussianScene:
             raise EmptySceneError(f"{source}: holds no Gaussian (0 vertices); expected at least one")
         means, logits, log_scales, quats = (_columns(vertices, names) for names in (_MEANS, _OPACITY, _SCALES, _QUATS))
         _check_finite(means, "positions", source)
-        _check_finite(logits, "opacities", source)
-        _check_finite(log_scales, "scales", source)
-        _check_finite(quats, "rotations", source)
+        _check_finite(logits, "opacities", source, _ANY)
+        _check_finite(log_scales, "scales", source, _ANY)
+        _check_finite(quats, "rotations", source, _ANY)
         _check_finite(_columns(vertices, sh_names), "SH coefficients", source)
 
         lengths = np.linalg.norm(quats.astype(np.float64), axis=1, keepdims=True)
@@ -288,11 +289,11 @@ def _check_finite(
     values: npt.NDArray[np.float32],  # (N, C)
     what: str,
     source: str,
+    most: float = LIMITS.max_value,
 ) -> None:
-    most = LIMITS.max_value
     if values.size and not (values.min() >= -most and values.max() <= most):
         bad = np.flatnonzero(~(np.abs(values) <= most).all(axis=1))
         raise SceneValueError(
             f"{source}: {bad.size} of {len(values)} Gaussians have NaN, infinite or too large {what} "
-            f"(first at index {bad[0]}); expected finite numbers, at most {most:g} in size (limit max_value)"
+            f"(first at index {bad[0]}); expected finite numbers, at most {most:.3g} in size (limit max_value)"
         )
