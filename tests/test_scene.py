@@ -261,9 +261,7 @@ def test_doubles_beyond_float32_count_as_infinite(tmp_path: Path) -> None:
     vertices = random_vertices(3, kind="f8")
     vertices["z"][1] = 1e200
     for encoding in ENCODINGS:
-        with pytest.raises(
-            SceneValueError, match="1 of 3 Gaussians have NaN, infinite or too large"
-        ):
+        with pytest.raises(SceneValueError, match="1 of 3 Gaussians have NaN, infinite or too large"):
             GaussianScene.load(write_ply(tmp_path / "in.ply", vertices, encoding))
 
 
