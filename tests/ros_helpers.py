@@ -59,6 +59,11 @@ def next_domain() -> int:
     return _WORKER * share + next(_counter) % share + 1
 
 
+def own_domain() -> int:
+    """A ROS domain for a program that runs for long: 215 to 232, where no tests are."""
+    return os.getpid() % 18 + 215
+
+
 def wait_until(condition: Callable[[], Any], what: str, timeout: float = PATIENCE) -> None:
     """Wait until the condition holds; fails the test, saying what was waited for."""
     deadline = time.monotonic() + timeout
@@ -140,8 +145,8 @@ class Process:
 class Ros:
     """A ROS context of its own in a domain of its own, with a node that a thread spins."""
 
-    def __init__(self, folder: Path) -> None:
-        self.domain = next_domain()
+    def __init__(self, folder: Path, domain: int | None = None) -> None:
+        self.domain = next_domain() if domain is None else domain
         self.environment = {
             **os.environ,
             "ROS_DOMAIN_ID": str(self.domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
