@@ -150,7 +150,7 @@ def _changed_array(array: np.ndarray, rng: random.Random) -> np.ndarray:
         return shapes[rng.randrange(len(shapes))]
     if kind == "type":
         with np.errstate(all="ignore"):
-                    numbers = ("?", "i1", "u8", "i8", "f2", "f8", "c16", "M8[s]")
+            numbers = ("?", "i1", "u8", "i8", "f2", "f8", "c16", "M8[s]")
             return array.astype(rng.choice(("S5", "U5", *(() if array.dtype.kind in "SU" else numbers))))
     if array.dtype.kind not in "iufb" or not array.size:
         return np.zeros_like(array)
