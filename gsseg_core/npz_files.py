@@ -164,7 +164,8 @@ def class_names_of(header: dict[str, Any]) -> dict[int, str]:
 
 def check_shares(name: str, rows: npt.NDArray[np.float32]) -> None:  # (N, K)
     """Raise `UnfitError` unless every row holds probabilities that sum to 1, or zeros."""
-    sums, low = rows.sum(axis=1, dtype=np.float64), rows.min(axis=1, initial=0)
+    with np.errstate(all="ignore"):  # What is infinite or NaN is found below.
+        sums, low = rows.sum(axis=1, dtype=np.float64), rows.min(axis=1, initial=0)
     bad = np.flatnonzero(~((low >= 0) & ((sums == 0) | (np.abs(sums - 1) <= SHARES_TOLERANCE))))
     if bad.size:
         i = int(bad[0])
