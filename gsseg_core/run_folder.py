@@ -123,10 +123,9 @@ def require_own_folder(out: Path, kind: str, earlier: Earlier) -> None:
     PathTakenError
         It is such a folder.
     """
-    if not os.path.lexists(out):
-        return
+    _refuse_no_folder(out)
     if not out.is_dir():
-        raise PathTakenError(f"{out}: is not a folder; expected one, or nothing")
+        return
     there = (path.name for path in out.iterdir() if path.name not in (RUN_FILE, LOCK_FILE))
     strangers = sorted(name for name in there if not _STAGING.fullmatch(name))
     if strangers and not _own(out, kind, earlier):
@@ -160,8 +159,7 @@ class StagedRun:
     def begin(self, only_own: bool) -> None:
         """Make the folder, finish or remove what dead runs left in it, and see that something can be written there."""
         try:
-            if os.path.lexists(self.out) and not self.out.is_dir():
-                raise PathTakenError(f"{self.out}: is not a folder; expected one, or nothing")
+            _refuse_no_folder(self.out)
             self._made = [path for path in (self.out, *self.out.parents) if not path.exists()]
             self.out.mkdir(parents=True, exist_ok=True)
             with _locked(self.out):
@@ -255,6 +253,11 @@ class StagedRun:
         for i, place in enumerate(places):
             with contextlib.suppress(OSError):
                 os.link(self.out / place, self._staging / "old" / str(i))
+
+
+def _refuse_no_folder(out: Path) -> None:
+    if os.path.lexists(out) and not out.is_dir():
+        raise PathTakenError(f"{out}: is not a folder; expected one, or nothing")
 
 
 def _own(out: Path, kind: str, earlier: Earlier) -> dict[str, FileRecord | None]:
