@@ -22,11 +22,12 @@ from unittest import mock
 
 import pytest
 from doc_blocks import REPOSITORY
+from patience import PATIENCE
 
 from gsseg_core.cli import main
 from gsseg_core.cli_parser import build_parser
 
-TIMEOUT = 60
+TIMEOUT = PATIENCE
 _SHELL = re.compile(r"[|&><;`]|\$\(")
 
 

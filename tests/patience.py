@@ -2,5 +2,5 @@
 
 from __future__ import annotations
 
-PATIENCE = 180.0
+PATIENCE = 300.0
 """Seconds until a wait gives up."""

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from patience import PATIENCE
 from ros_helpers import Process, Ros
 from small_scenes import NAMES, write_dataset
 
@@ -86,7 +87,7 @@ class Background:
         self._thread.start()
 
     def join(self) -> None:
-        self._thread.join(30)
+        self._thread.join(PATIENCE)
         assert not self._thread.is_alive(), "the call does not return"
 
     def _run(self) -> None:

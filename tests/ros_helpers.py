@@ -107,7 +107,7 @@ class Process:
         except subprocess.TimeoutExpired:
             self.kill()
             pytest.fail(f"{self._name} did not end within {timeout:g} s; its output:\n{self.output}")
-        self._reader.join(5)
+        self._reader.join(PATIENCE)
         return code
 
     def wait_for(self, text: str, timeout: float = PATIENCE) -> None:
@@ -115,7 +115,7 @@ class Process:
         deadline = time.monotonic() + timeout
         while text not in self.output:
             if not self.running:
-                self._reader.join(5)
+                self._reader.join(PATIENCE)
             if time.monotonic() > deadline or (not self.running and text not in self.output):
                 pytest.fail(f"{self._name} did not write {text!r}; its output:\n{self.output}")
             time.sleep(0.01)
@@ -124,7 +124,7 @@ class Process:
         """Send a signal."""
         self._process.send_signal(number)
 
-    def stop(self, timeout: float = 10.0) -> int:
+    def stop(self, timeout: float = PATIENCE) -> int:
         """End it as Ctrl-C does and return the exit code; kills it and fails the test if it does not end."""
         if self.running:
             self.send(signal.SIGINT)
@@ -133,8 +133,8 @@ class Process:
     def kill(self) -> None:
         """End it whatever it does; harmless where it has ended."""
         self._process.kill()
-        self._process.wait(10)
-        self._reader.join(5)
+        self._process.wait(PATIENCE)
+        self._reader.join(PATIENCE)
 
     def _read(self) -> None:
         assert self._process.stdout is not None
@@ -207,7 +207,7 @@ class Ros:
             process.kill()
         self._closing = True
         self.executor.wake()
-        self._thread.join(10)
+        self._thread.join(PATIENCE)
         self.executor.shutdown(5)
         self.node.destroy_node()
         self.context.try_shutdown()

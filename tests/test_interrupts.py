@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from patience import PATIENCE
 
 # Like `bin/gsseg`. A finder that finds nothing counts imports, and interrupts a copy of the process at every so many.
 COPIES = """
@@ -54,7 +55,7 @@ sys.exit(main())
 
 def run(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-c", program, *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE)
 
 
 @pytest.mark.parametrize(
@@ -95,5 +96,5 @@ def test_ctrl_c_while_kernels_compile_ends_with_130_and_not_a_word(tmp_path: Pat
         assert process.stdout is not None and process.stderr is not None
         assert b"compiling kernels" in process.stderr.readline()
         process.send_signal(signal.SIGINT)
-        assert process.communicate(timeout=120) == (b"", b"")
+        assert process.communicate(timeout=PATIENCE) == (b"", b"")
     assert process.returncode == 130

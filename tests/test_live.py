@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, taught, write_dataset, wrong_views
 
 from gsseg_core import live
@@ -292,7 +293,7 @@ def test_threads_that_fuse_learn_and_segment_at_once_lose_nothing() -> None:
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(60)
+        thread.join(PATIENCE)
     assert not errors and not any(thread.is_alive() for thread in threads)
     assert session.num_fused == len(VIEWS)
     session._learnt = None

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros, wait_until
 from ros_node_here import NodeHere, node_here
@@ -46,7 +47,7 @@ def in_thread(work: Callable[[], Any]) -> tuple[threading.Thread, list[Any]]:
 
 
 def joined(thread: threading.Thread) -> None:
-    thread.join(30)
+    thread.join(PATIENCE)
     assert not thread.is_alive()
 
 

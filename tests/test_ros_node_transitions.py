@@ -117,7 +117,7 @@ def test_a_misspelt_quality_of_service_is_one_clear_error(
     robot = Robot(ros)
     topic, _, policy = override.split(".")
     process = robot.start({**parameters, f"qos_overrides.{override}": "relible"}, lossless=False)
-    process.wait_for(f"cannot be {step}", timeout=120)
+    process.wait_for(f"cannot be {step}")
     assert robot.state == state
     (line,) = (line for line in process.output.splitlines() if "[ERROR]" in line)
     assert f"cannot be {step}: parameters qos_overrides of the topic " in line and topic.split("/")[-1] in line
@@ -159,7 +159,7 @@ def test_a_signal_is_heard_while_kernels_compile_and_so_are_questions(
     if how == "change_state":
         process.wait_for("autostart is false")
         robot.send("change_state", transition=CONFIGURE)
-    process.wait_for("compiling kernels", timeout=120)
+    process.wait_for("compiling kernels")
     assert robot.state == "configuring"
     process.send(number)
     assert process.wait(5) == 0, process.output

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 from ros_fixtures import shared_fixture  # noqa: F401
 from ros_helpers import Ros
 from small_scenes import NAMES, balls_on_a_table, clean_views
@@ -145,7 +146,7 @@ def test_two_runs_do_not_publish_at_the_same_time() -> None:
         thread.start()
         thread.join(0.2)
         assert thread.is_alive() and not took
-    thread.join(30)
+    thread.join(PATIENCE)
     assert took == [2]
 
 

@@ -54,8 +54,11 @@ def test_the_policy_lists_exactly_what_the_running_node_has(ros: Ros, tmp_path: 
         policy = listed(kind, permission)
         ros.wait_until(lambda a=ask, p=policy: unused(names(a), p) <= ONE_OF, f"what the policy allows to {permission}")
         assert not uncovered(names(ask), policy), f"{permission}: the node has more than the policy"
-    actions = {name for name, _ in get_action_server_names_and_types_by_node(graph, "gsseg", "/")}
-    assert actions == listed("action", "execute")
+
+    def actions() -> set[str]:
+        return {name for name, _ in get_action_server_names_and_types_by_node(graph, "gsseg", "/")}
+
+    ros.wait_until(lambda: actions() == listed("action", "execute"), "the actions of the node")
 
 
 def assert_listed(ros: Ros, node: str, unused_allowed: set[str]) -> None:
@@ -78,13 +81,16 @@ def assert_listed(ros: Ros, node: str, unused_allowed: set[str]) -> None:
             f"what the policy allows {node} to {permission}: {sorted(policy)}, and it has {sorted(names())}",
         )
         assert not uncovered(names(), policy), f"{permission}: {node} has more than the policy"
-    actions = {name for name, _ in get_action_client_names_and_types_by_node(graph, node, "/")}
-    assert actions == listed("action", "call", node)
+
+    def actions() -> set[str]:
+        return {name for name, _ in get_action_client_names_and_types_by_node(graph, node, "/")}
+
+    ros.wait_until(lambda: actions() == listed("action", "call", node), f"the actions that {node} calls")
 
 
 def test_the_policy_lists_exactly_what_replay_client_and_viewer_have(ros: Ros, tmp_path: Path) -> None:
     data = write_dataset(tmp_path / "data")
-    ros.start("segment_node", {"scene_path": data / "scene.ply"}).wait_for("active: listening", timeout=120)
+    ros.start("segment_node", {"scene_path": data / "scene.ply"}).wait_for("active: listening")
     ros.start("replay_node", {"data": data, "rate": 0.1})
     assert_listed(ros, "replay", {"/clock"})
     with SegmentationClient(domain_id=ros.domain) as client:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 from small_scenes import clean_views, write_dataset
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
@@ -26,7 +27,7 @@ BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 def ran(program: str, *arguments: object) -> subprocess.CompletedProcess[str]:
     """Run a program in a process of its own: it forks, which one that has used OpenMP cannot."""
     command = [sys.executable, str(BENCHMARKS / program), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300)
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
 
 
 def test_kills_are_counted_and_drawn_again_by_their_number(tmp_path: Path) -> None:
