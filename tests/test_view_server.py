@@ -103,6 +103,8 @@ def connected(viewer: Viewer, host: str = "localhost", origin: str | None = None
         subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
         max_size=None,
         open_timeout=PATIENCE,
+        max_queue=None,  # What is not read yet must not keep pings from being answered.
+        ping_interval=None,
     )
 
 
