@@ -28,10 +28,10 @@ from plots import Axis, draw_panels
 from results import machine, markdown, points
 from scipy import ndimage
 
-from gsseg_core.atomic import write_atomically
 from gsseg_core.dataset import Dataset, View
 from gsseg_core.demo_scene import build_demo
 from gsseg_core.em import EMLearner
+from gsseg_core.files.atomic import write_atomically
 from gsseg_core.graph import GraphSettings, graph_of, propagate
 from gsseg_core.metrics import Evaluation
 from gsseg_core.operator import ViewOperator, make_operator

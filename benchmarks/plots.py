@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-from gsseg_core.atomic import write_atomically
+from gsseg_core.files.atomic import write_atomically
 
 COLORS = ("#2f6fd0", "#7fb0ec", "#d1495b", "#4a9c5d", "#e09f3e")
 INK, FAINT, GRID = "#202226", "#80838a", "#e4e5e8"

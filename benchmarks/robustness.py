@@ -28,10 +28,10 @@ from results import machine, markdown, points, score
 from robustness_text import BAR, CURVES, HEADER, RELIABILITY
 from scipy.stats import spearmanr
 
-from gsseg_core.atomic import write_atomically
 from gsseg_core.dataset import Dataset, View, spread
 from gsseg_core.demo_scene import build_demo
 from gsseg_core.em import EMLearner, EMSettings
+from gsseg_core.files.atomic import write_atomically
 from gsseg_core.learner import Learner
 from gsseg_core.mask_errors import MaskErrors
 from gsseg_core.pipeline import make_learner

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.errors import IntrinsicsError, MaskSizeError, PoseError
-from gsseg_core.input_files import check_pixels
-from gsseg_core.limits import LIMITS
+from gsseg_core.files.input_files import check_pixels
+from gsseg_core.files.limits import LIMITS
 from gsseg_core.printable import clipped
 
 # Poses come from text files of few digits; a deviation this small moves no point by a pixel.

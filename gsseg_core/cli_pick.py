@@ -38,12 +38,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Pick, and say what was written."""
     from gsseg_core.dataset import Dataset, View
-    from gsseg_core.earlier_outputs import earlier_pick
     from gsseg_core.export import background_image
+    from gsseg_core.files.earlier_outputs import earlier_pick
+    from gsseg_core.files.run_folder import staged_run
     from gsseg_core.operator import make_operator
     from gsseg_core.pick import pick_clicks, pick_mask, read_object_mask
     from gsseg_core.pictures import overlay, palette, save_png
-    from gsseg_core.run_folder import staged_run
     from gsseg_core.scene import GaussianScene
 
     cameras = {camera.name: camera for camera in Dataset(options.data).cameras}

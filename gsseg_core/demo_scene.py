@@ -18,11 +18,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from gsseg_core.atomic import write_atomically
 from gsseg_core.cameras import Camera
+from gsseg_core.files.atomic import write_atomically
+from gsseg_core.files.run_folder import staged_run
 from gsseg_core.mask_errors import MaskErrors, corrupt
 from gsseg_core.masks import write_mask
-from gsseg_core.run_folder import staged_run
 from gsseg_core.scene import GaussianScene
 from gsseg_core.solids import Box, Cone, Ellipsoid, Solid, dot
 from gsseg_core.spherical_harmonics import C0, basis

@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.atomic import write_atomically
 from gsseg_core.dataset import View
-from gsseg_core.earlier_outputs import earlier_classes
+from gsseg_core.files.atomic import write_atomically
+from gsseg_core.files.earlier_outputs import earlier_classes
+from gsseg_core.files.run_folder import staged_run
 from gsseg_core.operator import ViewOperator, make_operator
 from gsseg_core.pictures import contact_sheet, legend, overlay, palette, save_png
 from gsseg_core.ply import write_vertices
-from gsseg_core.run_folder import staged_run
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
@@ -36,7 +36,7 @@ def export_classes(
 
     Two properties are added: `label` (int), the class, and `confidence` (float), that of the segmentation.
 
-    All PLYs of an earlier export are replaced in one step, as `gsseg_core.run_folder` says; other files stay.
+    All PLYs of an earlier export are replaced in one step, as `gsseg_core.files.run_folder` says; other files stay.
 
     Raises
     ------

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from gsseg_core.atomic import write_atomically
+from gsseg_core.files.atomic import write_atomically
 from gsseg_core.masks import run_text
 
 BACKGROUND = (58, 60, 66)

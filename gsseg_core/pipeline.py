@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gsseg_core.dataset import Dataset, View, spread
-from gsseg_core.earlier_outputs import earlier_render, earlier_segment
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.export import (
@@ -25,6 +24,8 @@ from gsseg_core.export import (
     write_overview,
     write_pictures,
 )
+from gsseg_core.files.earlier_outputs import earlier_render, earlier_segment
+from gsseg_core.files.run_folder import StagedRun, staged_run
 from gsseg_core.graph import GraphSettings, is_scarce, spread_if_scarce
 from gsseg_core.held_out import calibrate
 from gsseg_core.layout import mask_hint
@@ -38,7 +39,6 @@ from gsseg_core.report import Stopwatch, build_report
 from gsseg_core.report_findings import Evidence
 from gsseg_core.report_page import write_report_page
 from gsseg_core.report_pictures import ViewImages
-from gsseg_core.run_folder import StagedRun, staged_run
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.votes import VoteLearner

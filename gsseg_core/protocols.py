@@ -18,7 +18,7 @@ import numpy as np
 from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
 from gsseg_core.errors import CameraFileError, MaskFormatError, MaskSizeError
-from gsseg_core.input_files import open_image
+from gsseg_core.files.input_files import open_image
 from gsseg_core.masks import UNKNOWN
 from gsseg_core.metrics import Evaluation
 

@@ -13,7 +13,7 @@ from PIL import Image
 from gsseg_core.dataset import View
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.export import background_image
-from gsseg_core.input_files import open_image
+from gsseg_core.files.input_files import open_image
 from gsseg_core.masks import UNKNOWN, PackedLabels
 from gsseg_core.operator import make_operator
 from gsseg_core.pictures import outline, overlay

@@ -15,7 +15,7 @@ from numpy.lib.recfunctions import structured_to_unstructured
 
 from gsseg_core import spherical_harmonics
 from gsseg_core.errors import EmptySceneError, ScenePropertyError, SceneValueError
-from gsseg_core.limits import LIMITS
+from gsseg_core.files.limits import LIMITS
 from gsseg_core.ply import read_vertices, write_vertices
 
 _MEANS = ("x", "y", "z")

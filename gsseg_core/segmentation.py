@@ -12,16 +12,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsseg_core.atomic import write_atomically
 from gsseg_core.calibration import tempered
+from gsseg_core.files.atomic import write_atomically
+from gsseg_core.files.npz_files import UnfitError, check_shares, class_names_of, open_npz, temperature_of
+from gsseg_core.files.run_folder import settle
 from gsseg_core.neighbours import neighbours_of
-from gsseg_core.npz_files import UnfitError, check_shares, class_names_of, open_npz, temperature_of
 from gsseg_core.operator import ViewOperator
 from gsseg_core.printable import clipped
 from gsseg_core.refine import cluster, statistical_filter
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.rows import largest
-from gsseg_core.run_folder import settle
 from gsseg_core.scene import GaussianScene
 
 UNOBSERVED, REMOVED = -1, -2
@@ -256,7 +256,7 @@ class Segmentation:
         StateMismatchError
             It belongs to another scene.
         WriteError
-            The run that wrote it was cut short at its very end, and cannot be finished now (`gsseg_core.run_folder`).
+            The run that wrote it was cut short at its very end, and cannot be finished now (`gsseg_core.files.run_folder`).
         """
         path = Path(path)
         settle(path.parent)

@@ -22,7 +22,7 @@ from gsseg_core.dataset import View
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.error_model import ErrorModel
 from gsseg_core.errors import GssegError
-from gsseg_core.input_files import open_input
+from gsseg_core.files.input_files import open_input
 from gsseg_core.learner import UNITS
 from gsseg_core.rows import Rows
 from gsseg_core.scene import DC, GaussianScene

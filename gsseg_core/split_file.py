@@ -7,8 +7,8 @@ from collections.abc import Collection
 from pathlib import Path
 
 from gsseg_core.errors import SplitFileError
-from gsseg_core.input_files import is_there
-from gsseg_core.json_files import kind_of, read_json
+from gsseg_core.files.input_files import is_there
+from gsseg_core.files.json_files import kind_of, read_json
 from gsseg_core.printable import clipped, quoted
 
 

@@ -11,14 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from gsseg_core.atomic import write_atomically
 from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
 from gsseg_core.errors import GssegError, PathTakenError
-from gsseg_core.limits import LIMITS
-from gsseg_core.masks import MAX_LABEL, UNKNOWN
-from gsseg_core.meaning import Meaning
-from gsseg_core.npz_files import (
+from gsseg_core.files.atomic import write_atomically
+from gsseg_core.files.limits import LIMITS
+from gsseg_core.files.npz_files import (
     NpzArrays,
     UnfitError,
     check_shares,
@@ -28,6 +26,8 @@ from gsseg_core.npz_files import (
     temperature_of,
     whole_number,
 )
+from gsseg_core.masks import MAX_LABEL, UNKNOWN
+from gsseg_core.meaning import Meaning
 from gsseg_core.printable import clipped, quoted
 from gsseg_core.soft_masks import TOLERANCE, SeenLabels
 

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from gsseg_core.errors import StateFileError, UnknownLabelError
-from gsseg_core.json_files import read_json
+from gsseg_core.files.json_files import read_json
+from gsseg_core.files.npz_files import SHARES_TOLERANCE
 from gsseg_core.masks import BACKGROUND_NAME
-from gsseg_core.npz_files import SHARES_TOLERANCE
 from gsseg_core.pictures import palette
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation

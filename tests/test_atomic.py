@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from gsseg_core.atomic import check_writable, write_atomically
 from gsseg_core.errors import GssegError, PathTakenError, SettingsError, WriteError
+from gsseg_core.files.atomic import check_writable, write_atomically
 
 
 @contextlib.contextmanager

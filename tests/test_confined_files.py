@@ -11,11 +11,11 @@ import pytest
 from PIL import Image
 from small_scenes import write_dataset
 
-from gsseg_core import input_files
-from gsseg_core.confined_files import pinned_folder
 from gsseg_core.dataset import Dataset
 from gsseg_core.errors import CameraFileError, PathNotAllowedError, WriteError
-from gsseg_core.input_files import open_input
+from gsseg_core.files import input_files
+from gsseg_core.files.confined_files import pinned_folder
+from gsseg_core.files.input_files import open_input
 from gsseg_core.scene import GaussianScene
 
 

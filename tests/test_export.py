@@ -20,8 +20,8 @@ from gsseg_core.export import (
     write_json,
     write_pictures,
 )
+from gsseg_core.files.run_folder import RUN_FILE
 from gsseg_core.refine_settings import RefineSettings
-from gsseg_core.run_folder import RUN_FILE
 from gsseg_core.scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 

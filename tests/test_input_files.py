@@ -15,7 +15,6 @@ import pytest
 from PIL import Image
 from small_scenes import balls_on_a_table, ring, write_dataset
 
-from gsseg_core import input_files, json_files
 from gsseg_core.camera_files import read_cameras
 from gsseg_core.dataset import Dataset
 from gsseg_core.errors import (
@@ -27,9 +26,10 @@ from gsseg_core.errors import (
     StateFileError,
     SupervisesFileError,
 )
-from gsseg_core.input_files import open_input
-from gsseg_core.json_files import read_json
-from gsseg_core.limits import Limits
+from gsseg_core.files import input_files, json_files
+from gsseg_core.files.input_files import open_input
+from gsseg_core.files.json_files import read_json
+from gsseg_core.files.limits import Limits
 from gsseg_core.masks import read_classes, read_mask
 from gsseg_core.printable import clipped, quoted
 from gsseg_core.scene import GaussianScene

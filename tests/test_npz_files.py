@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from small_scenes import HEIGHT, NAMES, NUM_CLASSES, WIDTH, balls_on_a_table, clean_views, ring, taught
 
-from gsseg_core import npz_files
 from gsseg_core.dataset import View
 from gsseg_core.errors import GssegError, MaskFormatError, MaskSizeError, StateFileError, UnknownLabelError
-from gsseg_core.limits import Limits
+from gsseg_core.files import npz_files
+from gsseg_core.files.limits import Limits
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.state_file import State
 from gsseg_core.votes import VoteLearner

@@ -15,9 +15,9 @@ from pathlib import Path
 import pytest
 from test_atomic import small_files_only
 
-from gsseg_core import run_folder
 from gsseg_core.errors import PathTakenError, SettingsError, WriteError
-from gsseg_core.run_folder import COMMIT_FILE, RUN_FILE, settle, staged_run
+from gsseg_core.files import run_folder
+from gsseg_core.files.run_folder import COMMIT_FILE, RUN_FILE, settle, staged_run
 
 FIRST = ["a.npz", "classes/1_cup.ply", "classes/2_box.ply", "old/gone.png", "report.json"]
 SECOND = ["a.npz", "classes/1_cup.ply", "classes/3_ball.ply", "new/here.png", "report.json"]

@@ -1,6 +1,6 @@
 """Which files of a folder are results of gsseg, where it wrote no manifest: versions before it did, and bare copies.
 
-Each function is an `earlier` for `gsseg_core.run_folder.staged_run`: it takes a folder, and gives relative paths. A
+Each function is an `earlier` for `gsseg_core.files.run_folder.staged_run`: it takes a folder, and gives relative paths. A
 file counts only by what it holds, or because a report of gsseg names it.
 """
 
@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from gsseg_core.errors import GssegError
-from gsseg_core.json_files import read_json
-from gsseg_core.npz_files import npz_format
-from gsseg_core.run_manifest import is_inside
+from gsseg_core.files.json_files import read_json
+from gsseg_core.files.npz_files import npz_format
+from gsseg_core.files.run_manifest import is_inside
 
 _HEADER = 1 << 14  # bytes of a PLY in which its header ends
 

@@ -15,9 +15,9 @@ from pathlib import Path
 
 from PIL import Image, UnidentifiedImageError
 
-from gsseg_core.confined_files import OPENED, require_below
 from gsseg_core.errors import GssegError
-from gsseg_core.limits import LIMITS
+from gsseg_core.files.confined_files import OPENED, require_below
+from gsseg_core.files.limits import LIMITS
 from gsseg_core.printable import clipped
 
 _KINDS = {

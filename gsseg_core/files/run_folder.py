@@ -30,9 +30,9 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
-from gsseg_core.atomic import sync_folder, try_lock
 from gsseg_core.errors import GssegError, PathTakenError, WriteError
-from gsseg_core.run_manifest import FileRecord, Manifest
+from gsseg_core.files.atomic import sync_folder, try_lock
+from gsseg_core.files.run_manifest import FileRecord, Manifest
 
 RUN_FILE, COMMIT_FILE, LOCK_FILE = ".gsseg-run.json", ".gsseg-commit.json", ".gsseg-lock"
 

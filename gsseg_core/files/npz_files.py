@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.errors import GssegError, StateFileError, StateMismatchError
-from gsseg_core.input_files import open_input, reason
-from gsseg_core.limits import LIMITS
+from gsseg_core.files.input_files import open_input, reason
+from gsseg_core.files.limits import LIMITS
 from gsseg_core.masks import MAX_LABEL
 from gsseg_core.printable import clipped, quoted
 

@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 
 from gsseg_core.errors import GssegError
-from gsseg_core.input_files import open_input, reason
-from gsseg_core.limits import LIMITS
+from gsseg_core.files.input_files import open_input, reason
+from gsseg_core.files.limits import LIMITS
 from gsseg_core.printable import clipped
 
 _KINDS = {

@@ -1,0 +1,1 @@
+"""Files in and out: opened with care, read within limits, written whole or not at all."""
