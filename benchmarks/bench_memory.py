@@ -11,11 +11,11 @@ import numpy as np
 from machine import describe, peak_memory
 from workloads import RoomSize, make_room
 
+from gsseg_core.csr_rows import Rows
 from gsseg_core.dataset import View
 from gsseg_core.em import EMLearner
 from gsseg_core.learner import MEMORY_BUDGET
 from gsseg_core.operator import make_operator
-from gsseg_core.rows import Rows
 from gsseg_core.segmentation import Segmentation
 
 

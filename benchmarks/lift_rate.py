@@ -37,8 +37,8 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from gsseg_core.blend import in_tile
-from gsseg_core.lanes import LANES
 from gsseg_core.projection import Projected
+from gsseg_core.simd import LANES
 from gsseg_core.splat import ALPHA_MAX, HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, T_MIN, WIDTH, U, V
 from gsseg_core.tiles import TILE, Tiles
 

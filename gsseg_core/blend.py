@@ -18,7 +18,7 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from gsseg_core.lanes import first_bit, prefetch, store_row
+from gsseg_core.simd import first_bit, prefetch, store_row
 from gsseg_core.splat import OPEN, SIDE, WIDTH, aim, blend_block
 from gsseg_core.tiles import TILE
 

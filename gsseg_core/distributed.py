@@ -18,12 +18,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from gsseg_core.csr_rows import Rows
 from gsseg_core.dataset import View
 from gsseg_core.em import EMLearner
 from gsseg_core.error_model import ErrorModel
 from gsseg_core.errors import GssegError, SchedulerError
 from gsseg_core.learner import Learner, Progress, silent
-from gsseg_core.rows import Rows
 from gsseg_core.scene import GaussianScene
 from gsseg_core.scheduler import PATIENCE, UNREACHABLE, check_workers, find_workers, name_of
 from gsseg_core.shard import (

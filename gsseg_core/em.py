@@ -56,6 +56,7 @@ from functools import partial
 
 import numpy as np
 
+from gsseg_core.csr_rows import Rows, starts
 from gsseg_core.error_model import ErrorModel
 from gsseg_core.errors import SettingsError
 from gsseg_core.gaussian_kernels import collect, improve, improve_without, mix, promised, tally
@@ -66,7 +67,6 @@ from gsseg_core.operator import Observation, ViewOperator, make_operator
 from gsseg_core.others import counted_by_others
 from gsseg_core.outlines import scene_edges, settle_outlines
 from gsseg_core.regions import by_region, in_doubt, take_back
-from gsseg_core.rows import Rows, starts
 from gsseg_core.scene import GaussianScene
 from gsseg_core.soft_masks import SeenLabels
 

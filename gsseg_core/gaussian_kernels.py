@@ -10,7 +10,7 @@ import numpy as np
 from llvmlite import ir
 from numba.core import types
 
-from gsseg_core.lanes import intrinsic
+from gsseg_core.simd import intrinsic
 
 BLOCKS = 16
 """Counts are summed in this many parts, then together, so that they do not depend on the number of threads."""

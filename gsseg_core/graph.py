@@ -25,11 +25,11 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
+from gsseg_core.csr_rows import starts
 from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.kd_tree import Tree, scaled, tree_of
 from gsseg_core.nearest import CHUNK, nearest
 from gsseg_core.per_scene import PerScene
-from gsseg_core.rows import starts
 from gsseg_core.scene import GaussianScene
 
 BLOCK = 16

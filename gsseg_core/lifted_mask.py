@@ -11,10 +11,10 @@ import numpy as np
 
 from gsseg_core.blend import AHEAD
 from gsseg_core.cameras import Camera
-from gsseg_core.lanes import prefetch
+from gsseg_core.csr_rows import starts
 from gsseg_core.lift import Labels, cut_labels, lift
 from gsseg_core.meaning import Meaning
-from gsseg_core.rows import starts
+from gsseg_core.simd import prefetch
 from gsseg_core.tiles import Tiles
 
 CHUNKS = 16

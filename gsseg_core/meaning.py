@@ -21,8 +21,8 @@ from functools import cached_property
 import numba as nb
 import numpy as np
 
+from gsseg_core.csr_rows import Rows, starts
 from gsseg_core.masks import UNKNOWN
-from gsseg_core.rows import Rows, starts
 
 _ROUNDS = 50
 

@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.kd_tree import LEAF, gap_to_point, leaf_of, leaf_range
-from gsseg_core.lanes import count_at_most
+from gsseg_core.simd import count_at_most
 from gsseg_core.surroundings import DEPTH, FAR, Surroundings, end_of_group, look_around, measure, room_for
 
 DIGITS = 24

@@ -27,10 +27,10 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
+from gsseg_core.csr_rows import starts
 from gsseg_core.operator import ViewOperator
 from gsseg_core.per_scene import PerScene
 from gsseg_core.regions import connected_pixels
-from gsseg_core.rows import starts
 from gsseg_core.scene import GaussianScene
 
 SHARPNESS = 3.0

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from gsseg_core.calibration import VIEWS, Sample, sample_pixels
+from gsseg_core.csr_rows import Rows
 from gsseg_core.dataset import View, spread
 from gsseg_core.em import EMLearner, codes_without
 from gsseg_core.export import background_image
@@ -27,7 +28,6 @@ from gsseg_core.masks import UNKNOWN, PackedLabels
 from gsseg_core.meaning import Meaning
 from gsseg_core.operator import make_operator
 from gsseg_core.pictures import contact_sheet, overlay, palette
-from gsseg_core.rows import Rows
 
 CONFUSIONS = 3
 """Most confusions that the report of a view names."""

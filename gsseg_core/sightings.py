@@ -12,7 +12,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.blend import AHEAD, open_rays, stride_of, tile_of_turn
-from gsseg_core.lanes import (
+from gsseg_core.simd import (
     FAST,
     add_product,
     add_product_where,

@@ -1,6 +1,6 @@
 """One projected Gaussian over the pixels of a tile: which blocks it reaches, and how it is blended into one of them.
 
-Both are vector instructions on sixteen numbers (`gsseg_core.lanes`): the sixteen rows of a tile, and the sixteen pixels
+Both are vector instructions on sixteen numbers (`gsseg_core.simd`): the sixteen rows of a tile, and the sixteen pixels
 of a block. A row of the table of projected Gaussians is what they read of it.
 """
 
@@ -13,7 +13,7 @@ from typing import Any
 from llvmlite import ir
 from numba.core import cgutils, types
 
-from gsseg_core.lanes import BITS, F32, I64, LANES, ROW, Builder, constant, intrinsic, row_type
+from gsseg_core.simd import BITS, F32, I64, LANES, ROW, Builder, constant, intrinsic, row_type
 
 SIDE = 4
 """Side of a block in px: its sixteen pixels, row by row, are one vector."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
-from gsseg_core.lanes import LANES
 from gsseg_core.projection import Projected
+from gsseg_core.simd import LANES
 from gsseg_core.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
 
 TILE = LANES

@@ -24,13 +24,13 @@ from small_scenes import (
 )
 from threadpoolctl import threadpool_limits
 
+from gsseg_core.csr_rows import Rows
 from gsseg_core.dataset import View
 from gsseg_core.em import EMLearner, EMSettings, codes_without
 from gsseg_core.errors import SettingsError
 from gsseg_core.gaussian_kernels import GAIN_UNIT, collect, improve, promised
 from gsseg_core.operator import make_operator
 from gsseg_core.regions import SMALLEST
-from gsseg_core.rows import Rows
 from gsseg_core.scene import GaussianScene
 from gsseg_core.votes import VoteLearner
 

@@ -21,6 +21,7 @@ from small_scenes import (
 )
 
 from gsseg_core.cli import main
+from gsseg_core.csr_rows import Rows
 from gsseg_core.dataset import View
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import UnknownLabelError
@@ -31,7 +32,6 @@ from gsseg_core.meaning import Meaning, guess, standing
 from gsseg_core.operator import make_operator
 from gsseg_core.pipeline import LEARNERS, make_learner
 from gsseg_core.reliability import check_views
-from gsseg_core.rows import Rows
 from gsseg_core.soft_masks import SeenLabels
 from gsseg_core.votes import VoteLearner
 
