@@ -22,7 +22,7 @@ from gsseg_core.dataset import Dataset, View, spread
 from gsseg_core.em import EMLearner
 from gsseg_core.errors import SettingsError
 from gsseg_core.operator import make_operator
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.warm_up import warm_up
 
 SAMPLED = 5

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 COUNT, RUNS = 1_000_000, 5
 

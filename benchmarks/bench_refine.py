@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 from gsseg_core.neighbours import Neighbours
 from gsseg_core.refine import cluster, statistical_filter
 from gsseg_core.refine_settings import RefineSettings
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 REPEATS = 7
 CLASSES = 40

@@ -28,7 +28,7 @@ from gsseg_core.dataset import Dataset, View, spread
 from gsseg_core.em import EMLearner
 from gsseg_core.lifted_mask import LiftedMask
 from gsseg_core.operator import Shares, ViewOperator, make_operator
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.simd import FAST, LANES, add_scaled, add_scaled_where, first_bit, intrinsic, load_row, store_row
 from gsseg_core.soft_masks import SeenLabels
 from gsseg_core.splat import WIDTH, aim, blend_block

@@ -20,7 +20,7 @@ from workloads import REAL, RoomSize, make_room, true_labels
 
 from gsseg_core.dataset import Dataset, View, spread
 from gsseg_core.em import EMLearner, EMSettings
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.warm_up import warm_up
 
 MOVES = (1e-3, 1e-2)

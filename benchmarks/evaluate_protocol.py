@@ -19,12 +19,12 @@ import numpy as np
 from results import markdown, points
 
 from gsseg_core.camera_files import read_cameras
-from gsseg_core.cameras import Camera
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.operator import make_operator
 from gsseg_core.pick import pick_mask
 from gsseg_core.protocols import Scores, Task, lerf_mask, nvos, score_task, spin_nerf
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
 

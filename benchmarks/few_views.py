@@ -37,7 +37,7 @@ from gsseg_core.metrics import Evaluation
 from gsseg_core.operator import ViewOperator, make_operator
 from gsseg_core.pick import Pick, pick_clicks, pick_mask
 from gsseg_core.refine_settings import RefineSettings
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.warm_up import warm_up
 

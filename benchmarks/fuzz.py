@@ -147,7 +147,7 @@ def load_state(data: Path) -> int:
 
     from gsseg_core.errors import GssegError
     from gsseg_core.live import LiveSession
-    from gsseg_core.scene import GaussianScene
+    from gsseg_core.scene.gaussian_scene import GaussianScene
 
     session = LiveSession(GaussianScene.load(data / "scene.ply"), NAMES)
     try:

@@ -14,10 +14,10 @@ import numpy as np
 from mutations import Mutation
 from small_scenes import NAMES, balls_on_a_table, look_at, ring, write_dataset
 
-from gsseg_core.cameras import Camera
 from gsseg_core.dataset import Dataset
 from gsseg_core.live import LiveSession
 from gsseg_core.masks import read_mask
+from gsseg_core.scene.camera import Camera
 
 WIDTH, HEIGHT = 16, 12
 STATE, SEGMENTATION = "state.npz", "out/segmentation.npz"

@@ -30,7 +30,7 @@ from gsseg_core.held_out import calibrate
 from gsseg_core.mask_errors import MaskErrors, corrupt
 from gsseg_core.metrics import Evaluation
 from gsseg_core.refine_settings import RefineSettings
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.warm_up import warm_up
 

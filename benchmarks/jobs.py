@@ -25,7 +25,7 @@ from gsseg_core.lifted_mask import LiftedMask
 from gsseg_core.metrics import Evaluation
 from gsseg_core.operator import make_operator
 from gsseg_core.projection import project
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.tiles import assign
 from gsseg_core.votes import VoteLearner

@@ -22,7 +22,7 @@ from results import markdown, points, score
 from gsseg_core.dataset import Dataset, View
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.mask_errors import MaskErrors
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.view_errors import corrupt_views
 

@@ -18,7 +18,7 @@ from gsseg_core.blend import in_tile, open_rays
 from gsseg_core.dataset import View
 from gsseg_core.operator import make_operator
 from gsseg_core.projection import project
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.silhouettes import BEHIND, depths, surface
 from gsseg_core.simd import first_bit, store_row
 from gsseg_core.splat import WIDTH, aim, blend_block

@@ -28,7 +28,7 @@ from gsseg_core.export import background_image
 from gsseg_core.operator import make_operator
 from gsseg_core.pictures import contact_sheet, save_png
 from gsseg_core.refine_settings import RefineSettings
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.silhouettes import ObjectScores, objects_of, surface
 from gsseg_core.straddlers import split, straddlers

@@ -15,9 +15,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from gsseg_core.cameras import Camera
 from gsseg_core.gradient import GradientSettings
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 TILE = 32
 """Side of a tile in px: larger than a rasteriser's, since every tile costs some twenty calls into PyTorch."""

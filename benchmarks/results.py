@@ -34,7 +34,7 @@ from gsseg_core.pictures import contact_sheet, overlay, palette, save_png
 from gsseg_core.pipeline import make_learner
 from gsseg_core.refine import cluster, statistical_filter
 from gsseg_core.refine_settings import RefineSettings
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
 MASKS = {"labels": "true masks", "labels_noisy": "wrong masks"}

@@ -36,7 +36,7 @@ from gsseg_core.learner import Learner
 from gsseg_core.mask_errors import MaskErrors
 from gsseg_core.pipeline import make_learner
 from gsseg_core.reliability import OtherViews, check_views, draw_worst_views
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.view_errors import STRONGEST, PoseErrors, corrupt_views, errors_at, typical_depth
 from gsseg_core.warm_up import warm_up

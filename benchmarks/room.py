@@ -25,8 +25,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsseg_core.cameras import Camera
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 SIZE = np.array([8.0, 6.0, 2.8])  # m
 DETAIL = 4.0  # Gaussians per area on objects, in multiples of those on walls

@@ -29,7 +29,7 @@ from gsseg_core.dataset import Dataset, View
 from gsseg_core.demo_scene import build_demo
 from gsseg_core.masks import UNKNOWN
 from gsseg_core.pipeline import make_learner
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
 LEARNERS = ("em", "votes")

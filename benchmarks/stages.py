@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from machine import asked_anew, drop_from_page_cache, once, timed
 
-from gsseg_core.cameras import Camera
 from gsseg_core.dataset import Dataset, View, spread
 from gsseg_core.depth_sort import sort_by_depth
 from gsseg_core.em import EMLearner
@@ -23,7 +22,8 @@ from gsseg_core.operator import make_operator
 from gsseg_core.projection import project
 from gsseg_core.refine import cluster, statistical_filter
 from gsseg_core.refine_settings import RefineSettings
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.tiles import assign
 from gsseg_core.votes import VoteLearner

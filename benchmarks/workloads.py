@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from room import Room, build_room
 
-from gsseg_core.cameras import Camera
 from gsseg_core.mask_errors import corrupt
 from gsseg_core.masks import write_mask
 from gsseg_core.operator import make_operator
+from gsseg_core.scene.camera import Camera
 
 REAL = ("replica_apartment", "fern")
 MASKS = {"labels": "true masks", "labels_noisy": "wrong masks"}

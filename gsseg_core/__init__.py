@@ -19,7 +19,6 @@ from gsseg_core import kernel_cache as _kernel_cache  # noqa: F401
 
 if TYPE_CHECKING:
     from gsseg_core.boxes import OrientedBox, object_boxes
-    from gsseg_core.cameras import Camera
     from gsseg_core.dataset import Dataset, View
     from gsseg_core.em import EMLearner, EMSettings
     from gsseg_core.errors import GssegError
@@ -28,17 +27,18 @@ if TYPE_CHECKING:
     from gsseg_core.metrics import Evaluation
     from gsseg_core.operator import ViewOperator, make_operator
     from gsseg_core.refine_settings import RefineSettings
-    from gsseg_core.scene import GaussianScene
+    from gsseg_core.scene.camera import Camera
+    from gsseg_core.scene.gaussian_scene import GaussianScene
     from gsseg_core.segmentation import Segmentation
     from gsseg_core.votes import VoteLearner
 
 _HOMES = {
-    "Camera": "cameras",
+    "Camera": "scene.camera",
     "Dataset": "dataset",
     "EMLearner": "em",
     "EMSettings": "em",
     "Evaluation": "metrics",
-    "GaussianScene": "scene",
+    "GaussianScene": "scene.gaussian_scene",
     "GradientLearner": "gradient",
     "GradientSettings": "gradient",
     "GssegError": "errors",

@@ -28,8 +28,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 
-from gsseg_core.rotations import rotations
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.quaternions import rotations
 from gsseg_core.segmentation import Segmentation
 
 Array = npt.NDArray[np.float64]

@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> int:
     from gsseg_core.operator import make_operator
     from gsseg_core.pick import pick_clicks, pick_mask, read_object_mask
     from gsseg_core.pictures import overlay, palette, save_png
-    from gsseg_core.scene import GaussianScene
+    from gsseg_core.scene.gaussian_scene import GaussianScene
 
     cameras = {camera.name: camera for camera in Dataset(options.data).cameras}
     if options.view not in cameras:

@@ -22,12 +22,12 @@ import numba as nb
 import numpy as np
 from scipy import ndimage
 
-from gsseg_core.cameras import Camera
 from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.masks import UNKNOWN
 from gsseg_core.operator import make_operator
-from gsseg_core.rotations import rotations
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.quaternions import rotations
 
 CELLS = 160
 """Cells along the longer side of the view, at most."""

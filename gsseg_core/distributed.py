@@ -24,7 +24,7 @@ from gsseg_core.em import EMLearner
 from gsseg_core.error_model import ErrorModel
 from gsseg_core.errors import GssegError, SchedulerError
 from gsseg_core.learner import Learner, Progress, silent
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scheduler import PATIENCE, UNREACHABLE, check_workers, find_workers, name_of
 from gsseg_core.shard import (
     NotHereError,

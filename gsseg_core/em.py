@@ -67,7 +67,7 @@ from gsseg_core.operator import Observation, ViewOperator, make_operator
 from gsseg_core.others import counted_by_others
 from gsseg_core.outlines import scene_edges, settle_outlines
 from gsseg_core.regions import by_region, in_doubt, take_back
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.soft_masks import SeenLabels
 
 ROUGH = 8

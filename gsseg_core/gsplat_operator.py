@@ -20,12 +20,12 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import torch
 
-from gsseg_core.cameras import Camera
 from gsseg_core.csr_rows import starts
 from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.operator import Blended, Observation, Shares, ViewOperator, Weights
 from gsseg_core.projection import ALPHA_MIN, DILATION, NEAR
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.splat import ALPHA_MAX, T_MIN
 
 TILE = 16

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
-from gsseg_core.per_scene import PerScene
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.scene_cache import PerScene
 
 LEAF = 16
 """Most points in a leaf of the tree."""

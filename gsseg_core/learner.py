@@ -17,7 +17,7 @@ from gsseg_core.meaning import decided, guess
 from gsseg_core.operator import Observation, ViewOperator, make_operator
 from gsseg_core.progress import Progress as Progress
 from gsseg_core.progress import silent as silent
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.soft_masks import SeenLabels
 from gsseg_core.state_file import State
 

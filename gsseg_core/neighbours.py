@@ -20,8 +20,8 @@ import numpy as np
 from gsseg_core.csr_rows import Rows
 from gsseg_core.kd_tree import LEAF, Tree, enclose, leaf_range, scaled, tree_of
 from gsseg_core.nearest import CHUNK, NO_SKIP, middle_of, nearest
-from gsseg_core.per_scene import PerScene
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.scene_cache import PerScene
 from gsseg_core.simd import at_most, first_bit, load_row
 from gsseg_core.surroundings import Surroundings, end_of_group, look_around, measure, room_for
 

@@ -29,9 +29,9 @@ import numpy as np
 
 from gsseg_core.csr_rows import starts
 from gsseg_core.operator import ViewOperator
-from gsseg_core.per_scene import PerScene
 from gsseg_core.regions import connected_pixels
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.scene_cache import PerScene
 
 SHARPNESS = 3.0
 """How much edges of one unit in the mean say, in nats, where `LENGTH` pixels lie along the outline."""

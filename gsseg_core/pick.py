@@ -28,7 +28,6 @@ from pathlib import Path
 
 import numpy as np
 
-from gsseg_core.cameras import Camera
 from gsseg_core.clicks import Pixel, click_labels
 from gsseg_core.dataset import View
 from gsseg_core.errors import MaskFormatError, NoUsableViewsError, SettingsError
@@ -36,7 +35,8 @@ from gsseg_core.files.atomic import write_atomically
 from gsseg_core.graph import GraphSettings, graph_of, propagate
 from gsseg_core.masks import UNKNOWN, read_mask
 from gsseg_core.operator import make_operator
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 FORMAT = "gsseg-pick-1"
 

@@ -39,7 +39,7 @@ from gsseg_core.report import Stopwatch, build_report
 from gsseg_core.report_findings import Evidence
 from gsseg_core.report_page import write_report_page
 from gsseg_core.report_pictures import ViewImages
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.votes import VoteLearner
 

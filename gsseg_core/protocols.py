@@ -15,12 +15,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
 from gsseg_core.errors import CameraFileError, MaskFormatError, MaskSizeError
 from gsseg_core.files.input_files import open_image
 from gsseg_core.masks import UNKNOWN
 from gsseg_core.metrics import Evaluation
+from gsseg_core.scene.camera import Camera
 
 ASPECT_TOLERANCE = 0.01
 """How far the aspect ratio of a mask may be from its camera's, as a share: sizes are rounded when images are halved."""

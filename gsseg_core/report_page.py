@@ -22,7 +22,7 @@ from gsseg_core.printable import html_text
 from gsseg_core.report_findings import Evidence, class_ious, mean_reliability, warnings_of
 from gsseg_core.report_pictures import PICTURE_PX, THUMBNAIL_PX, ViewImages, draw_triple, jpeg_uri, thumbnails
 from gsseg_core.report_preview import look_from, make_preview, up_of
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 from gsseg_core.tables import percent
 

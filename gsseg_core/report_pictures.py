@@ -19,7 +19,7 @@ from gsseg_core.operator import make_operator
 from gsseg_core.pictures import outline, overlay
 from gsseg_core.reliability import ViewCheck
 from gsseg_core.report_findings import Evidence
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 PICTURE_PX = 480
 """Views are shrunk to this many pixels a side."""

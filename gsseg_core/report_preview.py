@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from gsseg_core.cameras import Camera
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import UNOBSERVED, Segmentation
 
 MOST_GAUSSIANS = 60_000

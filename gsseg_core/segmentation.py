@@ -22,7 +22,7 @@ from gsseg_core.operator import ViewOperator
 from gsseg_core.printable import clipped
 from gsseg_core.refine import cluster, statistical_filter
 from gsseg_core.refine_settings import RefineSettings
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 UNOBSERVED, REMOVED = -1, -2
 """Labels of Gaussians that no view spoke for, and of those that the filter took out."""

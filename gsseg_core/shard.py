@@ -25,7 +25,7 @@ from gsseg_core.error_model import ErrorModel
 from gsseg_core.errors import GssegError
 from gsseg_core.files.input_files import open_input
 from gsseg_core.learner import UNITS
-from gsseg_core.scene import DC, GaussianScene
+from gsseg_core.scene.gaussian_scene import DC, GaussianScene
 
 Part = tuple[Any, dict[str, Any]]
 """A sum over some views, of int64, or None, and by view what else came out."""

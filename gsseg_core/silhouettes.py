@@ -15,11 +15,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsseg_core.cameras import Camera
 from gsseg_core.errors import MaskSizeError
 from gsseg_core.metrics import BOUNDARY_SHARE, boundary_band
 from gsseg_core.operator import ViewOperator, make_operator
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 COVERED = 0.5
 """Accumulated alpha above which a pixel belongs to a silhouette."""

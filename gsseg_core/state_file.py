@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
 from gsseg_core.errors import GssegError, PathTakenError
 from gsseg_core.files.atomic import write_atomically
@@ -29,6 +28,7 @@ from gsseg_core.files.npz_files import (
 from gsseg_core.masks import MAX_LABEL, UNKNOWN
 from gsseg_core.meaning import Meaning
 from gsseg_core.printable import clipped, quoted
+from gsseg_core.scene.camera import Camera
 from gsseg_core.soft_masks import TOLERANCE, SeenLabels
 
 FORMAT = "gsseg-state-1"

@@ -21,8 +21,8 @@ import numpy as np
 
 from gsseg_core.carve import Shares
 from gsseg_core.errors import SceneValueError
-from gsseg_core.rotations import rotations
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.quaternions import rotations
 
 DISTANCE = 0.5
 """Of the halves' centres from the old one, in standard deviations along the longest axis."""

@@ -7,13 +7,13 @@ import copy
 import numpy as np
 
 from gsseg_core import products
-from gsseg_core.cameras import Camera
 from gsseg_core.csr_rows import Rows
 from gsseg_core.lifted_mask import LiftedMask
 from gsseg_core.meaning import Meaning
 from gsseg_core.operator import Blended, Observation, ViewOperator, Weights
 from gsseg_core.projection import project
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.sightings import take
 from gsseg_core.splat import LOG_OPACITY
 from gsseg_core.tile_observation import TileObservation

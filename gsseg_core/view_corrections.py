@@ -7,14 +7,14 @@ from collections.abc import Mapping
 import numpy as np
 from scipy import ndimage
 
-from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.live import LiveSession
 from gsseg_core.masks import UNKNOWN
 from gsseg_core.operator import make_operator
 from gsseg_core.projection import project
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED
 from gsseg_core.splat import HEIGHT, LOG_OPACITY, WIDTH
 from gsseg_core.view_model import Labelling

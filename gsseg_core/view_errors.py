@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
 from gsseg_core.errors import SettingsError
 from gsseg_core.mask_errors import MaskErrors, corrupt
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 STRONGEST = {
     "missed objects": "half of the objects of a view are missed",

@@ -10,10 +10,10 @@ from contextlib import suppress
 import numpy as np
 import viser
 
-from gsseg_core.cameras import Camera
 from gsseg_core.errors import GssegError
 from gsseg_core.operator import ViewOperator, make_operator
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.view_picture import Picture
 
 FINE_ROWS, QUICK_ROWS = 720, 320

@@ -10,7 +10,7 @@ from importlib.metadata import entry_points
 from typing import NamedTuple, Protocol
 
 from gsseg_core.errors import SettingsError
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.view_model import Labelling
 
 GROUP = "gsseg.live_sources"

@@ -15,7 +15,7 @@ from gsseg_core.files.json_files import read_json
 from gsseg_core.files.npz_files import SHARES_TOLERANCE
 from gsseg_core.masks import BACKGROUND_NAME
 from gsseg_core.pictures import palette
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 
 TRUE_COLOURS, BY_CLASS, BY_CONFIDENCE, BY_RELIABILITY = "true colours", "class", "confidence", "view reliability"

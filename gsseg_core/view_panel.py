@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import viser
 
-from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.printable import html_text, printable
+from gsseg_core.scene.camera import Camera
 from gsseg_core.view_corrections import box, disc, region
 from gsseg_core.view_model import MODES, ClassRow
 from gsseg_core.view_nodes import BANDS

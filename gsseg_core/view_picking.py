@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
 from gsseg_core.learner import Progress, silent
 from gsseg_core.operator import make_operator
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 _FOCAL = 1000.0
 _WINDOW = 3

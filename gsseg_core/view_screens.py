@@ -12,7 +12,7 @@ import numpy as np
 import viser
 import viser.transforms as vtf
 
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.view_frames import CameraOf, Frames
 from gsseg_core.view_picture import Picture
 from gsseg_core.view_splats import SplatNodes, Splats

@@ -7,8 +7,8 @@ from functools import cached_property
 import numpy as np
 import viser
 
-from gsseg_core.rotations import rotations
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.quaternions import rotations
 from gsseg_core.view_nodes import BYTES_PER_GAUSSIAN, Key, Node, after, changes
 
 _LARGEST = 200.0

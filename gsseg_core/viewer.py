@@ -14,12 +14,12 @@ import numpy as np
 import viser
 import viser.transforms as vtf
 
-from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.export import background_image
 from gsseg_core.operator import make_operator
 from gsseg_core.pictures import overlay, palette
+from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.view_access import Listener, listen
 from gsseg_core.view_corrections import Corrections

@@ -9,12 +9,12 @@ import numpy as np
 from numba.core import event
 
 from gsseg_core import kernel_cache
-from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.operator import make_operator
 from gsseg_core.reliability import OtherViews
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.votes import VoteLearner
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from gsseg_msgs.msg import SegmentationReport
 
 from gsseg_core.boxes import OrientedBox
-from gsseg_core.cameras import Camera
+from gsseg_core.scene.camera import Camera
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,9 +20,9 @@ from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Transform
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
-from gsseg_core.cameras import Camera
 from gsseg_core.errors import IntrinsicsError, MaskFormatError, PoseError, SceneValueError
 from gsseg_core.masks import UNKNOWN
+from gsseg_core.scene.camera import Camera
 from gsseg_ros.frames import Similarity, quaternion_from_rotation, rigid, rotation_from_quaternion
 
 _NS = 1_000_000_000

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from gsseg_core.boxes import OrientedBox
 from gsseg_core.errors import SettingsError
-from gsseg_core.rotations import rotations
+from gsseg_core.scene.quaternions import rotations
 
 Array: TypeAlias = npt.NDArray[np.float64]
 Quaternion: TypeAlias = tuple[float, float, float, float]

@@ -14,7 +14,7 @@ from rcl_interfaces.srv import GetParameters
 from sensor_msgs.msg import PointCloud2
 
 from gsseg_core.errors import StateMismatchError
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import UNOBSERVED
 from gsseg_core.view_live import LiveUpdate
 from gsseg_core.view_model import Labelling

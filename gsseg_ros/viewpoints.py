@@ -11,11 +11,11 @@ import numpy.typing as npt
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
-from gsseg_core.cameras import Camera
 from gsseg_core.errors import IntrinsicsError, PoseError
 from gsseg_core.export import background_image
 from gsseg_core.operator import make_operator
 from gsseg_core.pictures import overlay, palette
+from gsseg_core.scene.camera import Camera
 from gsseg_ros.conversions import (
     camera_from_messages,
     confidence_image,

@@ -21,7 +21,7 @@ from gsseg_core.names import class_ids
 from gsseg_core.pipeline import PER_VIEW
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.report import Stopwatch
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_ros.errors import (
     InvalidRequestError,
     MissingFileError,

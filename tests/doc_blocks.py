@@ -11,7 +11,7 @@ from pathlib import Path
 import protocol_layouts
 import small_scenes
 
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
 REPOSITORY = Path(__file__).parents[1]

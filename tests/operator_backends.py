@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import plain_gsplat
 from naive_rasteriser import NaiveView, naive_gsplat_view, naive_view
 
-from gsseg_core.cameras import Camera
 from gsseg_core.errors import SettingsError
 from gsseg_core.gsplat_operator import GsplatOperator, load_gsplat
 from gsseg_core.operator import ViewOperator, make_operator
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 
 @dataclass(frozen=True)

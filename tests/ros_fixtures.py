@@ -18,7 +18,7 @@ from ros_helpers import PATIENCE, Ros
 from ros_robot import CLASSES, copied, core_session, private_ros, write_long_dataset
 from small_scenes import balls_on_a_table, clean_views, write_dataset
 
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 

@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
 from gsseg_core.learner import Learner
 from gsseg_core.masks import write_mask
 from gsseg_core.metrics import Evaluation
 from gsseg_core.operator import make_operator
 from gsseg_core.pictures import palette
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.spherical_harmonics import C0
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.spherical_harmonics import C0
 
 WIDTH, HEIGHT = 64, 48
 NAMES = {0: "background", 1: "red ball", 2: "cup/mug", 3: "box"}

@@ -30,7 +30,7 @@ from workloads import SIZES, RoomSize, make_room, split
 from gsseg_core.gradient import GradientLearner, GradientSettings
 from gsseg_core.operator import make_operator
 from gsseg_core.projection import project
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.tiles import assign
 
 SCENE, TRUTH = balls_on_a_table()

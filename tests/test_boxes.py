@@ -15,7 +15,7 @@ from gsseg_core.boxes import OrientedBox, class_box, object_boxes, oriented_box
 from gsseg_core.live import LiveSession
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.report import build_report
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
 SIZE = np.array([0.6, 0.4, 0.15])

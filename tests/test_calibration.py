@@ -30,7 +30,7 @@ from gsseg_core.masks import UNKNOWN
 from gsseg_core.operator import make_operator
 from gsseg_core.pipeline import segment
 from gsseg_core.reliability import OtherViews
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.votes import VoteLearner
 

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from gsseg_core.camera_files import read_cameras
-from gsseg_core.cameras import Camera
 from gsseg_core.errors import CameraFileError, GssegError, IntrinsicsError, PathNotAllowedError, PoseError
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 # A camera at POSITION looks along the world's +x, the world's +z being up. POINT lies 2 before it, 0.5 to its right and
 # 0.25 below its axis: with focal lengths 100 and 120 it lands 25 pixels right of, and 15 below, the principal point.

@@ -16,7 +16,7 @@ from gsseg_core.errors import CameraFileError, PathNotAllowedError, WriteError
 from gsseg_core.files import input_files
 from gsseg_core.files.confined_files import pinned_folder
 from gsseg_core.files.input_files import open_input
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 
 @pytest.fixture

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsseg_core.cameras import Camera
 from gsseg_core.dataset import Dataset, View
 from gsseg_core.errors import (
     CameraFileError,
@@ -21,6 +20,7 @@ from gsseg_core.errors import (
     UnknownLabelError,
 )
 from gsseg_core.masks import UNKNOWN, write_mask
+from gsseg_core.scene.camera import Camera
 
 WIDTH, HEIGHT = 6, 4
 LABELS = np.arange(WIDTH * HEIGHT, dtype=np.int32).reshape(HEIGHT, WIDTH) % 4

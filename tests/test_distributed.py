@@ -27,7 +27,7 @@ from gsseg_core.dataset import Dataset, View
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import MaskFormatError, SchedulerError
 from gsseg_core.learner import Learner
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.votes import VoteLearner
 
 distributed = pytest.importorskip("distributed", reason="Dask is not installed")

@@ -31,7 +31,7 @@ from gsseg_core.errors import SettingsError
 from gsseg_core.gaussian_kernels import GAIN_UNIT, collect, improve, promised
 from gsseg_core.operator import make_operator
 from gsseg_core.regions import SMALLEST
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.votes import VoteLearner
 
 SCENE, TRUTH = balls_on_a_table()

@@ -18,7 +18,7 @@ from gsseg_core.cli import main
 from gsseg_core.dataset import Dataset, View
 from gsseg_core.demo_scene import build_demo
 from gsseg_core.masks import read_mask
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 REPOSITORY = Path(__file__).parents[1]
 NOTEBOOK = REPOSITORY / "examples/from_ply_to_objects.ipynb"

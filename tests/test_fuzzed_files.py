@@ -21,7 +21,7 @@ from gsseg_core.camera_files import read_cameras
 from gsseg_core.dataset import Dataset
 from gsseg_core.errors import GssegError
 from gsseg_core.masks import read_classes, read_mask
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.soft_files import read_soft_mask
 from gsseg_core.state_file import State

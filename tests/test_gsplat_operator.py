@@ -22,14 +22,14 @@ from operator_backends import PLAIN, why_missing
 from operator_cases import dense, make_scene, random_mask, random_view
 from small_scenes import NUM_CLASSES, balls_on_a_table, ring, taught, true_labels
 
-from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import SettingsError
 from gsseg_core.gradient import GradientLearner, GradientSettings
 from gsseg_core.gsplat_operator import GsplatOperator, _tensors_of, chunks, load_gsplat
 from gsseg_core.operator import make_operator
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.votes import VoteLearner
 
 FUNCTIONS = ("fully_fused_projection", "isect_tiles", "isect_offset_encode", "rasterize_to_pixels")

@@ -32,7 +32,7 @@ from gsseg_core.files.json_files import read_json
 from gsseg_core.files.limits import Limits
 from gsseg_core.masks import read_classes, read_mask
 from gsseg_core.printable import clipped, quoted
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.soft_files import read_soft_mask
 from gsseg_core.state_file import State

@@ -29,7 +29,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
 from object_ceiling import best_selection
 
-from gsseg_core.cameras import Camera
 from gsseg_core.carve import Silhouette, carve, carved, shares
 from gsseg_core.cli import main
 from gsseg_core.dataset import View
@@ -39,7 +38,8 @@ from gsseg_core.names import class_ids
 from gsseg_core.operator import make_operator
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.removal import without_objects
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
 from gsseg_core.silhouettes import BEHIND, ObjectScores, depths, objects_of, surface
 from gsseg_core.straddlers import DISTANCE, half_opacity, split, straddlers

@@ -12,9 +12,9 @@ from operator_backends import CPU
 from operator_cases import dense, make_camera, make_scene, one_gaussian, random_mask, random_view
 
 from gsseg_core import blend
-from gsseg_core.cameras import Camera
 from gsseg_core.errors import MaskSizeError, SceneValueError, SettingsError
 from gsseg_core.operator import make_operator
+from gsseg_core.scene.camera import Camera
 
 SIZES = [(37, 21), (16, 16), (33, 50), (70, 5), (1, 1), (1, 40)]
 COUNTS = [40, 150]  # rays that get through, and rays that end

@@ -17,7 +17,7 @@ from gsseg_core.mask_errors import resize
 from gsseg_core.operator import make_operator
 from gsseg_core.outlines import _along_outlines, _reach_across, scene_edges, settle_outlines
 from gsseg_core.regions import connected_pixels
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 SCENE, _ = balls_on_a_table()
 FARTHEST = 3

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import small_scenes
 
-from gsseg_core.cameras import Camera
 from gsseg_core.cli import main
 from gsseg_core.dataset import View
 from gsseg_core.errors import MaskFormatError, NoUsableViewsError, SettingsError
 from gsseg_core.masks import write_mask
 from gsseg_core.pick import Pick, pick_mask, read_object_mask
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 SCENE, TRUTH = small_scenes.balls_on_a_table()
 CAMERA = small_scenes.ring(1)[0]

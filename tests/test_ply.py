@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from gsseg_core.errors import SceneFileError, ScenePropertyError
-from gsseg_core.ply import read_vertices, write_vertices
+from gsseg_core.scene.ply import read_vertices, write_vertices
 
 ENCODINGS = {"ascii": (True, "="), "little endian": (False, "<"), "big endian": (False, ">")}
 PLY_TYPES = ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"]

@@ -16,8 +16,8 @@ from geometry_msgs.msg import Point, Pose, Quaternion, Transform, Vector3
 from ros_message_cases import HEADER, IDENTITY, K, info, refusal
 from sensor_msgs.msg import RegionOfInterest
 
-from gsseg_core.cameras import Camera
 from gsseg_core.errors import IntrinsicsError, PoseError
+from gsseg_core.scene.camera import Camera
 from gsseg_ros.conversions import (
     array_from_point,
     camera_from_messages,

@@ -16,9 +16,9 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
-from gsseg_core.cameras import Camera
 from gsseg_core.errors import IntrinsicsError, PoseError
 from gsseg_core.pictures import palette
+from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.client import NodeUnavailableError, SegmentationClient, Viewpoint
 

@@ -22,7 +22,7 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from gsseg_core.demo_scene import CLASS_NAMES
 from gsseg_core.masks import read_mask
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_ros.child_nodes import ChildError, ChildNodes
 
 EXAMPLES = sorted((REPOSITORY / "examples").glob("*.py"))

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsseg_core.cameras import Camera
 from gsseg_core.errors import SettingsError
+from gsseg_core.scene.camera import Camera
 from gsseg_ros.frames import (
     Similarity,
     interpolate,

@@ -18,7 +18,7 @@ from gsseg_core.held_out import calibrate
 from gsseg_core.live import LiveSession
 from gsseg_core.pipeline import make_learner
 from gsseg_core.refine_settings import RefineSettings
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")

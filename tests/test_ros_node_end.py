@@ -14,7 +14,7 @@ from ros_robot import Goal, Robot, core_session, renamed
 from small_scenes import clean_views
 
 from gsseg_core.dataset import Dataset
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")

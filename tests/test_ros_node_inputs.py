@@ -14,7 +14,7 @@ from small_scenes import clean_views, look_at
 
 from gsseg_core.dataset import Dataset, View
 from gsseg_core.refine_settings import RefineSettings
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.frames import Similarity
 

@@ -15,14 +15,14 @@ from ros_helpers import Ros, wait_until
 from ros_robot import CLASSES, LATCHED, Robot, core_session, messages
 from small_scenes import balls_on_a_table, clean_views
 
-from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.live import LiveSession
 from gsseg_core.operator import make_operator
 from gsseg_core.pictures import overlay, palette
 from gsseg_core.refine_settings import RefineSettings
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 

@@ -16,7 +16,7 @@ from ros_robot import LATCHED, SERVICES, Robot, core_session, renamed, viewpoint
 from small_scenes import clean_views
 
 from gsseg_core.dataset import View
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_ros import segment_node
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")

@@ -15,7 +15,7 @@ from small_scenes import NAMES, clean_views
 from gsseg_core.export import background_image
 from gsseg_core.operator import make_operator
 from gsseg_core.pictures import overlay, palette
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")

@@ -17,7 +17,7 @@ from small_scenes import clean_views, ring
 
 from gsseg_core import cli
 from gsseg_core.dataset import Dataset, View
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")

@@ -18,7 +18,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
 from gsseg_core.errors import SettingsError, StateMismatchError
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 from gsseg_core.view_live import LiveUpdate, open_source
 from gsseg_ros.client import NodeUnavailableError, SegmentationClient

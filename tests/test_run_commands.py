@@ -19,7 +19,7 @@ from small_scenes import balls_on_a_table, write_dataset
 
 from gsseg_core.cli import main
 from gsseg_core.files.run_folder import COMMIT_FILE, RUN_FILE
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
 

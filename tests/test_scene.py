@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from test_ply import ENCODINGS, write_ply
 
 from gsseg_core.errors import EmptySceneError, SceneFileError, ScenePropertyError, SceneValueError, WriteError
-from gsseg_core.ply import read_vertices
-from gsseg_core.scene import GaussianScene
-from gsseg_core.spherical_harmonics import C0
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.ply import read_vertices
+from gsseg_core.scene.spherical_harmonics import C0
 
 GEOMETRY = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
 

@@ -20,7 +20,7 @@ from gsseg_core.errors import UnknownLabelError
 from gsseg_core.masks import read_mask, write_mask
 from gsseg_core.operator import make_operator
 from gsseg_core.pipeline import make_learner
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
 from gsseg_core.view_model import Labelling, ViewModel, completed
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import lpmv
 
-from gsseg_core.spherical_harmonics import C0, basis, to_rgb
+from gsseg_core.scene.spherical_harmonics import C0, basis, to_rgb
 
 
 def random_directions(n: int, seed: int = 0) -> np.ndarray:

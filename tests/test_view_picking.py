@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from small_scenes import NAMES, balls_on_a_table, clean_views, ring, true_labels
 
-from gsseg_core.cameras import Camera
 from gsseg_core.dataset import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.masks import UNKNOWN
 from gsseg_core.operator import make_operator
+from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import REMOVED, UNOBSERVED
 from gsseg_core.view_corrections import Corrections, box, disc, region, share_seen
 from gsseg_core.view_model import Labelling

@@ -20,7 +20,7 @@ from small_scenes import NAMES, balls_on_a_table, clean_views, write_dataset
 
 from gsseg_core.cli import main
 from gsseg_core.errors import SettingsError
-from gsseg_core.scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.view_access import listen
 from gsseg_core.view_live import LiveUpdate

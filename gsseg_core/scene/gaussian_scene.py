@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib.recfunctions import structured_to_unstructured
 
-from gsseg_core import spherical_harmonics
 from gsseg_core.errors import EmptySceneError, ScenePropertyError, SceneValueError
 from gsseg_core.files.limits import LIMITS
-from gsseg_core.ply import read_vertices, write_vertices
+from gsseg_core.scene import spherical_harmonics
+from gsseg_core.scene.ply import read_vertices, write_vertices
 
 _MEANS = ("x", "y", "z")
 DC = ("f_dc_0", "f_dc_1", "f_dc_2")

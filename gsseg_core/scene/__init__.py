@@ -1,0 +1,1 @@
+"""A trained scene: its Gaussians, the cameras that look at it, and the files that they come from."""
