@@ -18,7 +18,7 @@ import numpy as np
 from machine import DATA, asked_anew, once, processor, timed, version
 from room import build_room
 
-from gsseg_core.dataset import Dataset, View, spread
+from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.em import EMLearner
 from gsseg_core.errors import SettingsError
 from gsseg_core.operator import make_operator

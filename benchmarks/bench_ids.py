@@ -26,7 +26,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from gsseg_core.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.demo_scene import build_demo
 from gsseg_core.em import EMLearner
 from gsseg_core.matching import Contingency, renamed

@@ -12,7 +12,7 @@ from machine import describe, peak_memory
 from workloads import RoomSize, make_room
 
 from gsseg_core.csr_rows import Rows
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
 from gsseg_core.em import EMLearner
 from gsseg_core.learner import MEMORY_BUDGET
 from gsseg_core.operator import make_operator

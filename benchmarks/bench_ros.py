@@ -37,7 +37,7 @@ from room import build_room
 from sensor_msgs.msg import PointCloud2
 
 from gsseg_core import pipeline
-from gsseg_core.masks import write_mask
+from gsseg_core.data.label_images import write_mask
 from gsseg_core.operator import make_operator
 
 DATA = Path(os.environ.get("GSSEG_DATA") or Path(__file__).parents[2] / "shared" / "data") / "replica_apartment"

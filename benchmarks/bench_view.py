@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from browser import opened_page, started_chromium, why_missing
 from playwright.sync_api import Page
 
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
 from gsseg_core.operator import make_operator
 from gsseg_core.view_access import listen
 from gsseg_core.view_model import Labelling, ViewModel

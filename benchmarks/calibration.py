@@ -35,7 +35,7 @@ from gsseg_core.calibration import (
     sample_pixels,
     tempered,
 )
-from gsseg_core.dataset import Dataset, View, spread
+from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.demo_scene import build_demo
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.held_out import calibrate, votes_without

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from results import markdown, points
 
-from gsseg_core.camera_files import read_cameras
+from gsseg_core.data.camera_files import read_cameras
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.operator import make_operator
 from gsseg_core.pick import pick_mask

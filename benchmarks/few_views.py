@@ -28,7 +28,7 @@ from plots import Axis, draw_panels
 from results import machine, markdown, points
 from scipy import ndimage
 
-from gsseg_core.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.demo_scene import build_demo
 from gsseg_core.em import EMLearner
 from gsseg_core.files.atomic import write_atomically

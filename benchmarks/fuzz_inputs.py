@@ -14,9 +14,9 @@ import numpy as np
 from mutations import Mutation
 from small_scenes import NAMES, balls_on_a_table, look_at, ring, write_dataset
 
-from gsseg_core.dataset import Dataset
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.label_images import read_mask
 from gsseg_core.live import LiveSession
-from gsseg_core.masks import read_mask
 from gsseg_core.scene.camera import Camera
 
 WIDTH, HEIGHT = 16, 12
@@ -129,7 +129,7 @@ def _colmap_bin(folder: Path) -> None:
 
 
 def _sixteen_bits(folder: Path) -> None:
-    from gsseg_core.masks import write_mask
+    from gsseg_core.data.label_images import write_mask
 
     for path in (folder / "labels").iterdir():
         write_mask(path, read_mask(path).labels, 16)

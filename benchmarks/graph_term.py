@@ -21,7 +21,7 @@ from machine import DATA, REPOSITORY
 from results import markdown
 
 from gsseg_core.calibration import ReliabilityDiagram
-from gsseg_core.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.demo_scene import build_demo
 from gsseg_core.em import EMLearner
 from gsseg_core.files.atomic import write_atomically

@@ -17,7 +17,7 @@ from stages import measure_stages
 from workloads import RoomSize, make_room, split, true_labels, write_room
 
 from gsseg_core import pipeline
-from gsseg_core.dataset import Dataset, View, spread
+from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.freed_memory import keep_freed_memory
 from gsseg_core.learner import UNITS, Learner

@@ -214,7 +214,7 @@ def _turn_labels(data: Path) -> None:
     """Put the same masks with other ids beside those of a dataset, so that every output of theirs differs."""
     import numpy as np
 
-    from gsseg_core.masks import read_mask, write_mask
+    from gsseg_core.data.label_images import read_mask, write_mask
 
     turned = np.array([0, 2, 3, 1])
     for path in (data / "labels").iterdir():

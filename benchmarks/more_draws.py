@@ -19,7 +19,7 @@ from pathlib import Path
 from machine import DATA
 from results import markdown, points, score
 
-from gsseg_core.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.mask_errors import MaskErrors
 from gsseg_core.scene.gaussian_scene import GaussianScene

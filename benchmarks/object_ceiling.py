@@ -15,7 +15,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.blend import in_tile, open_rays
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
 from gsseg_core.operator import make_operator
 from gsseg_core.projection import project
 from gsseg_core.scene.gaussian_scene import GaussianScene

@@ -21,7 +21,7 @@ from object_ceiling import best_selection
 from results import machine, markdown, points
 
 from gsseg_core.carve import KEPT, Silhouette, shares
-from gsseg_core.dataset import Dataset, View, spread
+from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.demo_scene import build_demo
 from gsseg_core.em import EMLearner
 from gsseg_core.export import background_image

@@ -20,7 +20,7 @@ from machine import DATA, describe
 from results import score
 from robustness import Bench, open_benches
 
-from gsseg_core.dataset import View, spread
+from gsseg_core.data.dataset import View, spread
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.view_errors import corrupt_views, errors_at

@@ -24,7 +24,7 @@ import numpy as np
 from jobs import hard_votes
 from machine import processor
 
-from gsseg_core.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.export import background_image
 from gsseg_core.learner import Learner

@@ -36,8 +36,8 @@ from ros_robot import CLASSES, Robot
 from rosgraph_msgs.msg import Clock
 from small_scenes import NAMES, balls_on_a_table, ring, true_labels, write_dataset
 
+from gsseg_core.data.label_images import write_mask
 from gsseg_core.live import LiveSession
-from gsseg_core.masks import write_mask
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.state_file import State

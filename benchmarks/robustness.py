@@ -28,7 +28,7 @@ from results import machine, markdown, points, score
 from robustness_text import BAR, CURVES, HEADER, RELIABILITY
 from scipy.stats import spearmanr
 
-from gsseg_core.dataset import Dataset, View, spread
+from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.demo_scene import build_demo
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.files.atomic import write_atomically

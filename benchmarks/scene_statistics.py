@@ -17,7 +17,7 @@ from machine import DATA
 from room import build_room
 from scipy.spatial import cKDTree
 
-from gsseg_core.dataset import Dataset
+from gsseg_core.data.dataset import Dataset
 from gsseg_core.projection import project
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene

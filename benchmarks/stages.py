@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from machine import asked_anew, drop_from_page_cache, once, timed
 
-from gsseg_core.dataset import Dataset, View, spread
+from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.depth_sort import sort_by_depth
 from gsseg_core.em import EMLearner
 from gsseg_core.export import export_classes

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from room import Room, build_room
 
+from gsseg_core.data.label_images import write_mask
 from gsseg_core.mask_errors import corrupt
-from gsseg_core.masks import write_mask
 from gsseg_core.operator import make_operator
 from gsseg_core.scene.camera import Camera
 

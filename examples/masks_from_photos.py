@@ -22,7 +22,7 @@ from PIL import Image
 from skimage.segmentation import felzenszwalb
 
 from gsseg_core import Dataset, GaussianScene, GssegError, View, make_operator
-from gsseg_core.masks import UNKNOWN, write_mask
+from gsseg_core.data.label_images import UNKNOWN, write_mask
 
 SCALE = 300
 """How unlike two areas have to be to stay apart; larger means fewer areas."""

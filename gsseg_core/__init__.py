@@ -19,7 +19,7 @@ from gsseg_core import kernel_cache as _kernel_cache  # noqa: F401
 
 if TYPE_CHECKING:
     from gsseg_core.boxes import OrientedBox, object_boxes
-    from gsseg_core.dataset import Dataset, View
+    from gsseg_core.data.dataset import Dataset, View
     from gsseg_core.em import EMLearner, EMSettings
     from gsseg_core.errors import GssegError
     from gsseg_core.export import export_classes
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "Camera": "scene.camera",
-    "Dataset": "dataset",
+    "Dataset": "data.dataset",
     "EMLearner": "em",
     "EMSettings": "em",
     "Evaluation": "metrics",
@@ -45,7 +45,7 @@ _HOMES = {
     "OrientedBox": "boxes",
     "RefineSettings": "refine_settings",
     "Segmentation": "segmentation",
-    "View": "dataset",
+    "View": "data.dataset",
     "ViewOperator": "operator",
     "VoteLearner": "votes",
     "export_classes": "export",

@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Pick, and say what was written."""
-    from gsseg_core.dataset import Dataset, View
+    from gsseg_core.data.dataset import Dataset, View
     from gsseg_core.export import background_image
     from gsseg_core.files.earlier_outputs import earlier_pick
     from gsseg_core.files.run_folder import staged_run

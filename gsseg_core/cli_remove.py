@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gsseg_core.names import class_ids, listed
+from gsseg_core.data.names import class_ids, listed
 from gsseg_core.printable import clipped
 from gsseg_core.tables import counted
 from gsseg_core.terminal import tell

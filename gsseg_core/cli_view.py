@@ -67,7 +67,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _show(options: argparse.Namespace, listener: Listener, viewer_module: ModuleType) -> int:
-    from gsseg_core.dataset import Dataset
+    from gsseg_core.data.dataset import Dataset
     from gsseg_core.scene.gaussian_scene import GaussianScene
     from gsseg_core.segmentation import Segmentation
     from gsseg_core.view_live import open_source

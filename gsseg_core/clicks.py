@@ -22,8 +22,8 @@ import numba as nb
 import numpy as np
 from scipy import ndimage
 
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import NoUsableViewsError, SettingsError
-from gsseg_core.masks import UNKNOWN
 from gsseg_core.operator import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene

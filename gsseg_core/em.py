@@ -43,7 +43,7 @@ the minorities along with it would smear every large class over the rows of the 
 converged the models are learnt anew in this way, and then the codes once more.
 
 Soft and partial masks. There the segmenter's words y are classes, and "none of those that I looked for", which is right
-for all others. A pixel's label m is a mixture of words with shares s_m[y] (see `gsseg_core.meaning`): wherever
+for all others. A pixel's label m is a mixture of words with shares s_m[y] (see `gsseg_core.data.label_evidence`): wherever
 C_v[k, y] stands for a pixel, it is sum_y s_m[y] C_v[k, y] there, and the expected counts of R_v are split in proportion
 to the summands.
 """
@@ -57,18 +57,18 @@ from functools import partial
 import numpy as np
 
 from gsseg_core.csr_rows import Rows, starts
+from gsseg_core.data.label_evidence import standing
+from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.error_model import ErrorModel
 from gsseg_core.errors import SettingsError
 from gsseg_core.gaussian_kernels import collect, improve, improve_without, mix, promised, tally
 from gsseg_core.learner import MEMORY_BUDGET, VOTE_UNIT, Learner, Progress, silent
-from gsseg_core.meaning import standing
 from gsseg_core.neighbours import neighbours_of
 from gsseg_core.operator import Observation, ViewOperator, make_operator
 from gsseg_core.others import counted_by_others
 from gsseg_core.outlines import scene_edges, settle_outlines
 from gsseg_core.regions import by_region, in_doubt, take_back
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.soft_masks import SeenLabels
 
 ROUGH = 8
 """Codes that error models are learnt anew from may be so many times less settled than those that are handed out."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsseg_core.meaning import Meaning
+from gsseg_core.data.label_evidence import Meaning
 
 
 @dataclass

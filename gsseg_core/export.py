@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.earlier_outputs import earlier_classes
 from gsseg_core.files.run_folder import staged_run

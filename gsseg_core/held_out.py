@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gsseg_core.calibration import VIEWS, Sample, fit_temperature, sample_pixels
-from gsseg_core.dataset import View, spread
+from gsseg_core.data.dataset import View, spread
 from gsseg_core.em import EMLearner
 from gsseg_core.learner import UNITS, Learner, Progress, silent
 from gsseg_core.operator import make_operator

@@ -11,8 +11,8 @@ import numpy as np
 
 from gsseg_core.blend import AHEAD
 from gsseg_core.csr_rows import starts
+from gsseg_core.data.label_evidence import Meaning
 from gsseg_core.lift import Labels, cut_labels, lift
-from gsseg_core.meaning import Meaning
 from gsseg_core.scene.camera import Camera
 from gsseg_core.simd import prefetch
 from gsseg_core.tiles import Tiles

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gsseg_core.dataset import Dataset, View, spread
+from gsseg_core.data.dataset import Dataset, View, spread
+from gsseg_core.data.label_images import BACKGROUND_NAME
 from gsseg_core.errors import (
     GssegError,
     NoCodesError,
@@ -21,7 +22,6 @@ from gsseg_core.errors import (
 )
 from gsseg_core.held_out import calibrate
 from gsseg_core.live_results import SCENE_CHANGED, Outcome, Rejection
-from gsseg_core.masks import BACKGROUND_NAME
 from gsseg_core.neighbours import neighbours_of
 from gsseg_core.pipeline import make_learner
 from gsseg_core.refine_settings import RefineSettings

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gsseg_core.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.live import LiveSession
 from gsseg_core.live_results import Outcome, Rejection

@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from gsseg_core.masks import UNKNOWN
+from gsseg_core.data.label_images import UNKNOWN
 
 
 class Contingency:

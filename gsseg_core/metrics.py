@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from gsseg_core.data.label_images import UNKNOWN, read_mask
 from gsseg_core.errors import MaskFormatError, MaskSizeError, NoUsableViewsError
 from gsseg_core.files.run_folder import settle
-from gsseg_core.masks import UNKNOWN, read_mask
 
 BOUNDARY_SHARE = 0.02
 """Width of the boundary band as a share of the image diagonal (Cheng et al., Boundary IoU, CVPR 2021)."""

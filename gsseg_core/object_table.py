@@ -10,10 +10,10 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from gsseg_core.association import AssociationSettings, associate
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
+from gsseg_core.data.label_images import BACKGROUND_NAME, MAX_LABEL, UNKNOWN
 from gsseg_core.errors import UnknownLabelError
 from gsseg_core.learner import Progress, silent
-from gsseg_core.masks import BACKGROUND_NAME, MAX_LABEL, UNKNOWN
 from gsseg_core.operator import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segments import Lifted, Profiles, sums

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from gsseg_core.csr_rows import Rows
+from gsseg_core.data.label_evidence import Meaning
 from gsseg_core.devices import checked_device
 from gsseg_core.errors import MaskSizeError, SceneValueError, SettingsError
-from gsseg_core.meaning import Meaning
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.sightings import add_votes

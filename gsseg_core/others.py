@@ -6,9 +6,9 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import Rows
+from gsseg_core.data.label_evidence import Meaning, stand
 from gsseg_core.gaussian_kernels import BLOCKS, take_row
 from gsseg_core.learner import UNITS
-from gsseg_core.meaning import Meaning, stand
 from gsseg_core.operator import Observation
 
 

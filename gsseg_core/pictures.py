@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from gsseg_core.data.label_images import run_text
 from gsseg_core.files.atomic import write_atomically
-from gsseg_core.masks import run_text
 
 BACKGROUND = (58, 60, 66)
 """The colour of label 0, a dark neutral grey."""

@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gsseg_core.dataset import Dataset, View, spread
+from gsseg_core.data.dataset import Dataset, View, spread
+from gsseg_core.data.hints import mask_hint
+from gsseg_core.data.label_images import write_mask
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.export import (
@@ -28,9 +30,7 @@ from gsseg_core.files.earlier_outputs import earlier_render, earlier_segment
 from gsseg_core.files.run_folder import StagedRun, staged_run
 from gsseg_core.graph import GraphSettings, is_scarce, spread_if_scarce
 from gsseg_core.held_out import calibrate
-from gsseg_core.layout import mask_hint
 from gsseg_core.learner import MEMORY_BUDGET, NO_MASK, Learner, Progress, silent
-from gsseg_core.masks import write_mask
 from gsseg_core.object_table import find_objects
 from gsseg_core.pictures import save_png
 from gsseg_core.refine_settings import RefineSettings

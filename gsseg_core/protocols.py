@@ -15,10 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import CameraFileError, MaskFormatError, MaskSizeError
 from gsseg_core.files.input_files import open_image
-from gsseg_core.masks import UNKNOWN
 from gsseg_core.metrics import Evaluation
 from gsseg_core.scene.camera import Camera
 

@@ -13,13 +13,13 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import Rows
+from gsseg_core.data.label_evidence import Meaning
+from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.gaussian_kernels import take_votes
 from gsseg_core.learner import UNITS
-from gsseg_core.masks import UNKNOWN
-from gsseg_core.meaning import Meaning
 from gsseg_core.operator import Observation
 from gsseg_core.others import counted_by_others
-from gsseg_core.soft_masks import SeenLabels
 
 SMALLEST = 64
 """Regions of fewer px are not told apart: all of one label are judged as one."""

@@ -20,12 +20,12 @@ import numpy as np
 
 from gsseg_core.calibration import VIEWS, Sample, sample_pixels
 from gsseg_core.csr_rows import Rows
-from gsseg_core.dataset import View, spread
+from gsseg_core.data.dataset import View, spread
+from gsseg_core.data.label_evidence import Meaning
+from gsseg_core.data.label_images import UNKNOWN, PackedLabels
 from gsseg_core.em import EMLearner, codes_without
 from gsseg_core.export import background_image
 from gsseg_core.learner import Progress, silent
-from gsseg_core.masks import UNKNOWN, PackedLabels
-from gsseg_core.meaning import Meaning
 from gsseg_core.operator import make_operator
 from gsseg_core.pictures import contact_sheet, overlay, palette
 

@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
+from gsseg_core.data.label_images import UNKNOWN, PackedLabels
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.export import background_image
 from gsseg_core.files.input_files import open_image
-from gsseg_core.masks import UNKNOWN, PackedLabels
 from gsseg_core.operator import make_operator
 from gsseg_core.pictures import outline, overlay
 from gsseg_core.reliability import ViewCheck

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.lib.recfunctions import repack_fields
 
 from gsseg_core.csr_rows import Rows
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.error_model import ErrorModel
 from gsseg_core.errors import GssegError

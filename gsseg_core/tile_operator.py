@@ -8,8 +8,8 @@ import numpy as np
 
 from gsseg_core import products
 from gsseg_core.csr_rows import Rows
+from gsseg_core.data.label_evidence import Meaning
 from gsseg_core.lifted_mask import LiftedMask
-from gsseg_core.meaning import Meaning
 from gsseg_core.operator import Blended, Observation, ViewOperator, Weights
 from gsseg_core.projection import project
 from gsseg_core.scene.camera import Camera

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 from scipy import ndimage
 
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.live import LiveSession
-from gsseg_core.masks import UNKNOWN
 from gsseg_core.operator import make_operator
 from gsseg_core.projection import project
 from gsseg_core.scene.camera import Camera

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import viser
 
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.printable import html_text, printable
 from gsseg_core.scene.camera import Camera

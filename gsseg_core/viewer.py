@@ -14,7 +14,7 @@ import numpy as np
 import viser
 import viser.transforms as vtf
 
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.export import background_image
 from gsseg_core.operator import make_operator

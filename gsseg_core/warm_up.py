@@ -9,7 +9,7 @@ import numpy as np
 from numba.core import event
 
 from gsseg_core import kernel_cache
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.operator import make_operator
 from gsseg_core.reliability import OtherViews

@@ -20,13 +20,13 @@ from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Transform
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import IntrinsicsError, MaskFormatError, PoseError, SceneValueError
-from gsseg_core.masks import UNKNOWN
 from gsseg_core.scene.camera import Camera
 from gsseg_ros.frames import Similarity, quaternion_from_rotation, rigid, rotation_from_quaternion
 
 _NS = 1_000_000_000
-_LARGEST_LABEL = 2**16 - 2  # As in files, see `gsseg_core.masks.read_classes`.
+_LARGEST_LABEL = 2**16 - 2  # As in files, see `gsseg_core.data.label_images.read_classes`.
 _UNIT_TOLERANCE = 1e-3
 _LONGEST_TOKEN = 64  # The full name of a topic must stay below 256 characters.
 

@@ -17,13 +17,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from gsseg_core.dataset import Dataset, View, spread
+from gsseg_core.data.dataset import Dataset, View, spread
+from gsseg_core.data.label_images import write_mask
 from gsseg_core.demo import gaussian_ious
 from gsseg_core.demo_scene import DemoScene, build_demo
 from gsseg_core.errors import GssegError
 from gsseg_core.export import write_overview
 from gsseg_core.learner import Progress, silent
-from gsseg_core.masks import write_mask
 from gsseg_core.metrics import evaluate_folders
 from gsseg_core.pictures import contact_sheet, palette, save_png
 from gsseg_core.progress import progress_bars

@@ -19,7 +19,7 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo, Image
 
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
 from gsseg_core.errors import GssegError, PoseError
 from gsseg_core.live_results import SCENE_CHANGED, Rejection
 from gsseg_ros.camera_images import CameraImages

@@ -13,7 +13,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.lifecycle import LifecycleNode
 from std_msgs.msg import Header
 
-from gsseg_core.dataset import Dataset
+from gsseg_core.data.dataset import Dataset
 from gsseg_core.live import LiveSession
 from gsseg_core.live_results import Outcome
 from gsseg_core.pipeline import LEARNERS

@@ -14,10 +14,10 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 
+from gsseg_core.data.names import class_ids
 from gsseg_core.errors import PathNotAllowedError, SettingsError
 from gsseg_core.live import LiveSession
 from gsseg_core.live_ids import PerViewSession
-from gsseg_core.names import class_ids
 from gsseg_core.pipeline import PER_VIEW
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.report import Stopwatch

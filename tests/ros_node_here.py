@@ -19,7 +19,7 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
 from gsseg_ros.inputs import Inputs
 from gsseg_ros.outputs import Outputs
 from gsseg_ros.segment_node import SegmentNode

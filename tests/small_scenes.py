@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
+from gsseg_core.data.label_images import write_mask
 from gsseg_core.learner import Learner
-from gsseg_core.masks import write_mask
 from gsseg_core.metrics import Evaluation
 from gsseg_core.operator import make_operator
 from gsseg_core.pictures import palette

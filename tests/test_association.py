@@ -27,11 +27,11 @@ import bench_ids
 
 from gsseg_core.association import AssociationSettings, associate
 from gsseg_core.cli import main
-from gsseg_core.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.label_images import UNKNOWN, read_mask, write_mask
 from gsseg_core.em import EMLearner
 from gsseg_core.errors import SettingsError, UnknownLabelError
 from gsseg_core.live_ids import PerViewSession
-from gsseg_core.masks import UNKNOWN, read_mask, write_mask
 from gsseg_core.matching import Contingency, renamed
 from gsseg_core.object_table import ObjectTable, find_objects
 from gsseg_core.operator import make_operator

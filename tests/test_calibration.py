@@ -21,12 +21,12 @@ from gsseg_core.calibration import (
     sample_pixels,
     tempered,
 )
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.em import EMLearner
 from gsseg_core.export import export_classes
 from gsseg_core.held_out import calibrate, votes_without
 from gsseg_core.learner import Learner
 from gsseg_core.live import LiveSession
-from gsseg_core.masks import UNKNOWN
 from gsseg_core.operator import make_operator
 from gsseg_core.pipeline import segment
 from gsseg_core.reliability import OtherViews

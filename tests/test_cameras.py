@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from gsseg_core.camera_files import read_cameras
+from gsseg_core.data.camera_files import read_cameras
 from gsseg_core.errors import CameraFileError, GssegError, IntrinsicsError, PathNotAllowedError, PoseError
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene

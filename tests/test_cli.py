@@ -19,8 +19,8 @@ from small_scenes import balls_on_a_table, look_at, many_classes, write_dataset
 
 from gsseg_core.cli import main
 from gsseg_core.cli_parser import build_parser
+from gsseg_core.data.label_images import read_mask, write_mask
 from gsseg_core.files import atomic
-from gsseg_core.masks import read_mask, write_mask
 from gsseg_core.scene import ply
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.votes import VoteLearner

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from small_scenes import write_dataset
 
-from gsseg_core.dataset import Dataset
+from gsseg_core.data.dataset import Dataset
 from gsseg_core.errors import CameraFileError, PathNotAllowedError, WriteError
 from gsseg_core.files import input_files
 from gsseg_core.files.confined_files import pinned_folder

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsseg_core.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.label_images import UNKNOWN, write_mask
 from gsseg_core.errors import (
     CameraFileError,
     ClassesFileError,
@@ -19,7 +20,6 @@ from gsseg_core.errors import (
     SplitFileError,
     UnknownLabelError,
 )
-from gsseg_core.masks import UNKNOWN, write_mask
 from gsseg_core.scene.camera import Camera
 
 WIDTH, HEIGHT = 6, 4

@@ -23,7 +23,7 @@ from small_scenes import NUM_CLASSES, balls_on_a_table, taught, with_clutter, wr
 
 from gsseg_core import scheduler
 from gsseg_core.cli import main
-from gsseg_core.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import MaskFormatError, SchedulerError
 from gsseg_core.learner import Learner

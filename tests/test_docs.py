@@ -24,7 +24,7 @@ from doc_commands import Started, check, core_libraries, kind_of, run_commands, 
 
 from gsseg_core.cli import main
 from gsseg_core.cli_parser import COMMANDS
-from gsseg_core.dataset import Dataset
+from gsseg_core.data.dataset import Dataset
 
 MOST_NOT_RUN = 7
 PROGRAMS = {

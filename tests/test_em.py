@@ -25,7 +25,7 @@ from small_scenes import (
 from threadpoolctl import threadpool_limits
 
 from gsseg_core.csr_rows import Rows
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
 from gsseg_core.em import EMLearner, EMSettings, codes_without
 from gsseg_core.errors import SettingsError
 from gsseg_core.gaussian_kernels import GAIN_UNIT, collect, improve, promised

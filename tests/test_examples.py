@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from small_scenes import NAMES, write_dataset
 
 from gsseg_core.cli import main
-from gsseg_core.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.label_images import read_mask
 from gsseg_core.demo_scene import build_demo
-from gsseg_core.masks import read_mask
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 REPOSITORY = Path(__file__).parents[1]

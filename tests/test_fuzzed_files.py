@@ -17,13 +17,13 @@ from hypothesis import strategies as st
 from PIL import Image
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, ring, taught, write_dataset
 
-from gsseg_core.camera_files import read_cameras
-from gsseg_core.dataset import Dataset
+from gsseg_core.data.camera_files import read_cameras
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.label_images import read_classes, read_mask
+from gsseg_core.data.mask_files import read_soft_mask
 from gsseg_core.errors import GssegError
-from gsseg_core.masks import read_classes, read_mask
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.soft_files import read_soft_mask
 from gsseg_core.state_file import State
 from gsseg_core.votes import VoteLearner
 

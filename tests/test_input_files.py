@@ -15,8 +15,10 @@ import pytest
 from PIL import Image
 from small_scenes import balls_on_a_table, ring, write_dataset
 
-from gsseg_core.camera_files import read_cameras
-from gsseg_core.dataset import Dataset
+from gsseg_core.data.camera_files import read_cameras
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.label_images import read_classes, read_mask
+from gsseg_core.data.mask_files import read_soft_mask
 from gsseg_core.errors import (
     CameraFileError,
     ClassesFileError,
@@ -30,11 +32,9 @@ from gsseg_core.files import input_files, json_files
 from gsseg_core.files.input_files import open_input
 from gsseg_core.files.json_files import read_json
 from gsseg_core.files.limits import Limits
-from gsseg_core.masks import read_classes, read_mask
 from gsseg_core.printable import clipped, quoted
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.soft_files import read_soft_mask
 from gsseg_core.state_file import State
 
 SCENE, _ = balls_on_a_table()

@@ -12,7 +12,8 @@ from patience import PATIENCE
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, taught, write_dataset, wrong_views
 
 from gsseg_core import live
-from gsseg_core.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.em import EMLearner
 from gsseg_core.errors import (
     MaskFormatError,
@@ -24,7 +25,6 @@ from gsseg_core.errors import (
     UnknownLabelError,
 )
 from gsseg_core.live import LiveSession
-from gsseg_core.masks import UNKNOWN
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.votes import VoteLearner
 

@@ -12,9 +12,9 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import SettingsError
 from gsseg_core.mask_errors import MaskErrors, corrupt
-from gsseg_core.masks import UNKNOWN
 
 NONE = MaskErrors(missed=0, swapped=0, edge_px=0)
 

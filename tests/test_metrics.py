@@ -10,8 +10,8 @@ import pytest
 from scipy import ndimage
 from sklearn.metrics import confusion_matrix, jaccard_score, recall_score
 
+from gsseg_core.data.label_images import UNKNOWN, write_mask
 from gsseg_core.errors import MaskFormatError, MaskSizeError, NoUsableViewsError
-from gsseg_core.masks import UNKNOWN, write_mask
 from gsseg_core.metrics import BOUNDARY_SHARE, Evaluation, evaluate_folders
 
 

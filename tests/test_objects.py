@@ -31,10 +31,10 @@ from object_ceiling import best_selection
 
 from gsseg_core.carve import Silhouette, carve, carved, shares
 from gsseg_core.cli import main
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
+from gsseg_core.data.names import class_ids
 from gsseg_core.errors import EmptySceneError, MaskSizeError, SceneValueError, SettingsError
 from gsseg_core.export import export_classes
-from gsseg_core.names import class_ids
 from gsseg_core.operator import make_operator
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.removal import without_objects

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views
 
 from gsseg_core.csr_rows import Rows
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
+from gsseg_core.data.label_evidence import Meaning, standing
 from gsseg_core.em import EMLearner
 from gsseg_core.learner import UNITS
-from gsseg_core.meaning import Meaning, standing
 from gsseg_core.operator import Observation
 from gsseg_core.others import counted_by_others
 

@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as arrays
 from scipy import ndimage
 from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, mean_iou
 
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import SettingsError
 from gsseg_core.mask_errors import resize

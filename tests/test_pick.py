@@ -10,9 +10,9 @@ import pytest
 import small_scenes
 
 from gsseg_core.cli import main
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
+from gsseg_core.data.label_images import write_mask
 from gsseg_core.errors import MaskFormatError, NoUsableViewsError, SettingsError
-from gsseg_core.masks import write_mask
 from gsseg_core.pick import Pick, pick_mask, read_object_mask
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import WriteError
-from gsseg_core.masks import UNKNOWN
 from gsseg_core.pictures import BACKGROUND, PAPER, contact_sheet, legend, overlay, palette, save_png
 
 

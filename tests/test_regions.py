@@ -11,12 +11,12 @@ from scipy import ndimage
 from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, mean_iou, taught, with_clutter
 
 from gsseg_core.csr_rows import Rows
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
+from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import SettingsError
-from gsseg_core.masks import UNKNOWN
 from gsseg_core.regions import MOST, SMALLEST, by_region, connected_pixels, in_doubt
-from gsseg_core.soft_masks import SeenLabels
 from gsseg_core.votes import VoteLearner
 
 SCENE, _ = balls_on_a_table()

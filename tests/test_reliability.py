@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, taught
 
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.em import EMLearner
 from gsseg_core.mask_errors import MaskErrors
-from gsseg_core.masks import UNKNOWN
 from gsseg_core.reliability import (
     OtherViews,
     ViewCheck,

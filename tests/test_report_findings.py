@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from report_cases import minimal_report
 
-from gsseg_core.masks import UNKNOWN
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.reliability import ViewCheck
 from gsseg_core.report_findings import (
     Evidence,

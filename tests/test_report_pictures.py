@@ -9,8 +9,8 @@ import numpy as np
 from report_cases import painted
 from small_scenes import balls_on_a_table, look_at
 
-from gsseg_core.dataset import View
-from gsseg_core.masks import UNKNOWN
+from gsseg_core.data.dataset import View
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.pictures import palette
 from gsseg_core.reliability import hold_against
 from gsseg_core.report_findings import Evidence

@@ -15,8 +15,8 @@ pytest.importorskip("sensor_msgs")
 from ros_message_cases import HEADER, image, refusal
 from sensor_msgs.msg import Image
 
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import MaskFormatError
-from gsseg_core.masks import UNKNOWN
 from gsseg_ros.conversions import (
     confidence_image,
     label_image,

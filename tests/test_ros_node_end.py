@@ -13,7 +13,7 @@ from ros_helpers import Ros, ros_fixture  # noqa: F401
 from ros_robot import Goal, Robot, core_session, renamed
 from small_scenes import clean_views
 
-from gsseg_core.dataset import Dataset
+from gsseg_core.data.dataset import Dataset
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 

@@ -15,8 +15,8 @@ from PIL import Image as Picture
 from ros_helpers import Process, Ros, ros_fixture  # noqa: F401
 from small_scenes import NAMES, balls_on_a_table, many_classes, ring, write_dataset
 
-from gsseg_core.dataset import Dataset
-from gsseg_core.masks import UNKNOWN, write_mask
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.label_images import UNKNOWN, write_mask
 
 pytest.importorskip("rosbags", reason="rosbags is not installed")
 

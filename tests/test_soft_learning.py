@@ -22,17 +22,17 @@ from small_scenes import (
 
 from gsseg_core.cli import main
 from gsseg_core.csr_rows import Rows
-from gsseg_core.dataset import View
+from gsseg_core.data.dataset import View
+from gsseg_core.data.label_evidence import Meaning, guess, standing
+from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import UnknownLabelError
 from gsseg_core.learner import VOTE_UNIT, Learner
 from gsseg_core.live import LiveSession
-from gsseg_core.masks import UNKNOWN
-from gsseg_core.meaning import Meaning, guess, standing
 from gsseg_core.operator import make_operator
 from gsseg_core.pipeline import LEARNERS, make_learner
 from gsseg_core.reliability import check_views
-from gsseg_core.soft_masks import SeenLabels
 from gsseg_core.votes import VoteLearner
 
 SCENE, TRUTH = balls_on_a_table()

@@ -15,9 +15,9 @@ from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, ring, write_datas
 
 from gsseg_core import pipeline
 from gsseg_core.cli import main
-from gsseg_core.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.label_images import read_mask, write_mask
 from gsseg_core.errors import UnknownLabelError
-from gsseg_core.masks import read_mask, write_mask
 from gsseg_core.operator import make_operator
 from gsseg_core.pipeline import make_learner
 from gsseg_core.scene.gaussian_scene import GaussianScene

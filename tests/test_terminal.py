@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsseg_core.masks import write_mask
+from gsseg_core.data.label_images import write_mask
 from gsseg_core.progress import progress_bars
 from gsseg_core.tables import counted, table
 

@@ -68,7 +68,7 @@ def test_a_robots_day_ends_with_a_table_of_bars(tmp_path: Path) -> None:
 @pytest.fixture(name="results", scope="module")
 def results_fixture(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Results of two runs over the same scene, whose masks have other ids."""
-    from gsseg_core.masks import write_mask
+    from gsseg_core.data.label_images import write_mask
 
     data = write_dataset(tmp_path_factory.mktemp("data"))
     for view in clean_views(6):

@@ -15,7 +15,7 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 from browser import opened_page, screenshot, started_chromium
 
-from gsseg_core.dataset import Dataset
+from gsseg_core.data.dataset import Dataset
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.view_access import listen

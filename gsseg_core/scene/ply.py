@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 import plyfile
 
+from gsseg_core.data.hints import scene_hint
 from gsseg_core.errors import SceneFileError, ScenePropertyError
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.input_files import open_input, reason
-from gsseg_core.layout import scene_hint
 from gsseg_core.printable import clipped, quoted
 
 _MAX_HEADER = 1 << 20

@@ -10,9 +10,9 @@ import shlex
 from collections.abc import Collection
 from pathlib import Path
 
+from gsseg_core.data.label_images import mask_bits
+from gsseg_core.data.mask_files import SUPERVISES, mask_files
 from gsseg_core.errors import GssegError
-from gsseg_core.masks import mask_bits
-from gsseg_core.soft_files import SUPERVISES, mask_files
 
 _CAMERA_FILES = ("cameras.json", "transforms.json")
 _COLMAP_FILES = ("cameras.bin", "cameras.txt")

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
+from gsseg_core.data.hints import camera_hint
+from gsseg_core.data.names import flaw_of_view_name
 from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError
 from gsseg_core.files.input_files import is_there, open_input, reason
 from gsseg_core.files.json_files import kind_of, read_json
-from gsseg_core.layout import camera_hint
-from gsseg_core.names import flaw_of_view_name
 from gsseg_core.printable import clipped, quoted
 from gsseg_core.scene.camera import Camera
 

@@ -13,15 +13,23 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.camera_files import read_cameras
+from gsseg_core.data.camera_files import read_cameras
+from gsseg_core.data.label_images import (
+    BACKGROUND_NAME,
+    MAX_LABEL,
+    UNKNOWN,
+    mask_bits,
+    mask_header,
+    read_classes,
+    read_mask,
+)
+from gsseg_core.data.mask_files import SUPERVISES, mask_files, read_soft_mask, read_supervises
+from gsseg_core.data.soft_masks import PackedMask, SeenLabels, combine_detections, quantise, restrict
+from gsseg_core.data.split_file import read_split
 from gsseg_core.errors import ClassesFileError, MaskFormatError, SettingsError, UnknownLabelError
 from gsseg_core.files.confined_files import require_folder_below
 from gsseg_core.files.input_files import is_there
-from gsseg_core.masks import BACKGROUND_NAME, MAX_LABEL, UNKNOWN, mask_bits, mask_header, read_classes, read_mask
 from gsseg_core.scene.camera import Camera
-from gsseg_core.soft_files import SUPERVISES, mask_files, read_soft_mask, read_supervises
-from gsseg_core.soft_masks import PackedMask, SeenLabels, combine_detections, quantise, restrict
-from gsseg_core.split_file import read_split
 
 _IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 
@@ -109,7 +117,7 @@ class View:
         unknown: npt.NDArray[np.bool_] | None = None,  # (H, W)
         class_names: Mapping[int, str] | None = None,
     ) -> View:
-        """Build a view from the probabilities of one segmenter, rounded as `gsseg_core.soft_masks.quantise` says.
+        """Build a view from the probabilities of one segmenter, rounded as `gsseg_core.data.soft_masks.quantise` says.
 
         Parameters
         ----------

@@ -14,9 +14,9 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from gsseg_core.data.label_evidence import Meaning
+from gsseg_core.data.label_images import MAX_LABEL, UNKNOWN, PackedLabels
 from gsseg_core.errors import MaskFormatError, MaskSizeError, UnknownLabelError
-from gsseg_core.masks import MAX_LABEL, UNKNOWN, PackedLabels
-from gsseg_core.meaning import Meaning
 from gsseg_core.printable import clipped
 
 STEPS = (16, 8, 4, 2, 1)

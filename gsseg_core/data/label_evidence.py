@@ -22,7 +22,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import Rows, starts
-from gsseg_core.masks import UNKNOWN
+from gsseg_core.data.label_images import UNKNOWN
 
 _ROUNDS = 50
 

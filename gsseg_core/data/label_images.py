@@ -18,11 +18,11 @@ import numpy.typing as npt
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
+from gsseg_core.data.names import flaw_of_class_name
 from gsseg_core.errors import ClassesFileError, MaskFormatError, SettingsError
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.input_files import check_pixels, open_image, open_input, reason
 from gsseg_core.files.json_files import kind_of, read_json
-from gsseg_core.names import flaw_of_class_name
 from gsseg_core.printable import quoted
 
 UNKNOWN = -1
