@@ -22,10 +22,10 @@ import numba as nb
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsseg_core.neighbours import Neighbours
 from gsseg_core.refine import cluster, statistical_filter
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.spatial.neighbourhood import Neighbours
 
 REPEATS = 7
 CLASSES = 40

@@ -17,7 +17,6 @@ from gsseg_core.em import EMLearner
 from gsseg_core.export import export_classes
 from gsseg_core.learner import UNITS
 from gsseg_core.live import LiveSession
-from gsseg_core.neighbours import Neighbours
 from gsseg_core.operator import make_operator
 from gsseg_core.projection import project
 from gsseg_core.refine import cluster, statistical_filter
@@ -25,6 +24,7 @@ from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
+from gsseg_core.spatial.neighbourhood import Neighbours
 from gsseg_core.tiles import assign
 from gsseg_core.votes import VoteLearner
 

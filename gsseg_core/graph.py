@@ -27,10 +27,10 @@ import numpy as np
 
 from gsseg_core.csr_rows import starts
 from gsseg_core.errors import SceneValueError, SettingsError
-from gsseg_core.kd_tree import Tree, scaled, tree_of
-from gsseg_core.nearest import CHUNK, nearest
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
+from gsseg_core.spatial.kd_tree import Tree, scaled, tree_of
+from gsseg_core.spatial.knn import CHUNK, nearest
 
 BLOCK = 16
 """Classes that are propagated at once; bounds the memory at 8 N of these in bytes, besides the codes themselves."""

@@ -22,12 +22,12 @@ from gsseg_core.errors import (
 )
 from gsseg_core.held_out import calibrate
 from gsseg_core.live_results import SCENE_CHANGED, Outcome, Rejection
-from gsseg_core.neighbours import neighbours_of
 from gsseg_core.pipeline import make_learner
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.report import Stopwatch
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
+from gsseg_core.spatial.neighbourhood import neighbours_of
 from gsseg_core.state_file import Learnt, State
 from gsseg_core.votes import VoteLearner
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsseg_core.csr_rows import Rows, largest
-from gsseg_core.neighbours import Neighbours
 from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.spatial.neighbourhood import Neighbours
 
 
 @dataclass(frozen=True, eq=False)

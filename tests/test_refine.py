@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from gsseg_core import refine
 from gsseg_core.errors import SettingsError
-from gsseg_core.neighbours import Neighbours, neighbours_of
 from gsseg_core.refine import cluster, statistical_filter
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.spatial.neighbourhood import Neighbours, neighbours_of
 
 
 def slow_cluster(means, probabilities, observed, k, beta):

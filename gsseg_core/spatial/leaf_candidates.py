@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from gsseg_core.kd_tree import LEAF, gap_to_box, leaf_of, leaf_range
 from gsseg_core.simd import squared_distances, store_row
+from gsseg_core.spatial.kd_tree import LEAF, gap_to_box, leaf_of, leaf_range
 
 DEPTH = 64  # nodes that can wait at once; a descent leaves at most one behind at each level
 FAR = np.float32(np.inf)

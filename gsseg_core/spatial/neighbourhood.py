@@ -18,12 +18,12 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import Rows
-from gsseg_core.kd_tree import LEAF, Tree, enclose, leaf_range, scaled, tree_of
-from gsseg_core.nearest import CHUNK, NO_SKIP, middle_of, nearest
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 from gsseg_core.simd import at_most, first_bit, load_row
-from gsseg_core.surroundings import Surroundings, end_of_group, look_around, measure, room_for
+from gsseg_core.spatial.kd_tree import LEAF, Tree, enclose, leaf_range, scaled, tree_of
+from gsseg_core.spatial.knn import CHUNK, NO_SKIP, middle_of, nearest
+from gsseg_core.spatial.leaf_candidates import Surroundings, end_of_group, look_around, measure, room_for
 
 CODE_UNIT = 2.0**-24
 """Codes are summed in steps of this, which is the precision of a float32 near 1."""

@@ -7,9 +7,9 @@ import math
 import numba as nb
 import numpy as np
 
-from gsseg_core.kd_tree import LEAF, gap_to_point, leaf_of, leaf_range
 from gsseg_core.simd import count_at_most
-from gsseg_core.surroundings import DEPTH, FAR, Surroundings, end_of_group, look_around, measure, room_for
+from gsseg_core.spatial.kd_tree import LEAF, gap_to_point, leaf_of, leaf_range
+from gsseg_core.spatial.leaf_candidates import DEPTH, FAR, Surroundings, end_of_group, look_around, measure, room_for
 
 DIGITS = 24
 """Distances are summed in steps of 2^-DIGITS of the k-th one, or finer: the precision of a float32."""
