@@ -32,7 +32,7 @@ from gsseg_core.em import EMLearner
 from gsseg_core.matching import Contingency, renamed
 from gsseg_core.metrics import Evaluation
 from gsseg_core.object_table import find_objects
-from gsseg_core.operator import make_operator
+from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.warm_up import warm_up

@@ -33,7 +33,7 @@ from browser import opened_page, started_chromium, why_missing
 from playwright.sync_api import Page
 
 from gsseg_core.data.dataset import View
-from gsseg_core.operator import make_operator
+from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.view_access import listen
 from gsseg_core.view_model import Labelling, ViewModel
 from gsseg_core.view_screens import BROWSER, SERVER

@@ -41,8 +41,8 @@ from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.held_out import calibrate, votes_without
 from gsseg_core.learner import VOTE_UNIT, Learner
 from gsseg_core.metrics import Evaluation
-from gsseg_core.operator import make_operator
 from gsseg_core.pipeline import make_learner
+from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.reliability import OtherViews
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation

@@ -34,8 +34,8 @@ from gsseg_core.em import EMLearner
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.graph import GraphSettings, graph_of, propagate
 from gsseg_core.metrics import Evaluation
-from gsseg_core.operator import ViewOperator, make_operator
 from gsseg_core.pick import Pick, pick_clicks, pick_mask
+from gsseg_core.raster.view_operator import ViewOperator, make_operator
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from gsseg_core.projection import HALF_LOG2E, HEIGHT, LOG_OPACITY, SHEAR, WIDTH, Projected, U, V
-from gsseg_core.tiles import TILE, Tiles
+from gsseg_core.raster.cpu.projection import HALF_LOG2E, HEIGHT, LOG_OPACITY, SHEAR, WIDTH, Projected, U, V
+from gsseg_core.raster.cpu.tiling import TILE, Tiles
 
 
 class Splats(NamedTuple):

@@ -21,13 +21,13 @@ from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.freed_memory import keep_freed_memory
 from gsseg_core.learner import UNITS, Learner
-from gsseg_core.lifted_mask import LiftedMask
 from gsseg_core.metrics import Evaluation
-from gsseg_core.operator import make_operator
-from gsseg_core.projection import project
+from gsseg_core.raster.cpu.lifted_mask import LiftedMask
+from gsseg_core.raster.cpu.projection import project
+from gsseg_core.raster.cpu.tiling import assign
+from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.tiles import assign
 from gsseg_core.votes import VoteLearner
 from gsseg_core.warm_up import warm_up
 

@@ -36,11 +36,11 @@ from machine import once
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from gsseg_core.blend import in_tile
-from gsseg_core.projection import Projected
+from gsseg_core.raster.cpu.blending import in_tile
+from gsseg_core.raster.cpu.projection import Projected
+from gsseg_core.raster.cpu.splat import ALPHA_MAX, HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, T_MIN, WIDTH, U, V
+from gsseg_core.raster.cpu.tiling import TILE, Tiles
 from gsseg_core.simd import LANES
-from gsseg_core.splat import ALPHA_MAX, HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, T_MIN, WIDTH, U, V
-from gsseg_core.tiles import TILE, Tiles
 
 AIM_FLOPS, AIM_INSTRUCTIONS = 22, 29  # of one aim, per lane and per sixteen
 FLOPS, INSTRUCTIONS = 17, 21  # of one evaluation, per pixel and per sixteen

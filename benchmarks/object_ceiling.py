@@ -14,15 +14,15 @@ from collections.abc import Sequence
 import numba as nb
 import numpy as np
 
-from gsseg_core.blend import in_tile, open_rays
 from gsseg_core.data.dataset import View
-from gsseg_core.operator import make_operator
-from gsseg_core.projection import project
+from gsseg_core.raster.cpu.blending import in_tile, open_rays
+from gsseg_core.raster.cpu.projection import project
+from gsseg_core.raster.cpu.splat import WIDTH, aim, blend_block
+from gsseg_core.raster.cpu.tiling import TILE, assign
+from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.silhouettes import BEHIND, depths, surface
 from gsseg_core.simd import first_bit, store_row
-from gsseg_core.splat import WIDTH, aim, blend_block
-from gsseg_core.tiles import TILE, assign
 
 SWEEPS = 4  # for each steepness
 STEEPNESS = (4.0, 12.0, 36.0)  # of the logistic, in optical depth, one after the other

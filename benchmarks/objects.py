@@ -25,8 +25,8 @@ from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.demo_scene import build_demo
 from gsseg_core.em import EMLearner
 from gsseg_core.export import background_image
-from gsseg_core.operator import make_operator
 from gsseg_core.pictures import contact_sheet, save_png
+from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation

@@ -18,10 +18,10 @@ from room import build_room
 from scipy.spatial import cKDTree
 
 from gsseg_core.data.dataset import Dataset
-from gsseg_core.projection import project
+from gsseg_core.raster.cpu.projection import project
+from gsseg_core.raster.cpu.tiling import assign
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.tiles import assign
 
 QUANTILES = (5, 50, 95)
 CAMERAS = 20

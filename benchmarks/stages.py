@@ -12,20 +12,20 @@ import numpy as np
 from machine import asked_anew, drop_from_page_cache, once, timed
 
 from gsseg_core.data.dataset import Dataset, View, spread
-from gsseg_core.depth_sort import sort_by_depth
 from gsseg_core.em import EMLearner
 from gsseg_core.export import export_classes
 from gsseg_core.learner import UNITS
 from gsseg_core.live import LiveSession
-from gsseg_core.operator import make_operator
-from gsseg_core.projection import project
+from gsseg_core.raster.cpu.depth_sort import sort_by_depth
+from gsseg_core.raster.cpu.projection import project
+from gsseg_core.raster.cpu.tiling import assign
+from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.refine import cluster, statistical_filter
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.spatial.neighbourhood import Neighbours
-from gsseg_core.tiles import assign
 from gsseg_core.votes import VoteLearner
 
 Times = dict[str, list[float]]

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from gsseg_core.export import export_classes
     from gsseg_core.gradient import GradientLearner, GradientSettings
     from gsseg_core.metrics import Evaluation
-    from gsseg_core.operator import ViewOperator, make_operator
+    from gsseg_core.raster.view_operator import ViewOperator, make_operator
     from gsseg_core.refine_settings import RefineSettings
     from gsseg_core.scene.camera import Camera
     from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -46,10 +46,10 @@ _HOMES = {
     "RefineSettings": "refine_settings",
     "Segmentation": "segmentation",
     "View": "data.dataset",
-    "ViewOperator": "operator",
+    "ViewOperator": "raster.view_operator",
     "VoteLearner": "votes",
     "export_classes": "export",
-    "make_operator": "operator",
+    "make_operator": "raster.view_operator",
     "object_boxes": "boxes",
 }
 

@@ -26,17 +26,17 @@ from dataclasses import dataclass, replace
 import numba as nb
 import numpy as np
 
-from gsseg_core.blend import in_block, open_rays, stride_of, tile_of_turn
 from gsseg_core.errors import MaskSizeError
-from gsseg_core.operator import ViewOperator, make_operator
-from gsseg_core.projection import project
+from gsseg_core.raster.cpu.blending import in_block, open_rays, stride_of, tile_of_turn
+from gsseg_core.raster.cpu.projection import project
+from gsseg_core.raster.cpu.splat import WIDTH, aim, blend_block
+from gsseg_core.raster.cpu.tiling import TILE, Tiles, assign
+from gsseg_core.raster.view_operator import ViewOperator, make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
 from gsseg_core.silhouettes import BEHIND, depths, surface
 from gsseg_core.simd import first_bit, store_row
-from gsseg_core.splat import WIDTH, aim, blend_block
-from gsseg_core.tiles import TILE, Tiles, assign
 
 STEPS = 5
 """Steps of the shares: the labels hardly change after these."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from gsseg_core.devices import DEVICES, checked_device
 from gsseg_core.errors import SettingsError
+from gsseg_core.raster.devices import DEVICES, checked_device
 from gsseg_core.terminal import note
 
 

@@ -63,9 +63,9 @@ from gsseg_core.error_model import ErrorModel
 from gsseg_core.errors import SettingsError
 from gsseg_core.gaussian_kernels import collect, improve, improve_without, mix, promised, tally
 from gsseg_core.learner import MEMORY_BUDGET, VOTE_UNIT, Learner, Progress, silent
-from gsseg_core.operator import Observation, ViewOperator, make_operator
 from gsseg_core.others import counted_by_others
 from gsseg_core.outlines import scene_edges, settle_outlines
+from gsseg_core.raster.view_operator import Observation, ViewOperator, make_operator
 from gsseg_core.regions import by_region, in_doubt, take_back
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import neighbours_of

@@ -17,7 +17,7 @@ from gsseg_core.calibration import VIEWS, Sample, fit_temperature, sample_pixels
 from gsseg_core.data.dataset import View, spread
 from gsseg_core.em import EMLearner
 from gsseg_core.learner import UNITS, Learner, Progress, silent
-from gsseg_core.operator import make_operator
+from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.reliability import OtherViews
 from gsseg_core.votes import VoteLearner
 

@@ -15,9 +15,9 @@ from gsseg_core.data.label_evidence import decided, guess
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
 from gsseg_core.gaussian_kernels import share_votes
-from gsseg_core.operator import Observation, ViewOperator, make_operator
 from gsseg_core.progress import Progress as Progress
 from gsseg_core.progress import silent as silent
+from gsseg_core.raster.view_operator import Observation, ViewOperator, make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.state_file import State
 

@@ -9,7 +9,7 @@ from gsseg_core.csr_rows import Rows
 from gsseg_core.data.label_evidence import Meaning, stand
 from gsseg_core.gaussian_kernels import BLOCKS, take_row
 from gsseg_core.learner import UNITS
-from gsseg_core.operator import Observation
+from gsseg_core.raster.view_operator import Observation
 
 
 def counted_by_others(

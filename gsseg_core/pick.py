@@ -34,7 +34,7 @@ from gsseg_core.data.label_images import UNKNOWN, read_mask
 from gsseg_core.errors import MaskFormatError, NoUsableViewsError, SettingsError
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.graph import GraphSettings, graph_of, propagate
-from gsseg_core.operator import make_operator
+from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 

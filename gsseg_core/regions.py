@@ -18,8 +18,8 @@ from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.gaussian_kernels import take_votes
 from gsseg_core.learner import UNITS
-from gsseg_core.operator import Observation
 from gsseg_core.others import counted_by_others
+from gsseg_core.raster.view_operator import Observation
 
 SMALLEST = 64
 """Regions of fewer px are not told apart: all of one label are judged as one."""

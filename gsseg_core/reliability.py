@@ -26,8 +26,8 @@ from gsseg_core.data.label_images import UNKNOWN, PackedLabels
 from gsseg_core.em import EMLearner, codes_without
 from gsseg_core.export import background_image
 from gsseg_core.learner import Progress, silent
-from gsseg_core.operator import make_operator
 from gsseg_core.pictures import contact_sheet, overlay, palette
+from gsseg_core.raster.view_operator import make_operator
 
 CONFUSIONS = 3
 """Most confusions that the report of a view names."""

@@ -15,8 +15,8 @@ from gsseg_core.data.label_images import UNKNOWN, PackedLabels
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.export import background_image
 from gsseg_core.files.input_files import open_image
-from gsseg_core.operator import make_operator
 from gsseg_core.pictures import outline, overlay
+from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.reliability import ViewCheck
 from gsseg_core.report_findings import Evidence
 from gsseg_core.scene.gaussian_scene import GaussianScene

@@ -17,8 +17,8 @@ from gsseg_core.csr_rows import largest
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.npz_files import UnfitError, check_shares, class_names_of, open_npz, temperature_of
 from gsseg_core.files.run_folder import settle
-from gsseg_core.operator import ViewOperator
 from gsseg_core.printable import clipped
+from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.refine import cluster, statistical_filter
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
-from gsseg_core.operator import Observation
+from gsseg_core.raster.view_operator import Observation
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ import numpy as np
 
 from gsseg_core.errors import MaskSizeError
 from gsseg_core.metrics import BOUNDARY_SHARE, boundary_band
-from gsseg_core.operator import ViewOperator, make_operator
+from gsseg_core.raster.view_operator import ViewOperator, make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 

@@ -11,7 +11,7 @@ import numpy as np
 import viser
 
 from gsseg_core.errors import GssegError
-from gsseg_core.operator import ViewOperator, make_operator
+from gsseg_core.raster.view_operator import ViewOperator, make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.view_picture import Picture

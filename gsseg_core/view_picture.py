@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from gsseg_core.operator import ViewOperator
+from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.view_nodes import Key, Node, paint
 

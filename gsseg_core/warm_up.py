@@ -11,7 +11,7 @@ from numba.core import event
 from gsseg_core import kernel_cache
 from gsseg_core.data.dataset import View
 from gsseg_core.em import EMLearner, EMSettings
-from gsseg_core.operator import make_operator
+from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.reliability import OtherViews
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene

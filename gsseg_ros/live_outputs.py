@@ -17,8 +17,8 @@ from builtin_interfaces.msg import Time
 from std_msgs.msg import Header
 
 from gsseg_core.errors import GssegError
-from gsseg_core.operator import make_operator
 from gsseg_core.pictures import overlay, palette
+from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.color_images import color_from_image

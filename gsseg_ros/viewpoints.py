@@ -13,8 +13,8 @@ from std_msgs.msg import Header
 
 from gsseg_core.errors import IntrinsicsError, PoseError
 from gsseg_core.export import background_image
-from gsseg_core.operator import make_operator
 from gsseg_core.pictures import overlay, palette
+from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_ros.conversions import (
     camera_from_messages,

@@ -34,7 +34,7 @@ from gsseg_core.errors import SettingsError, UnknownLabelError
 from gsseg_core.live_ids import PerViewSession
 from gsseg_core.matching import Contingency, renamed
 from gsseg_core.object_table import ObjectTable, find_objects
-from gsseg_core.operator import make_operator
+from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segments import Lifted
 from gsseg_core.state_file import Learnt

@@ -28,10 +28,10 @@ from report import Bar, Report, short
 from workloads import SIZES, RoomSize, make_room, split
 
 from gsseg_core.gradient import GradientLearner, GradientSettings
-from gsseg_core.operator import make_operator
-from gsseg_core.projection import project
+from gsseg_core.raster.cpu.projection import project
+from gsseg_core.raster.cpu.tiling import assign
+from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.tiles import assign
 
 SCENE, TRUTH = balls_on_a_table()
 SMALL_ROOM = make_room(RoomSize(3000, 2, 3, 70, 50))

@@ -27,8 +27,8 @@ from gsseg_core.export import export_classes
 from gsseg_core.held_out import calibrate, votes_without
 from gsseg_core.learner import Learner
 from gsseg_core.live import LiveSession
-from gsseg_core.operator import make_operator
 from gsseg_core.pipeline import segment
+from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.reliability import OtherViews
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation

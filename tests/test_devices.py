@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from gsseg_core import cli
-from gsseg_core.devices import checked_device
 from gsseg_core.errors import SettingsError
+from gsseg_core.raster.devices import checked_device
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda", "cuda:0", "cuda:12"])

@@ -29,7 +29,7 @@ from gsseg_core.data.dataset import View
 from gsseg_core.em import EMLearner, EMSettings, codes_without
 from gsseg_core.errors import SettingsError
 from gsseg_core.gaussian_kernels import GAIN_UNIT, collect, improve, promised
-from gsseg_core.operator import make_operator
+from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.regions import SMALLEST
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.votes import VoteLearner

@@ -26,8 +26,8 @@ from gsseg_core.data.dataset import View
 from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import SettingsError
 from gsseg_core.gradient import GradientLearner, GradientSettings
-from gsseg_core.gsplat_operator import GsplatOperator, _tensors_of, chunks, load_gsplat
-from gsseg_core.operator import make_operator
+from gsseg_core.raster.gsplat_backend import GsplatOperator, _tensors_of, chunks, load_gsplat
+from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.votes import VoteLearner
@@ -216,7 +216,7 @@ def test_without_gsplat_the_error_names_the_extra(monkeypatch):
 
 
 def test_without_torch_the_error_names_the_extra(monkeypatch):
-    monkeypatch.delitem(sys.modules, "gsseg_core.gsplat_operator")
+    monkeypatch.delitem(sys.modules, "gsseg_core.raster.gsplat_backend")
     monkeypatch.setitem(sys.modules, "torch", None)
     assert refused("cuda").endswith(
         "PyTorch is missing; expected a CUDA build of it and gsplat: pip install 'gsseg[gsplat]'"

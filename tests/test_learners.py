@@ -13,7 +13,7 @@ from gsseg_core.em import EMLearner
 from gsseg_core.errors import MaskSizeError, NoUsableViewsError, SettingsError, UnknownLabelError
 from gsseg_core.gradient import GradientLearner
 from gsseg_core.learner import VOTE_UNIT, Learner
-from gsseg_core.operator import make_operator
+from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.segmentation import UNOBSERVED, Segmentation
 from gsseg_core.votes import VoteLearner

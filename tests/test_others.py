@@ -13,8 +13,8 @@ from gsseg_core.data.dataset import View
 from gsseg_core.data.label_evidence import Meaning, standing
 from gsseg_core.em import EMLearner
 from gsseg_core.learner import UNITS
-from gsseg_core.operator import Observation
 from gsseg_core.others import counted_by_others
+from gsseg_core.raster.view_operator import Observation
 
 SCENE, _ = balls_on_a_table()
 POSSIBLE = np.ones(NUM_CLASSES, bool)

@@ -13,8 +13,8 @@ from ros_robot import CLASSES, LATCHED, SERVICES, Learn, Robot, core_session, vi
 from small_scenes import NAMES, clean_views
 
 from gsseg_core.export import background_image
-from gsseg_core.operator import make_operator
 from gsseg_core.pictures import overlay, palette
+from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
 

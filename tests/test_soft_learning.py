@@ -30,8 +30,8 @@ from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import UnknownLabelError
 from gsseg_core.learner import VOTE_UNIT, Learner
 from gsseg_core.live import LiveSession
-from gsseg_core.operator import make_operator
 from gsseg_core.pipeline import LEARNERS, make_learner
+from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.reliability import check_views
 from gsseg_core.votes import VoteLearner
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from gsseg_core.blend import AHEAD
 from gsseg_core.csr_rows import starts
 from gsseg_core.data.label_evidence import Meaning
-from gsseg_core.lift import Labels, cut_labels, lift
+from gsseg_core.raster.cpu.blending import AHEAD
+from gsseg_core.raster.cpu.lifting import Labels, cut_labels, lift
+from gsseg_core.raster.cpu.tiling import Tiles
 from gsseg_core.scene.camera import Camera
 from gsseg_core.simd import prefetch
-from gsseg_core.tiles import Tiles
 
 CHUNKS = 16
 """Parts of the Gaussians that are gone through beside each other."""

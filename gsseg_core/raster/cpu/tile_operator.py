@@ -6,18 +6,18 @@ import copy
 
 import numpy as np
 
-from gsseg_core import products
 from gsseg_core.csr_rows import Rows
 from gsseg_core.data.label_evidence import Meaning
-from gsseg_core.lifted_mask import LiftedMask
-from gsseg_core.operator import Blended, Observation, ViewOperator, Weights
-from gsseg_core.projection import project
+from gsseg_core.raster.cpu import products
+from gsseg_core.raster.cpu.label_pairs import take
+from gsseg_core.raster.cpu.lifted_mask import LiftedMask
+from gsseg_core.raster.cpu.projection import project
+from gsseg_core.raster.cpu.splat import LOG_OPACITY
+from gsseg_core.raster.cpu.tile_observation import TileObservation
+from gsseg_core.raster.cpu.tiling import TILE, assign
+from gsseg_core.raster.view_operator import Blended, Observation, ViewOperator, Weights
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.sightings import take
-from gsseg_core.splat import LOG_OPACITY
-from gsseg_core.tile_observation import TileObservation
-from gsseg_core.tiles import TILE, assign
 
 
 class TileOperator(ViewOperator):

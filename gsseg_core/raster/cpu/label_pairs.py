@@ -11,7 +11,9 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from gsseg_core.blend import AHEAD, open_rays, stride_of, tile_of_turn
+from gsseg_core.raster.cpu.blending import AHEAD, open_rays, stride_of, tile_of_turn
+from gsseg_core.raster.cpu.splat import WIDTH, aim, blend_block
+from gsseg_core.raster.cpu.tiling import TILE
 from gsseg_core.simd import (
     FAST,
     add_product,
@@ -25,8 +27,6 @@ from gsseg_core.simd import (
     store_row,
     sum_row,
 )
-from gsseg_core.splat import WIDTH, aim, blend_block
-from gsseg_core.tiles import TILE
 
 _TINY = np.float32(1e-30)
 

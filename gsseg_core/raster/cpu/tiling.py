@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
-from gsseg_core.projection import Projected
+from gsseg_core.raster.cpu.projection import Projected
+from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
 from gsseg_core.simd import LANES
-from gsseg_core.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
 
 TILE = LANES
 """Side of a tile in px. One row of a tile is one vector register of sixteen float32."""

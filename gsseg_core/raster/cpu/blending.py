@@ -18,9 +18,9 @@ from typing import Any
 import numba as nb
 import numpy as np
 
+from gsseg_core.raster.cpu.splat import OPEN, SIDE, WIDTH, aim, blend_block
+from gsseg_core.raster.cpu.tiling import TILE
 from gsseg_core.simd import first_bit, prefetch, store_row
-from gsseg_core.splat import OPEN, SIDE, WIDTH, aim, blend_block
-from gsseg_core.tiles import TILE
 
 AHEAD = 12
 """Entries between the one that is blended and the one that is fetched from memory."""

@@ -10,11 +10,11 @@ import numpy as np
 
 from gsseg_core.csr_rows import Rows
 from gsseg_core.data.label_evidence import Meaning
-from gsseg_core.devices import checked_device
 from gsseg_core.errors import MaskSizeError, SceneValueError, SettingsError
+from gsseg_core.raster.cpu.label_pairs import add_votes
+from gsseg_core.raster.devices import checked_device
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.sightings import add_votes
 
 
 class Weights(NamedTuple):
@@ -411,11 +411,11 @@ def make_operator(scene: GaussianScene, camera: Camera, device: str = "cpu") -> 
         There is no such device, or what it needs is not installed.
     """
     if checked_device(device) == "cpu":
-        from gsseg_core.tile_operator import TileOperator
+        from gsseg_core.raster.cpu.tile_operator import TileOperator
 
         return TileOperator(scene, camera)
     try:
-        from gsseg_core.gsplat_operator import GsplatOperator, load_gsplat
+        from gsseg_core.raster.gsplat_backend import GsplatOperator, load_gsplat
     except ModuleNotFoundError as missing:
         if missing.name != "torch":
             raise

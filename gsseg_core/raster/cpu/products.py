@@ -8,10 +8,19 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from gsseg_core.blend import AHEAD, aim_next, blend_tile, in_block, in_tile, open_rays, stride_of, tile_of_turn
+from gsseg_core.raster.cpu.blending import (
+    AHEAD,
+    aim_next,
+    blend_tile,
+    in_block,
+    in_tile,
+    open_rays,
+    stride_of,
+    tile_of_turn,
+)
+from gsseg_core.raster.cpu.splat import OPEN, WIDTH, blend_block
+from gsseg_core.raster.cpu.tiling import TILE
 from gsseg_core.simd import FAST, add_scaled, dot, first_bit, load_row, prefetch, store_row
-from gsseg_core.splat import OPEN, WIDTH, blend_block
-from gsseg_core.tiles import TILE
 
 _TINY = np.float32(1e-30)
 

@@ -22,11 +22,11 @@ import torch
 
 from gsseg_core.csr_rows import starts
 from gsseg_core.errors import SceneValueError, SettingsError
-from gsseg_core.operator import Blended, Observation, Shares, ViewOperator, Weights
-from gsseg_core.projection import ALPHA_MIN, DILATION, NEAR
+from gsseg_core.raster.cpu.projection import ALPHA_MIN, DILATION, NEAR
+from gsseg_core.raster.cpu.splat import ALPHA_MAX, T_MIN
+from gsseg_core.raster.view_operator import Blended, Observation, Shares, ViewOperator, Weights
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.splat import ALPHA_MAX, T_MIN
 
 TILE = 16
 """Side of the tiles that gsplat is asked for, in px."""

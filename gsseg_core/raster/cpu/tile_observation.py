@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsseg_core import sightings
 from gsseg_core.csr_rows import starts
 from gsseg_core.errors import SceneValueError
-from gsseg_core.lifted_mask import LiftedMask
-from gsseg_core.operator import Observation, Shares
+from gsseg_core.raster.cpu import label_pairs as sightings
+from gsseg_core.raster.cpu.lifted_mask import LiftedMask
+from gsseg_core.raster.cpu.tiling import Tiles
+from gsseg_core.raster.view_operator import Observation, Shares
 from gsseg_core.scene.camera import Camera
-from gsseg_core.tiles import Tiles
 
 
 class TileObservation(Observation):

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
-from gsseg_core.blend import aim_next, in_tile, open_rays, stride_of, tile_of_turn
+from gsseg_core.raster.cpu.blending import aim_next, in_tile, open_rays, stride_of, tile_of_turn
+from gsseg_core.raster.cpu.splat import OPEN, WIDTH, blend_block
+from gsseg_core.raster.cpu.tiling import TILE
 from gsseg_core.simd import FAST, LANES, add_where, count_bits, first_bit, nothing, sum_row
-from gsseg_core.splat import OPEN, WIDTH, blend_block
-from gsseg_core.tiles import TILE
 
 
 @dataclass(frozen=True)

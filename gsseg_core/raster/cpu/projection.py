@@ -18,11 +18,11 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
-from gsseg_core.depth_sort import sort_by_depth
+from gsseg_core.raster.cpu.depth_sort import sort_by_depth
+from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.simd import prefetch
-from gsseg_core.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
 
 NEAR = 0.01
 """Centres nearer than this to the camera plane are not drawn, in scene units."""
