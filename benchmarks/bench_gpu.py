@@ -19,8 +19,8 @@ from machine import DATA, asked_anew, once, processor, timed, version
 from room import build_room
 
 from gsseg_core.data.dataset import Dataset, View, spread
-from gsseg_core.em import EMLearner
 from gsseg_core.errors import SettingsError
+from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.warm_up import warm_up

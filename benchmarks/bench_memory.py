@@ -13,8 +13,8 @@ from workloads import RoomSize, make_room
 
 from gsseg_core.csr_rows import Rows
 from gsseg_core.data.dataset import View
-from gsseg_core.em import EMLearner
-from gsseg_core.learner import MEMORY_BUDGET
+from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.learn.learner import MEMORY_BUDGET
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.segmentation import Segmentation
 

@@ -24,7 +24,7 @@ from workloads import REAL, RoomSize, make_room, true_labels
 
 from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.data.soft_masks import SeenLabels
-from gsseg_core.em import EMLearner
+from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.raster.cpu import label_pairs as sightings
 from gsseg_core.raster.cpu.blending import open_rays
 from gsseg_core.raster.cpu.lifted_mask import LiftedMask

@@ -23,7 +23,13 @@ from plots import Axis, draw_panels
 from results import machine, markdown
 from scipy.optimize import minimize_scalar
 
-from gsseg_core.calibration import (
+from gsseg_core.data.dataset import Dataset, View, spread
+from gsseg_core.demo_scene import build_demo
+from gsseg_core.learn.calibrate import calibrate, votes_without
+from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
+from gsseg_core.learn.learner import VOTE_UNIT, Learner
+from gsseg_core.learn.mask_reliability import OtherViews
+from gsseg_core.learn.temperature import (
     HIGHEST,
     LOWEST,
     OUTLIERS,
@@ -35,15 +41,9 @@ from gsseg_core.calibration import (
     sample_pixels,
     tempered,
 )
-from gsseg_core.data.dataset import Dataset, View, spread
-from gsseg_core.demo_scene import build_demo
-from gsseg_core.em import EMLearner, EMSettings
-from gsseg_core.held_out import calibrate, votes_without
-from gsseg_core.learner import VOTE_UNIT, Learner
 from gsseg_core.metrics import Evaluation
 from gsseg_core.pipeline import make_learner
 from gsseg_core.raster.view_operator import make_operator
-from gsseg_core.reliability import OtherViews
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.warm_up import warm_up

@@ -30,9 +30,9 @@ from scipy import ndimage
 
 from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.demo_scene import build_demo
-from gsseg_core.em import EMLearner
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.graph import GraphSettings, graph_of, propagate
+from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.metrics import Evaluation
 from gsseg_core.pick import Pick, pick_clicks, pick_mask
 from gsseg_core.raster.view_operator import ViewOperator, make_operator

@@ -20,13 +20,13 @@ from few_views import Bench, split
 from machine import DATA, REPOSITORY
 from results import markdown
 
-from gsseg_core.calibration import ReliabilityDiagram
 from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.demo_scene import build_demo
-from gsseg_core.em import EMLearner
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.graph import GraphSettings, graph_of, is_scarce, propagate
-from gsseg_core.held_out import calibrate
+from gsseg_core.learn.calibrate import calibrate
+from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.learn.temperature import ReliabilityDiagram
 from gsseg_core.mask_errors import MaskErrors, corrupt
 from gsseg_core.metrics import Evaluation
 from gsseg_core.refine_settings import RefineSettings

@@ -18,9 +18,10 @@ from workloads import RoomSize, make_room, split, true_labels, write_room
 
 from gsseg_core import pipeline
 from gsseg_core.data.dataset import Dataset, View, spread
-from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.freed_memory import keep_freed_memory
-from gsseg_core.learner import UNITS, Learner
+from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
+from gsseg_core.learn.learner import UNITS, Learner
+from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.metrics import Evaluation
 from gsseg_core.raster.cpu.lifted_mask import LiftedMask
 from gsseg_core.raster.cpu.projection import project
@@ -28,7 +29,6 @@ from gsseg_core.raster.cpu.tiling import assign
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.votes import VoteLearner
 from gsseg_core.warm_up import warm_up
 
 DENSER, FAINTER = 2.2, 0.6
@@ -137,7 +137,7 @@ def torch_loop(size: dict[str, int], epochs: int) -> dict[str, Any]:
     import torch
     from plain_torch import PlainTorch
 
-    from gsseg_core.gradient import GradientLearner, GradientSettings
+    from gsseg_core.learn.gradient_learner import GradientLearner, GradientSettings
 
     warm_up()
     torch.set_num_threads(os.cpu_count() or 1)

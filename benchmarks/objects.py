@@ -23,8 +23,8 @@ from results import machine, markdown, points
 from gsseg_core.carve import KEPT, Silhouette, shares
 from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.demo_scene import build_demo
-from gsseg_core.em import EMLearner
 from gsseg_core.export import background_image
+from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.pictures import contact_sheet, save_png
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.refine_settings import RefineSettings

@@ -25,9 +25,9 @@ from jobs import hard_votes
 from machine import processor
 
 from gsseg_core.data.dataset import Dataset, View
-from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.export import background_image
-from gsseg_core.learner import Learner
+from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
+from gsseg_core.learn.learner import Learner
 from gsseg_core.metrics import Evaluation, evaluate_folders
 from gsseg_core.pictures import contact_sheet, overlay, palette, save_png
 from gsseg_core.pipeline import make_learner
@@ -239,8 +239,8 @@ view, and edges off by up to 3 px. Scores are of the test views against the true
 [What is measured](#what-is-measured) stands at the end. The settings of `em` were chosen on 15 of the train views, held
 out from learning for that purpose; but `least_agreement`, `majority` and `tolerance` on the test views here and on
 those of the demo scene, with masks drawn wrong in many ways ([robustness.md](robustness.md)); and so were `ROUGH`
-of `gsseg_core/em.py`, `SHARPNESS`, `SHORTEST` and `TELLING` of `gsseg_core/outlines.py` and `COVERED` of
-`gsseg_core/regions.py`.
+of `gsseg_core/learn/em/em_learner.py`, `SHARPNESS`, `SHORTEST` and `TELLING` of `gsseg_core/learn/em/boundary_alignment.py` and `COVERED` of
+`gsseg_core/learn/em/rejected_regions.py`.
 """
 
 LEARNERS = """## Learners

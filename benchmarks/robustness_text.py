@@ -25,7 +25,7 @@ learning, with the reading and preparing of the views.
 
 What each error costs alone; swapped pairs, in which two objects of a view have exchanged ids, are not among those
 above. The last three columns are the mIoU of other learners; `em` moves outlines to edges of the scene
-(`gsseg_core/outlines.py`), the first of the three does not.
+(`gsseg_core/learn/em/boundary_alignment.py`), the first of the three does not.
 
 {parts}
 """

@@ -12,9 +12,10 @@ import numpy as np
 from machine import asked_anew, drop_from_page_cache, once, timed
 
 from gsseg_core.data.dataset import Dataset, View, spread
-from gsseg_core.em import EMLearner
 from gsseg_core.export import export_classes
-from gsseg_core.learner import UNITS
+from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.learn.learner import UNITS
+from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live import LiveSession
 from gsseg_core.raster.cpu.depth_sort import sort_by_depth
 from gsseg_core.raster.cpu.projection import project
@@ -26,7 +27,6 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.spatial.neighbourhood import Neighbours
-from gsseg_core.votes import VoteLearner
 
 Times = dict[str, list[float]]
 """Seconds of each run of each stage, or other numbers of it."""

@@ -20,34 +20,34 @@ from gsseg_core import kernel_cache as _kernel_cache  # noqa: F401
 if TYPE_CHECKING:
     from gsseg_core.boxes import OrientedBox, object_boxes
     from gsseg_core.data.dataset import Dataset, View
-    from gsseg_core.em import EMLearner, EMSettings
     from gsseg_core.errors import GssegError
     from gsseg_core.export import export_classes
-    from gsseg_core.gradient import GradientLearner, GradientSettings
+    from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
+    from gsseg_core.learn.gradient_learner import GradientLearner, GradientSettings
+    from gsseg_core.learn.vote_learner import VoteLearner
     from gsseg_core.metrics import Evaluation
     from gsseg_core.raster.view_operator import ViewOperator, make_operator
     from gsseg_core.refine_settings import RefineSettings
     from gsseg_core.scene.camera import Camera
     from gsseg_core.scene.gaussian_scene import GaussianScene
     from gsseg_core.segmentation import Segmentation
-    from gsseg_core.votes import VoteLearner
 
 _HOMES = {
     "Camera": "scene.camera",
     "Dataset": "data.dataset",
-    "EMLearner": "em",
-    "EMSettings": "em",
+    "EMLearner": "learn.em.em_learner",
+    "EMSettings": "learn.em.em_learner",
     "Evaluation": "metrics",
     "GaussianScene": "scene.gaussian_scene",
-    "GradientLearner": "gradient",
-    "GradientSettings": "gradient",
+    "GradientLearner": "learn.gradient_learner",
+    "GradientSettings": "learn.gradient_learner",
     "GssegError": "errors",
     "OrientedBox": "boxes",
     "RefineSettings": "refine_settings",
     "Segmentation": "segmentation",
     "View": "data.dataset",
     "ViewOperator": "raster.view_operator",
-    "VoteLearner": "votes",
+    "VoteLearner": "learn.vote_learner",
     "export_classes": "export",
     "make_operator": "raster.view_operator",
     "object_boxes": "boxes",

@@ -9,7 +9,7 @@ import numpy as np
 
 from gsseg_core import pipeline
 from gsseg_core.demo_scene import DemoScene, build_demo
-from gsseg_core.learner import Progress, silent
+from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.metrics import evaluate_folders
 from gsseg_core.report import Stopwatch
 from gsseg_core.segmentation import Segmentation

@@ -20,7 +20,9 @@ from gsseg_core.errors import (
     StateFileError,
     UnknownLabelError,
 )
-from gsseg_core.held_out import calibrate
+from gsseg_core.learn.calibrate import calibrate
+from gsseg_core.learn.learner_state import Learnt, State
+from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live_results import SCENE_CHANGED, Outcome, Rejection
 from gsseg_core.pipeline import make_learner
 from gsseg_core.refine_settings import RefineSettings
@@ -28,8 +30,6 @@ from gsseg_core.report import Stopwatch
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.spatial.neighbourhood import neighbours_of
-from gsseg_core.state_file import Learnt, State
-from gsseg_core.votes import VoteLearner
 
 VOTES_LIMIT = 2 << 30
 """Bytes of votes up to which classes without declared names are added as their labels turn up."""
@@ -263,7 +263,7 @@ class LiveSession:
     def segmentation(self, settings: RefineSettings | None = None, watch: Stopwatch | None = None) -> Segmentation:
         """Refine the codes as they are now and label every Gaussian; kept until codes or settings change.
 
-        After `learn`, probabilities are calibrated (see `gsseg_core.held_out`). Those of mere votes are shares of the
+        After `learn`, probabilities are calibrated (see `gsseg_core.learn.calibrate`). Those of mere votes are shares of the
         pixels that saw a Gaussian, and so less sure than they might be.
 
         Raises

@@ -11,11 +11,11 @@ import numpy as np
 
 from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.errors import GssegError, SettingsError
+from gsseg_core.learn.learner_state import State
 from gsseg_core.live import LiveSession
 from gsseg_core.live_results import Outcome, Rejection
 from gsseg_core.object_table import ObjectTable, Repair, object_name
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.state_file import State
 
 
 class PerViewSession(LiveSession):

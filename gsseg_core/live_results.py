@@ -12,7 +12,7 @@ from gsseg_core.errors import (
     PoseError,
     UnknownLabelError,
 )
-from gsseg_core.state_file import Learnt
+from gsseg_core.learn.learner_state import Learnt
 
 SCENE_CHANGED = "scene_changed"
 """Reason for a view of what has been forgotten since it was taken."""

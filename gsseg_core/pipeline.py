@@ -14,7 +14,6 @@ import numpy as np
 from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.data.hints import mask_hint
 from gsseg_core.data.label_images import write_mask
-from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.export import (
     Drawn,
@@ -29,19 +28,20 @@ from gsseg_core.export import (
 from gsseg_core.files.earlier_outputs import earlier_render, earlier_segment
 from gsseg_core.files.run_folder import StagedRun, staged_run
 from gsseg_core.graph import GraphSettings, is_scarce, spread_if_scarce
-from gsseg_core.held_out import calibrate
-from gsseg_core.learner import MEMORY_BUDGET, NO_MASK, Learner, Progress, silent
+from gsseg_core.learn.calibrate import calibrate
+from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
+from gsseg_core.learn.learner import MEMORY_BUDGET, NO_MASK, Learner, Progress, silent
+from gsseg_core.learn.mask_reliability import OtherViews, ViewCheck, draw_worst_views, hold_against, reliability_report
+from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.object_table import find_objects
 from gsseg_core.pictures import save_png
 from gsseg_core.refine_settings import RefineSettings
-from gsseg_core.reliability import OtherViews, ViewCheck, draw_worst_views, hold_against, reliability_report
 from gsseg_core.report import Stopwatch, build_report
 from gsseg_core.report_findings import Evidence
 from gsseg_core.report_page import write_report_page
 from gsseg_core.report_pictures import ViewImages
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.votes import VoteLearner
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -98,7 +98,7 @@ def make_learner(
     where: dict[str, Any] = {"device": device, "memory_budget": memory_budget}
     em = EMSettings(max_steps=max_steps or EMSettings.max_steps)
     if client is not None and name in DISTRIBUTED:
-        from gsseg_core.distributed import DistributedEM, DistributedVotes
+        from gsseg_core.learn.distributed.dask_learners import DistributedEM, DistributedVotes
 
         if name == "em":
             return DistributedEM(client, scene, num_classes, em, **where)
@@ -109,7 +109,7 @@ def make_learner(
         return VoteLearner(scene, num_classes, **where)
     if name == "gradient":
         # PyTorch takes seconds to import, and the other learners do without.
-        from gsseg_core.gradient import GradientLearner, GradientSettings
+        from gsseg_core.learn.gradient_learner import GradientLearner, GradientSettings
 
         settings = GradientSettings(epochs=max_steps or GradientSettings.epochs, seed=seed)
         return GradientLearner(scene, num_classes, settings, **where)
@@ -222,7 +222,7 @@ def _segment(
         with watch.stage("load"):
             client = None
             if scheduler is not None:
-                from gsseg_core.scheduler import connected
+                from gsseg_core.learn.distributed.dask_cluster import connected
 
                 client = stack.enter_context(connected(scheduler))
             scene = GaussianScene.load(scene_path)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gsseg_core.data.dataset import View
-from gsseg_core.reliability import ViewCheck, worst_views
+from gsseg_core.learn.mask_reliability import ViewCheck, worst_views
 
 SHOWN = 1 / 2000
 """A view shows a class that fills at least this share of its checked pixels; less is an edge's blur."""

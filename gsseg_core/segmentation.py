@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsseg_core.calibration import tempered
 from gsseg_core.csr_rows import largest
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.npz_files import UnfitError, check_shares, class_names_of, open_npz, temperature_of
 from gsseg_core.files.run_folder import settle
+from gsseg_core.learn.temperature import tempered
 from gsseg_core.printable import clipped
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.refine import cluster, statistical_filter
@@ -132,7 +132,7 @@ class Segmentation:
         return replace(self, labels=np.where(removed, np.int32(REMOVED), self.labels))
 
     def calibrated(self, temperature: float) -> Segmentation:
-        """Bring all probabilities to a temperature, as `gsseg_core.held_out` fits it; labels and pictures stay.
+        """Bring all probabilities to a temperature, as `gsseg_core.learn.calibrate` fits it; labels and pictures stay.
 
         What blends into a view are always the shares that were learnt; a pixel's probability is what they blend to, at
         this temperature.
@@ -202,7 +202,7 @@ class Segmentation:
     def blend(self, operator: ViewOperator) -> np.ndarray:
         """Blend what was learnt into a view, (H, W, K) float32, not calibrated; rows sum to what is known of a pixel.
 
-        `gsseg_core.calibration.tempered` at `temperature` makes probabilities of them.
+        `gsseg_core.learn.temperature.tempered` at `temperature` makes probabilities of them.
         """
         image, left_over = operator.blend(self._blended)
         if self._shows_background:

@@ -10,13 +10,13 @@ from numba.core import event
 
 from gsseg_core import kernel_cache
 from gsseg_core.data.dataset import View
-from gsseg_core.em import EMLearner, EMSettings
+from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
+from gsseg_core.learn.mask_reliability import OtherViews
+from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.view_operator import make_operator
-from gsseg_core.reliability import OtherViews
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.votes import VoteLearner
 
 FIRST_RUN = "compiling kernels, a minute or two; only the first run after installing does this"
 EVERY_RUN = f"compiling kernels, a minute or two, as in every run: they cannot be kept; {kernel_cache.REMEDY}"

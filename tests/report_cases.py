@@ -11,8 +11,8 @@ import numpy as np
 from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, ring, taught, write_dataset
 
 from gsseg_core import pipeline
-from gsseg_core.em import EMLearner
-from gsseg_core.reliability import check_views
+from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.learn.mask_reliability import check_views
 from gsseg_core.report_findings import Evidence
 from gsseg_core.segmentation import Segmentation
 

@@ -27,7 +27,7 @@ from plain_torch import PlainTorch
 from report import Bar, Report, short
 from workloads import SIZES, RoomSize, make_room, split
 
-from gsseg_core.gradient import GradientLearner, GradientSettings
+from gsseg_core.learn.gradient_learner import GradientLearner, GradientSettings
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.tiling import assign
 from gsseg_core.raster.view_operator import make_operator

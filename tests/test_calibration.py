@@ -12,7 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, ring, taught, write_dataset, wrong_views
 
-from gsseg_core.calibration import (
+from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.export import export_classes
+from gsseg_core.learn.calibrate import calibrate, votes_without
+from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.learn.learner import Learner
+from gsseg_core.learn.mask_reliability import OtherViews
+from gsseg_core.learn.temperature import (
     PIXELS,
     ReliabilityDiagram,
     Sample,
@@ -21,18 +27,12 @@ from gsseg_core.calibration import (
     sample_pixels,
     tempered,
 )
-from gsseg_core.data.label_images import UNKNOWN
-from gsseg_core.em import EMLearner
-from gsseg_core.export import export_classes
-from gsseg_core.held_out import calibrate, votes_without
-from gsseg_core.learner import Learner
+from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live import LiveSession
 from gsseg_core.pipeline import segment
 from gsseg_core.raster.view_operator import make_operator
-from gsseg_core.reliability import OtherViews
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.votes import VoteLearner
 
 SCENE, _ = balls_on_a_table()
 VIEWS = wrong_views(10)

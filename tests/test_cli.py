@@ -21,9 +21,9 @@ from gsseg_core.cli import main
 from gsseg_core.cli_parser import build_parser
 from gsseg_core.data.label_images import read_mask, write_mask
 from gsseg_core.files import atomic
+from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.scene import ply
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.votes import VoteLearner
 
 
 @pytest.fixture(scope="module")
@@ -361,7 +361,7 @@ def test_ctrl_c_in_a_real_process_ends_with_130_and_no_traceback(place: Path) ->
     before = contents(place / "out")
     # The learner waits, so that the signal meets it at work; the warm-up, which tells nobody, goes on.
     program = (
-        "import sys, time; from gsseg_core.votes import VoteLearner; from gsseg_core.cli import main\n"
+        "import sys, time; from gsseg_core.learn.vote_learner import VoteLearner; from gsseg_core.cli import main\n"
         "def fit(self, progress=None):\n"
         "    if progress: progress('learn', 0, 9); print('at work', file=sys.stderr); time.sleep(60)\n"
         "VoteLearner.fit = fit\n"

@@ -21,19 +21,19 @@ import pytest
 from patience import PATIENCE
 from small_scenes import NUM_CLASSES, balls_on_a_table, taught, with_clutter, write_dataset, wrong_views
 
-from gsseg_core import scheduler
 from gsseg_core.cli import main
 from gsseg_core.data.dataset import Dataset, View
-from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import MaskFormatError, SchedulerError
-from gsseg_core.learner import Learner
+from gsseg_core.learn.distributed import dask_cluster as scheduler
+from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
+from gsseg_core.learn.learner import Learner
+from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.votes import VoteLearner
 
 distributed = pytest.importorskip("distributed", reason="Dask is not installed")
 dask = pytest.importorskip("dask")
 
-from gsseg_core.distributed import DistributedEM, DistributedVotes  # noqa: E402
+from gsseg_core.learn.distributed.dask_learners import DistributedEM, DistributedVotes  # noqa: E402
 
 SCENE, _ = balls_on_a_table()
 VIEWS = wrong_views(7)
@@ -189,7 +189,7 @@ def test_the_views_of_killed_workers_are_done_again_elsewhere(
         Path(marks, str(os.getpid())).touch()
         time.sleep(60)
 
-    lull = changed(client, victims, "gsseg_core.em", "mix", mix)
+    lull = changed(client, victims, "gsseg_core.learn.em.em_learner", "mix", mix)
     steps: list[int] = []
 
     def kill_at_work(stage: str, done: int, total: int) -> None:
@@ -275,7 +275,11 @@ def test_files_that_a_worker_has_not_or_has_different_are_sent(client: Any, data
     if elsewhere != "masks":
         balls_on_a_table(seed=1)[0].save(data / "scene.ply")
     one = list(client.nthreads())[:1] if elsewhere != "scene" else []
-    with changed(client, one, "gsseg_core.shard", "digest_of", lambda path: "another") if one else nullcontext():
+    with (
+        changed(client, one, "gsseg_core.learn.distributed.dask_worker", "digest_of", lambda path: "another")
+        if one
+        else nullcontext()
+    ):
         there = DistributedEM(client, scene, NUM_CLASSES, SETTINGS)
         there.observe_all(views)
         assert_same(there, here)

@@ -26,13 +26,13 @@ from threadpoolctl import threadpool_limits
 
 from gsseg_core.csr_rows import Rows
 from gsseg_core.data.dataset import View
-from gsseg_core.em import EMLearner, EMSettings, codes_without
 from gsseg_core.errors import SettingsError
-from gsseg_core.gaussian_kernels import GAIN_UNIT, collect, improve, promised
+from gsseg_core.learn.em.em_kernels import GAIN_UNIT, collect, improve, promised
+from gsseg_core.learn.em.em_learner import EMLearner, EMSettings, codes_without
+from gsseg_core.learn.em.rejected_regions import SMALLEST
+from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.view_operator import make_operator
-from gsseg_core.regions import SMALLEST
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.votes import VoteLearner
 
 SCENE, TRUTH = balls_on_a_table()
 

@@ -22,10 +22,10 @@ from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import read_classes, read_mask
 from gsseg_core.data.mask_files import read_soft_mask
 from gsseg_core.errors import GssegError
+from gsseg_core.learn.learner_state import State
+from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.state_file import State
-from gsseg_core.votes import VoteLearner
 
 SCENE, TRUTH = balls_on_a_table()
 SMALL = SCENE.subset(np.arange(0, len(SCENE), 40))

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsseg_core.data.dataset import View
-from gsseg_core.em import EMLearner
 from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.graph import Graph, GraphSettings, graph_of, is_scarce, propagate, spread_if_scarce
+from gsseg_core.learn.em.em_learner import EMLearner
 
 FEW = GraphSettings(k=4, steps=60)
 

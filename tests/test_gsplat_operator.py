@@ -23,14 +23,14 @@ from operator_cases import dense, make_scene, random_mask, random_view
 from small_scenes import NUM_CLASSES, balls_on_a_table, ring, taught, true_labels
 
 from gsseg_core.data.dataset import View
-from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import SettingsError
-from gsseg_core.gradient import GradientLearner, GradientSettings
+from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
+from gsseg_core.learn.gradient_learner import GradientLearner, GradientSettings
+from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.gsplat_backend import GsplatOperator, _tensors_of, chunks, load_gsplat
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.votes import VoteLearner
 
 FUNCTIONS = ("fully_fused_projection", "isect_tiles", "isect_offset_encode", "rasterize_to_pixels")
 TORN = 0.02
@@ -69,7 +69,9 @@ def test_labels_are_those_of_the_cpu(backend, monkeypatch, which):
         "gradient": lambda device: GradientLearner(scene, NUM_CLASSES, GradientSettings(epochs=1), device=device),
     }
     expected = taught(learners[which]("cpu"), views).fit()
-    monkeypatch.setattr("gsseg_core.learner.make_operator", lambda scene, camera, device: backend.make(scene, camera))
+    monkeypatch.setattr(
+        "gsseg_core.learn.learner.make_operator", lambda scene, camera, device: backend.make(scene, camera)
+    )
     got = taught(learners[which](backend.name), views).fit()
     both = expected.observed_ & got.observed_
     assert both.sum() >= 0.999 * expected.observed_.sum() > 300

@@ -32,10 +32,10 @@ from gsseg_core.files import input_files, json_files
 from gsseg_core.files.input_files import open_input
 from gsseg_core.files.json_files import read_json
 from gsseg_core.files.limits import Limits
+from gsseg_core.learn.learner_state import State
 from gsseg_core.printable import clipped, quoted
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.state_file import State
 
 SCENE, _ = balls_on_a_table()
 READERS: dict[str, Callable[[Path], object]] = {

@@ -22,7 +22,7 @@ for name in kernels:
     importlib.import_module(f"gsseg_core.{name}")
 import numpy as np
 from gsseg_core import kernel_cache
-from gsseg_core.regions import _root
+from gsseg_core.learn.em.rejected_regions import _root
 print(len(kernels) > 15, kernel_cache.FOLDER, _root(np.array([0, 0, 1]), 2), _root.stats.cache_path)
 """
 

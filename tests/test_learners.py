@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 from small_scenes import NAMES, NUM_CLASSES, OUT_OF_SIGHT, balls_on_a_table, clean_views, look_at, mean_iou, taught
 
 from gsseg_core.data.dataset import View
-from gsseg_core.em import EMLearner
 from gsseg_core.errors import MaskSizeError, NoUsableViewsError, SettingsError, UnknownLabelError
-from gsseg_core.gradient import GradientLearner
-from gsseg_core.learner import VOTE_UNIT, Learner
+from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.learn.gradient_learner import GradientLearner
+from gsseg_core.learn.learner import VOTE_UNIT, Learner
+from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.segmentation import UNOBSERVED, Segmentation
-from gsseg_core.votes import VoteLearner
 
 LEARNERS = [VoteLearner, EMLearner, GradientLearner]
 SCENE, TRUTH = balls_on_a_table()

@@ -14,7 +14,6 @@ from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, taug
 from gsseg_core import live
 from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.data.label_images import UNKNOWN
-from gsseg_core.em import EMLearner
 from gsseg_core.errors import (
     MaskFormatError,
     NoCodesError,
@@ -24,9 +23,10 @@ from gsseg_core.errors import (
     StateMismatchError,
     UnknownLabelError,
 )
+from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live import LiveSession
 from gsseg_core.refine_settings import RefineSettings
-from gsseg_core.votes import VoteLearner
 
 SCENE, TRUTH = balls_on_a_table()
 VIEWS = clean_views(6)

@@ -17,9 +17,9 @@ from gsseg_core.data.dataset import View
 from gsseg_core.errors import GssegError, MaskFormatError, MaskSizeError, StateFileError, UnknownLabelError
 from gsseg_core.files import npz_files
 from gsseg_core.files.limits import Limits
+from gsseg_core.learn.learner_state import State
+from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.state_file import State
-from gsseg_core.votes import VoteLearner
 
 SCENE, TRUTH = balls_on_a_table()
 N = len(SCENE)

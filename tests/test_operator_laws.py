@@ -11,7 +11,7 @@ from operator_backends import CPU
 from operator_cases import dense, make_camera, make_scene, moved, random_mask, random_view, rigid, spread
 
 from gsseg_core.data.label_evidence import Meaning
-from gsseg_core.learner import UNITS
+from gsseg_core.learn.learner import UNITS
 from gsseg_core.scene.camera import Camera
 
 views = st.fixed_dictionaries(

@@ -11,9 +11,9 @@ from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views
 from gsseg_core.csr_rows import Rows
 from gsseg_core.data.dataset import View
 from gsseg_core.data.label_evidence import Meaning, standing
-from gsseg_core.em import EMLearner
-from gsseg_core.learner import UNITS
-from gsseg_core.others import counted_by_others
+from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.learn.em.leave_one_out import counted_by_others
+from gsseg_core.learn.learner import UNITS
 from gsseg_core.raster.view_operator import Observation
 
 SCENE, _ = balls_on_a_table()

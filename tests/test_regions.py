@@ -14,10 +14,10 @@ from gsseg_core.csr_rows import Rows
 from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import SeenLabels
-from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import SettingsError
-from gsseg_core.regions import MOST, SMALLEST, by_region, connected_pixels, in_doubt
-from gsseg_core.votes import VoteLearner
+from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
+from gsseg_core.learn.em.rejected_regions import MOST, SMALLEST, by_region, connected_pixels, in_doubt
+from gsseg_core.learn.vote_learner import VoteLearner
 
 SCENE, _ = balls_on_a_table()
 SHAPES = st.tuples(st.integers(1, 12), st.integers(1, 12))

@@ -7,7 +7,7 @@ import pytest
 from report_cases import minimal_report
 
 from gsseg_core.data.label_images import UNKNOWN
-from gsseg_core.reliability import ViewCheck
+from gsseg_core.learn.mask_reliability import ViewCheck
 from gsseg_core.report_findings import (
     Evidence,
     class_ious,

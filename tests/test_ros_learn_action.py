@@ -14,7 +14,7 @@ from ros_robot import CLASSES, Goal, Robot, assert_same, copied, private_ros, re
 from small_scenes import clean_views, taught, write_dataset, wrong_views
 
 from gsseg_core.data.dataset import Dataset, View, spread
-from gsseg_core.held_out import calibrate
+from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.live import LiveSession
 from gsseg_core.pipeline import make_learner
 from gsseg_core.refine_settings import RefineSettings

@@ -11,10 +11,10 @@ from small_scenes import NAMES, NUM_CLASSES, OUT_OF_SIGHT, balls_on_a_table, cle
 
 from gsseg_core import segmentation
 from gsseg_core.errors import StateFileError, StateMismatchError, WriteError
+from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.refine_settings import RefineSettings
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
-from gsseg_core.votes import VoteLearner
 
 SCENE, TRUTH = balls_on_a_table()
 CODES = np.eye(NUM_CLASSES, dtype=np.float32)[TRUTH]

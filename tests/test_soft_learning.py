@@ -26,14 +26,14 @@ from gsseg_core.data.dataset import View
 from gsseg_core.data.label_evidence import Meaning, guess, standing
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import SeenLabels
-from gsseg_core.em import EMLearner, EMSettings
 from gsseg_core.errors import UnknownLabelError
-from gsseg_core.learner import VOTE_UNIT, Learner
+from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
+from gsseg_core.learn.learner import VOTE_UNIT, Learner
+from gsseg_core.learn.mask_reliability import check_views
+from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live import LiveSession
 from gsseg_core.pipeline import LEARNERS, make_learner
 from gsseg_core.raster.view_operator import make_operator
-from gsseg_core.reliability import check_views
-from gsseg_core.votes import VoteLearner
 
 SCENE, TRUTH = balls_on_a_table()
 

@@ -167,7 +167,7 @@ def test_soft_and_partial_masks_are_numbered_too(tmp_path: Path) -> None:
 
 
 def test_workers_read_numbered_masks_from_their_own_files(tmp_path: Path) -> None:
-    from gsseg_core.distributed import _by_path, _packed
+    from gsseg_core.learn.distributed.dask_learners import _by_path, _packed
 
     view = Dataset(with_gaps(tmp_path / "data")).numbered().views()[0]
     for sent in (_by_path(view)[0], _packed(view)[0]):

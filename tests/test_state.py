@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, taught
 
-from gsseg_core import state_file
 from gsseg_core.errors import PathTakenError, StateFileError, StateMismatchError, WriteError
-from gsseg_core.learner import Learner
-from gsseg_core.votes import VoteLearner
+from gsseg_core.learn import learner_state as state_file
+from gsseg_core.learn.learner import Learner
+from gsseg_core.learn.vote_learner import VoteLearner
 
 SCENE, TRUTH = balls_on_a_table()
 VIEWS = clean_views(3)

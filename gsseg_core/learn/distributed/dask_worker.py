@@ -20,11 +20,11 @@ from numpy.lib.recfunctions import repack_fields
 
 from gsseg_core.csr_rows import Rows
 from gsseg_core.data.dataset import View
-from gsseg_core.em import EMLearner, EMSettings
-from gsseg_core.error_model import ErrorModel
 from gsseg_core.errors import GssegError
 from gsseg_core.files.input_files import open_input
-from gsseg_core.learner import UNITS
+from gsseg_core.learn.em.confusion_model import ErrorModel
+from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
+from gsseg_core.learn.learner import UNITS
 from gsseg_core.scene.gaussian_scene import DC, GaussianScene
 
 Part = tuple[Any, dict[str, Any]]

@@ -1,7 +1,7 @@
 """How far each view's mask can be trusted: what the other views say of it, pixel by pixel.
 
 The codes that learnt from a mask agree with its errors, so a mask is held against codes that have not seen it: one
-more step of EM from the codes that were learnt, without the summand of this view (see `gsseg_core.em`). Rendered from
+more step of EM from the codes that were learnt, without the summand of this view (see `gsseg_core.learn.em.em_learner`). Rendered from
 where the view was taken, they predict its labels. A view's reliability is the share of its pixels whose label is the
 one predicted. It is an estimate of the share whose label is right. Of a soft mask, a pixel's label is
 its largest share; in a partial one "none of those looked for" is a label too, and right where a class is predicted that
@@ -18,14 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from gsseg_core.calibration import VIEWS, Sample, sample_pixels
 from gsseg_core.csr_rows import Rows
 from gsseg_core.data.dataset import View, spread
 from gsseg_core.data.label_evidence import Meaning
 from gsseg_core.data.label_images import UNKNOWN, PackedLabels
-from gsseg_core.em import EMLearner, codes_without
 from gsseg_core.export import background_image
-from gsseg_core.learner import Progress, silent
+from gsseg_core.learn.em.em_learner import EMLearner, codes_without
+from gsseg_core.learn.learner import Progress, silent
+from gsseg_core.learn.temperature import VIEWS, Sample, sample_pixels
 from gsseg_core.pictures import contact_sheet, overlay, palette
 from gsseg_core.raster.view_operator import make_operator
 
@@ -56,7 +56,7 @@ class ViewCheck:
         Of a soft or partial mask; `classes` are its words.
     unheard : float
         Share of the pixels with a label from which nothing was learnt, since they lie in regions in doubt; see
-        `gsseg_core.regions`.
+        `gsseg_core.learn.em.rejected_regions`.
     """
 
     name: str

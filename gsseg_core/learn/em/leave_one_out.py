@@ -7,8 +7,8 @@ import numpy as np
 
 from gsseg_core.csr_rows import Rows
 from gsseg_core.data.label_evidence import Meaning, stand
-from gsseg_core.gaussian_kernels import BLOCKS, take_row
-from gsseg_core.learner import UNITS
+from gsseg_core.learn.em.em_kernels import BLOCKS, take_row
+from gsseg_core.learn.learner import UNITS
 from gsseg_core.raster.view_operator import Observation
 
 

@@ -16,9 +16,9 @@ from gsseg_core.csr_rows import Rows
 from gsseg_core.data.label_evidence import Meaning
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import SeenLabels
-from gsseg_core.gaussian_kernels import take_votes
-from gsseg_core.learner import UNITS
-from gsseg_core.others import counted_by_others
+from gsseg_core.learn.em.em_kernels import take_votes
+from gsseg_core.learn.em.leave_one_out import counted_by_others
+from gsseg_core.learn.learner import UNITS
 from gsseg_core.raster.view_operator import Observation
 
 SMALLEST = 64

@@ -52,7 +52,7 @@ class Learnt:
     num_views : int
         Views that it learnt from.
     temperature : float
-        At which the codes are probabilities, see `gsseg_core.held_out`.
+        At which the codes are probabilities, see `gsseg_core.learn.calibrate`.
     """
 
     learner: str

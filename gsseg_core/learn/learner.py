@@ -14,12 +14,12 @@ from gsseg_core.data.dataset import View
 from gsseg_core.data.label_evidence import decided, guess
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
-from gsseg_core.gaussian_kernels import share_votes
+from gsseg_core.learn.em.em_kernels import share_votes
+from gsseg_core.learn.learner_state import State
 from gsseg_core.progress import Progress as Progress
 from gsseg_core.progress import silent as silent
 from gsseg_core.raster.view_operator import Observation, ViewOperator, make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.state_file import State
 
 VOTE_UNIT = 2.0**-24
 """Votes are counted in whole multiples of this many px, so that adding and taking back are exact."""

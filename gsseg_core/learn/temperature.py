@@ -8,7 +8,7 @@ mended by one number. With the temperature T, shares O[k] become
     P[k] = O[k]^(1/T) / sum_j O[j]^(1/T)
 
 (temperature scaling of log O; Guo et al., On Calibration of Modern Neural Networks, ICML 2017). Their order stays, and
-so do all labels. The temperature is fitted to masks that the codes have not learnt from (`gsseg_core.held_out`).
+so do all labels. The temperature is fitted to masks that the codes have not learnt from (`gsseg_core.learn.calibrate`).
 A mask may be wrong, while what is wanted is the probability of the true class, so what is maximised is the likelihood
 
     sum_v sum_p log sum_k P_v[p, k] C_v[k, y_p]

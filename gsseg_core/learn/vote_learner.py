@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsseg_core.learner import Learner, Progress, silent
+from gsseg_core.learn.learner import Learner, Progress, silent
 
 
 class VoteLearner(Learner):

@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gsseg_core.calibration import VIEWS, Sample, fit_temperature, sample_pixels
 from gsseg_core.data.dataset import View, spread
-from gsseg_core.em import EMLearner
-from gsseg_core.learner import UNITS, Learner, Progress, silent
+from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.learn.learner import UNITS, Learner, Progress, silent
+from gsseg_core.learn.mask_reliability import OtherViews
+from gsseg_core.learn.temperature import VIEWS, Sample, fit_temperature, sample_pixels
+from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.view_operator import make_operator
-from gsseg_core.reliability import OtherViews
-from gsseg_core.votes import VoteLearner
 
 
 class Calibration(NamedTuple):

@@ -10,11 +10,11 @@ A view in which a chair was missed or taken for a table has that in R_v, and so 
 chair.
 
 Outlines. What a segmenter draws too wide in one view and too narrow in the next is moved to where the scene has edges
-before anything is learnt from it; see `gsseg_core.outlines`.
+before anything is learnt from it; see `gsseg_core.learn.em.boundary_alignment`.
 
 Regions in doubt. An error model says what a view calls each class, wherever in the image. What is wrong in one place,
 say a blob of clutter, it does not explain. So regions of a mask that the votes of all other views speak against are
-left out of all that follows; see `gsseg_core.regions`.
+left out of all that follows; see `gsseg_core.learn.em.rejected_regions`.
 
 The objective. With the error models fixed, the log of the posterior of the codes, in nats:
 
@@ -59,14 +59,14 @@ import numpy as np
 from gsseg_core.csr_rows import Rows, starts
 from gsseg_core.data.label_evidence import standing
 from gsseg_core.data.soft_masks import SeenLabels
-from gsseg_core.error_model import ErrorModel
 from gsseg_core.errors import SettingsError
-from gsseg_core.gaussian_kernels import collect, improve, improve_without, mix, promised, tally
-from gsseg_core.learner import MEMORY_BUDGET, VOTE_UNIT, Learner, Progress, silent
-from gsseg_core.others import counted_by_others
-from gsseg_core.outlines import scene_edges, settle_outlines
+from gsseg_core.learn.em.boundary_alignment import scene_edges, settle_outlines
+from gsseg_core.learn.em.confusion_model import ErrorModel
+from gsseg_core.learn.em.em_kernels import collect, improve, improve_without, mix, promised, tally
+from gsseg_core.learn.em.leave_one_out import counted_by_others
+from gsseg_core.learn.em.rejected_regions import by_region, in_doubt, take_back
+from gsseg_core.learn.learner import MEMORY_BUDGET, VOTE_UNIT, Learner, Progress, silent
 from gsseg_core.raster.view_operator import Observation, ViewOperator, make_operator
-from gsseg_core.regions import by_region, in_doubt, take_back
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import neighbours_of
 
@@ -90,10 +90,10 @@ class EMSettings:
         How often error models are learnt anew once the codes have all but converged, and the codes then once more.
     edge_px : int
         Outlines of a mask may lie so many px too far in or out, and are moved to edges of the scene; see
-        `gsseg_core.outlines`. 0 leaves them where they are, and so do soft and partial masks.
+        `gsseg_core.learn.em.boundary_alignment`. 0 leaves them where they are, and so do soft and partial masks.
     least_agreement : float
         A region of a mask is not heard if a smaller share of it is of its label by the votes of the other views; see
-        `gsseg_core.regions`. 0 hears all.
+        `gsseg_core.learn.em.rejected_regions`. 0 hears all.
     majority : float
         The first error models are counted from the votes' codes to this power: above 1, majorities stand out.
     error_prior : float

@@ -28,8 +28,8 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import starts
+from gsseg_core.learn.em.rejected_regions import connected_pixels
 from gsseg_core.raster.view_operator import ViewOperator
-from gsseg_core.regions import connected_pixels
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 

@@ -20,13 +20,9 @@ import numpy as np
 
 from gsseg_core.csr_rows import Rows
 from gsseg_core.data.dataset import View
-from gsseg_core.em import EMLearner
-from gsseg_core.error_model import ErrorModel
 from gsseg_core.errors import GssegError, SchedulerError
-from gsseg_core.learner import Learner, Progress, silent
-from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.scheduler import PATIENCE, UNREACHABLE, check_workers, find_workers, name_of
-from gsseg_core.shard import (
+from gsseg_core.learn.distributed.dask_cluster import PATIENCE, UNREACHABLE, check_workers, find_workers, name_of
+from gsseg_core.learn.distributed.dask_worker import (
     NotHereError,
     Part,
     add,
@@ -41,7 +37,11 @@ from gsseg_core.shard import (
     sum_gains,
     sum_votes,
 )
-from gsseg_core.votes import VoteLearner
+from gsseg_core.learn.em.confusion_model import ErrorModel
+from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.learn.learner import Learner, Progress, silent
+from gsseg_core.learn.vote_learner import VoteLearner
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 if TYPE_CHECKING:
     from distributed import Client, Future

@@ -1,4 +1,4 @@
-"""What a view's segmenter calls each class: the error model of `gsseg_core.em`, of one view."""
+"""What a view's segmenter calls each class: the error model of `gsseg_core.learn.em.em_learner`, of one view."""
 
 from __future__ import annotations
 

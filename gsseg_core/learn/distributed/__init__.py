@@ -1,0 +1,1 @@
+"""Learning on the workers of a Dask cluster."""

@@ -1,0 +1,1 @@
+"""Expectation maximisation with an error model of every view."""
