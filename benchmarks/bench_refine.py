@@ -22,8 +22,8 @@ import numba as nb
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsseg_core.refine import cluster, statistical_filter
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.knn_filter import cluster, statistical_filter
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import Neighbours
 

@@ -31,12 +31,12 @@ from scipy import ndimage
 from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.demo_scene import build_demo
 from gsseg_core.files.atomic import write_atomically
-from gsseg_core.graph import GraphSettings, graph_of, propagate
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.metrics import Evaluation
 from gsseg_core.pick import Pick, pick_clicks, pick_mask
 from gsseg_core.raster.view_operator import ViewOperator, make_operator
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.label_propagation import GraphSettings, graph_of, propagate
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.warm_up import warm_up

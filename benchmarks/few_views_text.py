@@ -12,7 +12,7 @@ CURVES = """## How many views must be labelled
 
 {draws} draws of views at random, the same for all; true masks; mIoU of label maps of {scored}, mean and range of
 the draws. Classes that no labelled view shows count as 0, so that with one view the figure is bounded by what it
-shows. All have KNN clustering; "+ graph" is `gsseg_core.graph` before it.
+shows. All have KNN clustering; "+ graph" is `gsseg_core.refine.label_propagation` before it.
 
 ![mIoU by number of views](pictures/few_views.svg)
 

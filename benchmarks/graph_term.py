@@ -4,7 +4,7 @@ Usage: python benchmarks/graph_term.py [--data FOLDER] [--out results_out/graph_
 
 Views are spread evenly over the train views, of which every seventh is held out and scored; test views are not looked
 at. A quarter of the objects of the wrong masks are missed or carry another's id, and edges are off by up to 3 px. The
-share of Gaussians seen with less than 1 px is what `gsseg_core.graph.is_scarce` goes by.
+share of Gaussians seen with less than 1 px is what `gsseg_core.refine.label_propagation.is_scarce` goes by.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from results import markdown
 from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.demo_scene import build_demo
 from gsseg_core.files.atomic import write_atomically
-from gsseg_core.graph import GraphSettings, graph_of, is_scarce, propagate
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.temperature import ReliabilityDiagram
 from gsseg_core.mask_errors import MaskErrors, corrupt
 from gsseg_core.metrics import Evaluation
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.label_propagation import GraphSettings, graph_of, is_scarce, propagate
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.warm_up import warm_up

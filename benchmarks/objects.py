@@ -27,7 +27,7 @@ from gsseg_core.export import background_image
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.pictures import contact_sheet, save_png
 from gsseg_core.raster.view_operator import make_operator
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.silhouettes import ObjectScores, objects_of, surface

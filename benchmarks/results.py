@@ -32,8 +32,8 @@ from gsseg_core.metrics import Evaluation, evaluate_folders
 from gsseg_core.pictures import contact_sheet, overlay, palette, save_png
 from gsseg_core.pipeline import make_learner
 from gsseg_core.raster.view_operator import make_operator
-from gsseg_core.refine import cluster, statistical_filter
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.knn_filter import cluster, statistical_filter
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 

@@ -21,8 +21,8 @@ from gsseg_core.raster.cpu.depth_sort import sort_by_depth
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.tiling import assign
 from gsseg_core.raster.view_operator import make_operator
-from gsseg_core.refine import cluster, statistical_filter
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.knn_filter import cluster, statistical_filter
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from gsseg_core.learn.vote_learner import VoteLearner
     from gsseg_core.metrics import Evaluation
     from gsseg_core.raster.view_operator import ViewOperator, make_operator
-    from gsseg_core.refine_settings import RefineSettings
+    from gsseg_core.refine.settings import RefineSettings
     from gsseg_core.scene.camera import Camera
     from gsseg_core.scene.gaussian_scene import GaussianScene
     from gsseg_core.segmentation import Segmentation
@@ -43,7 +43,7 @@ _HOMES = {
     "GradientSettings": "learn.gradient_learner",
     "GssegError": "errors",
     "OrientedBox": "boxes",
-    "RefineSettings": "refine_settings",
+    "RefineSettings": "refine.settings",
     "Segmentation": "segmentation",
     "View": "data.dataset",
     "ViewOperator": "raster.view_operator",

@@ -6,7 +6,7 @@ import argparse
 
 from gsseg_core.cli_shared import add_scene, load_kernels
 from gsseg_core.progress import progress_bars
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.terminal import tell
 
 HELP = "learn from masks, refine, write labels and one PLY per object"

@@ -2,7 +2,7 @@
 
 A mask says of one view what is the object (1), what is not (0), and where nothing is said (-1). The view's operator
 carries that to the Gaussians, W^T onehot(y) px of each. What the view does not show takes its neighbours' answer along
-the graph of the scene (`gsseg_core.graph`): the back of a chair hangs together with its front, and the wall behind it
+the graph of the scene (`gsseg_core.refine.label_propagation`): the back of a chair hangs together with its front, and the wall behind it
 with the wall beside it.
 
 Two things would make a mask flood rooms that its view does not show. A thousandth of the light of a pixel comes from
@@ -33,8 +33,8 @@ from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import UNKNOWN, read_mask
 from gsseg_core.errors import MaskFormatError, NoUsableViewsError, SettingsError
 from gsseg_core.files.atomic import write_atomically
-from gsseg_core.graph import GraphSettings, graph_of, propagate
 from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.refine.label_propagation import GraphSettings, graph_of, propagate
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 

@@ -27,7 +27,6 @@ from gsseg_core.export import (
 )
 from gsseg_core.files.earlier_outputs import earlier_render, earlier_segment
 from gsseg_core.files.run_folder import StagedRun, staged_run
-from gsseg_core.graph import GraphSettings, is_scarce, spread_if_scarce
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import MEMORY_BUDGET, NO_MASK, Learner, Progress, silent
@@ -35,7 +34,8 @@ from gsseg_core.learn.mask_reliability import OtherViews, ViewCheck, draw_worst_
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.object_table import find_objects
 from gsseg_core.pictures import save_png
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, spread_if_scarce
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.report import Stopwatch, build_report
 from gsseg_core.report_findings import Evidence
 from gsseg_core.report_page import write_report_page
@@ -153,7 +153,7 @@ def segment(
         The paper's by default.
     graph : bool
         Where views are few, let codes spread to Gaussians that few or no pixels saw, before refinement; see
-        `gsseg_core.graph`.
+        `gsseg_core.refine.label_propagation`.
     memory_budget : int
         Bytes of prepared views to keep between the steps of learning; see docs/memory.md.
     scheduler : str, optional

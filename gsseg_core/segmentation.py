@@ -19,8 +19,8 @@ from gsseg_core.files.run_folder import settle
 from gsseg_core.learn.temperature import tempered
 from gsseg_core.printable import clipped
 from gsseg_core.raster.view_operator import ViewOperator
-from gsseg_core.refine import cluster, statistical_filter
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.knn_filter import cluster, statistical_filter
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import neighbours_of
 

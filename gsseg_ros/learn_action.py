@@ -17,7 +17,7 @@ from gsseg_core.data.dataset import Dataset
 from gsseg_core.live import LiveSession
 from gsseg_core.live_results import Outcome
 from gsseg_core.pipeline import LEARNERS
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_ros.errors import CanceledError, InvalidRequestError, NotActiveError, error_code
 from gsseg_ros.jobs import Job
 from gsseg_ros.outputs import Outputs

@@ -19,7 +19,7 @@ from std_msgs.msg import Header
 from gsseg_core.errors import GssegError
 from gsseg_core.pictures import overlay, palette
 from gsseg_core.raster.view_operator import make_operator
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.color_images import color_from_image
 from gsseg_ros.conversions import camera_from_messages, rgb_image

@@ -19,7 +19,7 @@ from gsseg_core.data.names import flaw_of_class_name
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.pipeline import PER_VIEW
 from gsseg_core.raster.devices import DEVICES, checked_device
-from gsseg_core.refine_settings import MAX_K, RefineSettings
+from gsseg_core.refine.settings import MAX_K, RefineSettings
 from gsseg_ros.frames import Similarity, pose_from_parameters
 
 POSE_SOURCES = ("topic", "odometry", "tf")

@@ -16,7 +16,7 @@ from std_msgs.msg import ColorRGBA, Header
 from gsseg_core.boxes import class_box
 from gsseg_core.live import LIVE, LiveSession
 from gsseg_core.pictures import palette
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.report import gaussian_counts
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.conversions import cloud

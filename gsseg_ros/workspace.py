@@ -19,7 +19,7 @@ from gsseg_core.errors import PathNotAllowedError, SettingsError
 from gsseg_core.live import LiveSession
 from gsseg_core.live_ids import PerViewSession
 from gsseg_core.pipeline import PER_VIEW
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.report import Stopwatch
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_ros.errors import (

@@ -21,7 +21,7 @@ from gsseg_core.export import (
     write_pictures,
 )
 from gsseg_core.files.run_folder import RUN_FILE
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from gsseg_core.data.dataset import View
 from gsseg_core.errors import SceneValueError, SettingsError
-from gsseg_core.graph import Graph, GraphSettings, graph_of, is_scarce, propagate, spread_if_scarce
 from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.refine.label_propagation import Graph, GraphSettings, graph_of, is_scarce, propagate, spread_if_scarce
 
 FEW = GraphSettings(k=4, steps=60)
 
@@ -148,7 +148,9 @@ def test_where_hardly_anything_is_scarce_codes_stay_and_no_graph_is_made(monkeyp
     evidence[:] = 2.0
     evidence[: len(scene) // 7] = 0
     assert not is_scarce(evidence)
-    monkeypatch.setattr("gsseg_core.graph.graph_of", lambda scene: pytest.fail("the graph was asked for"))
+    monkeypatch.setattr(
+        "gsseg_core.refine.label_propagation.graph_of", lambda scene: pytest.fail("the graph was asked for")
+    )
     assert spread_if_scarce(scene, codes, evidence) is codes
     monkeypatch.undo()
     evidence[: len(scene) // 5] = 0

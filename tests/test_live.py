@@ -26,7 +26,7 @@ from gsseg_core.errors import (
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live import LiveSession
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.settings import RefineSettings
 
 SCENE, TRUTH = balls_on_a_table()
 VIEWS = clean_views(6)

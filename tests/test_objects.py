@@ -36,7 +36,7 @@ from gsseg_core.data.names import class_ids
 from gsseg_core.errors import EmptySceneError, MaskSizeError, SceneValueError, SettingsError
 from gsseg_core.export import export_classes
 from gsseg_core.raster.view_operator import make_operator
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.removal import without_objects
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene

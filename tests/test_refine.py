@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gsseg_core import refine
 from gsseg_core.errors import SettingsError
-from gsseg_core.refine import cluster, statistical_filter
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine import knn_filter as refine
+from gsseg_core.refine.knn_filter import cluster, statistical_filter
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import Neighbours, neighbours_of
 

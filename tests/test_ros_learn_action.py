@@ -17,7 +17,7 @@ from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.live import LiveSession
 from gsseg_core.pipeline import make_learner
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 

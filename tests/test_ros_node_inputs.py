@@ -13,7 +13,7 @@ from ros_robot import SECOND, STEP, Robot, assert_same, core_session, messages, 
 from small_scenes import clean_views, look_at
 
 from gsseg_core.data.dataset import Dataset, View
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.frames import Similarity

@@ -14,7 +14,7 @@ from small_scenes import clean_views
 
 from gsseg_core.boxes import object_boxes
 from gsseg_core.pictures import palette
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.frames import Similarity

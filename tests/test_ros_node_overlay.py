@@ -20,7 +20,7 @@ from gsseg_core.errors import MaskFormatError
 from gsseg_core.live import LiveSession
 from gsseg_core.pictures import overlay, palette
 from gsseg_core.raster.view_operator import make_operator
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 

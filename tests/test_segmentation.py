@@ -13,7 +13,7 @@ from gsseg_core import segmentation
 from gsseg_core.errors import StateFileError, StateMismatchError, WriteError
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.view_operator import make_operator
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 
 SCENE, TRUTH = balls_on_a_table()

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsseg_core.csr_rows import Rows, largest
-from gsseg_core.refine_settings import RefineSettings
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.spatial.neighbourhood import Neighbours
 
 

@@ -1,0 +1,1 @@
+"""Learnt probabilities made better by what lies near in space."""
