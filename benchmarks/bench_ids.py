@@ -31,7 +31,7 @@ from gsseg_core.demo_scene import build_demo
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.matching import Contingency, renamed
 from gsseg_core.metrics import Evaluation
-from gsseg_core.object_table import find_objects
+from gsseg_core.objects.object_table import find_objects
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation

@@ -2,7 +2,7 @@
 
 Each object keeps any subset of its own Gaussians. Those are taken out, and put back, one after the other whenever that
 raises the IoU of the object with its true masks, until nothing changes. It is the `visible` score of
-`gsseg_core.silhouettes`, but for two things: the threshold at an alpha of one half is a steep logistic, so that two
+`gsseg_core.objects.silhouettes`, but for two things: the threshold at an alpha of one half is a steep logistic, so that two
 Gaussians that hide each other can both go, and whether a pixel is hidden is asked of each Gaussian rather than of the
 object's mean depth. It finds a local optimum: a bound from below on what selection can reach.
 """
@@ -15,13 +15,13 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.data.dataset import View
+from gsseg_core.objects.silhouettes import BEHIND, depths, surface
 from gsseg_core.raster.cpu.blending import in_tile, open_rays
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.splat import WIDTH, aim, blend_block
 from gsseg_core.raster.cpu.tiling import TILE, assign
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.silhouettes import BEHIND, depths, surface
 from gsseg_core.simd import first_bit, store_row
 
 SWEEPS = 4  # for each steepness

@@ -20,17 +20,17 @@ from machine import DATA, REPOSITORY
 from object_ceiling import best_selection
 from results import machine, markdown, points
 
-from gsseg_core.carve import KEPT, Silhouette, shares
 from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.demo_scene import build_demo
 from gsseg_core.export import background_image
 from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.objects.silhouette_carving import KEPT, Silhouette, shares
+from gsseg_core.objects.silhouettes import ObjectScores, objects_of, surface
 from gsseg_core.pictures import contact_sheet, save_png
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.silhouettes import ObjectScores, objects_of, surface
 from gsseg_core.straddlers import split, straddlers
 
 PAPER = {
@@ -185,7 +185,7 @@ The silhouette of an object is where its own Gaussians, rendered alone, accumula
 with the true mask of the object: IoU, and boundary IoU with bands as wide as 2 % of the image diagonal. Pixels are
 summed over the views per object; means are over all objects that the truth shows. The background is no object.
 
-A mask shows only what is visible of an object. So there are two scores, both by `gsseg_core.silhouettes`:
+A mask shows only what is visible of an object. So there are two scores, both by `gsseg_core.objects.silhouettes`:
 
 - **visible**: a pixel of another label does not count where the object lies behind the surface of the scene, that is
   where its depth is above that of the whole scene by more than 2 %. What sticks out in front or beside counts.
@@ -199,7 +199,7 @@ which others hid a part, show in full, and so do those just under a neighbour's 
 - **KNN** gives unobserved Gaussians to what is around them.
 - **The paper's filter** removes whatever is farther from its fellows than mu + sigma. Where Gaussians are large and
   sparse this takes away good ones.
-- **Carving** (`gsseg segment --carve`, `gsseg_core.carve`) drops the Gaussians that stick out of the silhouettes in 24
+- **Carving** (`gsseg segment --carve`, `gsseg_core.objects.silhouette_carving`) drops the Gaussians that stick out of the silhouettes in 24
   train views, unless the object would have holes without them. The silhouettes are those of the label maps that the
   segmentation itself renders, so errors of single masks carve nothing away; no retraining. What no view reaches stays.
   It replaces the filter. Where objects touch, it may take a little of the object itself: see the foot of the can.
@@ -224,7 +224,7 @@ that it goes by have the same one.
 gsseg remove scene.ply --segmentation out/segmentation.npz --class chair --out without_chair.ply
 ```
 
-Writes a valid 3DGS PLY; in Python it is `gsseg_core.removal.without_objects`. The objects' PLYs and what is left make
+Writes a valid 3DGS PLY; in Python it is `gsseg_core.objects.removal.without_objects`. The objects' PLYs and what is left make
 up the scene, Gaussian for Gaussian. What an object hid, no camera has seen: holes are left as they are. Gaussians that
 refinement took out of an object stay in the scene.
 """

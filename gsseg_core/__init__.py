@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 from gsseg_core import kernel_cache as _kernel_cache  # noqa: F401
 
 if TYPE_CHECKING:
-    from gsseg_core.boxes import OrientedBox, object_boxes
     from gsseg_core.data.dataset import Dataset, View
     from gsseg_core.errors import GssegError
     from gsseg_core.export import export_classes
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from gsseg_core.learn.gradient_learner import GradientLearner, GradientSettings
     from gsseg_core.learn.vote_learner import VoteLearner
     from gsseg_core.metrics import Evaluation
+    from gsseg_core.objects.oriented_boxes import OrientedBox, object_boxes
     from gsseg_core.raster.view_operator import ViewOperator, make_operator
     from gsseg_core.refine.settings import RefineSettings
     from gsseg_core.scene.camera import Camera
@@ -42,7 +42,7 @@ _HOMES = {
     "GradientLearner": "learn.gradient_learner",
     "GradientSettings": "learn.gradient_learner",
     "GssegError": "errors",
-    "OrientedBox": "boxes",
+    "OrientedBox": "objects.oriented_boxes",
     "RefineSettings": "refine.settings",
     "Segmentation": "segmentation",
     "View": "data.dataset",
@@ -50,7 +50,7 @@ _HOMES = {
     "VoteLearner": "learn.vote_learner",
     "export_classes": "export",
     "make_operator": "raster.view_operator",
-    "object_boxes": "boxes",
+    "object_boxes": "objects.oriented_boxes",
 }
 
 __all__ = [

@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Remove, and say what is left."""
     from gsseg_core.files.atomic import check_writable
-    from gsseg_core.removal import without_objects
+    from gsseg_core.objects.removal import without_objects
     from gsseg_core.scene.gaussian_scene import GaussianScene
     from gsseg_core.segmentation import Segmentation
 

@@ -32,7 +32,7 @@ from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import MEMORY_BUDGET, NO_MASK, Learner, Progress, silent
 from gsseg_core.learn.mask_reliability import OtherViews, ViewCheck, draw_worst_views, hold_against, reliability_report
 from gsseg_core.learn.vote_learner import VoteLearner
-from gsseg_core.object_table import find_objects
+from gsseg_core.objects.object_table import find_objects
 from gsseg_core.pictures import save_png
 from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, spread_if_scarce
 from gsseg_core.refine.settings import RefineSettings
@@ -278,7 +278,7 @@ def _segment(
         del codes
     if refine.carve:
         # Only now: the kernels of the carving take a while to compile, and most runs do without.
-        from gsseg_core.carve import carved
+        from gsseg_core.objects.silhouette_carving import carved
 
         with watch.stage("carve"):
             cameras = [view.camera for view in spread(train, refine.carve_views)]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from gsseg_core.boxes import object_boxes
+from gsseg_core.objects.oriented_boxes import object_boxes
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 

@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsseg_core.carve import Shares
 from gsseg_core.errors import SceneValueError
+from gsseg_core.objects.silhouette_carving import Shares
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.quaternions import rotations
 
@@ -90,7 +90,7 @@ def straddlers(
     Parameters
     ----------
     shares : Shares
-        From `gsseg_core.carve.shares`.
+        From `gsseg_core.objects.silhouette_carving.shares`.
     balance : float
         How large the weaker of the two reasons must be, as a share of the stronger one, 0 to 1.
     least : float

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from gsseg_msgs.msg import SegmentationReport
 
-from gsseg_core.boxes import OrientedBox
+from gsseg_core.objects.oriented_boxes import OrientedBox
 from gsseg_core.scene.camera import Camera
 
 
@@ -76,7 +76,7 @@ class SegmentedObject:
         Of the class in clouds and pictures.
     oriented_box : OrientedBox
         The box that it fills, which lies as it does, with its mean and covariance, in the map frame, metres; see
-        `gsseg_core.boxes`. Stray Gaussians do not blow it up.
+        `gsseg_core.objects.oriented_boxes`. Stray Gaussians do not blow it up.
     """
 
     class_id: int

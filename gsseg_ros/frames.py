@@ -12,8 +12,8 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.boxes import OrientedBox
 from gsseg_core.errors import SettingsError
+from gsseg_core.objects.oriented_boxes import OrientedBox
 from gsseg_core.scene.quaternions import rotations
 
 Array: TypeAlias = npt.NDArray[np.float64]

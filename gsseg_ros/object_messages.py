@@ -10,7 +10,7 @@ from gsseg_msgs.msg import Object, ObjectArray
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from gsseg_core.boxes import OrientedBox
+from gsseg_core.objects.oriented_boxes import OrientedBox
 from gsseg_ros.conversions import matrix_from_pose, pose_from_matrix
 from gsseg_ros.frames import rigid
 

@@ -25,7 +25,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
 import bench_ids
 
-from gsseg_core.association import AssociationSettings, associate
 from gsseg_core.cli import main
 from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.data.label_images import UNKNOWN, read_mask, write_mask
@@ -34,10 +33,11 @@ from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner_state import Learnt
 from gsseg_core.live_ids import PerViewSession
 from gsseg_core.matching import Contingency, renamed
-from gsseg_core.object_table import ObjectTable, find_objects
+from gsseg_core.objects.association import AssociationSettings, associate
+from gsseg_core.objects.lifted_segments import Lifted
+from gsseg_core.objects.object_table import ObjectTable, find_objects
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.segments import Lifted
 
 SCENE, TRUTH = balls_on_a_table()
 VIEWS = clean_views(8)

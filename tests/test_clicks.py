@@ -8,9 +8,9 @@ import small_scenes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsseg_core.clicks import click_labels, longest_lived, merge_tree
 from gsseg_core.errors import NoUsableViewsError, SettingsError
-from gsseg_core.pick import pick_clicks
+from gsseg_core.objects.clicks import click_labels, longest_lived, merge_tree
+from gsseg_core.objects.pick import pick_clicks
 
 SCENE, TRUTH = small_scenes.balls_on_a_table()
 CAMERA = small_scenes.ring(1)[0]

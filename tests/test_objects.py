@@ -29,19 +29,19 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
 from object_ceiling import best_selection
 
-from gsseg_core.carve import Silhouette, carve, carved, shares
 from gsseg_core.cli import main
 from gsseg_core.data.dataset import View
 from gsseg_core.data.names import class_ids
 from gsseg_core.errors import EmptySceneError, MaskSizeError, SceneValueError, SettingsError
 from gsseg_core.export import export_classes
+from gsseg_core.objects.removal import without_objects
+from gsseg_core.objects.silhouette_carving import Silhouette, carve, carved, shares
+from gsseg_core.objects.silhouettes import BEHIND, ObjectScores, depths, objects_of, surface
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.refine.settings import RefineSettings
-from gsseg_core.removal import without_objects
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
-from gsseg_core.silhouettes import BEHIND, ObjectScores, depths, objects_of, surface
 from gsseg_core.straddlers import DISTANCE, half_opacity, split, straddlers
 
 SCENE, TRUTH = balls_on_a_table()

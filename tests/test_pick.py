@@ -13,7 +13,7 @@ from gsseg_core.cli import main
 from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.errors import MaskFormatError, NoUsableViewsError, SettingsError
-from gsseg_core.pick import Pick, pick_mask, read_object_mask
+from gsseg_core.objects.pick import Pick, pick_mask, read_object_mask
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import ros_helpers  # noqa: F401
 
-from gsseg_core.boxes import OrientedBox
 from gsseg_core.errors import PoseError
+from gsseg_core.objects.oriented_boxes import OrientedBox
 from gsseg_ros.frames import rotation_from_quaternion
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")

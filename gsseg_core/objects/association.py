@@ -31,7 +31,7 @@ import numpy as np
 from scipy import sparse
 
 from gsseg_core.errors import SettingsError
-from gsseg_core.segments import Lifted, Profiles, sums
+from gsseg_core.objects.lifted_segments import Lifted, Profiles, sums
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ evidence against the object besides what was seen, the more, the farther away it
 with c and R^2 the mean and the mean squared distance of what the mask shows, each Gaussian weighed by its votes. Within
 the object that is next to nothing; it knows no unit of length.
 
-Clicks become a mask first (`gsseg_core.clicks`).
+Clicks become a mask first (`gsseg_core.objects.clicks`).
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gsseg_core.clicks import Pixel, click_labels
 from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import UNKNOWN, read_mask
 from gsseg_core.errors import MaskFormatError, NoUsableViewsError, SettingsError
 from gsseg_core.files.atomic import write_atomically
+from gsseg_core.objects.clicks import Pixel, click_labels
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.refine.label_propagation import GraphSettings, graph_of, propagate
 from gsseg_core.scene.camera import Camera
@@ -154,7 +154,7 @@ def pick_clicks(
     camera : Camera
         Where the clicks were made.
     inside, outside : sequence of (row, column)
-        Pixels of the object, at least one, and others; see `gsseg_core.clicks.click_labels`.
+        Pixels of the object, at least one, and others; see `gsseg_core.objects.clicks.click_labels`.
 
     Raises
     ------

@@ -68,7 +68,7 @@ def click_labels(
     *,
     device: str = "cpu",
 ) -> np.ndarray:
-    """Make labels for `gsseg_core.pick.pick_mask` of clicks in a view.
+    """Make labels for `gsseg_core.objects.pick.pick_mask` of clicks in a view.
 
     Parameters
     ----------

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from gsseg_core.association import AssociationSettings, associate
 from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import BACKGROUND_NAME, MAX_LABEL, UNKNOWN
 from gsseg_core.errors import UnknownLabelError
 from gsseg_core.learn.learner import Progress, silent
+from gsseg_core.objects.association import AssociationSettings, associate
+from gsseg_core.objects.lifted_segments import Lifted, Profiles, sums
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.segments import Lifted, Profiles, sums
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""Objects: found over views, picked, boxed, cut out and taken away."""
