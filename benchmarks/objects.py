@@ -22,11 +22,11 @@ from results import machine, markdown, points
 
 from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.demo_scene import build_demo
-from gsseg_core.export import background_image
+from gsseg_core.export.class_plys import background_image
+from gsseg_core.export.pictures import contact_sheet, save_png
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.objects.silhouette_carving import KEPT, Silhouette, shares
 from gsseg_core.objects.silhouettes import ObjectScores, objects_of, surface
-from gsseg_core.pictures import contact_sheet, save_png
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene

@@ -20,7 +20,7 @@ from gsseg_core import kernel_cache as _kernel_cache  # noqa: F401
 if TYPE_CHECKING:
     from gsseg_core.data.dataset import Dataset, View
     from gsseg_core.errors import GssegError
-    from gsseg_core.export import export_classes
+    from gsseg_core.export.class_plys import export_classes
     from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
     from gsseg_core.learn.gradient_learner import GradientLearner, GradientSettings
     from gsseg_core.learn.vote_learner import VoteLearner
@@ -48,7 +48,7 @@ _HOMES = {
     "View": "data.dataset",
     "ViewOperator": "raster.view_operator",
     "VoteLearner": "learn.vote_learner",
-    "export_classes": "export",
+    "export_classes": "export.class_plys",
     "make_operator": "raster.view_operator",
     "object_boxes": "objects.oriented_boxes",
 }

@@ -29,7 +29,7 @@ def run(options: argparse.Namespace) -> int:
     """Score, and print a table."""
     from gsseg_core.data.label_images import read_classes
     from gsseg_core.errors import ClassesFileError
-    from gsseg_core.export import write_json
+    from gsseg_core.export.class_plys import write_json
     from gsseg_core.files.atomic import check_writable
     from gsseg_core.files.input_files import is_there
     from gsseg_core.metrics import evaluate_folders

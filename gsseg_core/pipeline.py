@@ -15,7 +15,7 @@ from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.data.hints import mask_hint
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.errors import NoUsableViewsError, SettingsError
-from gsseg_core.export import (
+from gsseg_core.export.class_plys import (
     Drawn,
     draw_views,
     segment_places,
@@ -25,6 +25,7 @@ from gsseg_core.export import (
     write_overview,
     write_pictures,
 )
+from gsseg_core.export.pictures import save_png
 from gsseg_core.files.earlier_outputs import earlier_render, earlier_segment
 from gsseg_core.files.run_folder import StagedRun, staged_run
 from gsseg_core.learn.calibrate import calibrate
@@ -33,7 +34,6 @@ from gsseg_core.learn.learner import MEMORY_BUDGET, NO_MASK, Learner, Progress, 
 from gsseg_core.learn.mask_reliability import OtherViews, ViewCheck, draw_worst_views, hold_against, reliability_report
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.objects.object_table import find_objects
-from gsseg_core.pictures import save_png
 from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, spread_if_scarce
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.report import Stopwatch, build_report

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from gsseg_core import report_html as html
+from gsseg_core.export.pictures import palette
 from gsseg_core.files.atomic import write_atomically
-from gsseg_core.pictures import palette
 from gsseg_core.printable import html_text
 from gsseg_core.report_findings import Evidence, class_ious, mean_reliability, warnings_of
 from gsseg_core.report_pictures import PICTURE_PX, THUMBNAIL_PX, ViewImages, draw_triple, jpeg_uri, thumbnails

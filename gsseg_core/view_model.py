@@ -12,9 +12,9 @@ import numpy as np
 
 from gsseg_core.data.label_images import BACKGROUND_NAME
 from gsseg_core.errors import StateFileError, UnknownLabelError
+from gsseg_core.export.pictures import palette
 from gsseg_core.files.json_files import read_json
 from gsseg_core.files.npz_files import SHARES_TOLERANCE
-from gsseg_core.pictures import palette
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 

@@ -22,10 +22,10 @@ from gsseg_core.data.label_images import write_mask
 from gsseg_core.demo import gaussian_ious
 from gsseg_core.demo_scene import DemoScene, build_demo
 from gsseg_core.errors import GssegError
-from gsseg_core.export import write_overview
+from gsseg_core.export.class_plys import write_overview
+from gsseg_core.export.pictures import contact_sheet, palette, save_png
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.metrics import evaluate_folders
-from gsseg_core.pictures import contact_sheet, palette, save_png
 from gsseg_core.progress import progress_bars
 from gsseg_core.report import Stopwatch
 from gsseg_core.segmentation import Segmentation

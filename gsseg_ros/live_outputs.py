@@ -17,7 +17,7 @@ from builtin_interfaces.msg import Time
 from std_msgs.msg import Header
 
 from gsseg_core.errors import GssegError
-from gsseg_core.pictures import overlay, palette
+from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.segmentation import Segmentation

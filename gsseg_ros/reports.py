@@ -13,9 +13,9 @@ from gsseg_msgs.msg import ClassSummary, Object, ObjectArray, SegmentationReport
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import ColorRGBA, Header
 
+from gsseg_core.export.pictures import palette
 from gsseg_core.live import LIVE, LiveSession
 from gsseg_core.objects.oriented_boxes import class_box
-from gsseg_core.pictures import palette
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.report import gaussian_counts
 from gsseg_core.segmentation import Segmentation

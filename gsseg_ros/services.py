@@ -18,7 +18,7 @@ from rclpy.lifecycle import LifecycleNode
 from std_msgs.msg import Header
 
 from gsseg_core.errors import GssegError
-from gsseg_core.export import write_classes, write_json
+from gsseg_core.export.class_plys import write_classes, write_json
 from gsseg_core.files.confined_files import pinned_folder
 from gsseg_core.files.earlier_outputs import earlier_segment
 from gsseg_core.files.run_folder import require_own_folder, staged_run

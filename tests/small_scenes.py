@@ -9,9 +9,9 @@ import numpy as np
 
 from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import write_mask
+from gsseg_core.export.pictures import palette
 from gsseg_core.learn.learner import Learner
 from gsseg_core.metrics import Evaluation
-from gsseg_core.pictures import palette
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene

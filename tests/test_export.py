@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views
 
-from gsseg_core import export
 from gsseg_core.errors import PathTakenError, WriteError
-from gsseg_core.export import (
+from gsseg_core.export import class_plys as export
+from gsseg_core.export.class_plys import (
     class_file_name,
     draw_views,
     export_classes,

@@ -33,7 +33,7 @@ from gsseg_core.cli import main
 from gsseg_core.data.dataset import View
 from gsseg_core.data.names import class_ids
 from gsseg_core.errors import EmptySceneError, MaskSizeError, SceneValueError, SettingsError
-from gsseg_core.export import export_classes
+from gsseg_core.export.class_plys import export_classes
 from gsseg_core.objects.removal import without_objects
 from gsseg_core.objects.silhouette_carving import Silhouette, carve, carved, shares
 from gsseg_core.objects.silhouettes import BEHIND, ObjectScores, depths, objects_of, surface

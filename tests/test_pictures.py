@@ -10,7 +10,7 @@ from PIL import Image
 
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import WriteError
-from gsseg_core.pictures import BACKGROUND, PAPER, contact_sheet, legend, overlay, palette, save_png
+from gsseg_core.export.pictures import BACKGROUND, PAPER, contact_sheet, legend, overlay, palette, save_png
 
 
 def test_colours_are_all_different_and_the_first_is_the_background() -> None:

@@ -11,8 +11,8 @@ from small_scenes import balls_on_a_table, look_at
 
 from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.export.pictures import palette
 from gsseg_core.learn.mask_reliability import hold_against
-from gsseg_core.pictures import palette
 from gsseg_core.report_findings import Evidence
 from gsseg_core.report_pictures import THUMBNAIL_PX, ViewImages, draw_triple, jpeg_uri, thumbnails
 

@@ -17,7 +17,7 @@ import rclpy
 from rclpy.signals import SignalHandlerOptions
 
 from gsseg_core.errors import IntrinsicsError, PoseError
-from gsseg_core.pictures import palette
+from gsseg_core.export.pictures import palette
 from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.client import NodeUnavailableError, SegmentationClient, Viewpoint

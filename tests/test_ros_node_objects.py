@@ -12,8 +12,8 @@ from ros_helpers import Ros, ros_fixture  # noqa: F401
 from ros_robot import LATCHED, Robot, core_session
 from small_scenes import clean_views
 
+from gsseg_core.export.pictures import palette
 from gsseg_core.objects.oriented_boxes import object_boxes
-from gsseg_core.pictures import palette
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation

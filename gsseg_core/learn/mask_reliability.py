@@ -22,11 +22,11 @@ from gsseg_core.csr_rows import Rows
 from gsseg_core.data.dataset import View, spread
 from gsseg_core.data.label_evidence import Meaning
 from gsseg_core.data.label_images import UNKNOWN, PackedLabels
-from gsseg_core.export import background_image
+from gsseg_core.export.class_plys import background_image
+from gsseg_core.export.pictures import contact_sheet, overlay, palette
 from gsseg_core.learn.em.em_learner import EMLearner, codes_without
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.learn.temperature import VIEWS, Sample, sample_pixels
-from gsseg_core.pictures import contact_sheet, overlay, palette
 from gsseg_core.raster.view_operator import make_operator
 
 CONFUSIONS = 3

@@ -14,10 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.data.dataset import View
+from gsseg_core.export.pictures import contact_sheet, legend, overlay, palette, save_png
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.earlier_outputs import earlier_classes
 from gsseg_core.files.run_folder import staged_run
-from gsseg_core.pictures import contact_sheet, legend, overlay, palette, save_png
 from gsseg_core.raster.view_operator import ViewOperator, make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.ply import write_vertices

@@ -1,0 +1,1 @@
+"""A segmentation as files for others: PLY files and pictures."""
