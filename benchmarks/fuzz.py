@@ -146,7 +146,7 @@ def load_state(data: Path) -> int:
     from fuzz_inputs import NAMES, STATE
 
     from gsseg_core.errors import GssegError
-    from gsseg_core.live import LiveSession
+    from gsseg_core.live.session import LiveSession
     from gsseg_core.scene.gaussian_scene import GaussianScene
 
     session = LiveSession(GaussianScene.load(data / "scene.ply"), NAMES)

@@ -16,7 +16,7 @@ from small_scenes import NAMES, balls_on_a_table, look_at, ring, write_dataset
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import read_mask
-from gsseg_core.live import LiveSession
+from gsseg_core.live.session import LiveSession
 from gsseg_core.scene.camera import Camera
 
 WIDTH, HEIGHT = 16, 12

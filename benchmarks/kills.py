@@ -198,7 +198,7 @@ def state_faults(path: Path, scene: object, views: set[int]) -> list[Fault]:
     """Load a state, which must be one of those that were saved: it goes by the number of views."""
     from ros_robot import CLASSES
 
-    from gsseg_core.live import LiveSession
+    from gsseg_core.live.session import LiveSession
 
     if not path.is_file():
         return [("lost", f"{path.name} is not there")]

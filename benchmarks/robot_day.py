@@ -38,7 +38,7 @@ from small_scenes import NAMES, balls_on_a_table, ring, true_labels, write_datas
 
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.learn.learner_state import State
-from gsseg_core.live import LiveSession
+from gsseg_core.live.session import LiveSession
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.client import SegmentationClient

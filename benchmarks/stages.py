@@ -16,7 +16,7 @@ from gsseg_core.export.class_plys import export_classes
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner import UNITS
 from gsseg_core.learn.vote_learner import VoteLearner
-from gsseg_core.live import LiveSession
+from gsseg_core.live.session import LiveSession
 from gsseg_core.raster.cpu.depth_sort import sort_by_depth
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.tiling import assign

@@ -10,7 +10,7 @@ from scipy import ndimage
 from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import NoUsableViewsError, SettingsError
-from gsseg_core.live import LiveSession
+from gsseg_core.live.session import LiveSession
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_OPACITY, WIDTH
 from gsseg_core.raster.view_operator import make_operator

@@ -7,7 +7,7 @@ from collections import Counter
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from gsseg_core.live_results import SCENE_CHANGED
+from gsseg_core.live.results import SCENE_CHANGED
 from gsseg_ros.complaints import CLOCK, MISSING, PERIOD, TIME_JUMP, Complaints
 from gsseg_ros.inputs import Inputs
 from gsseg_ros.workspace import Workspace

@@ -21,7 +21,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from gsseg_core.data.dataset import View
 from gsseg_core.errors import GssegError, PoseError
-from gsseg_core.live_results import SCENE_CHANGED, Rejection
+from gsseg_core.live.results import SCENE_CHANGED, Rejection
 from gsseg_ros.camera_images import CameraImages
 from gsseg_ros.complaints import LIVE, PERIOD, REFUSED_POSE, Complaints
 from gsseg_ros.conversions import camera_from_messages, labels_from_image, matrix_from_pose, stamp_ns

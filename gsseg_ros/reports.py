@@ -14,7 +14,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import ColorRGBA, Header
 
 from gsseg_core.export.pictures import palette
-from gsseg_core.live import LIVE, LiveSession
+from gsseg_core.live.session import LIVE, LiveSession
 from gsseg_core.objects.oriented_boxes import class_box
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.report import gaussian_counts

@@ -16,8 +16,8 @@ from builtin_interfaces.msg import Time
 
 from gsseg_core.data.names import class_ids
 from gsseg_core.errors import PathNotAllowedError, SettingsError
-from gsseg_core.live import LiveSession
-from gsseg_core.live_ids import PerViewSession
+from gsseg_core.live.per_view_session import PerViewSession
+from gsseg_core.live.session import LiveSession
 from gsseg_core.pipeline import PER_VIEW
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.report import Stopwatch

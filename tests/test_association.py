@@ -31,7 +31,7 @@ from gsseg_core.data.label_images import UNKNOWN, read_mask, write_mask
 from gsseg_core.errors import SettingsError, UnknownLabelError
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner_state import Learnt
-from gsseg_core.live_ids import PerViewSession
+from gsseg_core.live.per_view_session import PerViewSession
 from gsseg_core.matching import Contingency, renamed
 from gsseg_core.objects.association import AssociationSettings, associate
 from gsseg_core.objects.lifted_segments import Lifted

@@ -11,7 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from small_scenes import NAMES, balls_on_a_table, clean_views
 
-from gsseg_core.live import LiveSession
+from gsseg_core.live.session import LiveSession
 from gsseg_core.objects.oriented_boxes import OrientedBox, class_box, object_boxes, oriented_box
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.report import build_report

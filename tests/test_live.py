@@ -11,7 +11,6 @@ import pytest
 from patience import PATIENCE
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, taught, write_dataset, wrong_views
 
-from gsseg_core import live
 from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import (
@@ -25,7 +24,8 @@ from gsseg_core.errors import (
 )
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.vote_learner import VoteLearner
-from gsseg_core.live import LiveSession
+from gsseg_core.live import session as live
+from gsseg_core.live.session import LiveSession
 from gsseg_core.refine.settings import RefineSettings
 
 SCENE, TRUTH = balls_on_a_table()

@@ -15,7 +15,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import ROSClock
 from rclpy.time import Time
 
-from gsseg_core import live_results
+from gsseg_core.live import results as live_results
 from gsseg_ros import diagnostics
 from gsseg_ros.complaints import KINDS, REASONS, REFUSED_POSE, Complaints
 from gsseg_ros.sim_time import SimTime, on_set_back

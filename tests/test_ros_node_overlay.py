@@ -18,7 +18,7 @@ from small_scenes import balls_on_a_table, clean_views
 from gsseg_core.data.dataset import View
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.export.pictures import overlay, palette
-from gsseg_core.live import LiveSession
+from gsseg_core.live.session import LiveSession
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.camera import Camera

@@ -24,7 +24,7 @@ from rclpy.lifecycle import LifecycleNode
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
-from gsseg_core.live import LiveSession
+from gsseg_core.live.session import LiveSession
 from gsseg_ros import outputs as outputs_module
 from gsseg_ros.frames import Similarity
 from gsseg_ros.outputs import Outputs

@@ -53,7 +53,7 @@ def test_after_warm_up_nothing_is_compiled_any_more(tmp_path: Path, what: str) -
     assert main(["segment", {scene!r}, "--data", {data!r}, "--out", {out!r}, "--no-graph", "--quiet"]) == 0""",
         "fuse": f"""
     from gsseg_core.data.dataset import Dataset
-    from gsseg_core.live import LiveSession
+    from gsseg_core.live.session import LiveSession
     from gsseg_core.scene.gaussian_scene import GaussianScene
     session, data = LiveSession(GaussianScene.load({scene!r})), Dataset({data!r})
     assert not any(map(session.fuse, data.views("train")))

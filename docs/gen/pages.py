@@ -64,7 +64,7 @@ def python() -> str:
     for title, names in {**API, **({"More": more} if more else {})}.items():
         parts.append(f"## {title}\n")
         parts += [f"::: gsseg_core.{gsseg_core._HOMES[name]}.{name}\n" for name in names]
-    parts += ["## A robot without ROS\n", "::: gsseg_core.live.LiveSession\n"]
+    parts += ["## A robot without ROS\n", "::: gsseg_core.live.session.LiveSession\n"]
     parts += ["## The client of the ROS node\n", "::: gsseg_ros.client.SegmentationClient\n"]
     return "\n".join(parts)
 

@@ -12,8 +12,8 @@ import numpy as np
 from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.learn.learner_state import State
-from gsseg_core.live import LiveSession
-from gsseg_core.live_results import Outcome, Rejection
+from gsseg_core.live.results import Outcome, Rejection
+from gsseg_core.live.session import LiveSession
 from gsseg_core.objects.object_table import ObjectTable, Repair, object_name
 from gsseg_core.scene.gaussian_scene import GaussianScene
 

@@ -23,7 +23,7 @@ from gsseg_core.errors import (
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.learner_state import Learnt, State
 from gsseg_core.learn.vote_learner import VoteLearner
-from gsseg_core.live_results import SCENE_CHANGED, Outcome, Rejection
+from gsseg_core.live.results import SCENE_CHANGED, Outcome, Rejection
 from gsseg_core.pipeline import make_learner
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.report import Stopwatch

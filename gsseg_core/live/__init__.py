@@ -1,0 +1,1 @@
+"""Sessions that learn while views come in, as a robot does."""
