@@ -11,7 +11,7 @@ from gsseg_core import pipeline
 from gsseg_core.demo_scene import DemoScene, build_demo
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.metrics import evaluate_folders
-from gsseg_core.report import Stopwatch
+from gsseg_core.report.summary import Stopwatch
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.tables import counted, percent, seconds_table, table
 

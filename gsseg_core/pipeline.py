@@ -36,10 +36,10 @@ from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.objects.object_table import find_objects
 from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, spread_if_scarce
 from gsseg_core.refine.settings import RefineSettings
-from gsseg_core.report import Stopwatch, build_report
-from gsseg_core.report_findings import Evidence
-from gsseg_core.report_page import write_report_page
-from gsseg_core.report_pictures import ViewImages
+from gsseg_core.report.findings import Evidence
+from gsseg_core.report.page import write_report_page
+from gsseg_core.report.pictures import ViewImages
+from gsseg_core.report.summary import Stopwatch, build_report
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 

@@ -27,7 +27,7 @@ from gsseg_core.export.pictures import contact_sheet, palette, save_png
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.metrics import evaluate_folders
 from gsseg_core.progress import progress_bars
-from gsseg_core.report import Stopwatch
+from gsseg_core.report.summary import Stopwatch
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.tables import percent, seconds_table, table
 from gsseg_ros.child_nodes import ChildNodes

@@ -23,7 +23,7 @@ from gsseg_core.files.confined_files import pinned_folder
 from gsseg_core.files.earlier_outputs import earlier_segment
 from gsseg_core.files.run_folder import require_own_folder, staged_run
 from gsseg_core.refine.settings import RefineSettings
-from gsseg_core.report import build_report
+from gsseg_core.report.summary import build_report
 from gsseg_ros.errors import InvalidRequestError, error_code
 from gsseg_ros.jobs import Turns
 from gsseg_ros.outputs import Outputs

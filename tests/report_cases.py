@@ -13,7 +13,7 @@ from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, ring, taugh
 from gsseg_core import pipeline
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.mask_reliability import check_views
-from gsseg_core.report_findings import Evidence
+from gsseg_core.report.findings import Evidence
 from gsseg_core.segmentation import Segmentation
 
 NASTY = {

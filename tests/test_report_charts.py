@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from report_cases import Outline
 
-from gsseg_core import report_charts as charts
+from gsseg_core.report import charts
 
 
 @given(st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 10**6)), min_size=1, max_size=30))

@@ -8,7 +8,7 @@ from report_cases import minimal_report
 
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.learn.mask_reliability import ViewCheck
-from gsseg_core.report_findings import (
+from gsseg_core.report.findings import (
     Evidence,
     class_ious,
     largest_confusions,

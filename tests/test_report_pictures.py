@@ -13,8 +13,8 @@ from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.export.pictures import palette
 from gsseg_core.learn.mask_reliability import hold_against
-from gsseg_core.report_findings import Evidence
-from gsseg_core.report_pictures import THUMBNAIL_PX, ViewImages, draw_triple, jpeg_uri, thumbnails
+from gsseg_core.report.findings import Evidence
+from gsseg_core.report.pictures import THUMBNAIL_PX, ViewImages, draw_triple, jpeg_uri, thumbnails
 
 SCENE, TRUTH = balls_on_a_table()
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_scenes import NUM_CLASSES, balls_on_a_table, look_at
 
-from gsseg_core.report_preview import RECORD, look_from, make_preview, up_of
+from gsseg_core.report.preview import RECORD, look_from, make_preview, up_of
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 

@@ -26,7 +26,7 @@ from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.results import SCENE_CHANGED, Outcome, Rejection
 from gsseg_core.pipeline import make_learner
 from gsseg_core.refine.settings import RefineSettings
-from gsseg_core.report import Stopwatch
+from gsseg_core.report.summary import Stopwatch
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.spatial.neighbourhood import neighbours_of
