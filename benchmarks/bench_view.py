@@ -34,10 +34,10 @@ from playwright.sync_api import Page
 
 from gsseg_core.data.dataset import View
 from gsseg_core.raster.view_operator import make_operator
-from gsseg_core.view_access import listen
-from gsseg_core.view_model import Labelling, ViewModel
-from gsseg_core.view_screens import BROWSER, SERVER
-from gsseg_core.viewer import Viewer
+from gsseg_core.viewer.access import listen
+from gsseg_core.viewer.clients import BROWSER, SERVER
+from gsseg_core.viewer.model import Labelling, ViewModel
+from gsseg_core.viewer.viewer import Viewer
 
 LIMIT = 200
 """Milliseconds that a toggle may take at 300,000 Gaussians."""

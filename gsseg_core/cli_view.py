@@ -17,7 +17,7 @@ from gsseg_core.errors import SettingsError
 from gsseg_core.terminal import tell
 
 if TYPE_CHECKING:
-    from gsseg_core.view_access import Listener
+    from gsseg_core.viewer.access import Listener
 
 HELP = "look at a scene in the browser, class by class, and correct labels"
 DESCRIPTION = """
@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Show the scene until interrupted."""
     viewer_module = load_viewer()
-    from gsseg_core.view_access import listen
+    from gsseg_core.viewer.access import listen
 
     if options.ros and options.segmentation:
         raise SettingsError("both --ros and --segmentation are given; expected one: the node has codes of its own")
@@ -70,8 +70,8 @@ def _show(options: argparse.Namespace, listener: Listener, viewer_module: Module
     from gsseg_core.data.dataset import Dataset
     from gsseg_core.scene.gaussian_scene import GaussianScene
     from gsseg_core.segmentation import Segmentation
-    from gsseg_core.view_live import open_source
-    from gsseg_core.view_model import BY_CLASS, TRUE_COLOURS, Labelling, ViewModel, read_reliability
+    from gsseg_core.viewer.live_source import open_source
+    from gsseg_core.viewer.model import BY_CLASS, TRUE_COLOURS, Labelling, ViewModel, read_reliability
 
     load_kernels(options.quiet, options.device)
     scene = GaussianScene.load(options.scene)
@@ -121,7 +121,7 @@ def load_viewer() -> ModuleType:
         viser is not installed.
     """
     try:
-        from gsseg_core import viewer
+        from gsseg_core.viewer import viewer
     except ModuleNotFoundError as missing:
         if missing.name != "viser":
             raise

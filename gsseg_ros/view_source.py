@@ -16,8 +16,8 @@ from sensor_msgs.msg import PointCloud2
 from gsseg_core.errors import StateMismatchError
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import UNOBSERVED
-from gsseg_core.view_live import LiveUpdate
-from gsseg_core.view_model import Labelling
+from gsseg_core.viewer.live_source import LiveUpdate
+from gsseg_core.viewer.model import Labelling
 from gsseg_ros.client_calls import Calls
 from gsseg_ros.conversions import CloudArrays, arrays_from_cloud, stamp_ns
 from gsseg_ros.errors import NodeUnavailableError, SegmentationError

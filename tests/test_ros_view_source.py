@@ -20,7 +20,7 @@ from std_msgs.msg import Header
 from gsseg_core.errors import SettingsError, StateMismatchError
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
-from gsseg_core.view_live import LiveUpdate, open_source
+from gsseg_core.viewer.live_source import LiveUpdate, open_source
 from gsseg_ros.client import NodeUnavailableError, SegmentationClient
 from gsseg_ros.view_source import RosSource
 

@@ -22,7 +22,7 @@ from gsseg_core.pipeline import make_learner
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
-from gsseg_core.view_model import Labelling, ViewModel, completed
+from gsseg_core.viewer.model import Labelling, ViewModel, completed
 
 IDS = np.array([0, 1, 700, 65534], np.int32)
 SCENE, TRUTH = balls_on_a_table()

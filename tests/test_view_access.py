@@ -9,10 +9,10 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
-from gsseg_core import view_access
 from gsseg_core.cli import main
 from gsseg_core.errors import SettingsError
-from gsseg_core.view_access import Listener, listen
+from gsseg_core.viewer import access as view_access
+from gsseg_core.viewer.access import Listener, listen
 
 PORT = 18300
 

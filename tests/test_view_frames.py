@@ -16,10 +16,10 @@ pytest.importorskip("viser")
 
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.camera import Camera
-from gsseg_core.view_frames import FINE_ROWS, QUICK_ROWS, RESTS, Frames
-from gsseg_core.view_model import Labelling, ViewModel
-from gsseg_core.view_nodes import cut
-from gsseg_core.view_picture import Picture
+from gsseg_core.viewer.model import Labelling, ViewModel
+from gsseg_core.viewer.picture import Picture
+from gsseg_core.viewer.server_frames import FINE_ROWS, QUICK_ROWS, RESTS, Frames
+from gsseg_core.viewer.splat_chunks import cut
 
 SCENE, TRUTH = balls_on_a_table()
 MODEL = ViewModel(SCENE, Labelling(TRUTH.astype(np.int32), np.eye(4, dtype=np.float32)[TRUTH], dict(NAMES)))

@@ -13,7 +13,7 @@ from small_scenes import NAMES, balls_on_a_table
 
 from gsseg_core.errors import StateFileError, UnknownLabelError
 from gsseg_core.segmentation import REMOVED, UNOBSERVED
-from gsseg_core.view_model import (
+from gsseg_core.viewer.model import (
     BY_CLASS,
     BY_CONFIDENCE,
     BY_RELIABILITY,
@@ -24,7 +24,7 @@ from gsseg_core.view_model import (
     ramp,
     read_reliability,
 )
-from gsseg_core.view_nodes import BANDS, Node, after, changes, cut, paint
+from gsseg_core.viewer.splat_chunks import BANDS, Node, after, changes, cut, paint
 
 SCENE, TRUTH = balls_on_a_table()
 N, K = len(SCENE), len(NAMES)

@@ -12,9 +12,9 @@ from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import REMOVED, UNOBSERVED
-from gsseg_core.view_corrections import Corrections, box, disc, region, share_seen
-from gsseg_core.view_model import Labelling
-from gsseg_core.view_picking import Evidence, pick, scene_camera
+from gsseg_core.viewer.corrections import Corrections, box, disc, region, share_seen
+from gsseg_core.viewer.model import Labelling
+from gsseg_core.viewer.picking import Evidence, pick, scene_camera
 
 SCENE, TRUTH = balls_on_a_table()
 CAMERA = ring(5)[0]

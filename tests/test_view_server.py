@@ -26,12 +26,12 @@ import zstandard
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from gsseg_core import view_server
 from gsseg_core.errors import SettingsError
-from gsseg_core.view_access import listen
-from gsseg_core.view_model import Labelling, ViewModel
-from gsseg_core.view_screens import SERVER
-from gsseg_core.viewer import Viewer
+from gsseg_core.viewer import server as view_server
+from gsseg_core.viewer.access import listen
+from gsseg_core.viewer.clients import SERVER
+from gsseg_core.viewer.model import Labelling, ViewModel
+from gsseg_core.viewer.viewer import Viewer
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator

@@ -22,15 +22,15 @@ from gsseg_core.cli import main
 from gsseg_core.errors import SettingsError
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.view_access import listen
-from gsseg_core.view_live import LiveUpdate
-from gsseg_core.view_model import BY_RELIABILITY, TRUE_COLOURS, Labelling, ViewModel
+from gsseg_core.viewer.access import listen
+from gsseg_core.viewer.live_source import LiveUpdate
+from gsseg_core.viewer.model import BY_RELIABILITY, TRUE_COLOURS, Labelling, ViewModel
 
 pytest.importorskip("viser")
 
-from gsseg_core import view_screens
-from gsseg_core.view_screens import AUTO, BROWSER, SERVER
-from gsseg_core.viewer import Viewer
+from gsseg_core.viewer import clients as view_screens
+from gsseg_core.viewer.clients import AUTO, BROWSER, SERVER
+from gsseg_core.viewer.viewer import Viewer
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

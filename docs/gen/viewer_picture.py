@@ -18,9 +18,9 @@ from browser import opened_page, screenshot, started_chromium
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.view_access import listen
-from gsseg_core.view_model import Labelling, ViewModel, read_reliability
-from gsseg_core.viewer import Viewer
+from gsseg_core.viewer.access import listen
+from gsseg_core.viewer.model import Labelling, ViewModel, read_reliability
+from gsseg_core.viewer.viewer import Viewer
 
 ROOT = Path(__file__).parents[2]
 BOWL = 2

@@ -21,16 +21,16 @@ from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.view_access import Listener, listen
-from gsseg_core.view_corrections import Corrections
-from gsseg_core.view_live import LiveSource
-from gsseg_core.view_model import BY_RELIABILITY, MODES, ViewModel, completed
-from gsseg_core.view_nodes import cut
-from gsseg_core.view_panel import Panel
-from gsseg_core.view_picking import Evidence, pick, scene_camera
-from gsseg_core.view_picture import Picture
-from gsseg_core.view_screens import AUTO, DRAWN_BY, Screens
-from gsseg_core.view_server import start_server
+from gsseg_core.viewer.access import Listener, listen
+from gsseg_core.viewer.clients import AUTO, DRAWN_BY, Screens
+from gsseg_core.viewer.corrections import Corrections
+from gsseg_core.viewer.live_source import LiveSource
+from gsseg_core.viewer.model import BY_RELIABILITY, MODES, ViewModel, completed
+from gsseg_core.viewer.panel import Panel
+from gsseg_core.viewer.picking import Evidence, pick, scene_camera
+from gsseg_core.viewer.picture import Picture
+from gsseg_core.viewer.server import start_server
+from gsseg_core.viewer.splat_chunks import cut
 
 DRAWING_HEIGHT = 480
 """Most rows of the image in which a correction is drawn; finer than the Gaussians is of no use."""

@@ -17,7 +17,7 @@ from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED
-from gsseg_core.view_model import Labelling
+from gsseg_core.viewer.model import Labelling
 
 TRUST = 4.0
 """A correction that sees the whole of a Gaussian weighs as much as so many times all that was learnt before."""

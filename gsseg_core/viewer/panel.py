@@ -18,13 +18,13 @@ from gsseg_core.data.dataset import View
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.printable import html_text, printable
 from gsseg_core.scene.camera import Camera
-from gsseg_core.view_corrections import box, disc, region
-from gsseg_core.view_model import MODES, ClassRow
-from gsseg_core.view_nodes import BANDS
-from gsseg_core.view_picking import Picked, Voice
+from gsseg_core.viewer.corrections import box, disc, region
+from gsseg_core.viewer.model import MODES, ClassRow
+from gsseg_core.viewer.picking import Picked, Voice
+from gsseg_core.viewer.splat_chunks import BANDS
 
 if TYPE_CHECKING:
-    from gsseg_core.viewer import Viewer
+    from gsseg_core.viewer.viewer import Viewer
 
 MOST_CLASSES, MOST_VIEWS = 5, 8
 """Of probabilities and views that the answer to a click names."""

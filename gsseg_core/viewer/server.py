@@ -24,7 +24,7 @@ from websockets.http11 import Request, Response
 from websockets.typing import Data
 
 from gsseg_core.errors import SettingsError
-from gsseg_core.view_access import Listener
+from gsseg_core.viewer.access import Listener
 
 MOST_BYTES = 2**20
 """Of one message from a browser; the largest is a small picture."""

@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 
 from gsseg_core.errors import SettingsError
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.view_model import Labelling
+from gsseg_core.viewer.model import Labelling
 
 GROUP = "gsseg.live_sources"
 

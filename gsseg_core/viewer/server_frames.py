@@ -14,7 +14,7 @@ from gsseg_core.errors import GssegError
 from gsseg_core.raster.view_operator import ViewOperator, make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.view_picture import Picture
+from gsseg_core.viewer.picture import Picture
 
 FINE_ROWS, QUICK_ROWS = 720, 320
 """Most rows of an image once nothing changes any more, and until then."""

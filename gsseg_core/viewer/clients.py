@@ -13,9 +13,9 @@ import viser
 import viser.transforms as vtf
 
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.view_frames import CameraOf, Frames
-from gsseg_core.view_picture import Picture
-from gsseg_core.view_splats import SplatNodes, Splats
+from gsseg_core.viewer.picture import Picture
+from gsseg_core.viewer.server_frames import CameraOf, Frames
+from gsseg_core.viewer.splats import SplatNodes, Splats
 
 AUTO, BROWSER, SERVER = "auto", "browser", "server"
 DRAWN_BY = (AUTO, BROWSER, SERVER)

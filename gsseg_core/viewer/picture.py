@@ -10,7 +10,7 @@ import numpy as np
 
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.view_nodes import Key, Node, paint
+from gsseg_core.viewer.splat_chunks import Key, Node, paint
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ import viser
 
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.quaternions import rotations
-from gsseg_core.view_nodes import BYTES_PER_GAUSSIAN, Key, Node, after, changes
+from gsseg_core.viewer.splat_chunks import BYTES_PER_GAUSSIAN, Key, Node, after, changes
 
 _LARGEST = 200.0
 """The largest standard deviation is sent as this many units: its square fits a 16-bit float, and so do small ones."""

@@ -1,0 +1,1 @@
+"""A segmentation in the browser."""
