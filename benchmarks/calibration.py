@@ -24,7 +24,7 @@ from results import machine, markdown
 from scipy.optimize import minimize_scalar
 
 from gsseg_core.data.dataset import Dataset, View, spread
-from gsseg_core.demo_scene import build_demo
+from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.learn.calibrate import calibrate, votes_without
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import VOTE_UNIT, Learner

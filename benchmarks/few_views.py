@@ -29,7 +29,7 @@ from results import machine, markdown, points
 from scipy import ndimage
 
 from gsseg_core.data.dataset import Dataset, View
-from gsseg_core.demo_scene import build_demo
+from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.metrics import Evaluation

@@ -21,12 +21,12 @@ from machine import DATA, REPOSITORY
 from results import markdown
 
 from gsseg_core.data.dataset import Dataset, View
-from gsseg_core.demo_scene import build_demo
+from gsseg_core.demo.mask_errors import MaskErrors, corrupt
+from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.temperature import ReliabilityDiagram
-from gsseg_core.mask_errors import MaskErrors, corrupt
 from gsseg_core.metrics import Evaluation
 from gsseg_core.refine.label_propagation import GraphSettings, graph_of, is_scarce, propagate
 from gsseg_core.refine.settings import RefineSettings

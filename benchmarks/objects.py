@@ -21,7 +21,7 @@ from object_ceiling import best_selection
 from results import machine, markdown, points
 
 from gsseg_core.data.dataset import Dataset, View, spread
-from gsseg_core.demo_scene import build_demo
+from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.export.class_plys import background_image
 from gsseg_core.export.pictures import contact_sheet, save_png
 from gsseg_core.learn.em.em_learner import EMLearner

@@ -11,7 +11,7 @@ import numpy as np
 from room import Room, build_room
 
 from gsseg_core.data.label_images import write_mask
-from gsseg_core.mask_errors import corrupt
+from gsseg_core.demo.mask_errors import corrupt
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.camera import Camera
 

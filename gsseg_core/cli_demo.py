@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Build the scene, segment it, and print tables."""
-    from gsseg_core.demo import run_demo
+    from gsseg_core.demo.run import run_demo
 
     load_kernels(options.quiet)
     with progress_bars(options.quiet) as progress:

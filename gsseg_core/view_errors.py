@@ -14,8 +14,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsseg_core.data.dataset import View
+from gsseg_core.demo.mask_errors import MaskErrors, corrupt
 from gsseg_core.errors import SettingsError
-from gsseg_core.mask_errors import MaskErrors, corrupt
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 

@@ -19,8 +19,8 @@ import numpy as np
 
 from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.data.label_images import write_mask
-from gsseg_core.demo import gaussian_ious
-from gsseg_core.demo_scene import DemoScene, build_demo
+from gsseg_core.demo.run import gaussian_ious
+from gsseg_core.demo.table_scene import DemoScene, build_demo
 from gsseg_core.errors import GssegError
 from gsseg_core.export.class_plys import write_overview
 from gsseg_core.export.pictures import contact_sheet, palette, save_png

@@ -9,9 +9,9 @@ import pytest
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import read_mask
-from gsseg_core.demo_scene import CLASS_NAMES, FLOATER, DemoScene, build_demo
+from gsseg_core.demo.solids import WALL, Box, Cone, Ellipsoid, Solid
+from gsseg_core.demo.table_scene import CLASS_NAMES, FLOATER, DemoScene, build_demo
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.solids import WALL, Box, Cone, Ellipsoid, Solid
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from small_scenes import NAMES, write_dataset
 from gsseg_core.cli import main
 from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.data.label_images import read_mask
-from gsseg_core.demo_scene import build_demo
+from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 REPOSITORY = Path(__file__).parents[1]

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.demo.mask_errors import MaskErrors, corrupt
 from gsseg_core.errors import SettingsError
-from gsseg_core.mask_errors import MaskErrors, corrupt
 
 NONE = MaskErrors(missed=0, swapped=0, edge_px=0)
 

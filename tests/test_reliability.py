@@ -12,6 +12,7 @@ from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, taug
 
 from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.demo.mask_errors import MaskErrors
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.mask_reliability import (
     OtherViews,
@@ -21,7 +22,6 @@ from gsseg_core.learn.mask_reliability import (
     reliability_report,
     worst_views,
 )
-from gsseg_core.mask_errors import MaskErrors
 from gsseg_core.view_errors import corrupt_views
 
 SCENE, _ = balls_on_a_table()

@@ -11,7 +11,7 @@ from PIL import Image
 
 from gsseg_core import Camera, Dataset, GaussianScene, Segmentation, make_operator
 from gsseg_core.data.label_images import read_mask
-from gsseg_core.demo import run_demo
+from gsseg_core.demo.run import run_demo
 from gsseg_core.export.pictures import overlay, palette
 
 PICTURES = Path(__file__).parents[1] / "pictures"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from gsseg_core.demo import run_demo
+from gsseg_core.demo.run import run_demo
 
 ROOT = Path(__file__).parents[2]
 WIDTH, HEIGHT = 1240, 1330

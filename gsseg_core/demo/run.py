@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gsseg_core import pipeline
-from gsseg_core.demo_scene import DemoScene, build_demo
+from gsseg_core.demo.table_scene import DemoScene, build_demo
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.metrics import evaluate_folders
 from gsseg_core.report.summary import Stopwatch

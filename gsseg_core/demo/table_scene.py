@@ -19,13 +19,13 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from gsseg_core.data.label_images import write_mask
+from gsseg_core.demo.mask_errors import MaskErrors, corrupt
+from gsseg_core.demo.solids import Box, Cone, Ellipsoid, Solid, dot
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.run_folder import staged_run
-from gsseg_core.mask_errors import MaskErrors, corrupt
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.spherical_harmonics import C0, basis
-from gsseg_core.solids import Box, Cone, Ellipsoid, Solid, dot
 
 CLASS_NAMES = ("background", "mug", "bowl", "book", "ball", "can", "box", "bottle", "apple", "table")
 FLOATER = -1

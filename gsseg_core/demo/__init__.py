@@ -1,0 +1,1 @@
+"""A small scene with known truth, and its segmentation from wrong masks."""
