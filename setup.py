@@ -85,7 +85,7 @@ setup(
     },
     entry_points={
         "console_scripts": [
-            "gsseg = gsseg_core.cli:main",
+            "gsseg = gsseg_core.cli.main:main",
             "replay_node = gsseg_ros.replay_node:main",
             "segment_node = gsseg_ros.segment_node:main",
         ],

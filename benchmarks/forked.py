@@ -85,7 +85,7 @@ def in_child(job: Callable[[], int | None], folder: Path, seconds: float) -> End
 
 def run_command(arguments: list[str]) -> int:
     """Do what `gsseg` with these arguments does; returns the exit code."""
-    from gsseg_core import cli
+    from gsseg_core.cli import main as cli
 
     try:
         return cli.main(arguments)

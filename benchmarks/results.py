@@ -174,7 +174,7 @@ def command(folder: Path) -> str:
     for masks in MASKS:
         with tempfile.TemporaryDirectory() as out:
             segment = [
-                sys.executable, "-m", "gsseg_core.cli", "segment", str(folder / "scene.ply"), "--data", str(folder),
+                sys.executable, "-m", "gsseg_core.cli.main", "segment", str(folder / "scene.ply"), "--data", str(folder),
                 "--labels", masks, "--out", f"{out}/out", "--quiet",
             ]  # fmt: skip
             seconds = []
@@ -184,7 +184,7 @@ def command(folder: Path) -> str:
                 seconds.append(time.perf_counter() - start)
             peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
             render = [
-                sys.executable, "-m", "gsseg_core.cli", "render", str(folder / "scene.ply"), "--data", str(folder),
+                sys.executable, "-m", "gsseg_core.cli.main", "render", str(folder / "scene.ply"), "--data", str(folder),
                 "--segmentation", f"{out}/out/segmentation.npz", "--out", f"{out}/test", "--quiet",
             ]  # fmt: skip
             subprocess.run(render, check=True, stdout=subprocess.DEVNULL)

@@ -24,8 +24,8 @@ import pytest
 from doc_blocks import REPOSITORY
 from patience import PATIENCE
 
-from gsseg_core.cli import main
-from gsseg_core.cli_parser import build_parser
+from gsseg_core.cli.arguments import build_parser
+from gsseg_core.cli.main import main
 
 TIMEOUT = PATIENCE
 _SHELL = re.compile(r"[|&><;`]|\$\(")

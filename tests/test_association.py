@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
 import bench_ids
 
-from gsseg_core.cli import main
+from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.data.label_images import UNKNOWN, read_mask, write_mask
 from gsseg_core.errors import SettingsError, UnknownLabelError

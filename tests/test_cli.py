@@ -17,8 +17,8 @@ import pytest
 from PIL import Image
 from small_scenes import balls_on_a_table, look_at, many_classes, write_dataset
 
-from gsseg_core.cli import main
-from gsseg_core.cli_parser import build_parser
+from gsseg_core.cli.arguments import build_parser
+from gsseg_core.cli.main import main
 from gsseg_core.data.label_images import read_mask, write_mask
 from gsseg_core.files import atomic
 from gsseg_core.learn.vote_learner import VoteLearner
@@ -361,7 +361,7 @@ def test_ctrl_c_in_a_real_process_ends_with_130_and_no_traceback(place: Path) ->
     before = contents(place / "out")
     # The learner waits, so that the signal meets it at work; the warm-up, which tells nobody, goes on.
     program = (
-        "import sys, time; from gsseg_core.learn.vote_learner import VoteLearner; from gsseg_core.cli import main\n"
+        "import sys, time; from gsseg_core.learn.vote_learner import VoteLearner; from gsseg_core.cli.main import main\n"
         "def fit(self, progress=None):\n"
         "    if progress: progress('learn', 0, 9); print('at work', file=sys.stderr); time.sleep(60)\n"
         "VoteLearner.fit = fit\n"
@@ -383,7 +383,7 @@ def test_ctrl_c_in_a_real_process_ends_with_130_and_no_traceback(place: Path) ->
 
 
 def test_the_command_runs_as_a_process_of_its_own(place: Path) -> None:
-    command = [sys.executable, "-W", "error", "-m", "gsseg_core.cli"]
+    command = [sys.executable, "-W", "error", "-m", "gsseg_core.cli.main"]
     run = subprocess.run([*command, *segment(place, "--learner", "votes")], capture_output=True, text=True, check=False)
     assert run.returncode == 0 and run.stderr == ""
     run = subprocess.run([*command, *segment(place, scene="no.ply")], capture_output=True, text=True, check=False)
@@ -392,7 +392,7 @@ def test_the_command_runs_as_a_process_of_its_own(place: Path) -> None:
 
 
 def test_the_package_and_the_pipeline_load_without_pytorch() -> None:
-    program = "import sys, gsseg_core, gsseg_core.cli, gsseg_core.pipeline; sys.exit('torch' in sys.modules)"
+    program = "import sys, gsseg_core, gsseg_core.cli.main, gsseg_core.pipeline; sys.exit('torch' in sys.modules)"
     subprocess.run([sys.executable, "-c", program], check=True)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gsseg_core import cli
+from gsseg_core.cli import main as cli
 from gsseg_core.errors import SettingsError
 from gsseg_core.raster.devices import checked_device
 

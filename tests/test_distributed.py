@@ -21,7 +21,7 @@ import pytest
 from patience import PATIENCE
 from small_scenes import NUM_CLASSES, balls_on_a_table, taught, with_clutter, write_dataset, wrong_views
 
-from gsseg_core.cli import main
+from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.errors import MaskFormatError, SchedulerError
 from gsseg_core.learn.distributed import dask_cluster as scheduler
@@ -378,7 +378,7 @@ def test_an_address_of_a_worker_is_said_to_be_none_of_a_scheduler(client: Any) -
 def test_ctrl_c_while_workers_learn_ends_with_130_and_not_a_word(address: str, data: Path) -> None:
     arguments = [option for option in segment(data, "out", "--scheduler", address) if option != "--quiet"]
     with subprocess.Popen(
-        [sys.executable, "-m", "gsseg_core.cli", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        [sys.executable, "-m", "gsseg_core.cli.main", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as process:
         assert process.stderr is not None
         stderr = b""
@@ -447,5 +447,5 @@ def written(path: Path) -> str:
 
 
 def test_dask_is_not_imported_where_nothing_is_distributed() -> None:
-    program = "import sys, gsseg_core.cli, gsseg_core.pipeline; sys.exit('distributed' in sys.modules)"
+    program = "import sys, gsseg_core.cli.main, gsseg_core.pipeline; sys.exit('distributed' in sys.modules)"
     subprocess.run([sys.executable, "-c", program], check=True)

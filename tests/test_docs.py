@@ -22,13 +22,13 @@ import pytest
 from doc_blocks import FENCE, FIRST, PAGES, REPOSITORY, Block, blocks_of, needs_ros
 from doc_commands import Started, check, core_libraries, kind_of, run_commands, words_of
 
-from gsseg_core.cli import main
-from gsseg_core.cli_parser import COMMANDS
+from gsseg_core.cli.arguments import COMMANDS
+from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset
 
 MOST_NOT_RUN = 7
 PROGRAMS = {
-    "gsseg": "gsseg_core.cli", "segment_node": "gsseg_ros.segment_node", "replay_node": "gsseg_ros.replay_node",
+    "gsseg": "gsseg_core.cli.main", "segment_node": "gsseg_ros.segment_node", "replay_node": "gsseg_ros.replay_node",
     "dask": "dask", "python": "", "python3": "",
 }  # fmt: skip
 MASKS = "docs/masks.md"

@@ -38,7 +38,7 @@ def test_the_site_asks_nobody_for_anything(site: Path) -> None:
 
 def test_the_reference_names_every_command_class_and_interface(site: Path) -> None:
     import gsseg_core
-    from gsseg_core.cli_parser import COMMANDS
+    from gsseg_core.cli.arguments import COMMANDS
 
     text = {name: (site / f"{name}.html").read_text(encoding="utf-8") for name in ("cli", "api", "ros")}
     assert all(f"gsseg {name}</h2>" in re.sub(r"<a class=\"headerlink.*?</a>", "", text["cli"]) for name in COMMANDS)

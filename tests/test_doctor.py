@@ -12,11 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from gsseg_core import doctor, kernel_cache
-from gsseg_core.cli import main
-from gsseg_core.cli_completion import SHELLS, subparsers
-from gsseg_core.cli_parser import COMMANDS, build_parser
-from gsseg_core.doctor import Finding, describe, examine, works
+from gsseg_core import kernel_cache
+from gsseg_core.cli import machine_check as doctor
+from gsseg_core.cli.arguments import COMMANDS, build_parser
+from gsseg_core.cli.completion import SHELLS, subparsers
+from gsseg_core.cli.machine_check import Finding, describe, examine, works
+from gsseg_core.cli.main import main
 
 
 def help_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -59,7 +60,7 @@ def test_every_argument_is_explained() -> None:
 def test_help_waits_for_no_kernel_and_no_large_library() -> None:
     slow = ("numpy", "numba", "scipy", "torch", "distributed", "pycolmap", "shtab", "viser", "rclpy")
     program = (
-        "import sys; from gsseg_core.cli import main; from gsseg_core.cli_parser import build_parser; build_parser();"
+        "import sys; from gsseg_core.cli.main import main; from gsseg_core.cli.arguments import build_parser; build_parser();"
         f"sys.exit(','.join(m for m in {slow} if m in sys.modules) or 0)"
     )
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
@@ -160,6 +161,8 @@ def test_doctor_reports_kernels_that_do_not_run(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_doctor_looks_for_ros_without_importing_it() -> None:
-    program = "import sys; from gsseg_core.doctor import examine; examine(); sys.exit('rclpy' in sys.modules)"
+    program = (
+        "import sys; from gsseg_core.cli.machine_check import examine; examine(); sys.exit('rclpy' in sys.modules)"
+    )
     environment = {**os.environ, "PYTHONPATH": str(Path(doctor.__file__).parents[1])}
     subprocess.run([sys.executable, "-c", program], check=True, env=environment)

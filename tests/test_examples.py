@@ -14,7 +14,7 @@ from patience import PATIENCE
 from scipy.spatial.transform import Rotation
 from small_scenes import NAMES, write_dataset
 
-from gsseg_core.cli import main
+from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.data.label_images import read_mask
 from gsseg_core.demo.table_scene import build_demo

@@ -20,7 +20,7 @@ class Interrupter:
     count, codes = 0, {}
     def find_spec(self, name, path=None, target=None):
         Interrupter.count += 1
-        if Interrupter.count % every or "gsseg_core.interrupts" not in sys.modules:
+        if Interrupter.count % every or "gsseg_core.cli.interrupts" not in sys.modules:
             return
         copy = os.fork()
         if copy == 0:
@@ -30,7 +30,7 @@ class Interrupter:
         else:
             Interrupter.codes[name] = os.waitstatus_to_exitcode(os.waitpid(copy, 0)[1])
 process = os.getpid()
-from gsseg_core.cli import main
+from gsseg_core.cli.main import main
 sys.meta_path.insert(0, Interrupter())
 try:
     sys.exit(main())
@@ -46,9 +46,9 @@ def interrupt():
     os.kill(os.getpid(), signal.SIGINT)
 def work(options):
 {work}
-from gsseg_core import cli_doctor
+from gsseg_core.cli import doctor as cli_doctor
 cli_doctor.run, sys.argv = work, ["gsseg", "doctor"]
-from gsseg_core.cli import main
+from gsseg_core.cli.main import main
 sys.exit(main())
 """
 
@@ -91,7 +91,7 @@ def test_a_job_in_the_background_stays_deaf_to_what_is_typed() -> None:
 
 def test_ctrl_c_while_kernels_compile_ends_with_130_and_not_a_word(tmp_path: Path) -> None:
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    command = [sys.executable, "-m", "gsseg_core.cli", "doctor"]
+    command = [sys.executable, "-m", "gsseg_core.cli.main", "doctor"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment) as process:
         assert process.stdout is not None and process.stderr is not None
         assert b"compiling kernels" in process.stderr.readline()

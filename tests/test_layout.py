@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from small_scenes import write_dataset
 
-from gsseg_core.cli import main
+from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.hints import camera_hint, mask_hint, scene_hint
 from gsseg_core.data.label_images import read_mask

@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
 from object_ceiling import best_selection
 
-from gsseg_core.cli import main
+from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import View
 from gsseg_core.data.names import class_ids
 from gsseg_core.errors import EmptySceneError, MaskSizeError, SceneValueError, SettingsError

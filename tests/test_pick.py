@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import small_scenes
 
-from gsseg_core.cli import main
+from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.errors import MaskFormatError, NoUsableViewsError, SettingsError

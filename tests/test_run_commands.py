@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 from small_scenes import balls_on_a_table, write_dataset
 
-from gsseg_core.cli import main
+from gsseg_core.cli.main import main
 from gsseg_core.files.run_folder import COMMIT_FILE, RUN_FILE
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
@@ -71,9 +71,7 @@ def contents(folder: Path) -> dict[Path, bytes]:
 
 
 def in_a_process(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    program = (
-        f"import os, signal, resource, sys\nfrom gsseg_core.cli import main\n{program}\nsys.exit(main(sys.argv[1:]))"
-    )
+    program = f"import os, signal, resource, sys\nfrom gsseg_core.cli.main import main\n{program}\nsys.exit(main(sys.argv[1:]))"
     return subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=False)
 
 

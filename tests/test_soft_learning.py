@@ -20,7 +20,7 @@ from small_scenes import (
     wrong_views,
 )
 
-from gsseg_core.cli import main
+from gsseg_core.cli.main import main
 from gsseg_core.csr_rows import Rows
 from gsseg_core.data.dataset import View
 from gsseg_core.data.label_evidence import Meaning, guess, standing

@@ -14,7 +14,7 @@ from PIL import Image
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, ring, write_dataset
 
 from gsseg_core import pipeline
-from gsseg_core.cli import main
+from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.data.label_images import read_mask, write_mask
 from gsseg_core.errors import UnknownLabelError

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
-from gsseg_core.cli import main
+from gsseg_core.cli.main import main
 from gsseg_core.errors import SettingsError
 from gsseg_core.viewer import access as view_access
 from gsseg_core.viewer.access import Listener, listen

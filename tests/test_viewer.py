@@ -18,7 +18,7 @@ from browser import opened_page, screenshot
 from patience import PATIENCE
 from small_scenes import NAMES, balls_on_a_table, clean_views, write_dataset
 
-from gsseg_core.cli import main
+from gsseg_core.cli.main import main
 from gsseg_core.errors import SettingsError
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
@@ -293,7 +293,16 @@ def test_a_browser_gets_images_until_it_has_shown_that_it_draws_fast(
 
 def test_the_command_serves_the_page_until_it_is_interrupted(tmp_path: Path) -> None:
     data = write_dataset(tmp_path / "data")
-    command = [sys.executable, "-m", "gsseg_core.cli", "view", str(data / "scene.ply"), "--data", str(data), "--quiet"]
+    command = [
+        sys.executable,
+        "-m",
+        "gsseg_core.cli.main",
+        "view",
+        str(data / "scene.ply"),
+        "--data",
+        str(data),
+        "--quiet",
+    ]
     process = subprocess.Popen([*command, "--port", "18085"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None and process.stderr is not None
@@ -334,7 +343,7 @@ def test_wrong_inputs_give_one_clear_error(
 def test_without_viser_one_error_says_what_to_install(tmp_path: Path) -> None:
     code = (
         "import sys; sys.modules['viser'] = None\n"
-        "from gsseg_core.cli import main\n"
+        "from gsseg_core.cli.main import main\n"
         f"sys.exit(main(['view', {str(tmp_path / 'scene.ply')!r}]))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE)

@@ -49,7 +49,7 @@ def test_after_warm_up_nothing_is_compiled_any_more(tmp_path: Path, what: str) -
     scene = str(Path(data) / "scene.ply")
     work = {
         "segment": f"""
-    from gsseg_core.cli import main
+    from gsseg_core.cli.main import main
     assert main(["segment", {scene!r}, "--data", {data!r}, "--out", {out!r}, "--no-graph", "--quiet"]) == 0""",
         "fuse": f"""
     from gsseg_core.data.dataset import Dataset

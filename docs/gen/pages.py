@@ -7,8 +7,8 @@ import re
 from pathlib import Path
 
 import gsseg_core
-from gsseg_core.cli_completion import subparsers
-from gsseg_core.cli_parser import COMMANDS, build_parser
+from gsseg_core.cli.arguments import COMMANDS, build_parser
+from gsseg_core.cli.completion import subparsers
 
 REPOSITORY = Path(__file__).parents[2]
 

@@ -11,17 +11,15 @@ from importlib.metadata import version
 from types import ModuleType
 from typing import Any
 
-from gsseg_core import (
-    cli_completion,
-    cli_demo,
-    cli_doctor,
-    cli_eval,
-    cli_pick,
-    cli_remove,
-    cli_render,
-    cli_segment,
-    cli_view,
-)
+from gsseg_core.cli import completion as cli_completion
+from gsseg_core.cli import demo as cli_demo
+from gsseg_core.cli import doctor as cli_doctor
+from gsseg_core.cli import eval as cli_eval
+from gsseg_core.cli import pick as cli_pick
+from gsseg_core.cli import remove as cli_remove
+from gsseg_core.cli import render as cli_render
+from gsseg_core.cli import segment as cli_segment
+from gsseg_core.cli import view as cli_view
 
 # In the order of `gsseg --help`. A command's module has HELP, one line; DESCRIPTION; EXAMPLES; `add_arguments(parser)`;
 # and `run(options)`, which returns the exit code. All that is slow to import is imported in `run`, so that

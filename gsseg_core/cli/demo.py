@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from gsseg_core.cli_shared import add_quiet, load_kernels
+from gsseg_core.cli.shared import add_quiet, load_kernels
+from gsseg_core.cli.terminal import tell
 from gsseg_core.progress import progress_bars
-from gsseg_core.terminal import tell
 
 HELP = "make a small scene with known truth and segment it"
 DESCRIPTION = """

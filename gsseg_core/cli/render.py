@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 
-from gsseg_core.cli_shared import add_scene, load_kernels
+from gsseg_core.cli.shared import add_scene, load_kernels
+from gsseg_core.cli.terminal import tell
 from gsseg_core.progress import progress_bars
 from gsseg_core.tables import counted
-from gsseg_core.terminal import tell
 
 HELP = "render label maps and overlays of a segmentation"
 DESCRIPTION = """

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 
+from gsseg_core.cli.terminal import note
 from gsseg_core.errors import SettingsError
 from gsseg_core.raster.devices import DEVICES, checked_device
-from gsseg_core.terminal import note
 
 
 def add_scene(parser: argparse.ArgumentParser) -> None:

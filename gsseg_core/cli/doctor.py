@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from gsseg_core.terminal import note, tell
+from gsseg_core.cli.terminal import note, tell
 
 HELP = "say what this machine has and lacks, and how to get it"
 DESCRIPTION = """
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Look, and print what was found."""
-    from gsseg_core.doctor import describe, examine, works
+    from gsseg_core.cli.machine_check import describe, examine, works
 
     findings = examine(note)
     tell(describe(findings))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from gsseg_core.cli.terminal import tell
 from gsseg_core.errors import SettingsError
-from gsseg_core.terminal import tell
 
 SHELLS = ("bash", "zsh", "fish")
 
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Print the script."""
-    from gsseg_core.cli_parser import build_parser
+    from gsseg_core.cli.arguments import build_parser
 
     try:
         import shtab

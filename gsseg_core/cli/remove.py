@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from gsseg_core.cli.terminal import tell
 from gsseg_core.data.names import class_ids, listed
 from gsseg_core.printable import clipped
 from gsseg_core.tables import counted
-from gsseg_core.terminal import tell
 
 HELP = "write the scene without some of its objects"
 DESCRIPTION = """

@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING
 
-from gsseg_core import interrupts
+from gsseg_core.cli import interrupts
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     if arguments is None:
         interrupts.leave_at_once()
-    from gsseg_core import terminal
+    from gsseg_core.cli import terminal
     from gsseg_core.errors import GssegError
 
     terminal.prepare()
@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: Sequence[str] | None) -> int:
-    from gsseg_core.cli_parser import build_parser
+    from gsseg_core.cli.arguments import build_parser
     from gsseg_core.freed_memory import keep_freed_memory
 
     options = build_parser().parse_args(sys.argv[1:] if arguments is None else arguments)

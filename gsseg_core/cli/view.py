@@ -12,9 +12,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from gsseg_core.cli_shared import add_quiet, load_kernels
+from gsseg_core.cli.shared import add_quiet, load_kernels
+from gsseg_core.cli.terminal import tell
 from gsseg_core.errors import SettingsError
-from gsseg_core.terminal import tell
 
 if TYPE_CHECKING:
     from gsseg_core.viewer.access import Listener

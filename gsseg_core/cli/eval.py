@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from gsseg_core.terminal import tell
+from gsseg_core.cli.terminal import tell
 
 HELP = "score label maps: mIoU, mAcc, boundary IoU"
 DESCRIPTION = """

@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from gsseg_core.cli_shared import add_scene, load_kernels
+from gsseg_core.cli.shared import add_scene, load_kernels
+from gsseg_core.cli.terminal import tell
 from gsseg_core.errors import SettingsError
-from gsseg_core.terminal import tell
 
 HELP = "pick one object by a mask or clicks in one view, and write it as a PLY"
 DESCRIPTION = """
