@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from matching import Contingency, renamed
 from results import markdown, points
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
@@ -29,7 +30,6 @@ from scipy.spatial import cKDTree
 from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.learn.em.em_learner import EMLearner
-from gsseg_core.matching import Contingency, renamed
 from gsseg_core.metrics import Evaluation
 from gsseg_core.objects.object_table import find_objects
 from gsseg_core.raster.view_operator import make_operator

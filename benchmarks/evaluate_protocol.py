@@ -16,12 +16,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from protocols import Scores, Task, lerf_mask, nvos, score_task, spin_nerf
 from results import markdown, points
 
 from gsseg_core.data.camera_files import read_cameras
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.objects.pick import pick_mask
-from gsseg_core.protocols import Scores, Task, lerf_mask, nvos, score_task, spin_nerf
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene

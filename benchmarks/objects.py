@@ -19,6 +19,7 @@ import numpy as np
 from machine import DATA, REPOSITORY
 from object_ceiling import best_selection
 from results import machine, markdown, points
+from straddlers import split, straddlers
 
 from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.demo.table_scene import build_demo
@@ -31,7 +32,6 @@ from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.straddlers import split, straddlers
 
 PAPER = {
     "no refinement": RefineSettings(cluster=False, filter=False),
@@ -203,7 +203,7 @@ which others hid a part, show in full, and so do those just under a neighbour's 
   train views, unless the object would have holes without them. The silhouettes are those of the label maps that the
   segmentation itself renders, so errors of single masks carve nothing away; no retraining. What no view reaches stays.
   It replaces the filter. Where objects touch, it may take a little of the object itself: see the foot of the can.
-- **Splitting straddlers** (`gsseg_core.straddlers`) puts two halves in place of each Gaussian that both fills its
+- **Splitting straddlers** (`straddlers`) puts two halves in place of each Gaussian that both fills its
   object and sticks out, and has each carved by itself. It changes the Gaussians of the scene, so it is a function of
   the library and no part of the command.
 

@@ -27,6 +27,7 @@ from plots import Axis, draw_panels
 from results import machine, markdown, points, score
 from robustness_text import BAR, CURVES, HEADER, RELIABILITY
 from scipy.stats import spearmanr
+from view_errors import STRONGEST, PoseErrors, corrupt_views, errors_at, typical_depth
 
 from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.demo.mask_errors import MaskErrors
@@ -38,7 +39,6 @@ from gsseg_core.learn.mask_reliability import OtherViews, check_views, draw_wors
 from gsseg_core.pipeline import make_learner
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.view_errors import STRONGEST, PoseErrors, corrupt_views, errors_at, typical_depth
 from gsseg_core.warm_up import warm_up
 
 EM, PLAIN, GRADIENT, VOTES, HARD = "em", "em without error model", "gradient", "votes", "FlashSplat's rule"

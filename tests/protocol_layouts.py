@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import small_scenes
 from PIL import Image
+from protocols import resized
 
-from gsseg_core.protocols import resized
 from gsseg_core.segmentation import Segmentation
 
 CAMERAS = small_scenes.ring(6)

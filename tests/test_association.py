@@ -24,6 +24,7 @@ from small_scenes import (
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
 import bench_ids
+from matching import Contingency, renamed
 
 from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset, View
@@ -32,7 +33,6 @@ from gsseg_core.errors import SettingsError, UnknownLabelError
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner_state import Learnt
 from gsseg_core.live.per_view_session import PerViewSession
-from gsseg_core.matching import Contingency, renamed
 from gsseg_core.objects.association import AssociationSettings, associate
 from gsseg_core.objects.lifted_segments import Lifted
 from gsseg_core.objects.object_table import ObjectTable, find_objects

@@ -28,6 +28,7 @@ from small_scenes import (
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
 from object_ceiling import best_selection
+from straddlers import DISTANCE, half_opacity, split, straddlers
 
 from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import View
@@ -42,7 +43,6 @@ from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
-from gsseg_core.straddlers import DISTANCE, half_opacity, split, straddlers
 
 SCENE, TRUTH = balls_on_a_table()
 LABELS = TRUTH.astype(np.int32)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import small_scenes
 from protocol_layouts import CAMERAS, save, true_segmentation, write_lerf, write_nvos, write_spin
+from protocols import Task, lerf_mask, nvos, score_task, spin_nerf
 
 from gsseg_core.data.camera_files import read_cameras
 from gsseg_core.errors import CameraFileError, MaskFormatError, MaskSizeError
-from gsseg_core.protocols import Task, lerf_mask, nvos, score_task, spin_nerf
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import evaluate_protocol

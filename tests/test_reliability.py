@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, taught
+from view_errors import corrupt_views
 
 from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import UNKNOWN
@@ -22,7 +23,6 @@ from gsseg_core.learn.mask_reliability import (
     reliability_report,
     worst_views,
 )
-from gsseg_core.view_errors import corrupt_views
 
 SCENE, _ = balls_on_a_table()
 CLEAN = clean_views(12)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from small_scenes import balls_on_a_table, clean_views, ring
 from test_mask_errors import make_grid
+from view_errors import STRONGEST, PoseErrors, corrupt_views, errors_at, jitter, typical_depth
 
 from gsseg_core.data.dataset import View
 from gsseg_core.demo.mask_errors import MaskErrors
 from gsseg_core.errors import SettingsError
-from gsseg_core.view_errors import STRONGEST, PoseErrors, corrupt_views, errors_at, jitter, typical_depth
 
 MASK_KINDS = [kind for kind in STRONGEST if kind != "jittered poses"]
 VIEWS = clean_views(12)
