@@ -4,7 +4,7 @@ The metadata is here and not in pyproject.toml because a ROS 2 workspace builds 
 the system's setuptools, and that of Ubuntu 24.04 (68) refuses the form in which newer ones want a licence stated there.
 """
 
-from setuptools import Distribution, setup
+from setuptools import Distribution, find_packages, setup
 
 SHARE = "share/gsseg_ros"
 
@@ -24,8 +24,8 @@ setup(
     description="Segments trained 3D Gaussian Splatting scenes into objects from posed 2D masks",
     author="gsseg developers",
     license="Apache-2.0",
-    packages=["gsseg_core", "gsseg_ros"],
-    package_data={"gsseg_core": ["report_page.css", "report_page.js"]},
+    packages=find_packages(include=["gsseg_core*", "gsseg_ros*"]),
+    package_data={"gsseg_core.report": ["page.css", "page.js"]},
     # What ROS looks for, at the places where it looks: the same after pip, colcon and colcon --symlink-install.
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/gsseg_ros"]),

@@ -43,10 +43,10 @@ masks flood rooms behind what they show, whose Gaussians a ray reaches with a th
 pixel contradicts. Its amount was chosen on held-out train views of both scenes.
 
 A click becomes a mask in its view, by regions of one colour and direction that merge until all is one; the
-longest-lived around the click is taken (`gsseg_core.objects.clicks`). It knows nothing of what people call an object: a drawer
-may last longer than the cupboard, or a wall and its picture be one. `--click` again adds a region, and
-`--not COLUMN ROW` says what is not of the object; with more than one click nothing has been measured yet. Where there
-is a 2D segmenter, put the click through it, and give its mask.
+longest-lived around the click is taken (`gsseg_core.objects.clicks`). It knows nothing of what people call an object: a
+drawer may last longer than the cupboard, or a wall and its picture be one. `--click` again adds a region, and `--not
+COLUMN ROW` says what is not of the object; with more than one click nothing has been measured yet. Where there is a 2D
+segmenter, put the click through it, and give its mask.
 
 What a mask's view does not show, as the other end of a corner sofa, is guessed from what is near and looks alike.
 """

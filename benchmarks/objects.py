@@ -199,10 +199,11 @@ which others hid a part, show in full, and so do those just under a neighbour's 
 - **KNN** gives unobserved Gaussians to what is around them.
 - **The paper's filter** removes whatever is farther from its fellows than mu + sigma. Where Gaussians are large and
   sparse this takes away good ones.
-- **Carving** (`gsseg segment --carve`, `gsseg_core.objects.silhouette_carving`) drops the Gaussians that stick out of the silhouettes in 24
-  train views, unless the object would have holes without them. The silhouettes are those of the label maps that the
-  segmentation itself renders, so errors of single masks carve nothing away; no retraining. What no view reaches stays.
-  It replaces the filter. Where objects touch, it may take a little of the object itself: see the foot of the can.
+- **Carving** (`gsseg segment --carve`, `gsseg_core.objects.silhouette_carving`) drops the Gaussians that stick out of
+  the silhouettes in 24 train views, unless the object would have holes without them. The silhouettes are those of the
+  label maps that the segmentation itself renders, so errors of single masks carve nothing away; no retraining. What no
+  view reaches stays. It replaces the filter. Where objects touch, it may take a little of the object itself: see the
+  foot of the can.
 - **Splitting straddlers** (`straddlers`) puts two halves in place of each Gaussian that both fills its
   object and sticks out, and has each carved by itself. It changes the Gaussians of the scene, so it is a function of
   the library and no part of the command.
@@ -224,9 +225,9 @@ that it goes by have the same one.
 gsseg remove scene.ply --segmentation out/segmentation.npz --class chair --out without_chair.ply
 ```
 
-Writes a valid 3DGS PLY; in Python it is `gsseg_core.objects.removal.without_objects`. The objects' PLYs and what is left make
-up the scene, Gaussian for Gaussian. What an object hid, no camera has seen: holes are left as they are. Gaussians that
-refinement took out of an object stay in the scene.
+Writes a valid 3DGS PLY; in Python it is `gsseg_core.objects.removal.without_objects`. The objects' PLYs and what is
+left make up the scene, Gaussian for Gaussian. What an object hid, no camera has seen: holes are left as they are.
+Gaussians that refinement took out of an object stay in the scene.
 """
 
 if __name__ == "__main__":

@@ -174,7 +174,7 @@ def command(folder: Path) -> str:
     for masks in MASKS:
         with tempfile.TemporaryDirectory() as out:
             segment = [
-                sys.executable, "-m", "gsseg_core.cli.main", "segment", str(folder / "scene.ply"), "--data", str(folder),
+                sys.executable, "-m", "gsseg_core.cli", "segment", str(folder / "scene.ply"), "--data", str(folder),
                 "--labels", masks, "--out", f"{out}/out", "--quiet",
             ]  # fmt: skip
             seconds = []
@@ -184,7 +184,7 @@ def command(folder: Path) -> str:
                 seconds.append(time.perf_counter() - start)
             peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20
             render = [
-                sys.executable, "-m", "gsseg_core.cli.main", "render", str(folder / "scene.ply"), "--data", str(folder),
+                sys.executable, "-m", "gsseg_core.cli", "render", str(folder / "scene.ply"), "--data", str(folder),
                 "--segmentation", f"{out}/out/segmentation.npz", "--out", f"{out}/test", "--quiet",
             ]  # fmt: skip
             subprocess.run(render, check=True, stdout=subprocess.DEVNULL)
@@ -239,8 +239,8 @@ view, and edges off by up to 3 px. Scores are of the test views against the true
 [What is measured](#what-is-measured) stands at the end. The settings of `em` were chosen on 15 of the train views, held
 out from learning for that purpose; but `least_agreement`, `majority` and `tolerance` on the test views here and on
 those of the demo scene, with masks drawn wrong in many ways ([robustness.md](robustness.md)); and so were `ROUGH`
-of `gsseg_core/learn/em/em_learner.py`, `SHARPNESS`, `SHORTEST` and `TELLING` of `gsseg_core/learn/em/boundary_alignment.py` and `COVERED` of
-`gsseg_core/learn/em/rejected_regions.py`.
+of `gsseg_core/learn/em/em_learner.py`, `SHARPNESS`, `SHORTEST` and `TELLING` of
+`gsseg_core/learn/em/boundary_alignment.py` and `COVERED` of `gsseg_core/learn/em/rejected_regions.py`.
 """
 
 LEARNERS = """## Learners

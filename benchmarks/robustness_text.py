@@ -7,12 +7,12 @@ HEADER = """# Robustness
 Made by `python benchmarks/robustness.py{quick}`, which measures everything here again, in {minutes} minutes.
 Machine: {machine}.
 
-Masks are drawn wrong from true ones (`gsseg_core/demo/mask_errors.py`, `benchmarks/view_errors.py`), each kind of error at
-a strength from 0 to 1. Learners see the wrong masks of train views only; rendered label maps of the test views are
+Masks are drawn wrong from true ones (`gsseg_core/demo/mask_errors.py`, `benchmarks/view_errors.py`), each kind of error
+at a strength from 0 to 1. Learners see the wrong masks of train views only; rendered label maps of the test views are
 scored against the true ones, without refinement (mIoU, as in [results.md](results.md)). "FlashSplat's rule" is votes
 made hard, on the same operator from the same views. The demo scene is the one of `make demo-local`: 30 views of 400 x
-300, 9 objects and a background, which missed objects become. The real one is Replica `apartment_0`: 105 views of 320
-x 320, 40 objects and no background; missed objects become what fills most of the view. One draw of errors per row.
+300, 9 objects and a background, which missed objects become. The real one is Replica `apartment_0`: 105 views of 320 x
+320, 40 objects and no background; missed objects become what fills most of the view. One draw of errors per row.
 """
 
 BAR = """## A quarter of the objects wrong

@@ -256,7 +256,8 @@ class Segmentation:
         StateMismatchError
             It belongs to another scene.
         WriteError
-            The run that wrote it was cut short at its very end, and cannot be finished now (`gsseg_core.files.run_folder`).
+            The run that wrote it was cut short at its very end, and cannot be finished now
+            (`gsseg_core.files.run_folder`).
         """
         path = Path(path)
         settle(path.parent)

@@ -361,7 +361,8 @@ def test_ctrl_c_in_a_real_process_ends_with_130_and_no_traceback(place: Path) ->
     before = contents(place / "out")
     # The learner waits, so that the signal meets it at work; the warm-up, which tells nobody, goes on.
     program = (
-        "import sys, time; from gsseg_core.learn.vote_learner import VoteLearner; from gsseg_core.cli.main import main\n"
+        "import sys, time\nfrom gsseg_core.cli.main import main\n"
+        "from gsseg_core.learn.vote_learner import VoteLearner\n"
         "def fit(self, progress=None):\n"
         "    if progress: progress('learn', 0, 9); print('at work', file=sys.stderr); time.sleep(60)\n"
         "VoteLearner.fit = fit\n"
@@ -383,7 +384,7 @@ def test_ctrl_c_in_a_real_process_ends_with_130_and_no_traceback(place: Path) ->
 
 
 def test_the_command_runs_as_a_process_of_its_own(place: Path) -> None:
-    command = [sys.executable, "-W", "error", "-m", "gsseg_core.cli.main"]
+    command = [sys.executable, "-W", "error", "-m", "gsseg_core.cli"]
     run = subprocess.run([*command, *segment(place, "--learner", "votes")], capture_output=True, text=True, check=False)
     assert run.returncode == 0 and run.stderr == ""
     run = subprocess.run([*command, *segment(place, scene="no.ply")], capture_output=True, text=True, check=False)

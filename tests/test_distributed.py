@@ -378,7 +378,7 @@ def test_an_address_of_a_worker_is_said_to_be_none_of_a_scheduler(client: Any) -
 def test_ctrl_c_while_workers_learn_ends_with_130_and_not_a_word(address: str, data: Path) -> None:
     arguments = [option for option in segment(data, "out", "--scheduler", address) if option != "--quiet"]
     with subprocess.Popen(
-        [sys.executable, "-m", "gsseg_core.cli.main", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        [sys.executable, "-m", "gsseg_core.cli", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as process:
         assert process.stderr is not None
         stderr = b""

@@ -91,7 +91,7 @@ def test_a_job_in_the_background_stays_deaf_to_what_is_typed() -> None:
 
 def test_ctrl_c_while_kernels_compile_ends_with_130_and_not_a_word(tmp_path: Path) -> None:
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    command = [sys.executable, "-m", "gsseg_core.cli.main", "doctor"]
+    command = [sys.executable, "-m", "gsseg_core.cli", "doctor"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment) as process:
         assert process.stdout is not None and process.stderr is not None
         assert b"compiling kernels" in process.stderr.readline()

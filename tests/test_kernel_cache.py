@@ -46,7 +46,7 @@ def run(environment: dict[str, str], *arguments: str) -> subprocess.CompletedPro
 def test_every_kernel_loads_and_runs_where_none_can_be_kept(nowhere: dict[str, str], tmp_path: Path) -> None:
     done = run(nowhere, "-c", EVERY_KERNEL)
     assert done.stdout == "True None 0 None\n", done.stderr
-    done = run(nowhere, "-m", "gsseg_core.cli.main", "segment", "--help")
+    done = run(nowhere, "-m", "gsseg_core.cli", "segment", "--help")
     assert done.returncode == 0 and done.stderr == ""
     done = run({**nowhere, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}, "-c", EVERY_KERNEL)
     assert done.stdout.startswith(f"True {tmp_path}/cache 0 {tmp_path}/cache/"), done.stderr

@@ -132,10 +132,10 @@ def test_a_page_that_cannot_be_written_leaves_the_earlier_one(
 
 def test_package_carries_the_style_sheet_and_the_script() -> None:
     root = Path(__file__).parents[1]
-    declared = re.search(r"package_data=\{\"gsseg_core\": \[(.*?)\]\}", (root / "setup.py").read_text())
+    declared = re.search(r"package_data=\{\"gsseg_core.report\": \[(.*?)\]\}", (root / "setup.py").read_text())
     assert declared is not None
-    others = {path.name for path in (root / "gsseg_core").iterdir() if path.is_file() and path.suffix != ".py"}
-    assert {"report_page.css", "report_page.js"} <= others == set(re.findall(r'"(.*?)"', declared[1]))
+    others = {path.name for path in (root / "gsseg_core").rglob("*.*") if path.suffix not in (".py", ".pyc", ".nbi", ".nbc")}
+    assert {"page.css", "page.js"} <= others == set(re.findall(r'"(.*?)"', declared[1]))
 
 
 @given(st.text() | st.text(alphabet="<>&\"'/!-\x00\x7f\ud800"))

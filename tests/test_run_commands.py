@@ -71,7 +71,8 @@ def contents(folder: Path) -> dict[Path, bytes]:
 
 
 def in_a_process(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    program = f"import os, signal, resource, sys\nfrom gsseg_core.cli.main import main\n{program}\nsys.exit(main(sys.argv[1:]))"
+    start = "import os, signal, resource, sys\nfrom gsseg_core.cli.main import main"
+    program = f"{start}\n{program}\nsys.exit(main(sys.argv[1:]))"
     return subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=False)
 
 

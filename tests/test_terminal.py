@@ -18,7 +18,7 @@ from gsseg_core.data.label_images import write_mask
 from gsseg_core.progress import progress_bars
 from gsseg_core.tables import counted, table
 
-GSSEG = [sys.executable, "-m", "gsseg_core.cli.main"]
+GSSEG = [sys.executable, "-m", "gsseg_core.cli"]
 NAME = "Stühle 椅子"
 
 

@@ -1,4 +1,4 @@
-"""The program `gsseg`: how it starts and ends, and what becomes of errors. What it takes is in `cli_parser`.
+"""The program `gsseg`: how it starts and ends, and what becomes of errors. What it takes is in `arguments`.
 
 Only `main` imports what takes time, so that Ctrl-C is heard from the start.
 """
@@ -58,7 +58,3 @@ def _run(arguments: Sequence[str] | None) -> int:
         return code
     finally:
         interrupts.leave_at_once()
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,7 +1,7 @@
 """Which files of a folder are results of gsseg, where it wrote no manifest: versions before it did, and bare copies.
 
-Each function is an `earlier` for `gsseg_core.files.run_folder.staged_run`: it takes a folder, and gives relative paths. A
-file counts only by what it holds, or because a report of gsseg names it.
+Each function is an `earlier` for `gsseg_core.files.run_folder.staged_run`: it takes a folder, and gives relative paths.
+A file counts only by what it holds, or because a report of gsseg names it.
 """
 
 from __future__ import annotations

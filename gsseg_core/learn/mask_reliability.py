@@ -1,11 +1,11 @@
 """How far each view's mask can be trusted: what the other views say of it, pixel by pixel.
 
 The codes that learnt from a mask agree with its errors, so a mask is held against codes that have not seen it: one
-more step of EM from the codes that were learnt, without the summand of this view (see `gsseg_core.learn.em.em_learner`). Rendered from
-where the view was taken, they predict its labels. A view's reliability is the share of its pixels whose label is the
-one predicted. It is an estimate of the share whose label is right. Of a soft mask, a pixel's label is
-its largest share; in a partial one "none of those looked for" is a label too, and right where a class is predicted that
-was not looked for.
+more step of EM from the codes that were learnt, without the summand of this view (see
+`gsseg_core.learn.em.em_learner`). Rendered from where the view was taken, they predict its labels. A view's reliability
+is the share of its pixels whose label is the one predicted. It is an estimate of the share whose label is right. Of a
+soft mask, a pixel's label is its largest share; in a partial one "none of those looked for" is a label too, and right
+where a class is predicted that was not looked for.
 """
 
 from __future__ import annotations

@@ -263,8 +263,8 @@ class LiveSession:
     def segmentation(self, settings: RefineSettings | None = None, watch: Stopwatch | None = None) -> Segmentation:
         """Refine the codes as they are now and label every Gaussian; kept until codes or settings change.
 
-        After `learn`, probabilities are calibrated (see `gsseg_core.learn.calibrate`). Those of mere votes are shares of the
-        pixels that saw a Gaussian, and so less sure than they might be.
+        After `learn`, probabilities are calibrated (see `gsseg_core.learn.calibrate`). Those of mere votes are shares
+        of the pixels that saw a Gaussian, and so less sure than they might be.
 
         Raises
         ------

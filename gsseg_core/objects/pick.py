@@ -2,8 +2,8 @@
 
 A mask says of one view what is the object (1), what is not (0), and where nothing is said (-1). The view's operator
 carries that to the Gaussians, W^T onehot(y) px of each. What the view does not show takes its neighbours' answer along
-the graph of the scene (`gsseg_core.refine.label_propagation`): the back of a chair hangs together with its front, and the wall behind it
-with the wall beside it.
+the graph of the scene (`gsseg_core.refine.label_propagation`): the back of a chair hangs together with its front, and
+the wall behind it with the wall beside it.
 
 Two things would make a mask flood rooms that its view does not show. A thousandth of the light of a pixel comes from
 behind what it shows, and no pixel says otherwise of a Gaussian that is hidden so: its share of the votes is that of the

@@ -96,7 +96,7 @@ def report_page(
     body = "".join(
         f'<section id="{anchor}"><h2>{title}</h2>{content}</section>' for title, anchor, content in sections if content
     )
-    style, script = (files("gsseg_core").joinpath(f"report_page.{kind}").read_text("utf-8") for kind in ("css", "js"))
+    style, script = (files("gsseg_core.report").joinpath(f"page.{kind}").read_text("utf-8") for kind in ("css", "js"))
     policy = (
         f"default-src 'none'; img-src data:; style-src {_hash(style)}; script-src {_hash(script)}; "
         "base-uri 'none'; form-action 'none'"

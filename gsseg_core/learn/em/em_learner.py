@@ -43,9 +43,9 @@ the minorities along with it would smear every large class over the rows of the 
 converged the models are learnt anew in this way, and then the codes once more.
 
 Soft and partial masks. There the segmenter's words y are classes, and "none of those that I looked for", which is right
-for all others. A pixel's label m is a mixture of words with shares s_m[y] (see `gsseg_core.data.label_evidence`): wherever
-C_v[k, y] stands for a pixel, it is sum_y s_m[y] C_v[k, y] there, and the expected counts of R_v are split in proportion
-to the summands.
+for all others. A pixel's label m is a mixture of words with shares s_m[y] (see `gsseg_core.data.label_evidence`):
+wherever C_v[k, y] stands for a pixel, it is sum_y s_m[y] C_v[k, y] there, and the expected counts of R_v are split in
+proportion to the summands.
 """
 
 from __future__ import annotations
