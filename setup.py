@@ -87,7 +87,7 @@ setup(
         "console_scripts": [
             "gsseg = gsseg_core.cli.main:main",
             "replay_node = gsseg_ros.replay_node:main",
-            "segment_node = gsseg_ros.segment_node:main",
+            "segment_node = gsseg_ros.node.segment_node:main",
         ],
         # Where `gsseg view` gets codes from that change while it runs; see gsseg_core/viewer/live_source.py.
         "gsseg.live_sources": ["ros = gsseg_ros.view_source:RosSource"],

@@ -25,8 +25,8 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.parameter import Parameter
 
-from gsseg_ros import segment_node
-from gsseg_ros.segment_node import THREADS, SegmentNode
+from gsseg_ros.node import segment_node
+from gsseg_ros.node.segment_node import THREADS, SegmentNode
 
 
 @pytest.fixture(name="root", scope="module")

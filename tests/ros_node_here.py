@@ -20,9 +20,9 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
 from gsseg_core.data.dataset import View
-from gsseg_ros.inputs import Inputs
-from gsseg_ros.outputs import Outputs
-from gsseg_ros.segment_node import SegmentNode
+from gsseg_ros.node.inputs import Inputs
+from gsseg_ros.node.outputs import Outputs
+from gsseg_ros.node.segment_node import SegmentNode
 
 
 class NodeHere:

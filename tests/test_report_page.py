@@ -134,7 +134,9 @@ def test_package_carries_the_style_sheet_and_the_script() -> None:
     root = Path(__file__).parents[1]
     declared = re.search(r"package_data=\{\"gsseg_core.report\": \[(.*?)\]\}", (root / "setup.py").read_text())
     assert declared is not None
-    others = {path.name for path in (root / "gsseg_core").rglob("*.*") if path.suffix not in (".py", ".pyc", ".nbi", ".nbc")}
+    others = {
+        path.name for path in (root / "gsseg_core").rglob("*.*") if path.suffix not in (".py", ".pyc", ".nbi", ".nbc")
+    }
     assert {"page.css", "page.js"} <= others == set(re.findall(r'"(.*?)"', declared[1]))
 
 

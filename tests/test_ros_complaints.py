@@ -16,9 +16,9 @@ from rclpy.clock import ROSClock
 from rclpy.time import Time
 
 from gsseg_core.live import results as live_results
-from gsseg_ros import diagnostics
-from gsseg_ros.complaints import KINDS, REASONS, REFUSED_POSE, Complaints
-from gsseg_ros.sim_time import SimTime, on_set_back
+from gsseg_ros.node import diagnostics
+from gsseg_ros.node.complaints import KINDS, REASONS, REFUSED_POSE, Complaints
+from gsseg_ros.node.sim_time import SimTime, on_set_back
 
 SECOND = 1_000_000_000
 

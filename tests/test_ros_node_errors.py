@@ -23,8 +23,8 @@ from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import Pose, PoseStamped, Quaternion
 
 from gsseg_ros.errors import PathNotAllowedError
-from gsseg_ros.parameters import DECLARATIONS, Settings
-from gsseg_ros.workspace import Workspace
+from gsseg_ros.node.parameters import DECLARATIONS, Settings
+from gsseg_ros.node.workspace import Workspace
 
 INTERFACES = {name: SERVICES[name].Response for name in (
     "segment", "render_view", "load_scene", "save_state", "load_state", "export", "reset",

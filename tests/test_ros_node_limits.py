@@ -19,9 +19,9 @@ from gsseg_msgs.srv import RenderView, Segment
 
 from gsseg_core.data.dataset import View
 from gsseg_core.scene.camera import Camera
-from gsseg_ros import services
-from gsseg_ros.segment_node import SegmentNode
-from gsseg_ros.services import AT_WORK, WAITING
+from gsseg_ros.node import services
+from gsseg_ros.node.segment_node import SegmentNode
+from gsseg_ros.node.services import AT_WORK, WAITING
 
 
 def test_few_requests_work_some_wait_the_rest_are_busy_and_everything_else_goes_on(

@@ -26,7 +26,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from gsseg_ros.conversions import pose_from_matrix
 from gsseg_ros.frames import rigid
-from gsseg_ros.live_outputs import OBJECTS_PERIOD
+from gsseg_ros.node.live_outputs import OBJECTS_PERIOD
 from gsseg_ros.object_messages import box_from_object
 
 RAW = RefineSettings(cluster=False, filter=False)

@@ -30,12 +30,12 @@ from builtin_interfaces.msg import Time
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
-from gsseg_ros import live_outputs
 from gsseg_ros.color_images import color_from_image
 from gsseg_ros.conversions import picture_from_image, rgb_image
 from gsseg_ros.frames import Similarity
-from gsseg_ros.live_outputs import LiveOutputs
-from gsseg_ros.pairing import Paired
+from gsseg_ros.node import live_outputs
+from gsseg_ros.node.live_outputs import LiveOutputs
+from gsseg_ros.node.pairing import Paired
 
 RAW = RefineSettings(cluster=False, filter=False)
 

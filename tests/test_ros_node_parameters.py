@@ -16,7 +16,7 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import Parameter
 
-from gsseg_ros.parameters import DECLARATIONS
+from gsseg_ros.node.parameters import DECLARATIONS
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from small_scenes import clean_views
 
 from gsseg_core.data.dataset import View
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_ros import segment_node
+from gsseg_ros.node import segment_node
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 

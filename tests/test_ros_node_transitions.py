@@ -18,8 +18,8 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 from lifecycle_msgs.msg import Transition
 from rclpy.lifecycle import TransitionCallbackReturn
 
-from gsseg_ros import diagnostics
-from gsseg_ros.segment_node import SegmentNode
+from gsseg_ros.node import diagnostics
+from gsseg_ros.node.segment_node import SegmentNode
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 CONFIGURE = Transition(id=Transition.TRANSITION_CONFIGURE)

@@ -25,10 +25,10 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
 from gsseg_core.live.session import LiveSession
-from gsseg_ros import outputs as outputs_module
 from gsseg_ros.frames import Similarity
-from gsseg_ros.outputs import Outputs
-from gsseg_ros.reports import Selection
+from gsseg_ros.node import outputs as outputs_module
+from gsseg_ros.node.outputs import Outputs
+from gsseg_ros.node.reports import Selection
 
 SUBSCRIBER = """
 import rclpy, sys

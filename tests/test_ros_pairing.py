@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from gsseg_core.errors import SettingsError
 from gsseg_ros.frames import rigid
-from gsseg_ros.pairing import ExactPoses, InterpolatedPoses, Paired, Pairing, PairingSettings
+from gsseg_ros.node.pairing import ExactPoses, InterpolatedPoses, Paired, Pairing, PairingSettings
 
 MS = 1_000_000
 S = 1000 * MS
@@ -474,7 +474,7 @@ def test_poses_are_neither_extrapolated_nor_interpolated_over_a_gap(stamp: int) 
 @pytest.mark.skipif(HAS_TF, reason="tf2_ros is here")
 def test_without_tf2_ros_the_error_names_the_parameter_and_the_package() -> None:
     pytest.importorskip("geometry_msgs")
-    from gsseg_ros.tf_poses import TfPoses
+    from gsseg_ros.node.tf_poses import TfPoses
 
     with pytest.raises(SettingsError, match=r"pose_source is 'tf'.*tf2_ros.*ros-jazzy-tf2-ros-py"):
         TfPoses(None, "map")
@@ -486,7 +486,7 @@ def test_tf_poses_are_looked_up_at_the_stamp_and_never_the_latest() -> None:
     from geometry_msgs.msg import TransformStamped
 
     from gsseg_ros.conversions import stamp_message
-    from gsseg_ros.tf_poses import TfPoses
+    from gsseg_ros.node.tf_poses import TfPoses
 
     context = rclpy.Context()
     rclpy.init(context=context)

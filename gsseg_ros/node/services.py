@@ -25,12 +25,12 @@ from gsseg_core.files.run_folder import require_own_folder, staged_run
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.report.summary import build_report
 from gsseg_ros.errors import InvalidRequestError, error_code
-from gsseg_ros.jobs import Turns
-from gsseg_ros.outputs import Outputs
+from gsseg_ros.node.jobs import Turns
+from gsseg_ros.node.outputs import Outputs
+from gsseg_ros.node.reports import Selection, empty_report, finish, report_message, stage_timings
+from gsseg_ros.node.viewpoints import Lookup, draw, viewpoint
+from gsseg_ros.node.workspace import Run, Workspace, checked_confidence, chosen_classes
 from gsseg_ros.qos import requests
-from gsseg_ros.reports import Selection, empty_report, finish, report_message, stage_timings
-from gsseg_ros.viewpoints import Lookup, draw, viewpoint
-from gsseg_ros.workspace import Run, Workspace, checked_confidence, chosen_classes
 
 STATE_FILE, EXPORT_FOLDER = "gsseg_state.npz", "gsseg_export"
 

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_ros.frames import interpolate
-from gsseg_ros.timeline import BEHIND_NS, MASK, SECOND, Message, Timeline
+from gsseg_ros.node.timeline import BEHIND_NS, MASK, SECOND, Message, Timeline
 
 Pose: TypeAlias = npt.NDArray[np.float64]  # (4, 4)
 T = TypeVar("T")
@@ -136,12 +136,12 @@ class Pairing:
     Poses that come from messages do not say of which camera they are. So when masks of two cameras carry one stamp, and
     the poses are not from a source that knows frames, none is paired until ten seconds (of stamps) later.
 
-    What is late and what shows that time was set back is said in `gsseg_ros.timeline.Timeline`.
+    What is late and what shows that time was set back is said in `gsseg_ros.node.timeline.Timeline`.
 
     Parameters
     ----------
     poses : PoseSource
-        `ExactPoses`, `InterpolatedPoses` or `gsseg_ros.tf_poses.TfPoses`.
+        `ExactPoses`, `InterpolatedPoses` or `gsseg_ros.node.tf_poses.TfPoses`.
     settings : PairingSettings
         How long masks wait.
     prefix : str

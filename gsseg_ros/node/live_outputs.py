@@ -23,11 +23,11 @@ from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.color_images import color_from_image
 from gsseg_ros.conversions import camera_from_messages, rgb_image
-from gsseg_ros.outputs import Outputs
-from gsseg_ros.pairing import Paired
-from gsseg_ros.reports import Selection
-from gsseg_ros.size_limits import require_size
-from gsseg_ros.workspace import Workspace
+from gsseg_ros.node.outputs import Outputs
+from gsseg_ros.node.pairing import Paired
+from gsseg_ros.node.reports import Selection
+from gsseg_ros.node.size_limits import require_size
+from gsseg_ros.node.workspace import Workspace
 
 RAW = RefineSettings(cluster=False, filter=False)
 

@@ -29,8 +29,8 @@ from gsseg_ros.errors import (
     NotActiveError,
     UnknownClassError,
 )
-from gsseg_ros.jobs import JobSlot, Requests
-from gsseg_ros.parameters import Settings
+from gsseg_ros.node.jobs import JobSlot, Requests
+from gsseg_ros.node.parameters import Settings
 
 
 @dataclass

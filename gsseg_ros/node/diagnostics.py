@@ -8,9 +8,9 @@ from collections import Counter
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from gsseg_core.live.results import SCENE_CHANGED
-from gsseg_ros.complaints import CLOCK, MISSING, PERIOD, TIME_JUMP, Complaints
-from gsseg_ros.inputs import Inputs
-from gsseg_ros.workspace import Workspace
+from gsseg_ros.node.complaints import CLOCK, MISSING, PERIOD, TIME_JUMP, Complaints
+from gsseg_ros.node.inputs import Inputs
+from gsseg_ros.node.workspace import Workspace
 
 WINDOW_SECONDS = 10.0
 """For which masks the verdict counts how many were refused, of a clock that never stands still."""

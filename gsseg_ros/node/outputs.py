@@ -20,9 +20,9 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
 from gsseg_ros.conversions import cloud, topic_tokens
+from gsseg_ros.node.reports import Selection
 from gsseg_ros.object_messages import object_markers
 from gsseg_ros.qos import clear_overrides, latched
-from gsseg_ros.reports import Selection
 
 InvalidHandle = rclpy_implementation.InvalidHandle
 

@@ -22,19 +22,19 @@ from sensor_msgs.msg import CameraInfo, Image
 from gsseg_core.data.dataset import View
 from gsseg_core.errors import GssegError, PoseError
 from gsseg_core.live.results import SCENE_CHANGED, Rejection
-from gsseg_ros.camera_images import CameraImages
-from gsseg_ros.complaints import LIVE, PERIOD, REFUSED_POSE, Complaints
 from gsseg_ros.conversions import camera_from_messages, labels_from_image, matrix_from_pose, stamp_ns
 from gsseg_ros.errors import NoSceneError, TooManyPixelsError
-from gsseg_ros.jobs import Worker
-from gsseg_ros.live_outputs import LiveOutputs
-from gsseg_ros.outputs import Outputs
-from gsseg_ros.pairing import ExactPoses, InterpolatedPoses, Paired, Pairing, PoseSource
+from gsseg_ros.node.camera_images import CameraImages
+from gsseg_ros.node.complaints import LIVE, PERIOD, REFUSED_POSE, Complaints
+from gsseg_ros.node.jobs import Worker
+from gsseg_ros.node.live_outputs import LiveOutputs
+from gsseg_ros.node.outputs import Outputs
+from gsseg_ros.node.pairing import ExactPoses, InterpolatedPoses, Paired, Pairing, PoseSource
+from gsseg_ros.node.sim_time import on_set_back
+from gsseg_ros.node.size_limits import require_size
+from gsseg_ros.node.tf_poses import TfPoses
+from gsseg_ros.node.workspace import Workspace
 from gsseg_ros.qos import clear_overrides, sensor_data
-from gsseg_ros.sim_time import on_set_back
-from gsseg_ros.size_limits import require_size
-from gsseg_ros.tf_poses import TfPoses
-from gsseg_ros.workspace import Workspace
 
 EXPIRE_PERIOD = 0.1  # s
 
@@ -56,7 +56,7 @@ class Inputs:
     explained : dict of str to str
         By reason: what was wrong with the last of these.
     counted : deque of (float, Counter)
-        What `gsseg_ros.diagnostics` counted lately, and when (s, `time.monotonic`).
+        What `gsseg_ros.node.diagnostics` counted lately, and when (s, `time.monotonic`).
     logged : Counter of str
         How many of these it has named in the log.
     refused_poses : int

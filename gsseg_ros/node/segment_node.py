@@ -24,16 +24,16 @@ from rclpy.signals import SignalHandlerOptions
 
 from gsseg_core.freed_memory import keep_freed_memory
 from gsseg_core.warm_up import warm_up
-from gsseg_ros import diagnostics, parameters
-from gsseg_ros.complaints import Complaints
-from gsseg_ros.inputs import Inputs
-from gsseg_ros.learn_action import LearnAction
-from gsseg_ros.outputs import Outputs
-from gsseg_ros.parameters import Settings
-from gsseg_ros.services import AT_WORK, WAITING, Services, describe
-from gsseg_ros.sim_time import SimTime
-from gsseg_ros.viewpoints import Lookup
-from gsseg_ros.workspace import Workspace
+from gsseg_ros.node import diagnostics, parameters
+from gsseg_ros.node.complaints import Complaints
+from gsseg_ros.node.inputs import Inputs
+from gsseg_ros.node.learn_action import LearnAction
+from gsseg_ros.node.outputs import Outputs
+from gsseg_ros.node.parameters import Settings
+from gsseg_ros.node.services import AT_WORK, WAITING, Services, describe
+from gsseg_ros.node.sim_time import SimTime
+from gsseg_ros.node.viewpoints import Lookup
+from gsseg_ros.node.workspace import Workspace
 
 THREADS = AT_WORK + WAITING + 6
 """Of the executor: those that requests hold that take long, one for a learn job, one for a transition, and always some

@@ -19,11 +19,11 @@ from gsseg_core.live.session import LiveSession
 from gsseg_core.pipeline import LEARNERS
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_ros.errors import CanceledError, InvalidRequestError, NotActiveError, error_code
-from gsseg_ros.jobs import Job
-from gsseg_ros.outputs import Outputs
-from gsseg_ros.reports import Selection, finish, report_message
-from gsseg_ros.services import explain
-from gsseg_ros.workspace import Run, Workspace
+from gsseg_ros.node.jobs import Job
+from gsseg_ros.node.outputs import Outputs
+from gsseg_ros.node.reports import Selection, finish, report_message
+from gsseg_ros.node.services import explain
+from gsseg_ros.node.workspace import Run, Workspace
 
 FEEDBACK_PERIOD = 0.1
 """Seconds between two messages of feedback, at least; a new stage is always told."""

@@ -12,9 +12,9 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Image
 
 from gsseg_ros.conversions import stamp_ns
-from gsseg_ros.live_outputs import LiveOutputs
-from gsseg_ros.outputs import Outputs
-from gsseg_ros.pairing import Pairing, PoseSource
+from gsseg_ros.node.live_outputs import LiveOutputs
+from gsseg_ros.node.outputs import Outputs
+from gsseg_ros.node.pairing import Pairing, PoseSource
 from gsseg_ros.qos import clear_overrides, sensor_data
 
 

@@ -25,9 +25,9 @@ from gsseg_ros.conversions import (
     stamp_ns,
 )
 from gsseg_ros.errors import NoTransformError, TooManyPixelsError, ViewpointError
-from gsseg_ros.parameters import Settings
-from gsseg_ros.reports import Selection
-from gsseg_ros.size_limits import require_size
+from gsseg_ros.node.parameters import Settings
+from gsseg_ros.node.reports import Selection
+from gsseg_ros.node.size_limits import require_size
 
 Lookup: TypeAlias = Callable[[str, int], "npt.NDArray[np.float64] | None"]
 """Pose (4, 4) of a frame in the map frame at a stamp in ns, 0 being the latest; None where there is none."""

@@ -21,8 +21,8 @@ from gsseg_core.report.summary import gaussian_counts
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.conversions import cloud
 from gsseg_ros.frames import Similarity
+from gsseg_ros.node.workspace import Run
 from gsseg_ros.object_messages import object_message
-from gsseg_ros.workspace import Run
 
 
 @dataclass(frozen=True, eq=False)
