@@ -90,6 +90,6 @@ setup(
             "segment_node = gsseg_ros.node.segment_node:main",
         ],
         # Where `gsseg view` gets codes from that change while it runs; see gsseg_core/viewer/live_source.py.
-        "gsseg.live_sources": ["ros = gsseg_ros.view_source:RosSource"],
+        "gsseg.live_sources": ["ros = gsseg_ros.client.view_source:RosSource"],
     },
 )

@@ -21,8 +21,8 @@ from gsseg_core.errors import SettingsError, StateMismatchError
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 from gsseg_core.viewer.live_source import LiveUpdate, open_source
-from gsseg_ros.client import NodeUnavailableError, SegmentationClient
-from gsseg_ros.view_source import RosSource
+from gsseg_ros.client.client import NodeUnavailableError, SegmentationClient
+from gsseg_ros.client.view_source import RosSource
 
 MOVED = {"scene_to_map.scale": 2.0, "scene_to_map.translation": [1.0, -2.0, 0.5]}
 
@@ -76,7 +76,7 @@ def test_a_cloud_of_before_a_run_is_not_taken_for_its_own_whatever_the_clock_did
 ) -> None:
     source = RosSource.__new__(RosSource)
     source._spinner = SimpleNamespace(wait_for=lambda condition, _: condition())
-    monkeypatch.setattr("gsseg_ros.view_source.arrays_from_cloud", lambda cloud, _: cloud)
+    monkeypatch.setattr("gsseg_ros.client.view_source.arrays_from_cloud", lambda cloud, _: cloud)
     before, later, after = (PointCloud2(header=Header(stamp=Time(sec=sec))) for sec in (50, 51, 50))
     source._clouds = {"/cloud": before, "/new": None}
     for stamp in (10, 50):  # Set back, and standing still.

@@ -11,8 +11,8 @@ from typing import Any
 from gsseg_msgs.action import Learn
 from rclpy.action import ActionClient
 
+from gsseg_ros.client.spinner import Spinner
 from gsseg_ros.errors import NodeUnavailableError, SegmentationError, error_name
-from gsseg_ros.spinner import Spinner
 
 GRACE_SECONDS = 1.0
 """For an answer on its way from a node that has just ended."""

@@ -27,8 +27,8 @@ from rclpy.action import ActionClient
 from rclpy.context import Context
 from sensor_msgs.msg import PointCloud2
 
-from gsseg_ros.client_calls import Calls, LearnGoal, class_names
-from gsseg_ros.client_results import (
+from gsseg_ros.client.calls import Calls, LearnGoal, class_names
+from gsseg_ros.client.results import (
     Exported,
     LearnResult,
     LoadedScene,
@@ -40,6 +40,7 @@ from gsseg_ros.client_results import (
     Viewpoint,
     seconds_of,
 )
+from gsseg_ros.client.spinner import Spinner
 from gsseg_ros.conversions import (
     array_from_point,
     arrays_from_cloud,
@@ -51,7 +52,6 @@ from gsseg_ros.conversions import (
 from gsseg_ros.errors import NodeUnavailableError, SegmentationError
 from gsseg_ros.object_messages import box_from_object
 from gsseg_ros.qos import all_clouds
-from gsseg_ros.spinner import Spinner
 
 __all__ = [
     "Exported", "LearnResult", "LoadedScene", "LoadedState", "NodeUnavailableError", "RenderedView", "SavedState",

@@ -18,12 +18,12 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import UNOBSERVED
 from gsseg_core.viewer.live_source import LiveUpdate
 from gsseg_core.viewer.model import Labelling
-from gsseg_ros.client_calls import Calls
+from gsseg_ros.client.calls import Calls
+from gsseg_ros.client.spinner import Spinner
 from gsseg_ros.conversions import CloudArrays, arrays_from_cloud, stamp_ns
 from gsseg_ros.errors import NodeUnavailableError, SegmentationError
 from gsseg_ros.frames import Similarity
 from gsseg_ros.qos import latched
-from gsseg_ros.spinner import Spinner
 
 ANSWER_SECONDS = 30.0
 """How long a request, and the clouds that follow it, may take."""
