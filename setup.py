@@ -86,7 +86,7 @@ setup(
     entry_points={
         "console_scripts": [
             "gsseg = gsseg_core.cli.main:main",
-            "replay_node = gsseg_ros.replay_node:main",
+            "replay_node = gsseg_ros.replay.replay_node:main",
             "segment_node = gsseg_ros.node.segment_node:main",
         ],
         # Where `gsseg view` gets codes from that change while it runs; see gsseg_core/viewer/live_source.py.

@@ -28,7 +28,7 @@ from gsseg_core.data.dataset import Dataset
 
 MOST_NOT_RUN = 7
 PROGRAMS = {
-    "gsseg": "gsseg_core.cli.main", "segment_node": "gsseg_ros.node.segment_node", "replay_node": "gsseg_ros.replay_node",
+    "gsseg": "gsseg_core.cli.main", "segment_node": "gsseg_ros.node.segment_node", "replay_node": "gsseg_ros.replay.replay_node",
     "dask": "dask", "python": "", "python3": "",
 }  # fmt: skip
 MASKS = "docs/masks.md"

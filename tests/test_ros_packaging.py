@@ -148,7 +148,7 @@ def test_launch_file_compiles_and_defines_what_ros2_launch_calls(file: Path) -> 
 
 
 def test_replay_launch_file_has_the_parameters_of_the_node_with_their_defaults() -> None:
-    from gsseg_ros.replay_node import _PARAMETERS
+    from gsseg_ros.replay.replay_node import _PARAMETERS
 
     assignment = next(node for node in ast.parse(LAUNCH_FILES[0].read_text()).body if isinstance(node, ast.Assign))
     arguments = {ast.literal_eval(row.elts[0]): ast.literal_eval(row.elts[2]) for row in assignment.value.elts}

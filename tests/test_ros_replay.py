@@ -37,7 +37,7 @@ from gsseg_ros.conversions import (
     stamp_message,
     stamp_ns,
 )
-from gsseg_ros.replay_sources import BagSource
+from gsseg_ros.replay.sources import BagSource
 
 KINDS = {"mask": Image, "camera_info": CameraInfo, "pose": PoseStamped, "image": Image}
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}

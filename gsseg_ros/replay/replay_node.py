@@ -23,7 +23,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_ros.conversions import stamp_message
-from gsseg_ros.replay_sources import TYPES, BagSource, FolderSource, Group, Source
+from gsseg_ros.replay.sources import TYPES, BagSource, FolderSource, Group, Source
 
 _CLASSES = {"mask": Image, "camera_info": CameraInfo, "pose": PoseStamped, "image": Image}
 _QOS = QoSProfile(depth=30, reliability=ReliabilityPolicy.RELIABLE)
