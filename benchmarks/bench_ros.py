@@ -39,6 +39,7 @@ from sensor_msgs.msg import PointCloud2
 from gsseg_core import pipeline
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.raster.view_operator import make_operator
+from gsseg_ros.child_nodes import NODES
 
 DATA = Path(os.environ.get("GSSEG_DATA") or Path(__file__).parents[2] / "shared" / "data") / "replica_apartment"
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -71,7 +72,7 @@ class Robot:
     def running(self, module: str, parameters: Mapping[str, Any]) -> Iterator[subprocess.Popen[bytes]]:
         """Run a node while the body runs, and wait for its end."""
         settings = [text for name, value in parameters.items() for text in ("-p", f"{name}:={json.dumps(value)}")]
-        command = [sys.executable, "-m", f"gsseg_ros.{module}", "--ros-args", *settings]
+        command = [sys.executable, "-m", NODES[module], "--ros-args", *settings]
         with open(self.folder / f"{module}.log", "ab") as log:
             process = subprocess.Popen(command, env=self.environment, stdout=log, stderr=log)
         try:

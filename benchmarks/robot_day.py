@@ -41,7 +41,7 @@ from gsseg_core.learn.learner_state import State
 from gsseg_core.live.session import LiveSession
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_ros.client.client import SegmentationClient
+from gsseg_ros.client import SegmentationClient
 from gsseg_ros.errors import SegmentationError
 
 SCENES = ("table", "other")

@@ -13,7 +13,7 @@ import sys
 
 import numpy as np
 
-from gsseg_ros.client.client import NodeUnavailableError, SegmentationClient, SegmentationError
+from gsseg_ros.client import NodeUnavailableError, SegmentationClient, SegmentationError
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--node", default="gsseg", help="name of the node (default: %(default)s)")

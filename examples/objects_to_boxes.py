@@ -18,7 +18,7 @@ import argparse
 import json
 import sys
 
-from gsseg_ros.client.client import NodeUnavailableError, SegmentationClient, SegmentationError
+from gsseg_ros.client import NodeUnavailableError, SegmentationClient, SegmentationError
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("classes", nargs="*", metavar="CLASS", help="names of the classes wanted (default: all)")

@@ -20,20 +20,23 @@ from gsseg_core.errors import GssegError
 STOP_SECONDS = 10.0
 """How long a child gets to end by itself."""
 
+NODES = {"segment_node": "gsseg_ros.node.segment_node", "replay_node": "gsseg_ros.replay.replay_node"}
+"""What `python -m` runs for each node."""
+
 
 class ChildError(GssegError):
     """A child process has ended that should not have."""
 
 
 class ChildNode:
-    """`python -m gsseg_ros.<module>` with parameters; what it writes goes to a log file."""
+    """`python -m` with one of `NODES` and parameters; what it writes goes to a log file."""
 
     def __init__(self, module: str, parameters: Mapping[str, Any], environment: Mapping[str, str], log: Path) -> None:
         self.module, self.log = module, log
         values = [text for name, value in parameters.items() for text in ("-p", f"{name}:={json.dumps(value)}")]
         with log.open("wb") as output:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", f"gsseg_ros.{module}", "--ros-args", *values],
+                [sys.executable, "-m", NODES[module], "--ros-args", *values],
                 env={**os.environ, **environment},
                 stdin=subprocess.DEVNULL,
                 stdout=output,

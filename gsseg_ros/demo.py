@@ -31,7 +31,7 @@ from gsseg_core.report.summary import Stopwatch
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.tables import percent, seconds_table, table
 from gsseg_ros.child_nodes import ChildNodes
-from gsseg_ros.client.client import NodeUnavailableError, SegmentationClient, SegmentResult, Viewpoint
+from gsseg_ros.client import NodeUnavailableError, SegmentationClient, SegmentResult, Viewpoint
 
 T = TypeVar("T")
 

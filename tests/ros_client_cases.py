@@ -20,7 +20,7 @@ from small_scenes import NAMES, write_dataset
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from gsseg_core.data.dataset import Dataset, View
-from gsseg_ros.client.client import SegmentationClient, SegmentationError
+from gsseg_ros.client import SegmentationClient, SegmentationError
 
 FOREVER: dict[str, Any] = {"learner": "gradient", "max_steps": 10_000_000}
 """A goal that does not come to its end while a test waits."""

@@ -31,6 +31,8 @@ from typing import Any
 import pytest
 from patience import PATIENCE
 
+from gsseg_ros.child_nodes import NODES
+
 try:
     # Set before any message class is imported: only then do they check their fields.
     os.environ.setdefault("ROS_PYTHON_CHECK_FIELDS", "1")
@@ -74,13 +76,13 @@ def wait_until(condition: Callable[[], Any], what: str, timeout: float = PATIENC
 
 
 class Process:
-    """`python -m gsseg_ros.<module> <arguments>` whose output, of both kinds, is collected as it comes."""
+    """A node or another program, whose output, of both kinds, is collected as it comes."""
 
     def __init__(self, module: str, arguments: list[str], environment: Mapping[str, str]) -> None:
         self._lines: list[str] = []
         self._name = module
         self._process = subprocess.Popen(
-            [sys.executable, "-m", f"gsseg_ros.{module}", *arguments],
+            [sys.executable, "-m", NODES.get(module, f"gsseg_ros.{module}"), *arguments],
             cwd=REPOSITORY, env=dict(environment), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT, text=True, errors="replace",
         )  # fmt: skip

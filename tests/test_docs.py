@@ -25,10 +25,11 @@ from doc_commands import Started, check, core_libraries, kind_of, run_commands, 
 from gsseg_core.cli.arguments import COMMANDS
 from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset
+from gsseg_ros.child_nodes import NODES
 
 MOST_NOT_RUN = 7
 PROGRAMS = {
-    "gsseg": "gsseg_core.cli.main", "segment_node": "gsseg_ros.node.segment_node", "replay_node": "gsseg_ros.replay.replay_node",
+    "gsseg": "gsseg_core.cli", **NODES,
     "dask": "dask", "python": "", "python3": "",
 }  # fmt: skip
 MASKS = "docs/masks.md"

@@ -17,9 +17,9 @@ from gsseg_core import kernel_cache, warm_up
 EVERY_KERNEL = """
 import importlib, os, pathlib, gsseg_core
 folder = pathlib.Path(gsseg_core.__file__).parent
-kernels = [path.stem for path in folder.glob("*.py") if "cache=True" in path.read_text()]
-for name in kernels:
-    importlib.import_module(f"gsseg_core.{name}")
+kernels = [path for path in folder.rglob("*.py") if "cache=True" in path.read_text()]
+for path in kernels:
+    importlib.import_module(".".join(path.relative_to(folder.parent).with_suffix("").parts))
 import numpy as np
 from gsseg_core import kernel_cache
 from gsseg_core.learn.em.rejected_regions import _root
@@ -31,7 +31,8 @@ print(len(kernels) > 15, kernel_cache.FOLDER, _root(np.array([0, 0, 1]), 2), _ro
 def nowhere(tmp_path: Path) -> dict[str, str]:
     """The environment of a copy of the package that numba can write nothing for; root may write to any real folder."""
     shutil.copytree(Path(gsseg_core.__file__).parent, tmp_path / "gsseg_core", ignore=shutil.ignore_patterns("__pyc*"))
-    (tmp_path / "gsseg_core/__pycache__").touch()  # A file, where a folder is expected.
+    for room in [tmp_path / "gsseg_core", *(path.parent for path in (tmp_path / "gsseg_core").rglob("__init__.py"))]:
+        (room / "__pycache__").touch()  # A file, where a folder is expected.
     environment = {**os.environ, "PYTHONPATH": str(tmp_path), "HOME": "/dev/null", "PYTHONDONTWRITEBYTECODE": "1"}
     for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
         environment.pop(name, None)

@@ -20,7 +20,7 @@ from gsseg_core.errors import IntrinsicsError, PoseError
 from gsseg_core.export.pictures import palette
 from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import Segmentation
-from gsseg_ros.client.client import NodeUnavailableError, SegmentationClient, Viewpoint
+from gsseg_ros.client import NodeUnavailableError, SegmentationClient, Viewpoint
 
 
 def test_learning_tells_its_progress_in_the_callers_thread_and_what_it_came_to(place: Place) -> None:

@@ -31,7 +31,7 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 import rclpy
 from gsseg_msgs.srv import Reset
 
-from gsseg_ros.client.client import NodeUnavailableError, SegmentationClient, SegmentationError
+from gsseg_ros.client import NodeUnavailableError, SegmentationClient, SegmentationError
 
 
 def test_cancel_from_another_thread_ends_learning_and_changes_nothing(learnt: Place) -> None:
@@ -82,7 +82,7 @@ def test_ctrl_c_in_a_plain_script_cancels_learning(place: Place) -> None:
     script = run_script(
         place.ros,
         f"""
-        from gsseg_ros.client.client import SegmentationClient
+        from gsseg_ros.client import SegmentationClient
         with SegmentationClient() as client:
             try:
                 client.learn("data", **{FOREVER}, on_feedback=lambda *told: print("told", flush=True))
@@ -101,7 +101,7 @@ def test_a_script_that_forgets_to_close_ends_cleanly(place: Place) -> None:
     script = run_script(
         place.ros,
         """
-        from gsseg_ros.client.client import SegmentationClient
+        from gsseg_ros.client import SegmentationClient
         client = SegmentationClient()
         client.wait_until_active()
         print("active")

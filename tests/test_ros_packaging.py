@@ -16,8 +16,9 @@ from typing import Any
 import pytest
 import yaml
 
+from gsseg_ros.child_nodes import NODES
+
 ROOT = Path(__file__).resolve().parent.parent
-NODES = ("replay_node", "segment_node")
 LAUNCH_FILES = sorted((ROOT / "launch").glob("*.launch.py"))
 
 # Where the ROS package's name is not that of the module.
@@ -78,8 +79,11 @@ def test_no_launch_or_configuration_file_is_forgotten_by_setup_py(monkeypatch: p
 
 def test_setup_py_installs_every_package_and_names_both_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
     handed = _set_up(monkeypatch)
-    assert sorted(handed["packages"]) == sorted(file.parent.name for file in ROOT.glob("gsseg_*/__init__.py"))
-    assert {f"{name} = gsseg_ros.{name}:main" for name in NODES} < set(handed["entry_points"]["console_scripts"])
+    folders = {file.parent.relative_to(ROOT) for file in ROOT.glob("gsseg_*/**/*.py")}
+    assert sorted(handed["packages"]) == sorted(folder.as_posix().replace("/", ".") for folder in folders)
+    assert {f"{name} = {module}:main" for name, module in NODES.items()} < set(
+        handed["entry_points"]["console_scripts"]
+    )
 
 
 def test_versions_are_the_same_everywhere(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,7 +106,7 @@ def test_node_script_is_executable_and_runs_the_node_of_its_name(name: str) -> N
     assert script.stat().st_mode & stat.S_IXUSR
     assert script.read_text().startswith("#!/bin/sh\n")
     assert _imports(script) == {"sys", "gsseg_ros"}
-    assert f"from gsseg_ros.{name} import main" in script.read_text()
+    assert f"from {NODES[name]} import main" in script.read_text()
 
 
 @pytest.mark.parametrize("activated", [True, False])
@@ -188,7 +192,7 @@ def test_a_node_accepts_the_parameters_file_as_it_stands(namespace: str) -> None
 
 
 def test_package_xml_lists_every_ros_package_that_gsseg_ros_imports() -> None:
-    used = set().union(*(_imports(file) for file in (ROOT / "gsseg_ros").glob("*.py")))
+    used = set().union(*(_imports(file) for file in (ROOT / "gsseg_ros").rglob("*.py")))
     used -= {*sys.stdlib_module_names, "gsseg_core", "gsseg_ros", *NOT_ROS}
     package = _package(ROOT)
     listed = {element.text for element in package if element.tag in ("depend", "exec_depend")}

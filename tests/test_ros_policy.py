@@ -15,7 +15,7 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 from rclpy.action import get_action_client_names_and_types_by_node, get_action_server_names_and_types_by_node
 
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_ros.client.client import SegmentationClient
+from gsseg_ros.client import SegmentationClient
 from gsseg_ros.client.view_source import RosSource
 
 # Of the kinds of pose source one is there at a time, a clock only with use_sim_time, and images while they are shown.

@@ -21,7 +21,7 @@ from gsseg_core.errors import SettingsError, StateMismatchError
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 from gsseg_core.viewer.live_source import LiveUpdate, open_source
-from gsseg_ros.client.client import NodeUnavailableError, SegmentationClient
+from gsseg_ros.client import NodeUnavailableError, SegmentationClient
 from gsseg_ros.client.view_source import RosSource
 
 MOVED = {"scene_to_map.scale": 2.0, "scene_to_map.translation": [1.0, -2.0, 0.5]}

@@ -65,7 +65,7 @@ def python() -> str:
         parts.append(f"## {title}\n")
         parts += [f"::: gsseg_core.{gsseg_core._HOMES[name]}.{name}\n" for name in names]
     parts += ["## A robot without ROS\n", "::: gsseg_core.live.session.LiveSession\n"]
-    parts += ["## The client of the ROS node\n", "::: gsseg_ros.client.client.SegmentationClient\n"]
+    parts += ["## The client of the ROS node\n", "::: gsseg_ros.client.SegmentationClient\n"]
     return "\n".join(parts)
 
 

@@ -35,7 +35,6 @@ from gsseg_ros.client.results import (
     LoadedState,
     RenderedView,
     SavedState,
-    SegmentedObject,
     SegmentResult,
     Viewpoint,
     seconds_of,
@@ -49,14 +48,9 @@ from gsseg_ros.conversions import (
     stamp_ns,
     viewpoint_messages,
 )
-from gsseg_ros.errors import NodeUnavailableError, SegmentationError
+from gsseg_ros.errors import NodeUnavailableError
 from gsseg_ros.object_messages import box_from_object
 from gsseg_ros.qos import all_clouds
-
-__all__ = [
-    "Exported", "LearnResult", "LoadedScene", "LoadedState", "NodeUnavailableError", "RenderedView", "SavedState",
-    "SegmentResult", "SegmentationClient", "SegmentationError", "SegmentedObject", "Viewpoint",
-]  # fmt: skip
 
 _SERVICES = {
     Segment: "segment", RenderView: "render_view", LoadScene: "load_scene", SaveState: "save_state",
