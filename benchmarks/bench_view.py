@@ -28,7 +28,7 @@ import numpy as np
 from machine import describe
 from room import build_room
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests/helpers"))
 from browser import opened_page, started_chromium, why_missing
 from playwright.sync_api import Page
 

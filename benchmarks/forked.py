@@ -22,7 +22,7 @@ THREADS = {"NUMBA_THREADING_LAYER": "workqueue", "NUMBA_NUM_THREADS": "1", "OPEN
 
 os.environ.update(THREADS)
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))  # Small scenes and the robot are there.
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/helpers"))  # Small scenes and the robot are there.
 
 HEADROOM = 4 << 30
 """Bytes of address space that a child may take beyond its parent's: a bomb must not take the machine with it."""

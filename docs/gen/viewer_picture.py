@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests/helpers"))
 from browser import opened_page, screenshot, started_chromium
 
 from gsseg_core.data.dataset import Dataset

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,13 +9,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-
 import robustness
 from plots import Axis, draw_panels
 from robustness import EM, HARD, LEARNERS, PLAIN, VOTES, Bench, learn, right_share, with_bad_frames
+from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views
 
 SVG = "{http://www.w3.org/2000/svg}"
 

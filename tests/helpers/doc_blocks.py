@@ -14,7 +14,7 @@ import small_scenes
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
-REPOSITORY = Path(__file__).parents[1]
+REPOSITORY = Path(__file__).parents[2]
 PAGES = [
     "README.md",
     "CONTRIBUTING.md",

@@ -78,7 +78,7 @@ def test_where_nobody_reads_the_command_does_its_work_all_the_same(
     shell["reader of stdout left"] = '{ "$@"; echo $? >code; } | true; exit $(cat code)'
     done = subprocess.run(
         ["bash", "-c", shell[lost], "bash", *scoring], capture_output=True, text=True, check=False, cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
     )  # fmt: skip
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert json.loads((tmp_path / "s.json").read_text())["views"] == 1

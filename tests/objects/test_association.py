@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
+import bench_ids
 import numpy as np
 import pytest
+from matching import Contingency, renamed
 from scipy import sparse
 from small_scenes import (
     NAMES,
@@ -20,11 +21,6 @@ from small_scenes import (
     true_labels,
     write_dataset,
 )
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-
-import bench_ids
-from matching import Contingency, renamed
 
 from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset, View

@@ -257,7 +257,7 @@ def test_gsplat_that_is_compiled_is_used(monkeypatch):
 def test_the_benchmark_says_in_one_line_that_there_is_no_gpu():
     if not why_missing("cuda"):
         pytest.skip("there is a GPU")
-    program = Path(__file__).parents[1] / "benchmarks" / "bench_gpu.py"
+    program = Path(__file__).parents[2] / "benchmarks" / "bench_gpu.py"
     ended = subprocess.run([sys.executable, program], capture_output=True, text=True, check=False)
     assert ended.returncode == 2
     assert ended.stdout == ""

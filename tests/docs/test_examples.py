@@ -20,7 +20,7 @@ from gsseg_core.data.label_images import read_mask
 from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
-REPOSITORY = Path(__file__).parents[1]
+REPOSITORY = Path(__file__).parents[2]
 NOTEBOOK = REPOSITORY / "examples/from_ply_to_objects.ipynb"
 
 

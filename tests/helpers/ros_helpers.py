@@ -48,7 +48,7 @@ try:
 except ImportError as _error:
     pytest.skip(f"ROS is not installed ({_error})", allow_module_level=True)
 
-REPOSITORY = Path(__file__).parents[1]
+REPOSITORY = Path(__file__).parents[2]
 _counter = itertools.count(os.getpid() * 17)
 _WORKER, _WORKERS = (
     int(os.environ.get(f"PYTEST_XDIST_WORKER{name}", alone).strip("gw")) for name, alone in (("", "0"), ("_COUNT", "1"))

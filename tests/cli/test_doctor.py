@@ -164,5 +164,5 @@ def test_doctor_looks_for_ros_without_importing_it() -> None:
     program = (
         "import sys; from gsseg_core.cli.machine_check import examine; examine(); sys.exit('rclpy' in sys.modules)"
     )
-    environment = {**os.environ, "PYTHONPATH": str(Path(doctor.__file__).parents[1])}
+    environment = {**os.environ, "PYTHONPATH": str(Path(doctor.__file__).parents[2])}
     subprocess.run([sys.executable, "-c", program], check=True, env=environment)

@@ -18,7 +18,7 @@ import yaml
 
 from gsseg_ros.child_nodes import NODES
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 LAUNCH_FILES = sorted((ROOT / "launch").glob("*.launch.py"))
 
 # Where the ROS package's name is not that of the module.

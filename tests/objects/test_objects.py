@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numba as nb
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from object_ceiling import best_selection
 from scipy.spatial.transform import Rotation
 from small_scenes import (
     HEIGHT,
@@ -24,10 +24,6 @@ from small_scenes import (
     true_labels,
     write_dataset,
 )
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-
-from object_ceiling import best_selection
 from straddlers import DISTANCE, half_opacity, split, straddlers
 
 from gsseg_core.cli.main import main

@@ -131,7 +131,7 @@ def test_a_page_that_cannot_be_written_leaves_the_earlier_one(
 
 
 def test_package_carries_the_style_sheet_and_the_script() -> None:
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     declared = re.search(r"package_data=\{\"gsseg_core.report\": \[(.*?)\]\}", (root / "setup.py").read_text())
     assert declared is not None
     others = {

@@ -8,23 +8,20 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pytest
-import torch
-from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, ring
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-
 import bench
 import children
 import growth
 import jobs
 import lift_rate
+import numpy as np
 import peers
+import pytest
+import torch
 from first_rasteriser import first_lift, to_splats
 from lift_rate import count_work
 from plain_torch import PlainTorch
 from report import Bar, Report, short
+from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, ring
 from workloads import SIZES, RoomSize, make_room, split
 
 from gsseg_core.learn.gradient_learner import GradientLearner, GradientSettings

@@ -9,19 +9,16 @@ import subprocess
 import sys
 from pathlib import Path
 
+import mutations
 import numpy as np
 import pytest
 from patience import PATIENCE
 from small_scenes import clean_views, write_dataset
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
-
-import mutations
 from whole_outputs import faults_of, leftovers, listing, read_folder
 
 from gsseg_core import pipeline
 
-BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
 
 def ran(program: str, *arguments: object) -> subprocess.CompletedProcess[str]:

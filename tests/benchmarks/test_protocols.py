@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
+import evaluate_protocol
 import numpy as np
 import pytest
 import small_scenes
@@ -14,9 +14,6 @@ from protocols import Task, lerf_mask, nvos, score_task, spin_nerf
 
 from gsseg_core.data.camera_files import read_cameras
 from gsseg_core.errors import CameraFileError, MaskFormatError, MaskSizeError
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-import evaluate_protocol
 
 
 @pytest.fixture
