@@ -1,6 +1,6 @@
 """Draws docs/pictures/report.jpg, the report of the demo scene: python docs/gen/report_picture.py [DEMO_OUT].
 
-It needs Playwright and a Chromium on PATH, as the tests do (tests/browser.py).
+It needs Playwright and a Chromium on PATH, as the tests do (tests/helpers/browser.py).
 """
 
 from __future__ import annotations

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from small_scenes import balls_on_a_table, clean_views, ring
-from test_mask_errors import make_grid
+from small_scenes import balls_on_a_table, clean_views, make_grid, ring
 from view_errors import STRONGEST, PoseErrors, corrupt_views, errors_at, jitter, typical_depth
 
 from gsseg_core.data.dataset import View

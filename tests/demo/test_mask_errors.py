@@ -11,19 +11,13 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from scipy import ndimage
+from small_scenes import make_grid
 
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.demo.mask_errors import MaskErrors, corrupt
 from gsseg_core.errors import SettingsError
 
 NONE = MaskErrors(missed=0, swapped=0, edge_px=0)
-
-
-def make_grid(rows: int = 5, columns: int = 6, size: int = 16, gap: int = 8) -> np.ndarray:
-    """Square objects 1, 2, 3, ... on background."""
-    ids = np.arange(1, rows * columns + 1, dtype=np.int32).reshape(rows, columns)
-    cell = np.pad(np.ones((size, size), np.int32), gap)
-    return np.kron(ids, cell)
 
 
 def test_no_errors_leave_the_labels_as_they_are() -> None:

@@ -151,3 +151,10 @@ def write_dataset(
     for camera in cameras:
         write_mask(folder / "labels" / f"{camera.name}.png", true_labels(scene, truth, camera), bits)
     return folder
+
+
+def make_grid(rows: int = 5, columns: int = 6, size: int = 16, gap: int = 8) -> np.ndarray:
+    """Square objects 1, 2, 3, ... on background."""
+    ids = np.arange(1, rows * columns + 1, dtype=np.int32).reshape(rows, columns)
+    cell = np.pad(np.ones((size, size), np.int32), gap)
+    return np.kron(ids, cell)
