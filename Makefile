@@ -20,6 +20,9 @@ TEST_WORKERS ?= 4
 # Both builders of the messages obey it; without it one of them compiles file after file.
 export CMAKE_BUILD_PARALLEL_LEVEL ?= $(shell nproc 2>/dev/null || echo 1)
 
+# Beside each other, threads of kernels that wait for work must leave the cores to the others: twice as fast.
+run-tests: export OMP_WAIT_POLICY = passive
+
 # Targets that `make test` makes beside the tests.
 BESIDE ?=
 

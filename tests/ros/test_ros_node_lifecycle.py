@@ -59,7 +59,8 @@ def test_with_autostart_false_it_waits_and_answers_that_it_is_not_active(robot: 
 def test_with_autostart_it_is_active_by_itself(ros: Ros, parameters: dict[str, Any]) -> None:
     robot = Robot(ros).started(parameters)
     assert robot.state == "active"
-    assert robot.process is not None and "loaded" in robot.process.output
+    assert robot.process is not None
+    robot.process.wait_for("loaded")
 
 
 def test_configure_loads_the_scene_and_offers_the_outputs(robot: Robot) -> None:
@@ -159,7 +160,7 @@ def test_a_configure_that_fails_leaves_it_unconfigured_until_the_parameter_is_ri
     (root / "broken.ply").write_text("no PLY")
     assert robot.set("scene_path", str(root / "broken.ply")) == (True, "")
     assert not robot.change("configure")
-    assert "broken.ply: truncated or not a PLY file" in process.output
+    process.wait_for("broken.ply: truncated or not a PLY file")
     assert robot.state == "unconfigured"
     assert_not_active(robot)
     assert robot.set("scene_path", str(parameters["scene_path"])) == (True, "")

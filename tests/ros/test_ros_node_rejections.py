@@ -204,7 +204,7 @@ def test_a_bad_pose_is_no_pose_and_the_log_says_what_is_wrong_with_it(misplaced:
     status = robot.wait_for_status(lambda status: status.get("rejected no_pose") == "2", "two masks without a pose")
     assert (status["views fused"], status[f"/{bad.what}/pose received"]) == ("0", "2")
     assert robot.process is not None
-    assert bad.log in robot.process.output
+    robot.process.wait_for(bad.log)
     assert robot.ask("segment").error_code == Segment.Response.NO_CODES
 
 
@@ -223,7 +223,7 @@ def test_two_hundred_bad_poses_are_a_few_lines_that_count_the_others(misplaced: 
 def test_masks_that_come_before_there_is_a_scene_are_counted(ros: Ros, parameters: dict[str, Any]) -> None:
     robot = Robot(ros).started({**parameters, "scene_path": ""})
     assert robot.process is not None
-    assert "no scene yet: set the parameter scene_path, or call ~/load_scene" in robot.process.output
+    robot.process.wait_for("no scene yet: set the parameter scene_path, or call ~/load_scene")
     robot.drive(clean_views(3))
     status = robot.wait_for_status(lambda status: status.get("rejected no_scene") == "3", "three masks")
     assert (status["scene"], status["message"]) == ("none", "no scene is loaded")
