@@ -46,6 +46,7 @@ test: $(READY) $(ROS_READY) $(MSGS_READY)  ## lint, check the types and run the 
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports --no-cache
 	$(WARM_UP)
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target --keep-going run-tests $(BESIDE)
 

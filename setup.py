@@ -54,6 +54,7 @@ setup(
         "dev": [
             "distributed>=2024.8",
             "hypothesis>=6.100",
+            "import-linter>=2.5",
             "mkdocs-material>=9.6",
             "mkdocstrings-python>=1.16",
             "mypy>=1.15",

@@ -29,6 +29,7 @@ from gsseg_core.learn.calibrate import calibrate, votes_without
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import VOTE_UNIT, Learner
 from gsseg_core.learn.mask_reliability import OtherViews
+from gsseg_core.learn.registry import make_learner
 from gsseg_core.learn.temperature import (
     HIGHEST,
     LOWEST,
@@ -42,7 +43,6 @@ from gsseg_core.learn.temperature import (
     tempered,
 )
 from gsseg_core.metrics import Evaluation
-from gsseg_core.pipeline import make_learner
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation

@@ -23,8 +23,8 @@ from straddlers import split, straddlers
 
 from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.demo.table_scene import build_demo
-from gsseg_core.export.class_plys import background_image
 from gsseg_core.export.pictures import contact_sheet, save_png
+from gsseg_core.export.view_pictures import background_image
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.objects.silhouette_carving import KEPT, Silhouette, shares
 from gsseg_core.objects.silhouettes import ObjectScores, objects_of, surface

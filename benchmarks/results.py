@@ -25,12 +25,12 @@ from jobs import hard_votes
 from machine import processor
 
 from gsseg_core.data.dataset import Dataset, View
-from gsseg_core.export.class_plys import background_image
 from gsseg_core.export.pictures import contact_sheet, overlay, palette, save_png
+from gsseg_core.export.view_pictures import background_image
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import Learner
+from gsseg_core.learn.registry import make_learner
 from gsseg_core.metrics import Evaluation, evaluate_folders
-from gsseg_core.pipeline import make_learner
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.refine.knn_filter import cluster, statistical_filter
 from gsseg_core.refine.settings import RefineSettings

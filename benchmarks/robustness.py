@@ -32,11 +32,12 @@ from view_errors import STRONGEST, PoseErrors, corrupt_views, errors_at, typical
 from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.demo.mask_errors import MaskErrors
 from gsseg_core.demo.table_scene import build_demo
+from gsseg_core.export.view_pictures import draw_worst_views
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import Learner
-from gsseg_core.learn.mask_reliability import OtherViews, check_views, draw_worst_views
-from gsseg_core.pipeline import make_learner
+from gsseg_core.learn.mask_reliability import OtherViews, check_views
+from gsseg_core.learn.registry import make_learner
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.warm_up import warm_up

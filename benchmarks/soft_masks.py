@@ -28,7 +28,7 @@ from scipy.special import ndtr
 from gsseg_core.data.dataset import Dataset, View
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.demo.table_scene import build_demo
-from gsseg_core.pipeline import make_learner
+from gsseg_core.learn.registry import make_learner
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 

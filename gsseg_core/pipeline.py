@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,105 +15,48 @@ from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.data.hints import mask_hint
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.errors import NoUsableViewsError, SettingsError
-from gsseg_core.export.class_plys import (
+from gsseg_core.export.class_plys import class_file_name, write_classes
+from gsseg_core.export.pictures import save_png
+from gsseg_core.export.summary import build_report
+from gsseg_core.export.view_pictures import (
     Drawn,
     draw_views,
-    segment_places,
+    draw_worst_views,
     view_file_name,
-    write_classes,
-    write_json,
     write_overview,
     write_pictures,
 )
-from gsseg_core.export.pictures import save_png
 from gsseg_core.files.earlier_outputs import earlier_render, earlier_segment
+from gsseg_core.files.json_files import write_json
 from gsseg_core.files.run_folder import StagedRun, staged_run
 from gsseg_core.learn.calibrate import calibrate
-from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
+from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner import MEMORY_BUDGET, NO_MASK, Learner, Progress, silent
-from gsseg_core.learn.mask_reliability import OtherViews, ViewCheck, draw_worst_views, hold_against, reliability_report
-from gsseg_core.learn.vote_learner import VoteLearner
-from gsseg_core.objects.object_table import find_objects
+from gsseg_core.learn.mask_reliability import OtherViews, ViewCheck, hold_against, reliability_report
+from gsseg_core.learn.registry import DISTRIBUTED, make_learner
+from gsseg_core.objects.object_table import IDS, PER_VIEW, find_objects
+from gsseg_core.progress import Stopwatch
 from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, spread_if_scarce
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.report.findings import Evidence
 from gsseg_core.report.page import write_report_page
 from gsseg_core.report.pictures import ViewImages
-from gsseg_core.report.summary import Stopwatch, build_report
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-
-if TYPE_CHECKING:
-    from distributed import Client
-
-LEARNERS = ("em", "votes", "gradient")
-
-DISTRIBUTED = ("em", "votes")
-"""Learners that sum over views, and so can do it on many machines."""
-
-PER_VIEW = "per-view"
-IDS = ("global", PER_VIEW)
 
 PICTURED_VIEWS = 12
 """Views that `segment` draws, spread evenly over the dataset."""
 
 
-def make_learner(
-    name: str,
-    scene: GaussianScene,
-    num_classes: int,
-    *,
-    max_steps: int | None = None,
-    seed: int = 0,
-    device: str = "cpu",
-    memory_budget: int = MEMORY_BUDGET,
-    client: Client | None = None,
-) -> Learner:
-    """Make a learner by its name, with its default settings.
-
-    Parameters
-    ----------
-    name : str
-        One of `LEARNERS`.
-    scene : GaussianScene
-        N Gaussians.
-    num_classes : int
-        K, the background included.
-    max_steps : int, optional
-        Steps of EM, or epochs of the gradient learner, at most.
-    seed : int
-        For the gradient learner, which draws views at random.
-    device : str
-        Where views are rendered.
-    memory_budget : int
-        Bytes of prepared views to keep; of each worker, if there are any.
-    client : distributed.Client, optional
-        Have the workers of this Dask cluster do it.
-
-    Raises
-    ------
-    SettingsError
-        There is no such learner, or it cannot be distributed.
-    """
-    where: dict[str, Any] = {"device": device, "memory_budget": memory_budget}
-    em = EMSettings(max_steps=max_steps or EMSettings.max_steps)
-    if client is not None and name in DISTRIBUTED:
-        from gsseg_core.learn.distributed.dask_learners import DistributedEM, DistributedVotes
-
-        if name == "em":
-            return DistributedEM(client, scene, num_classes, em, **where)
-        return DistributedVotes(client, scene, num_classes, **where)
-    if name == "em":
-        return EMLearner(scene, num_classes, em, **where)
-    if name == "votes":
-        return VoteLearner(scene, num_classes, **where)
-    if name == "gradient":
-        # PyTorch takes seconds to import, and the other learners do without.
-        from gsseg_core.learn.gradient_learner import GradientLearner, GradientSettings
-
-        settings = GradientSettings(epochs=max_steps or GradientSettings.epochs, seed=seed)
-        return GradientLearner(scene, num_classes, settings, **where)
-    raise SettingsError(f"learner is {name!r}; expected one of {', '.join(LEARNERS)}")
+def segment_places(class_names: Mapping[int, str], views: Iterable[View]) -> list[str]:
+    """Files that `gsseg segment` writes, as far as they are known before it learns; relative to its folder."""
+    pictures = ["contact_sheet.png", "legend.png", "worst_views.png"]
+    pictures += [view_file_name(view.name, "overlay_") for view in views]
+    plys = [class_file_name(k, name) for k, name in class_names.items()]
+    return [
+        "segmentation.npz", "report.json", "report.html",
+        *(f"classes/{name}" for name in plys), *(f"pictures/{name}" for name in pictures),
+    ]  # fmt: skip
 
 
 def segment(

@@ -1,8 +1,9 @@
-"""Progress of long work, and how it is shown on a terminal."""
+"""Progress of long work: how far it is, how that is shown on a terminal, and how long its stages took."""
 
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
@@ -56,3 +57,17 @@ class _Bars:
         if bar is not None:
             with suppress(OSError):
                 bar.close()
+
+
+class Stopwatch:
+    """Seconds per stage of a run, in the order in which the stages ran."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time what happens inside."""
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start

@@ -17,12 +17,12 @@ from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.npz_files import UnfitError, check_shares, class_names_of, open_npz, temperature_of
 from gsseg_core.files.run_folder import settle
 from gsseg_core.learn.temperature import tempered
-from gsseg_core.printable import clipped
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.refine.knn_filter import cluster, statistical_filter
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import neighbours_of
+from gsseg_core.text import clipped
 
 UNOBSERVED, REMOVED = -1, -2
 """Labels of Gaussians that no view spoke for, and of those that the filter took out."""

@@ -22,14 +22,13 @@ from gsseg_core.data.label_images import write_mask
 from gsseg_core.demo.run import gaussian_ious
 from gsseg_core.demo.table_scene import DemoScene, build_demo
 from gsseg_core.errors import GssegError
-from gsseg_core.export.class_plys import write_overview
 from gsseg_core.export.pictures import contact_sheet, palette, save_png
+from gsseg_core.export.view_pictures import write_overview
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.metrics import evaluate_folders
-from gsseg_core.progress import progress_bars
-from gsseg_core.report.summary import Stopwatch
+from gsseg_core.progress import Stopwatch, progress_bars
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.tables import percent, seconds_table, table
+from gsseg_core.text import percent, seconds_table, table
 from gsseg_ros.child_nodes import ChildNodes
 from gsseg_ros.client import NodeUnavailableError, SegmentationClient, SegmentResult, Viewpoint
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsseg_core.printable import printable
+from gsseg_core.text import printable
 
 
 @pytest.mark.parametrize(

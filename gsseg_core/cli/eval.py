@@ -29,11 +29,11 @@ def run(options: argparse.Namespace) -> int:
     """Score, and print a table."""
     from gsseg_core.data.label_images import read_classes
     from gsseg_core.errors import ClassesFileError
-    from gsseg_core.export.class_plys import write_json
     from gsseg_core.files.atomic import check_writable
     from gsseg_core.files.input_files import is_there
+    from gsseg_core.files.json_files import write_json
     from gsseg_core.metrics import evaluate_folders
-    from gsseg_core.tables import evaluation_summary
+    from gsseg_core.text import evaluation_summary
 
     if options.json:
         check_writable(options.json)

@@ -38,8 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Pick, and say what was written."""
     from gsseg_core.data.dataset import Dataset, View
-    from gsseg_core.export.class_plys import background_image
     from gsseg_core.export.pictures import overlay, palette, save_png
+    from gsseg_core.export.view_pictures import background_image
     from gsseg_core.files.earlier_outputs import earlier_pick
     from gsseg_core.files.run_folder import staged_run
     from gsseg_core.objects.pick import pick_clicks, pick_mask, read_object_mask

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from gsseg_core.cli.terminal import tell
 from gsseg_core.data.names import class_ids, listed
-from gsseg_core.printable import clipped
-from gsseg_core.tables import counted
+from gsseg_core.text import clipped, counted
 
 HELP = "write the scene without some of its objects"
 DESCRIPTION = """

@@ -7,7 +7,7 @@ import argparse
 from gsseg_core.cli.shared import add_scene, load_kernels
 from gsseg_core.cli.terminal import tell
 from gsseg_core.progress import progress_bars
-from gsseg_core.tables import counted
+from gsseg_core.text import counted
 
 HELP = "render label maps and overlays of a segmentation"
 DESCRIPTION = """

@@ -104,7 +104,7 @@ def run(options: argparse.Namespace) -> int:
             ids=options.ids,
             progress=progress,
         )
-    from gsseg_core.tables import segment_summary
+    from gsseg_core.text import segment_summary
 
     tell(segment_summary(report, options.out))
     return 0

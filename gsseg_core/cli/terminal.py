@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import TextIO
 
 from gsseg_core.errors import WriteError
-from gsseg_core.printable import printable
+from gsseg_core.text import printable
 
 _LONGEST = 2000
 

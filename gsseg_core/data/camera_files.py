@@ -19,8 +19,8 @@ from gsseg_core.data.names import flaw_of_view_name
 from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError
 from gsseg_core.files.input_files import is_there, open_input, reason
 from gsseg_core.files.json_files import kind_of, read_json
-from gsseg_core.printable import clipped, quoted
 from gsseg_core.scene.camera import Camera
+from gsseg_core.text import clipped, quoted
 
 if TYPE_CHECKING:
     import pycolmap

@@ -14,21 +14,14 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.data.camera_files import read_cameras
-from gsseg_core.data.label_images import (
-    BACKGROUND_NAME,
-    MAX_LABEL,
-    UNKNOWN,
-    mask_bits,
-    mask_header,
-    read_classes,
-    read_mask,
-)
+from gsseg_core.data.label_images import BACKGROUND_NAME, UNKNOWN, mask_bits, mask_header, read_classes, read_mask
 from gsseg_core.data.mask_files import SUPERVISES, mask_files, read_soft_mask, read_supervises
 from gsseg_core.data.soft_masks import PackedMask, SeenLabels, combine_detections, quantise, restrict
 from gsseg_core.data.split_file import read_split
 from gsseg_core.errors import ClassesFileError, MaskFormatError, SettingsError, UnknownLabelError
 from gsseg_core.files.confined_files import require_folder_below
 from gsseg_core.files.input_files import is_there
+from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.scene.camera import Camera
 
 _IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")

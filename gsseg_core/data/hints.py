@@ -93,23 +93,6 @@ def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
     return f"{looked}, but {labels}/ holds names such as {found[0].name}: rename them to the names of the images"
 
 
-def scene_hint(path: Path) -> str:
-    """Tell where a PLY lies, if a folder or nothing was found in the place of a scene."""
-    if path.is_dir():
-        # Trainers write point_cloud/iteration_30000/point_cloud.ply; the one of most steps is wanted.
-        found = sorted(path.glob("*.ply")) or sorted(path.glob("point_cloud/iteration_*/*.ply"), key=_iteration)
-        return f"; it is a folder: type {_quoted(found[-1])}" if found else "; it is a folder without a PLY"
-    if not path.exists():
-        near = sorted(path.parent.glob("*.ply")) if path.parent.is_dir() else []
-        return f"; found {', '.join(file.name for file in near[:4])} in {path.parent}" if near else ""
-    return ""
-
-
-def _iteration(path: Path) -> int:
-    number = path.parent.name.rpartition("_")[2]
-    return int(number) if number.isdecimal() else -1
-
-
 def _has_cameras(folder: Path) -> bool:
     return any(_camera_file(place) is not None for place in (folder, folder / "sparse/0", folder / "sparse"))
 

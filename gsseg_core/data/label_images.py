@@ -23,11 +23,9 @@ from gsseg_core.errors import ClassesFileError, MaskFormatError, SettingsError
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.input_files import check_pixels, open_image, open_input, reason
 from gsseg_core.files.json_files import kind_of, read_json
-from gsseg_core.printable import quoted
+from gsseg_core.text import quoted
 
 UNKNOWN = -1
-MAX_LABEL = 65534
-"""The largest label that a 16-bit mask can hold."""
 BACKGROUND_NAME = "background"
 
 _PNG_KINDS = {0: "gray", 2: "RGB", 3: "palette", 4: "gray + alpha", 6: "RGBA"}

@@ -13,15 +13,15 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.data.label_images import MAX_LABEL
 from gsseg_core.data.soft_masks import SeenLabels, combine_detections, quantise
 from gsseg_core.errors import MaskFormatError, MaskSizeError, SupervisesFileError, UnknownLabelError
 from gsseg_core.files.confined_files import require_folder_below
 from gsseg_core.files.input_files import check_pixels, is_there, open_image
 from gsseg_core.files.json_files import kind_of, read_json
+from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.npz_files import NpzArrays, open_arrays
-from gsseg_core.printable import clipped, quoted
 from gsseg_core.scene.camera import Camera
+from gsseg_core.text import clipped, quoted
 
 SUPERVISES = "supervises.json"
 _PROBABILITIES, _CLASSES, _UNKNOWN = "probabilities", "classes", "unknown"

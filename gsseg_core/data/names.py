@@ -10,7 +10,7 @@ import unicodedata
 from collections.abc import Iterable, Mapping
 
 from gsseg_core.errors import SettingsError
-from gsseg_core.printable import clipped, quoted
+from gsseg_core.text import clipped, quoted
 
 MAX_CLASS_NAME = 200
 """Characters of a class name."""

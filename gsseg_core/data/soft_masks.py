@@ -15,9 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.data.label_evidence import Meaning
-from gsseg_core.data.label_images import MAX_LABEL, UNKNOWN, PackedLabels
+from gsseg_core.data.label_images import UNKNOWN, PackedLabels
 from gsseg_core.errors import MaskFormatError, MaskSizeError, UnknownLabelError
-from gsseg_core.printable import clipped
+from gsseg_core.files.limits import MAX_LABEL
+from gsseg_core.text import clipped
 
 STEPS = (16, 8, 4, 2, 1)
 """Steps from probability 0 to 1: the first of these that gives no more than `MOST_PROTOTYPES`."""

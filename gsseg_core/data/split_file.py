@@ -9,7 +9,7 @@ from pathlib import Path
 from gsseg_core.errors import SplitFileError
 from gsseg_core.files.input_files import is_there
 from gsseg_core.files.json_files import kind_of, read_json
-from gsseg_core.printable import clipped, quoted
+from gsseg_core.text import clipped, quoted
 
 
 def read_split(path: Path, views: Collection[str], within: Path | None = None) -> dict[str, list[str]]:

@@ -11,9 +11,9 @@ from gsseg_core import pipeline
 from gsseg_core.demo.table_scene import DemoScene, build_demo
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.metrics import evaluate_folders
-from gsseg_core.report.summary import Stopwatch
+from gsseg_core.progress import Stopwatch
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.tables import counted, percent, seconds_table, table
+from gsseg_core.text import counted, percent, seconds_table, table
 
 
 def run_demo(out: str | os.PathLike[str], *, seed: int = 0, progress: Progress = silent) -> str:

@@ -18,7 +18,7 @@ from PIL import Image, UnidentifiedImageError
 from gsseg_core.errors import GssegError
 from gsseg_core.files.confined_files import OPENED, require_below
 from gsseg_core.files.limits import LIMITS
-from gsseg_core.printable import clipped
+from gsseg_core.text import clipped
 
 _KINDS = {
     stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket",

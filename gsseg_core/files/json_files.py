@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from gsseg_core.errors import GssegError
+from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.input_files import open_input, reason
 from gsseg_core.files.limits import LIMITS
-from gsseg_core.printable import clipped
+from gsseg_core.text import clipped
 
 _KINDS = {
     dict: "an object", list: "a list", str: "text", bool: "true or false", int: "a number", float: "a number",
@@ -35,3 +39,9 @@ def read_json(path: Path, error: type[GssegError], within: Path | None = None) -
 def kind_of(content: object) -> str:
     """Name what a JSON file holds, in the words of JSON."""
     return _KINDS[type(content)]
+
+
+def write_json(path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:
+    """Write JSON atomically."""
+    with write_atomically(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

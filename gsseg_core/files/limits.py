@@ -30,3 +30,6 @@ class Limits:
 
 
 LIMITS = Limits()
+
+MAX_LABEL = 65534
+"""The largest label that a 16-bit mask can hold."""

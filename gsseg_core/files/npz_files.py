@@ -16,11 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.data.label_images import MAX_LABEL
 from gsseg_core.errors import GssegError, StateFileError, StateMismatchError
 from gsseg_core.files.input_files import open_input, reason
-from gsseg_core.files.limits import LIMITS
-from gsseg_core.printable import clipped, quoted
+from gsseg_core.files.limits import LIMITS, MAX_LABEL
+from gsseg_core.text import clipped, quoted
 
 # What NumPy, zipfile and zlib raise on damaged bytes; RuntimeError where a flipped bit says "encrypted".
 _DAMAGED = (

@@ -13,11 +13,11 @@ import numpy as np
 
 from gsseg_core.data.dataset import View
 from gsseg_core.data.label_evidence import Meaning
-from gsseg_core.data.label_images import MAX_LABEL, UNKNOWN
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import TOLERANCE, SeenLabels
 from gsseg_core.errors import GssegError, PathTakenError
 from gsseg_core.files.atomic import write_atomically
-from gsseg_core.files.limits import LIMITS
+from gsseg_core.files.limits import LIMITS, MAX_LABEL
 from gsseg_core.files.npz_files import (
     NpzArrays,
     UnfitError,
@@ -28,8 +28,8 @@ from gsseg_core.files.npz_files import (
     temperature_of,
     whole_number,
 )
-from gsseg_core.printable import clipped, quoted
 from gsseg_core.scene.camera import Camera
+from gsseg_core.text import clipped, quoted
 
 FORMAT = "gsseg-state-1"
 

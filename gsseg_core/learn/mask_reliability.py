@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,8 +22,6 @@ from gsseg_core.csr_rows import Rows
 from gsseg_core.data.dataset import View, spread
 from gsseg_core.data.label_evidence import Meaning
 from gsseg_core.data.label_images import UNKNOWN, PackedLabels
-from gsseg_core.export.class_plys import background_image
-from gsseg_core.export.pictures import contact_sheet, overlay, palette
 from gsseg_core.learn.em.em_learner import EMLearner, codes_without
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.learn.temperature import VIEWS, Sample, sample_pixels
@@ -31,8 +29,6 @@ from gsseg_core.raster.view_operator import make_operator
 
 CONFUSIONS = 3
 """Most confusions that the report of a view names."""
-
-_DIFFERENT = np.array([[0, 0, 0], [230, 40, 40]], np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,37 +228,6 @@ def reliability_report(checks: Iterable[ViewCheck], class_names: Mapping[int, st
         }
         for check in worst_views(checks)
     ]
-
-
-def draw_worst_views(others: OtherViews, checks: Sequence[ViewCheck], count: int = 4) -> np.ndarray:
-    """Draw the worst views: the mask, what the other views predict, and in red where the two differ.
-
-    Parameters
-    ----------
-    others : OtherViews
-        Of the learner.
-    checks : sequence of ViewCheck
-        Of all its views, or of some; at least one.
-    count : int
-        Views at most, one a row.
-
-    Returns
-    -------
-    (H, W, 3) uint8
-    """
-    learner, images, captions = others.learner, [], []
-    colors = palette(learner.num_classes)
-    for check in worst_views(checks, count):
-        view = learner.views[check.name]
-        image = background_image(learner.scene, make_operator(learner.scene, view.camera, learner.device))
-        mask = view.read_labels()
-        predicted = others.predict(view) if check.predicted is None else check.predicted.unpack()
-        different = ((mask != predicted) & (mask != UNKNOWN) & (predicted != UNKNOWN)).astype(np.int32)
-        images += [overlay(image, mask, colors), overlay(image, predicted, colors)]
-        images.append(overlay(image, different, _DIFFERENT))
-        trusted = f"{100 * check.reliability:.0f} % reliable" if check.checked else "unchecked"
-        captions += [f"{check.name}: {trusted}", "what the other views say", "where they differ"]
-    return contact_sheet(images, captions, 3)
 
 
 def _strongest(

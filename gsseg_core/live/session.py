@@ -22,11 +22,11 @@ from gsseg_core.errors import (
 )
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.learner_state import Learnt, State
+from gsseg_core.learn.registry import make_learner
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.results import SCENE_CHANGED, Outcome, Rejection
-from gsseg_core.pipeline import make_learner
+from gsseg_core.progress import Stopwatch
 from gsseg_core.refine.settings import RefineSettings
-from gsseg_core.report.summary import Stopwatch
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.spatial.neighbourhood import neighbours_of
@@ -185,7 +185,7 @@ class LiveSession:
         Parameters
         ----------
         learner : str
-            One of `gsseg_core.pipeline.LEARNERS`.
+            One of `gsseg_core.learn.registry.LEARNERS`.
         dataset : Dataset, optional
             Learn from this in place of the views kept.
         num_views : int, optional

@@ -10,13 +10,18 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from gsseg_core.data.dataset import View
-from gsseg_core.data.label_images import BACKGROUND_NAME, MAX_LABEL, UNKNOWN
+from gsseg_core.data.label_images import BACKGROUND_NAME, UNKNOWN
 from gsseg_core.errors import UnknownLabelError
+from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.objects.association import AssociationSettings, associate
 from gsseg_core.objects.lifted_segments import Lifted, Profiles, sums
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
+
+PER_VIEW = "per-view"
+IDS = ("global", PER_VIEW)
+"""Whether an id means the same in every view, or the objects are to be found."""
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,9 @@ import numpy as np
 
 from gsseg_core.data.names import listed
 from gsseg_core.errors import EmptySceneError, SettingsError
-from gsseg_core.printable import clipped
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.tables import counted
+from gsseg_core.text import clipped, counted
 
 
 def without_objects(scene: GaussianScene, segmentation: Segmentation, classes: Collection[int]) -> GaussianScene:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gsseg_core.printable import html_text
+from gsseg_core.text import html_text
 
 MATRIX_PX, LARGEST_CELL, SMALLEST_CELL = 420, 30, 16
 NAMES_PX, SLANTED_PX, OVERHANG = 130, 110, 60

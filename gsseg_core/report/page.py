@@ -17,14 +17,13 @@ import numpy as np
 
 from gsseg_core.export.pictures import palette
 from gsseg_core.files.atomic import write_atomically
-from gsseg_core.printable import html_text
 from gsseg_core.report import sections as html
 from gsseg_core.report.findings import Evidence, class_ious, mean_reliability, warnings_of
 from gsseg_core.report.pictures import PICTURE_PX, THUMBNAIL_PX, ViewImages, draw_triple, jpeg_uri, thumbnails
 from gsseg_core.report.preview import look_from, make_preview, up_of
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
-from gsseg_core.tables import percent
+from gsseg_core.text import html_text, percent
 
 LOOKS = 8
 """Views from which the preview can be looked at."""

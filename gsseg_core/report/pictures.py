@@ -13,8 +13,8 @@ from PIL import Image
 from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import UNKNOWN, PackedLabels
 from gsseg_core.errors import MaskFormatError
-from gsseg_core.export.class_plys import background_image
 from gsseg_core.export.pictures import outline, overlay
+from gsseg_core.export.view_pictures import background_image
 from gsseg_core.files.input_files import open_image
 from gsseg_core.learn.mask_reliability import ViewCheck
 from gsseg_core.raster.view_operator import make_operator

@@ -9,11 +9,11 @@ from urllib.parse import quote
 
 import numpy as np
 
-from gsseg_core.printable import html_text as text
 from gsseg_core.report import charts
 from gsseg_core.report.findings import TRUSTED, largest_confusions, most_confused
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.tables import percent
+from gsseg_core.text import html_text as text
+from gsseg_core.text import percent
 
 BINS = 25
 MATRIX_CLASSES = 24

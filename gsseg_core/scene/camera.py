@@ -10,7 +10,7 @@ import numpy.typing as npt
 from gsseg_core.errors import IntrinsicsError, MaskSizeError, PoseError
 from gsseg_core.files.input_files import check_pixels
 from gsseg_core.files.limits import LIMITS
-from gsseg_core.printable import clipped
+from gsseg_core.text import clipped
 
 # Poses come from text files of few digits; a deviation this small moves no point by a pixel.
 _RIGID_TOLERANCE = 1e-3

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import shlex
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -11,11 +12,10 @@ import numpy as np
 import numpy.typing as npt
 import plyfile
 
-from gsseg_core.data.hints import scene_hint
 from gsseg_core.errors import SceneFileError, ScenePropertyError
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.input_files import open_input, reason
-from gsseg_core.printable import clipped, quoted
+from gsseg_core.text import clipped, quoted
 
 _MAX_HEADER = 1 << 20
 
@@ -112,3 +112,20 @@ def write_vertices(path: str | os.PathLike[str], vertices: npt.NDArray[Any], run
     ply = plyfile.PlyData([plyfile.PlyElement.describe(vertices, "vertex", comments=comments)], byte_order="<")
     with write_atomically(path) as temporary:
         ply.write(str(temporary))
+
+
+def scene_hint(path: Path) -> str:
+    """Tell where a PLY lies, if a folder or nothing was found in the place of a scene."""
+    if path.is_dir():
+        # Trainers write point_cloud/iteration_30000/point_cloud.ply; the one of most steps is wanted.
+        found = sorted(path.glob("*.ply")) or sorted(path.glob("point_cloud/iteration_*/*.ply"), key=_iteration)
+        return f"; it is a folder: type {shlex.quote(str(found[-1]))}" if found else "; it is a folder without a PLY"
+    if not path.exists():
+        near = sorted(path.parent.glob("*.ply")) if path.parent.is_dir() else []
+        return f"; found {', '.join(file.name for file in near[:4])} in {path.parent}" if near else ""
+    return ""
+
+
+def _iteration(path: Path) -> int:
+    number = path.parent.name.rpartition("_")[2]
+    return int(number) if number.isdecimal() else -1

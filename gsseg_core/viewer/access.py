@@ -20,7 +20,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from gsseg_core.errors import SettingsError
-from gsseg_core.printable import printable
+from gsseg_core.text import printable
 
 PATIENCE = 5.0
 """Most seconds to find out what the name of a host means."""

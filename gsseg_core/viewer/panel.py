@@ -16,8 +16,8 @@ import viser
 
 from gsseg_core.data.dataset import View
 from gsseg_core.errors import GssegError, SettingsError
-from gsseg_core.printable import html_text, printable
 from gsseg_core.scene.camera import Camera
+from gsseg_core.text import html_text, printable
 from gsseg_core.viewer.corrections import box, disc, region
 from gsseg_core.viewer.model import MODES, ClassRow
 from gsseg_core.viewer.picking import Picked, Voice

@@ -14,9 +14,9 @@ from rclpy.lifecycle import LifecycleNode
 from std_msgs.msg import Header
 
 from gsseg_core.data.dataset import Dataset
+from gsseg_core.learn.registry import LEARNERS
 from gsseg_core.live.results import Outcome
 from gsseg_core.live.session import LiveSession
-from gsseg_core.pipeline import LEARNERS
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_ros.errors import CanceledError, InvalidRequestError, NotActiveError, error_code
 from gsseg_ros.node.jobs import Job

@@ -14,10 +14,10 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from gsseg_core.data.label_images import MAX_LABEL
 from gsseg_core.data.names import flaw_of_class_name
 from gsseg_core.errors import GssegError, SettingsError
-from gsseg_core.pipeline import PER_VIEW
+from gsseg_core.files.limits import MAX_LABEL
+from gsseg_core.objects.object_table import PER_VIEW
 from gsseg_core.raster.devices import DEVICES, checked_device
 from gsseg_core.refine.settings import MAX_K, RefineSettings
 from gsseg_ros.frames import Similarity, pose_from_parameters

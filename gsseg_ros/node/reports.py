@@ -14,10 +14,10 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import ColorRGBA, Header
 
 from gsseg_core.export.pictures import palette
+from gsseg_core.export.summary import gaussian_counts
 from gsseg_core.live.session import LIVE, LiveSession
 from gsseg_core.objects.oriented_boxes import class_box
 from gsseg_core.refine.settings import RefineSettings
-from gsseg_core.report.summary import gaussian_counts
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.conversions import cloud
 from gsseg_ros.frames import Similarity

@@ -18,12 +18,13 @@ from rclpy.lifecycle import LifecycleNode
 from std_msgs.msg import Header
 
 from gsseg_core.errors import GssegError
-from gsseg_core.export.class_plys import write_classes, write_json
+from gsseg_core.export.class_plys import write_classes
+from gsseg_core.export.summary import build_report
 from gsseg_core.files.confined_files import pinned_folder
 from gsseg_core.files.earlier_outputs import earlier_segment
+from gsseg_core.files.json_files import write_json
 from gsseg_core.files.run_folder import require_own_folder, staged_run
 from gsseg_core.refine.settings import RefineSettings
-from gsseg_core.report.summary import build_report
 from gsseg_ros.errors import InvalidRequestError, error_code
 from gsseg_ros.node.jobs import Turns
 from gsseg_ros.node.outputs import Outputs

@@ -12,8 +12,8 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
 from gsseg_core.errors import IntrinsicsError, PoseError
-from gsseg_core.export.class_plys import background_image
 from gsseg_core.export.pictures import overlay, palette
+from gsseg_core.export.view_pictures import background_image
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_ros.conversions import (

@@ -18,9 +18,9 @@ from gsseg_core.data.names import class_ids
 from gsseg_core.errors import PathNotAllowedError, SettingsError
 from gsseg_core.live.per_view_session import PerViewSession
 from gsseg_core.live.session import LiveSession
-from gsseg_core.pipeline import PER_VIEW
+from gsseg_core.objects.object_table import PER_VIEW
+from gsseg_core.progress import Stopwatch
 from gsseg_core.refine.settings import RefineSettings
-from gsseg_core.report.summary import Stopwatch
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_ros.errors import (
     InvalidRequestError,

@@ -153,7 +153,7 @@ def test_an_out_that_cannot_be_written_or_holds_what_is_not_ours_is_said_before_
 ) -> None:
     damage(place / "out")
     before = contents(place)
-    monkeypatch.setattr("gsseg_core.pipeline.make_learner", lambda *_, **__: pytest.fail("learns"))
+    monkeypatch.setattr("gsseg_core.learn.registry.make_learner", lambda *_, **__: pytest.fail("learns"))
     assert main(command(place)) == 2
     stderr = capsys.readouterr().err
     assert said in stderr and stderr.count("\n") == 1

@@ -16,7 +16,7 @@ import pytest
 
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.progress import progress_bars
-from gsseg_core.tables import counted, table
+from gsseg_core.text import counted, table
 
 GSSEG = [sys.executable, "-m", "gsseg_core.cli"]
 NAME = "Stühle 椅子"

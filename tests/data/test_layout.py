@@ -14,8 +14,9 @@ from small_scenes import write_dataset
 
 from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset
-from gsseg_core.data.hints import camera_hint, mask_hint, scene_hint
+from gsseg_core.data.hints import camera_hint, mask_hint
 from gsseg_core.data.label_images import read_mask
+from gsseg_core.scene.ply import scene_hint
 
 
 @pytest.fixture

@@ -12,14 +12,9 @@ from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views
 
 from gsseg_core.errors import PathTakenError, WriteError
 from gsseg_core.export import class_plys as export
-from gsseg_core.export.class_plys import (
-    class_file_name,
-    draw_views,
-    export_classes,
-    view_file_name,
-    write_json,
-    write_pictures,
-)
+from gsseg_core.export.class_plys import class_file_name, export_classes
+from gsseg_core.export.view_pictures import draw_views, view_file_name, write_pictures
+from gsseg_core.files.json_files import write_json
 from gsseg_core.files.run_folder import RUN_FILE
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene

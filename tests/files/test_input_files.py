@@ -33,9 +33,9 @@ from gsseg_core.files.input_files import open_input
 from gsseg_core.files.json_files import read_json
 from gsseg_core.files.limits import Limits
 from gsseg_core.learn.learner_state import State
-from gsseg_core.printable import clipped, quoted
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
+from gsseg_core.text import clipped, quoted
 
 SCENE, _ = balls_on_a_table()
 READERS: dict[str, Callable[[Path], object]] = {

@@ -14,15 +14,9 @@ from view_errors import corrupt_views
 from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.demo.mask_errors import MaskErrors
+from gsseg_core.export.view_pictures import draw_worst_views
 from gsseg_core.learn.em.em_learner import EMLearner
-from gsseg_core.learn.mask_reliability import (
-    OtherViews,
-    ViewCheck,
-    check_views,
-    draw_worst_views,
-    reliability_report,
-    worst_views,
-)
+from gsseg_core.learn.mask_reliability import OtherViews, ViewCheck, check_views, reliability_report, worst_views
 
 SCENE, _ = balls_on_a_table()
 CLEAN = clean_views(12)

@@ -30,9 +30,9 @@ from gsseg_core.errors import UnknownLabelError
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import VOTE_UNIT, Learner
 from gsseg_core.learn.mask_reliability import check_views
+from gsseg_core.learn.registry import LEARNERS, make_learner
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.session import LiveSession
-from gsseg_core.pipeline import LEARNERS, make_learner
 from gsseg_core.raster.view_operator import make_operator
 
 SCENE, TRUTH = balls_on_a_table()

@@ -11,10 +11,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from small_scenes import NAMES, balls_on_a_table, clean_views
 
+from gsseg_core.export.summary import build_report
 from gsseg_core.live.session import LiveSession
 from gsseg_core.objects.oriented_boxes import OrientedBox, class_box, object_boxes, oriented_box
 from gsseg_core.refine.settings import RefineSettings
-from gsseg_core.report.summary import build_report
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 

@@ -16,11 +16,11 @@ from report_cases import NASTY, Outline, run_with_nasty_names, segmented
 from small_scenes import balls_on_a_table
 
 from gsseg_core.errors import WriteError
-from gsseg_core.printable import html_text, printable
 from gsseg_core.report import sections as report_html
 from gsseg_core.report.findings import Evidence
 from gsseg_core.report.page import report_page, write_report_page
 from gsseg_core.report.pictures import ViewImages
+from gsseg_core.text import html_text, printable
 
 SCENE, TRUTH = balls_on_a_table()
 

@@ -15,8 +15,8 @@ from small_scenes import clean_views, taught, write_dataset, wrong_views
 
 from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.learn.calibrate import calibrate
+from gsseg_core.learn.registry import make_learner
 from gsseg_core.live.session import LiveSession
-from gsseg_core.pipeline import make_learner
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation

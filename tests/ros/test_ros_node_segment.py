@@ -12,8 +12,8 @@ from ros_helpers import Ros
 from ros_robot import CLASSES, LATCHED, SERVICES, Learn, Robot, core_session, viewpoint
 from small_scenes import NAMES, clean_views
 
-from gsseg_core.export.class_plys import background_image
 from gsseg_core.export.pictures import overlay, palette
+from gsseg_core.export.view_pictures import background_image
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation

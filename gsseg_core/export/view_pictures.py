@@ -1,0 +1,149 @@
+"""Pictures of views: the scene tinted by class, and the masks that are trusted least."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from gsseg_core.data.dataset import View
+from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.export.pictures import contact_sheet, legend, overlay, palette, save_png
+from gsseg_core.learn.mask_reliability import OtherViews, ViewCheck, worst_views
+from gsseg_core.raster.view_operator import ViewOperator, make_operator
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.segmentation import Segmentation
+
+_DIFFERENT = np.array([[0, 0, 0], [230, 40, 40]], np.uint8)
+_LONGEST_NAME = 255
+"""Bytes that file systems take as the name of a file."""
+
+
+def view_file_name(name: str, prefix: str = "") -> str:
+    """File name of a picture of a view: `<prefix><name>.png`, or one near to it where no file can be named so."""
+    safe = re.sub(r"[\x00-\x1f\x7f/\ud800-\udfff]", "_", name)
+    room = _LONGEST_NAME - len(f"{prefix}.png")
+    if safe != name or len(safe.encode()) > room:
+        # What tells it from others that would be cut to the same.
+        digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]
+        safe = safe.encode()[: room - 9].decode(errors="ignore") + f"-{digest}"
+    return f"{prefix}{safe}.png"
+
+
+def background_image(scene: GaussianScene, operator: ViewOperator) -> np.ndarray:
+    """Render the scene's colours from a view, (H, W, 3) uint8, on black."""
+    image = operator.render(scene.colors(operator.camera.center))
+    pixels: np.ndarray = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    return pixels
+
+
+class Drawn(NamedTuple):
+    """A view of a segmentation, for people.
+
+    Attributes
+    ----------
+    view : View
+        Where from.
+    labels : (H, W) int32
+        Class of each pixel.
+    overlay : (H, W, 3) uint8
+        The scene, tinted by class.
+    image : (H, W, 3) uint8
+        The scene in its own colours.
+    """
+
+    view: View
+    labels: np.ndarray
+    overlay: np.ndarray
+    image: np.ndarray
+
+
+def draw_views(
+    scene: GaussianScene, segmentation: Segmentation, views: Iterable[View], *, device: str = "cpu"
+) -> Iterator[Drawn]:
+    """Draw the labels of some views, and the scene under them."""
+    colors = palette(segmentation.num_classes)
+    for view in views:
+        operator = make_operator(scene, view.camera, device)
+        labels = segmentation.render(operator).labels
+        image = background_image(scene, operator)
+        yield Drawn(view, labels, overlay(image, labels, colors), image)
+
+
+def write_pictures(
+    segmentation: Segmentation, drawn: Iterable[Drawn], folder: str | os.PathLike[str], run: str | None = None
+) -> list[Path]:
+    """Write overlays of some views, as `draw_views` gives them, a contact sheet of them, and the legend.
+
+    Parameters
+    ----------
+    run : str, optional
+        Id of the run that they belong to.
+
+    Returns
+    -------
+    list of pathlib.Path
+        `overlay_<stem>.png` ..., `contact_sheet.png`, `legend.png`.
+    """
+    folder = Path(folder)
+    images, captions, paths = [], [], []
+    for one in drawn:
+        images.append(one.overlay)
+        captions.append(one.view.name)
+        paths.append(folder / view_file_name(one.view.name, "overlay_"))
+        save_png(paths[-1], one.overlay, run)
+    return paths + write_overview(segmentation, images, captions, folder, run)
+
+
+def write_overview(
+    segmentation: Segmentation,
+    images: Sequence[np.ndarray],
+    captions: Sequence[str],
+    folder: Path,
+    run: str | None = None,
+) -> list[Path]:
+    """Write `contact_sheet.png` of some pictures, if there are any, and `legend.png`."""
+    paths = []
+    if images:
+        paths.append(folder / "contact_sheet.png")
+        save_png(paths[-1], contact_sheet(images, captions, min(4, len(images))), run)
+    paths.append(folder / "legend.png")
+    colors = palette(segmentation.num_classes)
+    save_png(paths[-1], legend(segmentation.class_names, colors, segmentation.counts()), run)
+    return paths
+
+
+def draw_worst_views(others: OtherViews, checks: Sequence[ViewCheck], count: int = 4) -> np.ndarray:
+    """Draw the worst views: the mask, what the other views predict, and in red where the two differ.
+
+    Parameters
+    ----------
+    others : OtherViews
+        Of the learner.
+    checks : sequence of ViewCheck
+        Of all its views, or of some; at least one.
+    count : int
+        Views at most, one a row.
+
+    Returns
+    -------
+    (H, W, 3) uint8
+    """
+    learner, images, captions = others.learner, [], []
+    colors = palette(learner.num_classes)
+    for check in worst_views(checks, count):
+        view = learner.views[check.name]
+        image = background_image(learner.scene, make_operator(learner.scene, view.camera, learner.device))
+        mask = view.read_labels()
+        predicted = others.predict(view) if check.predicted is None else check.predicted.unpack()
+        different = ((mask != predicted) & (mask != UNKNOWN) & (predicted != UNKNOWN)).astype(np.int32)
+        images += [overlay(image, mask, colors), overlay(image, predicted, colors)]
+        images.append(overlay(image, different, _DIFFERENT))
+        trusted = f"{100 * check.reliability:.0f} % reliable" if check.checked else "unchecked"
+        captions += [f"{check.name}: {trusted}", "what the other views say", "where they differ"]
+    return contact_sheet(images, captions, 3)
