@@ -37,6 +37,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if interrupts.came():
             return interrupts.EXIT_CODE
+        if isinstance(error, MemoryError):
+            terminal.note(
+                f"error: memory is not enough: {error or 'no more is free'}; expected smaller views or scenes"
+            )
+            return 2
         if not isinstance(error, GssegError):
             raise
         terminal.note(f"error: {error}")

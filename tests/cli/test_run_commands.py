@@ -153,11 +153,26 @@ def test_an_out_that_cannot_be_written_or_holds_what_is_not_ours_is_said_before_
 ) -> None:
     damage(place / "out")
     before = contents(place)
-    monkeypatch.setattr("gsseg_core.learn.registry.make_learner", lambda *_, **__: pytest.fail("learns"))
+    monkeypatch.setattr("gsseg_core.pipeline.make_learner", lambda *_, **__: pytest.fail("learns"))
     assert main(command(place)) == 2
     stderr = capsys.readouterr().err
     assert said in stderr and stderr.count("\n") == 1
     assert contents(place) == before
+
+
+def test_too_little_memory_is_one_clear_line_and_the_results_of_before_stay(
+    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = contents(place)
+
+    def too_large(*_: object, **__: object) -> None:
+        raise MemoryError("Unable to allocate 1.50 GiB for an array")
+
+    monkeypatch.setattr("gsseg_core.pipeline.make_learner", too_large)
+    assert main(command(place)) == 2
+    stderr = capsys.readouterr().err
+    assert stderr.startswith("gsseg: error: memory is not enough (Unable to allocate 1.50 GiB")
+    assert stderr.count("\n") == 1 and contents(place) == before
 
 
 def test_render_never_writes_over_the_masks(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
