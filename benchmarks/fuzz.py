@@ -174,7 +174,8 @@ def judge(ended: Ended) -> str:
         return f"traceback: {raised.split(':')[0]} at {':'.join(frames[-1]) if frames else 'no line of gsseg'}"
     if ended.code < 0:
         return f"ended by signal {-ended.code}"
-    if ended.peak > MOST_MEMORY or _NO_MEMORY.search(ended.errors):
+    short = len(lines) == 1 and lines[0].startswith("gsseg: error: memory is not enough")
+    if ended.peak > MOST_MEMORY or (_NO_MEMORY.search(ended.errors) and not short):
         return "memory: more than 2 GiB"
     if ended.code == 0:
         return f"warning: {_without_paths(lines[0])[:90]}" if lines else "done"
