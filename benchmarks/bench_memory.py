@@ -11,7 +11,7 @@ import numpy as np
 from machine import describe, peak_memory
 from workloads import RoomSize, make_room
 
-from gsseg_core.csr_rows import Rows
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import View
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner import MEMORY_BUDGET
@@ -29,7 +29,7 @@ def main() -> None:
     options = parser.parse_args()
     print(describe())
     room, many = make_room(RoomSize(options.gaussians, options.views, options.classes, 640, 480)), options.classes
-    truth = Rows(np.arange(len(room.truth) + 1), room.truth.astype(np.uint32), np.ones(len(room.truth), np.float32))
+    truth = CSRRows(np.arange(len(room.truth) + 1), room.truth.astype(np.uint32), np.ones(len(room.truth), np.float32))
     views = [
         View.from_arrays(c, make_operator(room.scene, c).blend_rows(truth, many).image.argmax(axis=2).astype(np.int32))
         for c in room.cameras

@@ -1,4 +1,4 @@
-"""Codes without their zeros: of K classes, a Gaussian has votes for a few, and so have those around it."""
+"""Sparse (N, K) arrays in compressed rows: of K classes, a Gaussian has votes for a few."""
 
 from __future__ import annotations
 
@@ -11,57 +11,57 @@ import numpy as np
 _NONE = np.uint32(2**32 - 1)
 
 
-class Rows(NamedTuple):
-    """Entries of an (N, K) array, row by row; all others are zero. What several of them share, they hold in common.
+class CSRRows(NamedTuple):
+    """A sparse (N, K) array in compressed rows, as SciPy's `csr_array`, with kernels that use all cores.
 
     Attributes
     ----------
-    start : (N + 1,) int64
-        Entries of row i are start[i] to start[i + 1].
-    classes : (Z,) uint32
+    indptr : (N + 1,) int64
+        Entries of row i are indptr[i] to indptr[i + 1].
+    indices : (Z,) uint32
         Column of each entry, ascending in a row.
-    values : (Z,)
-        The entries.
+    data : (Z,)
+        The entries. Arrays of one pattern share `indptr` and `indices`.
     """
 
-    start: np.ndarray
-    classes: np.ndarray
-    values: np.ndarray
+    indptr: np.ndarray
+    indices: np.ndarray
+    data: np.ndarray
 
     @classmethod
-    def of(
+    def from_dense(
         cls,
         array: np.ndarray,  # (N, K)
-    ) -> Rows:
+    ) -> CSRRows:
         """Keep the entries that are not zero."""
         array = np.ascontiguousarray(array)
-        start = np.zeros(len(array) + 1, np.int64)
-        _count(array, start[1:])
-        np.cumsum(start, out=start)
-        rows = cls(start, np.empty(start[-1], np.uint32), np.empty(start[-1], array.dtype))
+        indptr = np.zeros(len(array) + 1, np.int64)
+        _count(array, indptr[1:])
+        np.cumsum(indptr, out=indptr)
+        rows = cls(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], array.dtype))
         _fill(array, *rows)
         return rows
 
     @classmethod
-    def joined(
+    def vstack(
         cls,
-        parts: Sequence[Rows],  # at least one
-    ) -> Rows:
-        """Put rows below each other."""
-        lengths = np.concatenate([np.diff(part.start) for part in parts])
+        parts: Sequence[CSRRows],  # at least one
+    ) -> CSRRows:
+        """Stack rows below each other."""
+        lengths = np.concatenate([np.diff(part.indptr) for part in parts])
         return cls(
             starts(lengths),
-            np.concatenate([part.classes for part in parts]),
-            np.concatenate([part.values for part in parts]),
+            np.concatenate([part.indices for part in parts]),
+            np.concatenate([part.data for part in parts]),
         )
 
-    def with_values(self, values: np.ndarray) -> Rows:
-        """Have other entries in the same places."""
-        return self._replace(values=values)
+    def with_data(self, data: np.ndarray) -> CSRRows:
+        """Replace the entries and keep where they stand."""
+        return self._replace(data=data)
 
     def dense(self, num_classes: int) -> np.ndarray:
-        """Write out, zeros and all: (N, K)."""
-        out = np.zeros((len(self.start) - 1, num_classes), self.values.dtype)
+        """Return the array with its zeros, (N, K)."""
+        out = np.zeros((len(self.indptr) - 1, num_classes), self.data.dtype)
         self.write(out)
         return out
 
@@ -72,66 +72,62 @@ class Rows(NamedTuple):
         """Write the entries into an array, and leave the rest of it as it is."""
         _write(*self, out)
 
-    def united(self, other: Rows) -> tuple[Rows, Rows]:
-        """Give both the places of either, filled up with zeros."""
-        start = np.zeros_like(self.start)
-        _count_united(self.start, self.classes, other.start, other.classes, start[1:])
-        np.cumsum(start, out=start)
-        classes = np.empty(start[-1], np.uint32)
-        values = np.empty(start[-1], self.values.dtype), np.empty(start[-1], other.values.dtype)
-        _unite(*self, *other, start, classes, *values)
-        return Rows(start, classes, values[0]), Rows(start, classes, values[1])
+    def united(self, other: CSRRows) -> tuple[CSRRows, CSRRows]:
+        """Give both arrays the pattern of either, filled up with explicit zeros."""
+        indptr = np.zeros_like(self.indptr)
+        _count_united(self.indptr, self.indices, other.indptr, other.indices, indptr[1:])
+        np.cumsum(indptr, out=indptr)
+        indices = np.empty(indptr[-1], np.uint32)
+        data = np.empty(indptr[-1], self.data.dtype), np.empty(indptr[-1], other.data.dtype)
+        _unite(*self, *other, indptr, indices, *data)
+        return CSRRows(indptr, indices, data[0]), CSRRows(indptr, indices, data[1])
 
-    def moved(
+    def scattered(
         self,
         ids: np.ndarray,  # (N,) distinct
         count: int,
-    ) -> Rows:
-        """Make row ids[i], of `count` rows, of row i; the others have no entries."""
+    ) -> CSRRows:
+        """Scatter row i to row ids[i] of `count` rows; the others are empty."""
         source = np.full(count, -1, np.int64)
         source[ids] = np.arange(len(ids))
-        start = np.zeros(count + 1, np.int64)
-        start[1:][ids] = np.diff(self.start)
-        np.cumsum(start, out=start)
-        _, classes, values = self.take(source[source >= 0])
-        return Rows(start, classes, values)
+        indptr = np.zeros(count + 1, np.int64)
+        indptr[1:][ids] = np.diff(self.indptr)
+        np.cumsum(indptr, out=indptr)
+        _, indices, data = self.take(source[source >= 0])
+        return CSRRows(indptr, indices, data)
 
-    def normalised(self) -> Rows:
+    def normalised(self) -> CSRRows:
         """Scale each row of float32 to sum 1, in place; rows of zeros stay zero."""
-        _normalise(self.start, self.values)
+        _normalise(self.indptr, self.data)
         return self
 
-    def nonzero(self) -> Rows:
-        """Leave out entries that have become zero."""
-        kept = self.values != 0
-        return Rows(starts(kept)[self.start], self.classes[kept], self.values[kept])
+    def nonzero(self) -> CSRRows:
+        """Drop entries that have become zero."""
+        kept = self.data != 0
+        return CSRRows(starts(kept)[self.indptr], self.indices[kept], self.data[kept])
 
     def take(
         self,
         ids: np.ndarray,  # (M,)
-    ) -> Rows:
+    ) -> CSRRows:
         """Copy some rows: M of them."""
-        start = starts((self.start[1:] - self.start[:-1])[ids])
-        rows = Rows(start, np.empty(start[-1], np.uint32), np.empty(start[-1], self.values.dtype))
+        indptr = starts((self.indptr[1:] - self.indptr[:-1])[ids])
+        rows = CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], self.data.dtype))
         _take(*self, ids, *rows)
         return rows
 
-    def places(
+    def positions(
         self,
         ids: np.ndarray,  # (M,)
-    ) -> Rows:
-        """Of some rows, where in `values` their entries stand, as values: (Z',) int64."""
-        lengths = (self.start[1:] - self.start[:-1])[ids]
-        start = starts(lengths)
-        places = np.empty(start[-1], np.int64)
-        _place(self.start, ids, start, places)
-        return Rows(start, self.classes[places], places)
+    ) -> CSRRows:
+        """Find where in `data` the entries of some rows stand: M rows of int64."""
+        return self.with_data(np.arange(len(self.data))).take(ids)
 
 
 def starts(
     counts: np.ndarray,  # (n,)
 ) -> np.ndarray:
-    """Tell where each of several parts begins, and the last one ends: (n + 1,) int64."""
+    """Return the offset at which each of n consecutive parts begins, and the end of the last: (n + 1,) int64."""
     return np.concatenate([[0], np.cumsum(counts)])
 
 
@@ -163,66 +159,59 @@ def _count(array: np.ndarray, counts: np.ndarray) -> None:
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _fill(array: np.ndarray, start: np.ndarray, classes: np.ndarray, values: np.ndarray) -> None:
+def _fill(array: np.ndarray, indptr: np.ndarray, indices: np.ndarray, data: np.ndarray) -> None:
     for i in nb.prange(array.shape[0]):
-        z = start[i]
-        if z < start[i + 1]:
+        z = indptr[i]
+        if z < indptr[i + 1]:
             for k in range(array.shape[1]):
                 if array[i, k] != 0:
-                    classes[z], values[z] = k, array[i, k]
+                    indices[z], data[z] = k, array[i, k]
                     z += 1
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _write(start: np.ndarray, classes: np.ndarray, values: np.ndarray, out: np.ndarray) -> None:
+def _write(indptr: np.ndarray, indices: np.ndarray, data: np.ndarray, out: np.ndarray) -> None:
     for i in nb.prange(out.shape[0]):
-        for z in range(start[i], start[i + 1]):
-            out[i, classes[z]] = values[z]
+        for z in range(indptr[i], indptr[i + 1]):
+            out[i, indices[z]] = data[z]
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _normalise(start: np.ndarray, values: np.ndarray) -> None:
-    for i in nb.prange(start.shape[0] - 1):
+def _normalise(indptr: np.ndarray, data: np.ndarray) -> None:
+    for i in nb.prange(indptr.shape[0] - 1):
         total = np.float32(0.0)
-        for z in range(start[i], start[i + 1]):
-            total += values[z]
+        for z in range(indptr[i], indptr[i + 1]):
+            total += data[z]
         if total > 0:
-            for z in range(start[i], start[i + 1]):
-                values[z] /= total
+            for z in range(indptr[i], indptr[i + 1]):
+                data[z] /= total
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def _take(
-    start: np.ndarray,
-    classes: np.ndarray,
-    values: np.ndarray,
+    indptr: np.ndarray,
+    indices: np.ndarray,
+    data: np.ndarray,
     ids: np.ndarray,
-    taken_start: np.ndarray,
-    taken_classes: np.ndarray,
+    taken_indptr: np.ndarray,
+    taken_indices: np.ndarray,
     taken: np.ndarray,
 ) -> None:
     for m in nb.prange(ids.shape[0]):
-        first = start[ids[m]]
-        for j in range(taken_start[m + 1] - taken_start[m]):
-            taken_classes[taken_start[m] + j], taken[taken_start[m] + j] = classes[first + j], values[first + j]
-
-
-@nb.njit(parallel=True, nogil=True, cache=True)
-def _place(start: np.ndarray, ids: np.ndarray, part_start: np.ndarray, places: np.ndarray) -> None:
-    for m in nb.prange(ids.shape[0]):
-        for j in range(part_start[m + 1] - part_start[m]):
-            places[part_start[m] + j] = start[ids[m]] + j
+        first = indptr[ids[m]]
+        for j in range(taken_indptr[m + 1] - taken_indptr[m]):
+            taken_indices[taken_indptr[m] + j], taken[taken_indptr[m] + j] = indices[first + j], data[first + j]
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def _count_united(
-    start: np.ndarray, classes: np.ndarray, other_start: np.ndarray, other_classes: np.ndarray, counts: np.ndarray
+    indptr: np.ndarray, indices: np.ndarray, other_indptr: np.ndarray, other_indices: np.ndarray, counts: np.ndarray
 ) -> None:
     for i in nb.prange(counts.shape[0]):
-        a, b, n = start[i], other_start[i], 0
-        while a < start[i + 1] or b < other_start[i + 1]:
-            first = classes[a] if a < start[i + 1] else _NONE
-            second = other_classes[b] if b < other_start[i + 1] else _NONE
+        a, b, n = indptr[i], other_indptr[i], 0
+        while a < indptr[i + 1] or b < other_indptr[i + 1]:
+            first = indices[a] if a < indptr[i + 1] else _NONE
+            second = other_indices[b] if b < other_indptr[i + 1] else _NONE
             a += first <= second
             b += second <= first
             n += 1
@@ -231,24 +220,24 @@ def _count_united(
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def _unite(
-    start: np.ndarray,
-    classes: np.ndarray,
-    values: np.ndarray,
-    other_start: np.ndarray,
-    other_classes: np.ndarray,
-    other_values: np.ndarray,
-    united_start: np.ndarray,
-    united_classes: np.ndarray,
-    united_values: np.ndarray,
+    indptr: np.ndarray,
+    indices: np.ndarray,
+    data: np.ndarray,
+    other_indptr: np.ndarray,
+    other_indices: np.ndarray,
+    other_data: np.ndarray,
+    united_indptr: np.ndarray,
+    united_indices: np.ndarray,
+    united_data: np.ndarray,
     united_other: np.ndarray,
 ) -> None:
-    for i in nb.prange(start.shape[0] - 1):
-        a, b = start[i], other_start[i]
-        for z in range(united_start[i], united_start[i + 1]):
-            first = classes[a] if a < start[i + 1] else _NONE
-            second = other_classes[b] if b < other_start[i + 1] else _NONE
-            united_classes[z] = min(first, second)
-            united_values[z] = values[a] if first <= second else 0
-            united_other[z] = other_values[b] if second <= first else 0
+    for i in nb.prange(indptr.shape[0] - 1):
+        a, b = indptr[i], other_indptr[i]
+        for z in range(united_indptr[i], united_indptr[i + 1]):
+            first = indices[a] if a < indptr[i + 1] else _NONE
+            second = other_indices[b] if b < other_indptr[i + 1] else _NONE
+            united_indices[z] = min(first, second)
+            united_data[z] = data[a] if first <= second else 0
+            united_other[z] = other_data[b] if second <= first else 0
             a += first <= second
             b += second <= first

@@ -21,7 +21,7 @@ from functools import cached_property
 import numba as nb
 import numpy as np
 
-from gsseg_core.csr_rows import Rows, starts
+from gsseg_core.csr_rows import CSRRows, starts
 from gsseg_core.data.label_images import UNKNOWN
 
 _ROUNDS = 50
@@ -98,16 +98,16 @@ class Meaning:
         return shares
 
     @cached_property
-    def votes(self) -> Rows:
+    def votes(self) -> CSRRows:
         """What a pixel of each label votes: the mass of a class, less the rest if it was looked for; float64."""
         if self.mass is None:
-            return Rows(np.arange(len(self.classes) + 1), self.classes.astype(np.uint32), np.ones(len(self.classes)))
+            return CSRRows(np.arange(len(self.classes) + 1), self.classes.astype(np.uint32), np.ones(len(self.classes)))
         votes = np.zeros((len(self.mass), len(self.concerned)))
         votes[:, np.searchsorted(self.concerned, self.classes)] = self.mass
         if self.supervised is not None:
             votes -= self.rest[:, None].astype(np.float64)
-        rows = Rows.of(votes)
-        return Rows(rows.start, self.concerned[rows.classes].astype(np.uint32), rows.values)
+        rows = CSRRows.from_dense(votes)
+        return CSRRows(rows.indptr, self.concerned[rows.indices].astype(np.uint32), rows.data)
 
     @property
     def concerned(self) -> np.ndarray:
@@ -154,20 +154,20 @@ class Meaning:
 
 
 def standing(
-    votes: Rows,  # int64
+    votes: CSRRows,  # int64
     possible: np.ndarray,  # (K,) bool: ids that are classes
-) -> Rows:
+) -> CSRRows:
     """Keep of votes for and against classes what can be said with them, at least 0; all if none is against.
 
     A class whose looks went against it is out. If all classes but one were looked for at a Gaussian, that one stands
     for "none of these", with as many votes as the one that was looked for least.
     """
-    if votes.values.min(initial=0) >= 0:
+    if votes.data.min(initial=0) >= 0:
         return votes
-    counts, ids = np.empty(len(votes.start) - 1, np.int64), np.flatnonzero(possible)
+    counts, ids = np.empty(len(votes.indptr) - 1, np.int64), np.flatnonzero(possible)
     _count_standing(*votes, ids, counts)
     start = starts(counts)
-    out = Rows(start, np.empty(start[-1], np.uint32), np.empty(start[-1], np.int64))
+    out = CSRRows(start, np.empty(start[-1], np.uint32), np.empty(start[-1], np.int64))
     _keep_standing(*votes, ids, *out)
     return out
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from gsseg_core.csr_rows import Rows
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import View, spread
 from gsseg_core.data.label_evidence import Meaning
 from gsseg_core.data.label_images import UNKNOWN, PackedLabels
@@ -114,10 +114,10 @@ class OtherViews:
         self.learner = learner
         self._sampled = {view.name for view in spread(list(learner.views.values()), VIEWS)}
         self._samples: dict[str, Sample] = {}
-        self._codes = Rows.of(learner.codes_)
+        self._codes = CSRRows.from_dense(learner.codes_)
         # Where no other view has seen anything, nothing is to be said.
-        self._prior = np.zeros_like(self._codes.values)
-        self._shows_background = bool((self._codes.classes == 0).any())
+        self._prior = np.zeros_like(self._codes.data)
+        self._shows_background = bool((self._codes.indices == 0).any())
         total = len(learner.views)
         done = itertools.count()
         self._gains, _ = learner._gains(
@@ -139,11 +139,11 @@ class OtherViews:
         """Blend what all the others say into a view, (H, W, K) float32; rows sum to less where they are silent."""
         learner = self.learner
         model = learner.error_models_[view.name]
-        observation, codes = learner.observation(view.name), self._codes.values.copy()
-        places = self._codes.places(observation.ids[observation.order]).values
-        codes[places] = codes_without(observation, model, self._codes, self._gains, self._prior).values
+        observation, codes = learner.observation(view.name), self._codes.data.copy()
+        places = self._codes.positions(observation.ids[observation.order]).data
+        codes[places] = codes_without(observation, model, self._codes, self._gains, self._prior).data
         operator = make_operator(learner.scene, view.camera, learner.device)
-        image, left_over = operator.blend_rows(self._codes.with_values(codes), learner.num_classes)
+        image, left_over = operator.blend_rows(self._codes.with_data(codes), learner.num_classes)
         if self._shows_background:
             image[..., 0] += left_over
         return image

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsseg_core.csr_rows import Rows
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import Meaning
 from gsseg_core.errors import MaskSizeError, SceneValueError, SettingsError
 from gsseg_core.raster.cpu.label_pairs import add_votes
@@ -230,7 +230,7 @@ class ViewOperator(ABC):
             raise SceneValueError(f"codes have shape {codes.shape}; expected ({self.num_gaussians}, K)")
         return self._blend(codes)
 
-    def blend_rows(self, codes: Rows, num_classes: int) -> Blended:
+    def blend_rows(self, codes: CSRRows, num_classes: int) -> Blended:
         """Do the same for codes (N, K) of which only the entries that are not zero are at hand."""
         return self._blend(codes.dense(num_classes))
 

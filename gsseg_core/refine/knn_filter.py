@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsseg_core.csr_rows import Rows, largest
+from gsseg_core.csr_rows import CSRRows, largest
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.spatial.neighbourhood import Neighbours
 
@@ -78,8 +78,8 @@ def cluster(
     refined, changed = codes.copy(), np.zeros(len(codes), bool)
     if len(means) > 1 and wanted.any() and observed.any():
         known = neighbours or Neighbours.among(means, k)
-        found = known.mean_codes(Rows.of(codes), observed, codes.shape[1], wanted)
-        changed = np.diff(found.start) > 0
+        found = known.mean_codes(CSRRows.from_dense(codes), observed, codes.shape[1], wanted)
+        changed = np.diff(found.indptr) > 0
         refined[changed] = 0.0
         found.write(refined)
     return Clustered(refined, changed)

@@ -17,7 +17,7 @@ from itertools import pairwise
 import numba as nb
 import numpy as np
 
-from gsseg_core.csr_rows import Rows
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 from gsseg_core.simd import at_most, first_bit, load_row
@@ -82,21 +82,21 @@ class Neighbours:
 
     def mean_codes(
         self,
-        codes: Rows,  # N rows of K classes, float32 in [0, 1]
+        codes: CSRRows,  # N rows of K classes, float32 in [0, 1]
         counted: np.ndarray,  # (N,) bool
         num_classes: int,
         wanted: np.ndarray | None = None,  # (N,) bool
-    ) -> Rows:
+    ) -> CSRRows:
         """Mean code of those of the k nearest others that are counted, for all points or for those wanted.
 
         Returns
         -------
-        Rows
+        CSRRows
             N rows; one without entries where there is no such neighbour, or the point is not wanted.
         """
         order, tree = self.tree.order, self.tree
-        read = np.repeat(counted, np.diff(codes.start))
-        units = np.rint(codes.values * np.float32(1 / CODE_UNIT), where=read, out=np.zeros_like(codes.values))
+        read = np.repeat(counted, np.diff(codes.indptr))
+        units = np.rint(codes.data * np.float32(1 / CODE_UNIT), where=read, out=np.zeros_like(codes.data))
         units = units.astype(np.int32)
         mine = np.ones(len(order), bool) if wanted is None else wanted[order]
         asked = np.flatnonzero(mine)
@@ -107,11 +107,11 @@ class Neighbours:
             places = asked[first : first + BLOCK].astype(np.int32)
             out = np.zeros((len(places), num_classes), np.float32)
             average(
-                tree.points, tree.boxes, tree.blocks, order, codes.start, codes.classes, units, counted, places,
+                tree.points, tree.boxes, tree.blocks, order, codes.indptr, codes.indices, units, counted, places,
                 self.radii, self.k, out,
             )  # fmt: skip
-            parts.append(Rows.of(out))
-        return Rows.joined(parts).moved(order[asked], len(order))
+            parts.append(CSRRows.from_dense(out))
+        return CSRRows.vstack(parts).scattered(order[asked], len(order))
 
     def class_distances(
         self,
@@ -164,7 +164,7 @@ def average(
     boxes: np.ndarray,  # (2 L, 6)
     blocks: np.ndarray,  # (L, 3, LEAF)
     order: np.ndarray,  # (n,), which row each point has
-    rows: np.ndarray,  # (n + 1,) codes, as `Rows`
+    rows: np.ndarray,  # (n + 1,) codes, as `CSRRows`
     classes: np.ndarray,  # (Z,)
     units: np.ndarray,  # (Z,) int32, in steps of CODE_UNIT
     counted: np.ndarray,  # (n,) bool, by row

@@ -24,7 +24,7 @@ from small_scenes import (
 )
 from threadpoolctl import threadpool_limits
 
-from gsseg_core.csr_rows import Rows
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import View
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn.em.em_kernels import GAIN_UNIT, collect, improve, promised
@@ -202,22 +202,22 @@ def test_it_stops_by_itself(views: list[View]) -> None:
 
 def test_no_step_gains_more_than_its_slope_promises() -> None:
     learner = taught(EMLearner(SCENE, NUM_CLASSES), wrong_views(4))
-    votes = Rows.of(learner._votes)
+    votes = CSRRows.from_dense(learner._votes)
     models = learner._first_models(votes, {}, lambda: None)
-    codes, prior = votes.with_values(votes.values.astype(np.float32)).normalised(), np.full(len(votes.values), 0.1)
+    codes, prior = votes.with_data(votes.data.astype(np.float32)).normalised(), np.full(len(votes.data), 0.1)
 
     def look() -> tuple[np.ndarray, float]:
         gains, told = learner._gains(codes, models, lambda: None)
-        return gains, sum(told.values()) + (prior * np.log(codes.values.astype(np.float64))).sum()
+        return gains, sum(told.values()) + (prior * np.log(codes.data.astype(np.float64))).sum()
 
     gains, objective = look()
     slopes, gained = [], []
     for _ in range(6):
-        before = codes.values.astype(np.float64)
-        slopes.append(promised(codes.start, codes.values, gains, prior.astype(np.float32)))
-        improve(codes.start, codes.values, gains, prior.astype(np.float32))
+        before = codes.data.astype(np.float64)
+        slopes.append(promised(codes.indptr, codes.data, gains, prior.astype(np.float32)))
+        improve(codes.indptr, codes.data, gains, prior.astype(np.float32))
         gradient = gains * GAIN_UNIT + prior / before
-        np.testing.assert_allclose(slopes[-1], gradient @ (codes.values - before), rtol=1e-3)
+        np.testing.assert_allclose(slopes[-1], gradient @ (codes.data - before), rtol=1e-3)
         gains, after = look()
         gained.append(after - objective)
         objective = after
@@ -268,8 +268,8 @@ def test_the_order_of_the_gaussians_does_not_matter() -> None:
 @given(groups=st.lists(st.integers(0, 2), min_size=6, max_size=6), order=st.permutations(range(6)))
 def test_sums_over_views_do_not_depend_on_order_or_grouping(groups: list[int], order: list[int]) -> None:
     learner = taught(EMLearner(SCENE, NUM_CLASSES), [with_clutter(view) for view in wrong_views(6)])
-    codes, names = Rows.of(learner.vote_codes() + np.float32(0.01)), list(learner.views)
-    votes = Rows.of(learner._votes)
+    codes, names = CSRRows.from_dense(learner.vote_codes() + np.float32(0.01)), list(learner.views)
+    votes = CSRRows.from_dense(learner._votes)
     models = learner._first_models(votes, learner._judge(votes, lambda: None)[1], lambda: None)
     whole, told = learner._gains(codes, deepcopy(models), lambda: None)
     parts = np.zeros_like(whole)
@@ -283,21 +283,21 @@ def test_sums_over_views_do_not_depend_on_order_or_grouping(groups: list[int], o
 
 def test_codes_without_a_view_are_a_step_with_the_gains_of_all_the_others() -> None:
     learner = taught(EMLearner(SCENE, NUM_CLASSES), [with_clutter(view) for view in wrong_views(4)])
-    codes = Rows.of(learner.vote_codes() + np.float32(0.01))
-    prior = np.random.default_rng(0).uniform(0, 3, len(codes.values)).astype(np.float32)
-    votes = Rows.of(learner._votes)
+    codes = CSRRows.from_dense(learner.vote_codes() + np.float32(0.01))
+    prior = np.random.default_rng(0).uniform(0, 3, len(codes.data)).astype(np.float32)
+    votes = CSRRows.from_dense(learner._votes)
     models = learner._first_models(votes, learner._judge(votes, lambda: None)[1], lambda: None)
     gains, _ = learner._gains(codes, models, lambda: None)
     for name in learner.views:
         observation = learner.observation(name)
         others, _ = learner._gains(codes, {other: models[other] for other in models if other != name}, lambda: None)
-        expected = codes.with_values(codes.values.copy())
-        improve(expected.start, expected.values, others, prior)
-        seen = expected.places(observation.ids[observation.order])
+        expected = codes.with_data(codes.data.copy())
+        improve(expected.indptr, expected.data, others, prior)
+        seen = expected.positions(observation.ids[observation.order])
         found = codes_without(observation, models[name], codes, gains, prior)
         np.testing.assert_array_equal(found.start, seen.start)
         np.testing.assert_array_equal(found.classes, seen.classes)
-        np.testing.assert_array_equal(found.values, expected.values[seen.values])
+        np.testing.assert_array_equal(found.data, expected.data[seen.data])
 
 
 def test_what_was_all_but_ruled_out_does_not_overflow_the_sums() -> None:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views
 
-from gsseg_core.csr_rows import Rows
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import View
 from gsseg_core.data.label_evidence import Meaning, standing
 from gsseg_core.learn.em.em_learner import EMLearner
@@ -41,7 +41,7 @@ def slow_count(
         mine = slice(observation.start[m], observation.start[m + 1])
         label, pixels = observation.labels[mine], own[mine]
         others = votes[i] - np.rint(pixels[:, None] * voted[label] * UNITS).astype(np.int64).sum(axis=0)
-        others = standing(Rows.of(others[None]), POSSIBLE).dense(NUM_CLASSES)[0]
+        others = standing(CSRRows.from_dense(others[None]), POSSIBLE).dense(NUM_CLASSES)[0]
         if not others.any():
             continue
         code = (others / others.sum()) ** power
@@ -59,7 +59,7 @@ def test_counts_by_the_others_are_those_of_a_slow_twin(seed: int, power: float, 
     shape = learner._votes.shape
     votes = learner._votes + rng.integers(0, int(UNITS), shape) * (rng.random(shape) < 0.2)
     meaning = observation.meaning.without(rng.random(len(observation.classes)) < 0.3)
-    found = counted_by_others(Rows.of(votes), observation, POSSIBLE, meaning, power, most)
+    found = counted_by_others(CSRRows.from_dense(votes), observation, POSSIBLE, meaning, power, most)
     np.testing.assert_allclose(found, slow_count(votes, observation, meaning, power, most), rtol=1e-4, atol=1e-4)
 
 
@@ -72,7 +72,7 @@ def test_votes_against_classes_leave_what_can_be_said_with_them(looked_for: list
         views.append(View.from_arrays(view.camera, found, supervised=looked_for))
     learner, observation = observed(views, views[2].name)
     assert (learner._votes < 0).any()
-    counts = counted_by_others(Rows.of(learner._votes), observation, POSSIBLE, observation.meaning, 4.0)
+    counts = counted_by_others(CSRRows.from_dense(learner._votes), observation, POSSIBLE, observation.meaning, 4.0)
     expected = slow_count(learner._votes, observation, observation.meaning, 4.0, np.inf)
     np.testing.assert_allclose(counts, expected, rtol=1e-4, atol=1e-4)
     assert counts.any()
@@ -81,4 +81,6 @@ def test_votes_against_classes_leave_what_can_be_said_with_them(looked_for: list
 def test_a_view_alone_has_nobody_beside_it() -> None:
     view = clean_views(1)[0]
     learner, observation = observed([view], view.name)
-    assert not counted_by_others(Rows.of(learner._votes), observation, POSSIBLE, observation.meaning, 4.0).any()
+    assert not counted_by_others(
+        CSRRows.from_dense(learner._votes), observation, POSSIBLE, observation.meaning, 4.0
+    ).any()

@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as arrays
 from scipy import ndimage
 from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, mean_iou, taught, with_clutter
 
-from gsseg_core.csr_rows import Rows
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import SeenLabels
@@ -108,7 +108,7 @@ def test_a_region_is_in_doubt_only_where_the_others_saw_enough_of_it(seen: float
     votes = learner._votes.copy()
     votes[:, NUM_CLASSES] = seen * votes.sum(axis=1)  # all is one more class to the others
     observation, possible = learner._prepared[view.name], np.ones(NUM_CLASSES + 1, bool)
-    doubtful = in_doubt(Rows.of(votes), observation, possible, EMSettings().least_agreement)
+    doubtful = in_doubt(CSRRows.from_dense(votes), observation, possible, EMSettings().least_agreement)
     assert len(doubtful) >= NUM_CLASSES
     np.testing.assert_array_equal(doubtful, doubted)
 

@@ -21,7 +21,7 @@ from small_scenes import (
 )
 
 from gsseg_core.cli.main import main
-from gsseg_core.csr_rows import Rows
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import View
 from gsseg_core.data.label_evidence import Meaning, guess, standing
 from gsseg_core.data.label_images import UNKNOWN
@@ -218,7 +218,7 @@ def test_what_stands_of_votes_is_what_a_slow_twin_keeps(rows: list[list[int]], i
             free = [k for k in np.flatnonzero(possible) if row[k] == 0]
             if len(free) == 1 and (row < 0).any():
                 expected[i, free[0]] = np.abs(row[row != 0]).min()
-    np.testing.assert_array_equal(standing(Rows.of(votes), possible).dense(5), expected)
+    np.testing.assert_array_equal(standing(CSRRows.from_dense(votes), possible).dense(5), expected)
 
 
 def test_where_several_classes_are_left_they_share_by_how_frequent_they_are() -> None:

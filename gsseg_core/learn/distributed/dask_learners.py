@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from gsseg_core.csr_rows import Rows
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import View
 from gsseg_core.errors import GssegError, SchedulerError
 from gsseg_core.learn.distributed.dask_cluster import PATIENCE, UNREACHABLE, check_workers, find_workers, name_of
@@ -251,7 +251,7 @@ class DistributedEM(_OnWorkers, EMLearner):
 
     def _judge(
         self,
-        votes: Rows,  # int64
+        votes: CSRRows,  # int64
         tell: Callable[[], None],
         names: Iterable[str] | None = None,
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -259,7 +259,7 @@ class DistributedEM(_OnWorkers, EMLearner):
 
     def _first_models(
         self,
-        votes: Rows,  # int64
+        votes: CSRRows,  # int64
         doubts: Mapping[str, np.ndarray],  # (L,) bool
         tell: Callable[[], None],
         names: Iterable[str] | None = None,
@@ -269,7 +269,7 @@ class DistributedEM(_OnWorkers, EMLearner):
 
     def _gains(
         self,
-        codes: Rows,
+        codes: CSRRows,
         models: dict[str, ErrorModel],
         tell: Callable[[], None],
     ) -> tuple[np.ndarray, dict[str, float]]:
@@ -277,7 +277,7 @@ class DistributedEM(_OnWorkers, EMLearner):
 
     def _refit(
         self,
-        codes: Rows,
+        codes: CSRRows,
         gains: np.ndarray,  # (Z,) int64
         prior: np.ndarray,  # (Z,) px
         models: dict[str, ErrorModel],

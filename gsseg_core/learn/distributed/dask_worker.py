@@ -18,7 +18,7 @@ import numba
 import numpy as np
 from numpy.lib.recfunctions import repack_fields
 
-from gsseg_core.csr_rows import Rows
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import View
 from gsseg_core.errors import GssegError
 from gsseg_core.files.input_files import open_input
@@ -113,7 +113,7 @@ def sum_votes(shard: Shard, wanted: dict[str, Any]) -> Part:
 def sum_doubted(
     shard: Shard,
     wanted: dict[str, Any],
-    votes: Rows,  # int64
+    votes: CSRRows,  # int64
 ) -> Part:
     """Count the votes that are in doubt; beside them, what they have been given to."""
     with _all_threads():
@@ -123,7 +123,7 @@ def sum_doubted(
 def start_models(
     shard: Shard,
     doubts: dict[str, np.ndarray | None],
-    votes: Rows,  # int64
+    votes: CSRRows,  # int64
 ) -> Part:
     """Make the first error model of each view."""
     with _all_threads():
@@ -134,7 +134,7 @@ def start_models(
 def sum_gains(
     shard: Shard,
     models: dict[str, ErrorModel],
-    codes: Rows,
+    codes: CSRRows,
 ) -> Part:
     """Sum up gains; beside them, each view's part of J."""
     with _all_threads():
@@ -144,7 +144,7 @@ def sum_gains(
 def refit_models(
     shard: Shard,
     models: dict[str, ErrorModel],
-    codes: Rows,
+    codes: CSRRows,
     gains: np.ndarray,  # (Z,) int64
     prior: np.ndarray,  # (Z,)
 ) -> Part:
@@ -174,9 +174,9 @@ def _all_threads() -> Iterator[None]:
         yield
 
 
-def _as_compiled_for(rows: Rows) -> Rows:
+def _as_compiled_for(rows: CSRRows) -> CSRRows:
     """Kernels would be compiled once more for arrays that cannot be written to, as those from the network may be."""
-    return Rows(*(np.require(array, requirements=["C", "W"]) for array in rows))
+    return CSRRows(*(np.require(array, requirements=["C", "W"]) for array in rows))
 
 
 def _go_on() -> None: ...

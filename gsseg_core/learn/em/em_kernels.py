@@ -44,7 +44,7 @@ def in_units(_: Any, __: Any) -> Any:
 
 @nb.njit(parallel=True, nogil=True, cache=True, fastmath={"contract", "reassoc"})
 def mix(
-    rows: np.ndarray,  # (N + 1,) codes, as `Rows`
+    rows: np.ndarray,  # (N + 1,) codes, as `CSRRows`
     classes: np.ndarray,  # (Z,) uint32
     codes: np.ndarray,  # (Z,) float32
     order: np.ndarray,  # (M,) int32: in which to go through the Gaussians
@@ -69,7 +69,7 @@ def mix(
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def collect(
-    rows: np.ndarray,  # (N + 1,) gains, as `Rows`
+    rows: np.ndarray,  # (N + 1,) gains, as `CSRRows`
     classes: np.ndarray,  # (Z,)
     gains: np.ndarray,  # (Z,) int64, in units of GAIN_UNIT, added to
     order: np.ndarray,  # (M,) int32: in which to go through the Gaussians
@@ -92,7 +92,7 @@ def collect(
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def improve(
-    rows: np.ndarray,  # (N + 1,) all three, as `Rows`
+    rows: np.ndarray,  # (N + 1,) all three, as `CSRRows`
     codes: np.ndarray,  # (Z,) float32, changed in place
     gains: np.ndarray,  # (Z,) int64, in units of GAIN_UNIT
     prior: np.ndarray,  # (Z,) float32, px
@@ -110,7 +110,7 @@ def improve(
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def promised(
-    rows: np.ndarray,  # (N + 1,) all three, as `Rows`
+    rows: np.ndarray,  # (N + 1,) all three, as `CSRRows`
     codes: np.ndarray,  # (Z,) float32
     gains: np.ndarray,  # (Z,) int64, in units of GAIN_UNIT
     prior: np.ndarray,  # (Z,) float32, px
@@ -135,7 +135,7 @@ def promised(
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def improve_without(
-    rows: np.ndarray,  # (N + 1,) all three that follow, as `Rows`
+    rows: np.ndarray,  # (N + 1,) all three that follow, as `CSRRows`
     classes: np.ndarray,  # (Z,)
     codes: np.ndarray,  # (Z,) float32
     gains: np.ndarray,  # (Z,) int64, in units of GAIN_UNIT
@@ -146,7 +146,7 @@ def improve_without(
     labels: np.ndarray,  # (P,) int32
     likelihood: np.ndarray,  # (L, K) float32
     shares: np.ndarray,  # (P,) float32
-    out_rows: np.ndarray,  # (M + 1,) the result, as `Rows` in that order
+    out_rows: np.ndarray,  # (M + 1,) the result, as `CSRRows` in that order
     out_classes: np.ndarray,  # (Z',) out
     out: np.ndarray,  # (Z',) float32 out
 ) -> None:
@@ -169,7 +169,7 @@ def improve_without(
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def tally(
-    rows: np.ndarray,  # (M + 1,) codes, as `Rows`
+    rows: np.ndarray,  # (M + 1,) codes, as `CSRRows`
     classes: np.ndarray,  # (Z,)
     codes: np.ndarray,  # (Z,) float32
     order: np.ndarray,  # (M,) int32: whose rows these are
@@ -227,7 +227,7 @@ def take_row(
     classes: np.ndarray,  # (n,) of one Gaussian
     total: np.ndarray,  # (n,) int64, taken from
     labels: np.ndarray,  # (s,) label of each of its sightings
-    said_start: np.ndarray,  # (L + 1,) what a pixel of each label votes, as `Rows`
+    said_start: np.ndarray,  # (L + 1,) what a pixel of each label votes, as `CSRRows`
     said_classes: np.ndarray,
     said: np.ndarray,  # float64
     votes: np.ndarray,  # (s,) float32
@@ -250,7 +250,7 @@ def take_votes(
     order: np.ndarray,  # (M,) int32: whose rows these are
     start: np.ndarray,  # (M + 1,)
     labels: np.ndarray,  # (P,) int32: label of each sighting
-    said_start: np.ndarray,  # (L + 1,) what a pixel of each label votes, as `Rows`
+    said_start: np.ndarray,  # (L + 1,) what a pixel of each label votes, as `CSRRows`
     said_classes: np.ndarray,
     said: np.ndarray,  # float64
     votes: np.ndarray,  # (P,) float32

@@ -56,7 +56,7 @@ from functools import partial
 
 import numpy as np
 
-from gsseg_core.csr_rows import Rows, starts
+from gsseg_core.csr_rows import CSRRows, starts
 from gsseg_core.data.label_evidence import standing
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.errors import SettingsError
@@ -174,19 +174,17 @@ class EMLearner(Learner):
         """Step until a step can gain no more than the tolerance."""
         settings = self.settings
         self._begin()
-        votes, tell = Rows.of(self._votes), partial(progress, "em", 0, settings.max_steps)
+        votes, tell = CSRRows.from_dense(self._votes), partial(progress, "em", 0, settings.max_steps)
         doubts: dict[str, np.ndarray] = {}
         if settings.judges:
             doubted, doubts = self._judge(votes, tell)
-            votes = votes.with_values(votes.values - doubted).nonzero()
+            votes = votes.with_data(votes.data - doubted).nonzero()
         stands = standing(votes, self._possible())
-        self.observed_ = np.diff(stands.start) > 0
+        self.observed_ = np.diff(stands.indptr) > 0
         counted, prior = stands.united(self._smooth(stands))
         # Votes are the first step; with the prior counted in, the objective is finite from the start. What is zero now
         # is zero after every step, so the codes keep these places.
-        codes = counted.with_values(
-            counted.values.astype(np.float32) * np.float32(VOTE_UNIT) + prior.values
-        ).normalised()
+        codes = counted.with_data(counted.data.astype(np.float32) * np.float32(VOTE_UNIT) + prior.data).normalised()
         history: list[float] = []
         self.history_ = history
         models = self._first_models(votes, doubts, tell)
@@ -195,15 +193,15 @@ class EMLearner(Learner):
         while len(history) < settings.max_steps:
             tell = partial(progress, "em", len(history), settings.max_steps)
             gains, told = self._gains(codes, models, tell)
-            history.append((_log_prior(codes.values, prior.values) + sum(told[name] for name in self.views)) / pixels)
+            history.append((_log_prior(codes.data, prior.data) + sum(told[name] for name in self.views)) / pixels)
             rounds[-1] += 1
             last = len(rounds) > settings.refits or not settings.errors
             enough = settings.tolerance * (1 if last else ROUGH) * pixels
-            settled = promised(codes.start, codes.values, gains, prior.values) < enough
+            settled = promised(codes.indptr, codes.data, gains, prior.data) < enough
             if settled and not last:
-                self._refit(codes, gains, prior.values, models, tell)
+                self._refit(codes, gains, prior.data, models, tell)
                 rounds.append(0)
-            improve(codes.start, codes.values, gains, prior.values)
+            improve(codes.indptr, codes.data, gains, prior.data)
             self.converged_ = settled and last
             if self.converged_:
                 break
@@ -223,7 +221,7 @@ class EMLearner(Learner):
 
     def _judge(
         self,
-        votes: Rows,  # int64
+        votes: CSRRows,  # int64
         tell: Callable[[], None],
         names: Iterable[str] | None = None,
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -236,7 +234,7 @@ class EMLearner(Learner):
         doubts : dict of str to (L,) bool
             Which they are; views without any are left out.
         """
-        left, doubts = np.zeros_like(votes.values), {}
+        left, doubts = np.zeros_like(votes.data), {}
         for name, observation in self._observations(names):
             tell()
             doubtful = in_doubt(votes, observation, self._possible(), self.settings.least_agreement)
@@ -247,7 +245,7 @@ class EMLearner(Learner):
 
     def _first_models(
         self,
-        votes: Rows,  # int64
+        votes: CSRRows,  # int64
         doubts: Mapping[str, np.ndarray],  # (L,) bool
         tell: Callable[[], None],
         names: Iterable[str] | None = None,
@@ -259,7 +257,7 @@ class EMLearner(Learner):
             models[name] = self._first_model(votes, observation, doubts.get(name))
         return models
 
-    def _first_model(self, votes: Rows, observation: Observation, doubtful: np.ndarray | None) -> ErrorModel:
+    def _first_model(self, votes: CSRRows, observation: Observation, doubtful: np.ndarray | None) -> ErrorModel:
         settings, meaning = self.settings, observation.meaning
         if not settings.errors:
             return ErrorModel.trusting(meaning, self.num_classes, settings.outliers, observation.num_pixels)
@@ -271,7 +269,7 @@ class EMLearner(Learner):
 
     def _gains(
         self,
-        codes: Rows,
+        codes: CSRRows,
         models: dict[str, ErrorModel],
         tell: Callable[[], None],
     ) -> tuple[np.ndarray, dict[str, float]]:
@@ -284,19 +282,19 @@ class EMLearner(Learner):
         told : dict of str to float
             The part of J that is each view's own, at the codes and models that came in.
         """
-        gains, told = np.zeros(len(codes.values), np.int64), {}
+        gains, told = np.zeros(len(codes.data), np.int64), {}
         for name, observation in self._observations(models):
             tell()  # after each view, so that whoever listens can stop the work at once
             likelihood, taught = models[name].told
             seen = observation.order, observation.ids, observation.start, observation.labels
             shares = observation.shares(mix(*codes, *seen, likelihood), likelihood[:, 0])
             told[name] = shares.log_likelihood
-            collect(codes.start, codes.classes, gains, *seen, taught, shares.sightings)
+            collect(codes.indptr, codes.indices, gains, *seen, taught, shares.sightings)
         return gains, told
 
     def _refit(
         self,
-        codes: Rows,
+        codes: CSRRows,
         gains: np.ndarray,  # (Z,) int64, of a step at these codes and models
         prior: np.ndarray,  # (Z,) px
         models: dict[str, ErrorModel],
@@ -316,29 +314,29 @@ class EMLearner(Learner):
             model.maximise(model.expected(counts))
         return models
 
-    def _smooth(self, votes: Rows) -> Rows:
+    def _smooth(self, votes: CSRRows) -> CSRRows:
         """Weigh the mean code of those of the nearest Gaussians that were observed; rows without where none was."""
         neighbours = neighbours_of(self.scene, self.settings.prior_k)
         if neighbours is None or self.settings.prior_weight == 0:
-            return Rows(np.zeros_like(votes.start), np.empty(0, np.uint32), np.empty(0, np.float32))
-        codes = votes.with_values(votes.values.astype(np.float32) * np.float32(VOTE_UNIT)).normalised()
+            return CSRRows(np.zeros_like(votes.indptr), np.empty(0, np.uint32), np.empty(0, np.float32))
+        codes = votes.with_data(votes.data.astype(np.float32) * np.float32(VOTE_UNIT)).normalised()
         smooth = neighbours.mean_codes(codes, self.observed_, self.num_classes).normalised()
-        return smooth.with_values(np.float32(self.settings.prior_weight) * smooth.values)
+        return smooth.with_data(np.float32(self.settings.prior_weight) * smooth.data)
 
 
 def codes_without(
     observation: Observation,
     model: ErrorModel,
-    codes: Rows,
+    codes: CSRRows,
     gains: np.ndarray,  # (Z,) int64, of a step at these codes and models
     prior: np.ndarray,  # (Z,) float32, px
-) -> Rows:
+) -> CSRRows:
     """Take a step of EM that leaves a view's own summand out: codes of the M Gaussians that it sees, by `order`."""
     likelihood, taught = model.told
     seen = observation.order, observation.ids, observation.start, observation.labels
     shares = observation.shares(mix(*codes, *seen, likelihood), likelihood[:, 0])
-    start = starts(np.diff(codes.start)[observation.ids[observation.order]])
-    without = Rows(start, np.empty(start[-1], np.uint32), np.empty(start[-1], np.float32))
+    start = starts(np.diff(codes.indptr)[observation.ids[observation.order]])
+    without = CSRRows(start, np.empty(start[-1], np.uint32), np.empty(start[-1], np.float32))
     improve_without(*codes, gains, prior, *seen, taught, shares.sightings, *without)
     return without
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from gsseg_core.csr_rows import Rows
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import Meaning, stand
 from gsseg_core.learn.em.em_kernels import BLOCKS, take_row
 from gsseg_core.learn.learner import UNITS
@@ -13,7 +13,7 @@ from gsseg_core.raster.view_operator import Observation
 
 
 def counted_by_others(
-    votes: Rows,  # int64, of all views
+    votes: CSRRows,  # int64, of all views
     observation: Observation,
     possible: np.ndarray,  # (K,) bool: ids that are classes
     meaning: Meaning,
@@ -24,7 +24,7 @@ def counted_by_others(
 
     Parameters
     ----------
-    votes : Rows
+    votes : CSRRows
         Of all views, this one among them.
     observation : Observation
         The view.
@@ -58,7 +58,7 @@ def _raised(x: np.float32, power: float) -> np.float32:
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def _count(
-    rows: np.ndarray,  # (N + 1,) votes of all views, as `Rows`
+    rows: np.ndarray,  # (N + 1,) votes of all views, as `CSRRows`
     classes: np.ndarray,  # (Z,)
     votes: np.ndarray,  # (Z,) int64
     order: np.ndarray,  # (M,) in which to go through the Gaussians
@@ -66,7 +66,7 @@ def _count(
     start: np.ndarray,  # (M + 1,)
     labels: np.ndarray,  # (P,)
     own: np.ndarray,  # (P,) float32, px
-    said_start: np.ndarray,  # (L + 1,) what a pixel of each label votes, as `Rows`
+    said_start: np.ndarray,  # (L + 1,) what a pixel of each label votes, as `CSRRows`
     said_classes: np.ndarray,
     said: np.ndarray,  # float64
     possible: np.ndarray,  # ids that are classes, ascending

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from gsseg_core.csr_rows import Rows
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import Meaning
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import SeenLabels
@@ -69,7 +69,7 @@ def connected_pixels(
 
 
 def in_doubt(
-    votes: Rows,  # int64, of all views
+    votes: CSRRows,  # int64, of all views
     observation: Observation,
     possible: np.ndarray,  # (K,) bool: ids that are classes
     least: float,
@@ -98,7 +98,7 @@ def in_doubt(
 
 def take_back(
     doubtful: np.ndarray,  # (L,) bool
-    votes: Rows,  # int64, of all views
+    votes: CSRRows,  # int64, of all views
     observation: Observation,
     total: np.ndarray,  # (Z,) int64, changed in place
 ) -> None:
@@ -106,7 +106,7 @@ def take_back(
     order, said = observation.order, observation.meaning.without(~doubtful).votes
     ids = observation.ids[order]
     seen = order, observation.start, observation.labels
-    take_votes(votes.start[ids], votes.start[ids + 1], votes.classes, total, *seen, *said, observation.votes(), UNITS)
+    take_votes(votes.indptr[ids], votes.indptr[ids + 1], votes.indices, total, *seen, *said, observation.votes(), UNITS)
 
 
 @nb.njit(nogil=True, cache=True)

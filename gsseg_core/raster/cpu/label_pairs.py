@@ -135,7 +135,7 @@ def add_votes(
     ids: np.ndarray,  # (M,) int32, distinct
     start: np.ndarray,  # (M + 1,)
     labels: np.ndarray,  # (P,) int32: label of each sighting
-    said_start: np.ndarray,  # (L + 1,) what a pixel of each label votes, as `Rows`
+    said_start: np.ndarray,  # (L + 1,) what a pixel of each label votes, as `CSRRows`
     said_classes: np.ndarray,
     said: np.ndarray,  # float64
     votes: np.ndarray,  # (P,) float32

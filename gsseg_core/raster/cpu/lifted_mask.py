@@ -132,7 +132,7 @@ def _vote(
     sums: np.ndarray,
     present: np.ndarray,
     num_labels: int,
-    said_start: np.ndarray,  # (L + 1,) what a pixel of each label votes, as `Rows`
+    said_start: np.ndarray,  # (L + 1,) what a pixel of each label votes, as `CSRRows`
     said_classes: np.ndarray,
     said: np.ndarray,  # float64
     units: float,  # per vote; a power of 2

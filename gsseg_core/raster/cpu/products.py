@@ -68,7 +68,7 @@ def render(
     table: np.ndarray,  # (M, 8)
     start: np.ndarray,  # (T + 1,)
     entries: np.ndarray,  # (E,)
-    rows_of: np.ndarray,  # (M + 1,) codes, as `Rows`
+    rows_of: np.ndarray,  # (M + 1,) codes, as `CSRRows`
     classes: np.ndarray,  # (Z,) uint32
     codes: np.ndarray,  # (Z,) float32
     out: np.ndarray,  # (H, W, K) float32 out

@@ -6,7 +6,7 @@ import copy
 
 import numpy as np
 
-from gsseg_core.csr_rows import Rows
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import Meaning
 from gsseg_core.raster.cpu import products
 from gsseg_core.raster.cpu.label_pairs import take
@@ -49,13 +49,13 @@ class TileOperator(ViewOperator):
             products.render_few(tiles.columns, self._table, tiles.start, tiles.entries, visible, *blended)
             return blended
         # A Gaussian speaks for few classes; the others cost nothing.
-        return self._blend_visible(Rows.of(visible), codes.shape[1])
+        return self._blend_visible(CSRRows.from_dense(visible), codes.shape[1])
 
-    def blend_rows(self, codes: Rows, num_classes: int) -> Blended:
+    def blend_rows(self, codes: CSRRows, num_classes: int) -> Blended:
         """Blend codes without their zeros."""
         return self._blend_visible(codes.take(self.ids), num_classes)
 
-    def _blend_visible(self, codes: Rows, num_classes: int) -> Blended:
+    def _blend_visible(self, codes: CSRRows, num_classes: int) -> Blended:
         blended, tiles = self._blank(num_classes), self._tiles
         products.render(tiles.columns, self._table, tiles.start, tiles.entries, *codes, *blended)
         return blended

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from gsseg_core.csr_rows import Rows
+from gsseg_core.csr_rows import CSRRows
 
 codes = arrays.arrays(np.float32, st.tuples(st.integers(1, 20), st.integers(1, 6)), elements=st.sampled_from([0, 1, 2]))
 
@@ -16,8 +16,8 @@ codes = arrays.arrays(np.float32, st.tuples(st.integers(1, 20), st.integers(1, 6
 @given(codes, st.data())
 def test_rows_are_taken_as_from_an_array(array: np.ndarray, data: st.DataObject) -> None:
     ids = np.array(data.draw(st.lists(st.integers(0, len(array) - 1))), np.int32)
-    rows = Rows.of(array)
+    rows = CSRRows.from_dense(array)
     np.testing.assert_array_equal(rows.dense(array.shape[1]), array)
     np.testing.assert_array_equal(rows.take(ids).dense(array.shape[1]), array[ids])
-    places = rows.places(ids)
-    np.testing.assert_array_equal(rows.values[places.values], rows.take(ids).values)
+    positions = rows.positions(ids)
+    np.testing.assert_array_equal(rows.data[positions.data], rows.take(ids).data)
