@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from ros_datasets import copied, write_long_dataset
 from ros_helpers import PATIENCE, Ros
-from ros_robot import CLASSES, copied, core_session, private_ros, write_long_dataset
+from ros_robot import CLASSES, core_session, private_ros
 from small_scenes import balls_on_a_table, clean_views, write_dataset
 
 from gsseg_core.scene.gaussian_scene import GaussianScene

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ros_datasets import copied, write_long_dataset
 from ros_helpers import Ros
-from ros_robot import CLASSES, Goal, Robot, assert_same, copied, private_ros, renamed, write_long_dataset
+from ros_robot import CLASSES, Goal, Robot, assert_same, private_ros, renamed
 from small_scenes import clean_views, taught, write_dataset, wrong_views
 
 from gsseg_core.data.dataset import Dataset, View, spread
@@ -76,9 +77,9 @@ def codes(robot: Robot) -> np.ndarray:
 
 def expected(scene: GaussianScene, views: list[View], learner: str = "em", **settings: Any) -> Segmentation:
     """What the core's own learner comes to."""
-    teacher = taught(make_learner(learner, scene, len(CLASSES), **settings), views).fit()
-    result = Segmentation.from_codes(scene, teacher.codes_, dict(enumerate(CLASSES)))
-    return result.calibrated(calibrate(teacher).temperature)
+    fitted = taught(make_learner(learner, scene, len(CLASSES), **settings), views).fit()
+    result = Segmentation.from_codes(scene, fitted.codes_, dict(enumerate(CLASSES)))
+    return result.calibrated(calibrate(fitted).temperature)
 
 
 def assert_learnt(robot: Robot, wanted: Segmentation) -> None:
@@ -102,19 +103,19 @@ def test_the_result_equals_that_of_the_core_on_the_same_views(robot: Robot, scen
 def test_the_learner_is_em_unless_another_one_is_asked_for(robot: Robot, scene: GaussianScene) -> None:
     goal = robot.goal()
     status, result = robot.outcome(goal)
-    teacher = make_learner("em", scene, len(CLASSES))
-    taught(teacher, wrong_views()).fit()
+    fitted = make_learner("em", scene, len(CLASSES))
+    taught(fitted, wrong_views()).fit()
     assert (status, result.report.learner) == (GoalStatus.STATUS_SUCCEEDED, "em")
-    assert (result.num_steps, result.converged) == (len(teacher.history_), True)
-    assert result.loss == pytest.approx(teacher.loss, abs=1e-4)
+    assert (result.num_steps, result.converged) == (len(fitted.history_), True)
+    assert result.loss == pytest.approx(fitted.loss, abs=1e-4)
     assert_learnt(robot, expected(scene, wrong_views()))
 
 
 def test_the_result_reports_the_learnt_codes_before_refinement(robot: Robot, scene: GaussianScene) -> None:
     report = robot.learn()[1].report
-    teacher = taught(make_learner("em", scene, len(CLASSES)), wrong_views()).fit()
+    fitted = taught(make_learner("em", scene, len(CLASSES)), wrong_views()).fit()
     raw = RefineSettings(cluster=False, filter=False)
-    wanted = Segmentation.from_codes(scene, teacher.codes_, dict(enumerate(CLASSES)), raw)
+    wanted = Segmentation.from_codes(scene, fitted.codes_, dict(enumerate(CLASSES)), raw)
     assert [summary.num_gaussians for summary in report.classes] == wanted.counts().tolist()
     assert [summary.name for summary in report.classes] == CLASSES
     assert (report.k, report.filtered, report.num_removed) == (0, False, 0)
