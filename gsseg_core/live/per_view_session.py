@@ -1,4 +1,4 @@
-"""A live session for masks whose ids hold only inside their own view."""
+"""A live session for masks whose ids hold only inside their own view: it finds the objects itself."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class PerViewSession(LiveSession):
         return rejection
 
     def repair(self) -> Repair:
-        """Find the objects anew from all views that are kept, and count their votes for the right ones.
+        """Associate the views that are kept anew, and move their votes to the objects that turn out to be right.
 
         Votes of views that are no longer kept go along with most of their object.
 
@@ -76,31 +76,31 @@ class PerViewSession(LiveSession):
         with self._lock:
             undo = self._table.checkpoint()
             repair, order = self._table.solve(), list(self._live.views)
-            moved = (repair.heirs != np.arange(len(repair.heirs))).any()
+            moved = (repair.successors != np.arange(len(repair.successors))).any()
             forgotten = self.num_fused > len(order)
             names = order if moved and forgotten else [name for name in order if name in set(repair.changed)]
             views = {name: self._table.relabelled(self._table.views[name]) for name in names}
             try:
                 for view in views.values():
-                    self._make_room(view)
+                    self._grow_for(view)
             except GssegError:
                 undo()
                 raise
             for name in names:
                 self._live.retract(name)
             if moved and forgotten:
-                self._live.adopt(self._renumbered(self._live.state(), repair.heirs))
+                self._live.adopt(self._renumbered(self._live.state(), repair.successors))
             for view in views.values():
                 self._live.observe(view)
             # The oldest view still is the first one to go.
             self._live.views = {name: self._live.views[name] for name in order if name in self._live.views}
             if self._learnt is not None and moved:
-                self._learnt = replace(self._learnt, codes=_renumber(self._learnt.codes, repair.heirs))
+                self._learnt = replace(self._learnt, codes=_renumber(self._learnt.codes, repair.successors))
             self._version += 1
         return repair
 
     def learn(self, learner: str = "em", dataset: Dataset | None = None, **settings: Any) -> Outcome:
-        """Repair, then learn the best codes from the views kept. The repair stays, even if learning is ended.
+        """Repair, then learn class probabilities from the views kept. The repair stays, even if learning is ended.
 
         Raises
         ------
@@ -133,16 +133,16 @@ class PerViewSession(LiveSession):
             self._table.forget(name)
 
     @staticmethod
-    def _renumbered(state: State, heirs: np.ndarray) -> State:
-        return State(_renumber(state.votes, heirs), state.views, state.num_fused)
+    def _renumbered(state: State, successors: np.ndarray) -> State:
+        return State(_renumber(state.votes, successors), state.views, state.num_fused)
 
 
 def _renumber(
     columns: np.ndarray,  # (N, K)
-    heirs: np.ndarray,  # (K',) at least as many
+    successors: np.ndarray,  # (K',) at least as many
 ) -> np.ndarray:
-    """Add columns up by their new numbers."""
-    out = np.zeros((len(columns), max(columns.shape[1], int(heirs.max()) + 1)), columns.dtype)
+    """Add up columns (N, K) that get the same number."""
+    out = np.zeros((len(columns), max(columns.shape[1], int(successors.max()) + 1)), columns.dtype)
     for k in range(columns.shape[1]):
-        out[:, heirs[k] if k < len(heirs) else k] += columns[:, k]
+        out[:, successors[k] if k < len(successors) else k] += columns[:, k]
     return out

@@ -1,4 +1,4 @@
-"""What a live session answers: why a view could not be used, and what learning came to."""
+"""Results of a live session: why a view was rejected, and the outcome of learning."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _REASONS: dict[type[GssegError], str] = {
 
 @dataclass(frozen=True)
 class Rejection:
-    """Why a view could not be used.
+    """Reason for which a view was rejected.
 
     Attributes
     ----------
@@ -43,18 +43,18 @@ class Rejection:
 
     @classmethod
     def of(cls, error: GssegError) -> Rejection:
-        """Sort an error by its cause."""
+        """Name the reason for an error."""
         return cls(_REASONS.get(type(error), "unusable"), str(error))
 
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What `LiveSession.learn` did.
+    """Outcome of `LiveSession.learn`.
 
     Attributes
     ----------
     learnt : Learnt
-        The codes, in force from now on.
+        The class probabilities, in force from now on.
     num_steps : int
         Steps that were done; 0 for a learner that has none.
     converged : bool

@@ -1,4 +1,4 @@
-"""What a robot keeps of one scene while it drives: votes of every view, the last views, and the best codes."""
+"""A live session: fuses views of one scene as they arrive, learns from the last ones, and segments at any time."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from gsseg_core.errors import (
     UnknownLabelError,
 )
 from gsseg_core.learn.calibrate import calibrate
+from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.learner_state import Learnt, State
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.learn.vote_learner import VoteLearner
@@ -39,12 +40,12 @@ LIVE = "votes"
 
 
 class LiveSession:
-    """Fuses views as they arrive, learns better codes when asked, and segments at any time.
+    """Fuses views as they arrive, learns better class probabilities when asked, and segments at any time.
 
     Safe to use from several threads: `fuse`, `segmentation` and the rest answer while `learn` runs.
 
-    Which codes count: after `learn`, its codes hold for every Gaussian that its views saw; all others go by the votes,
-    which grow with every view. Without `learn`, all go by the votes.
+    After `learn`, the learnt class probabilities hold for every Gaussian that its views saw; those of all others come
+    from the votes, which grow with every view. Without `learn`, all come from the votes.
 
     Parameters
     ----------
@@ -101,12 +102,12 @@ class LiveSession:
 
     @property
     def version(self) -> int:
-        """Number of the codes: another one as soon as anything that `segmentation` goes by has changed."""
+        """Version of the class probabilities: another one after each change that `segmentation` depends on."""
         return self._version
 
     @property
     def era(self) -> object:
-        """Another one as soon as all that was known is forgotten or replaced, by `reset`, `load` or `retire`."""
+        """Token of what is known: another one as soon as that is replaced, by `reset`, `load` or `retire`."""
         return self._era
 
     @property
@@ -116,7 +117,7 @@ class LiveSession:
 
     @property
     def learnt(self) -> Learnt | None:
-        """What the last `learn` came to."""
+        """Class probabilities of the last `learn`; None without one."""
         return self._learnt
 
     @property
@@ -152,7 +153,7 @@ class LiveSession:
                 return self.reject(Rejection.of(error))
 
     def _fuse(self, view: View) -> Rejection | None:
-        self._make_room(view)
+        self._grow_for(view)
         repeated = view.name in self._live.views
         if not self._live.observe(view):
             why = self._live.rejected.pop(view.name)
@@ -178,7 +179,7 @@ class LiveSession:
         report: Callable[[str, int, int, float], None] = lambda stage, done, total, loss: None,
         watch: Stopwatch | None = None,
     ) -> Outcome:
-        """Learn the best codes from the views kept, or from the train views of a dataset.
+        """Learn class probabilities from the views kept, or from the train views of a dataset.
 
         Whatever `report` raises ends the work, and then, as after any error, nothing has changed.
 
@@ -206,32 +207,12 @@ class LiveSession:
         GssegError
             A file of the dataset is broken.
         """
-        watch = watch or Stopwatch()
         with self._lock:
             views, num_classes, era = list(self._live.views.values()), self._live.num_classes, self._era
         if dataset is not None:
-            views = dataset.views("train")
-            if not self._declared:
-                num_classes = max(num_classes, dataset.num_classes)
-                if num_classes > self.max_classes:
-                    raise UnknownLabelError(
-                        f"{dataset.root}: has {num_classes} classes; expected at most {self.max_classes}, as "
-                        "max_classes says, or class_names that declare them"
-                    )
-        teacher = make_learner(learner, self.scene, num_classes, max_steps=max_steps, device=self.device)
-        views = spread(views, num_views)
-
-        def progress(stage: str, done: int, total: int) -> None:
-            report(stage, done, total, teacher.loss)
-
-        with watch.stage("observe"):
-            teacher.observe_all(views, progress)
-        with watch.stage("learn"):
-            teacher.fit(progress)
-        with watch.stage("calibrate"):
-            temperature = calibrate(teacher, progress=progress).temperature
-        learnt = Learnt(learner, teacher.codes_, len(teacher.views), temperature)
-        outcome = Outcome(learnt, len(teacher.history_), teacher.converged_, teacher.loss, dict(teacher.rejected))
+            views, num_classes = dataset.views("train"), self._num_classes_with(dataset, num_classes)
+        made = make_learner(learner, self.scene, num_classes, max_steps=max_steps, device=self.device)
+        outcome = _fitted(learner, made, spread(views, num_views), report, watch or Stopwatch())
         with self._lock:
             if era is not self._era:
                 raise NoUsableViewsError("all views were forgotten while they were learnt from; nothing was learnt")
@@ -241,6 +222,18 @@ class LiveSession:
             self._learnt = outcome.learnt
             self._version += 1
         return outcome
+
+    def _num_classes_with(self, dataset: Dataset, num_classes: int) -> int:
+        """Count the classes once those of a dataset are added; refuse too many."""
+        if self._declared:
+            return num_classes
+        num_classes = max(num_classes, dataset.num_classes)
+        if num_classes > self.max_classes:
+            raise UnknownLabelError(
+                f"{dataset.root}: has {num_classes} classes; expected at most {self.max_classes}, as "
+                "max_classes says, or class_names that declare them"
+            )
+        return num_classes
 
     def codes(self) -> np.ndarray:
         """Class probabilities of every Gaussian as they are now, (N, K) float32; a row of zeros where nothing is known.
@@ -261,7 +254,7 @@ class LiveSession:
         return codes
 
     def segmentation(self, settings: RefineSettings | None = None, watch: Stopwatch | None = None) -> Segmentation:
-        """Refine the codes as they are now and label every Gaussian; kept until codes or settings change.
+        """Refine the class probabilities and label every Gaussian; kept until they or the settings change.
 
         After `learn`, probabilities are calibrated (see `gsseg_core.learn.calibrate`). Those of mere votes are shares
         of the pixels that saw a Gaussian, and so less sure than they might be.
@@ -289,7 +282,7 @@ class LiveSession:
         return result
 
     def save(self, path: str | os.PathLike[str]) -> int:
-        """Save votes, views and codes, atomically; return the number of views in the votes or the codes.
+        """Save votes, views and class probabilities, atomically; return the number of views that they come from.
 
         Raises
         ------
@@ -347,11 +340,11 @@ class LiveSession:
         threading.Thread(target=find, name="neighbours").start()
 
     def retire(self) -> None:
-        """Begin another `era`: what is still being fused or learnt comes too late. What is known stays."""
+        """Begin another `era`, so that what is still being fused or learnt is refused; what is known stays."""
         self._era = object()
 
     def reset(self) -> int:
-        """Forget votes, views and codes; return how many views were forgotten."""
+        """Forget votes, views and class probabilities; return how many views were forgotten."""
         with self._lock:
             dropped = self.num_fused
             self.rejected.clear()
@@ -367,7 +360,7 @@ class LiveSession:
         self._version += 1
         self.retire()
 
-    def _make_room(self, view: View) -> None:
+    def _grow_for(self, view: View) -> None:
         if self._declared or not view.has_mask or (needed := view.largest_label + 1) <= self._live.num_classes:
             return
         affordable = VOTES_LIMIT // (8 * len(self.scene))
@@ -383,3 +376,21 @@ class LiveSession:
     def _drop_old_views(self) -> None:
         while len(self._live.views) > self.max_views:
             self._live.forget(next(iter(self._live.views)))
+
+
+def _fitted(
+    name: str, learner: Learner, views: list[View], report: Callable[[str, int, int, float], None], watch: Stopwatch
+) -> Outcome:
+    """Have a learner observe views, fit and be calibrated."""
+
+    def progress(stage: str, done: int, total: int) -> None:
+        report(stage, done, total, learner.loss)
+
+    with watch.stage("observe"):
+        learner.observe_all(views, progress)
+    with watch.stage("learn"):
+        learner.fit(progress)
+    with watch.stage("calibrate"):
+        temperature = calibrate(learner, progress=progress).temperature
+    learnt = Learnt(name, learner.codes_, len(learner.views), temperature)
+    return Outcome(learnt, len(learner.history_), learner.converged_, learner.loss, dict(learner.rejected))

@@ -51,12 +51,12 @@ class Repair:
     ----------
     changed : list of str
         Views whose ids now mean something else than before.
-    heirs : (K,) int64
-        What has become of each earlier object: the number that most of it has now.
+    successors : (K,) int64
+        Successor of each earlier object: the number that most of its weight has now.
     """
 
     changed: list[str]
-    heirs: np.ndarray
+    successors: np.ndarray
 
 
 class ObjectTable:
@@ -191,16 +191,16 @@ class ObjectTable:
         """
         progress("associate", 0, 1)
         solved = associate(self._lifted, self.settings)
-        before, heirs = self._objects, np.arange(self._largest + 1)
+        before, successors = self._objects, np.arange(self._largest + 1)
         if before:
-            solved, heirs = self._renumbered(solved)
+            solved, successors = self._renumbered(solved)
         self._objects = solved
         self._largest = max([self._largest, *(int(objects.max(initial=0)) for objects in solved.values())])
-        self._forgotten = self._forgotten.renumbered(heirs)
+        self._forgotten = self._forgotten.renumbered(successors)
         self._fill()
         progress("associate", 1, 1)
         changed = [name for name in solved if name not in before or (before[name] != solved[name]).any()]
-        return Repair(changed, heirs)
+        return Repair(changed, successors)
 
     def relabelled(self, view: View) -> View:
         """Return a view as it came, with the numbers of objects for labels; ids that lie on no Gaussian are unknown.
@@ -264,7 +264,7 @@ class ObjectTable:
             self._profiles.add(self._lifted[name].gaussians, self._lifted[name].weights, objects)
 
     def _renumbered(self, solved: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Give solved objects the numbers that most of their weight had before; and who took over what."""
+        """Give solved objects the numbers that most of their weight had before; also return the successors."""
         names = sorted(self._objects)
         old, new = (np.concatenate([part[name] for name in names]) for part in (self._objects, solved))
         size = np.concatenate([sums(self._lifted[name].weights, 1) for name in names])
@@ -276,9 +276,9 @@ class ObjectTable:
         table[rows[kept] + 1] = columns[kept] + 1
         fresh = np.flatnonzero(table[1:] == 0) + 1
         table[fresh] = self._largest + 1 + np.arange(len(fresh))
-        heirs = np.where(shared.any(axis=0), table[shared.argmax(axis=0)], np.arange(self._largest + 1))
-        heirs[0] = 0
-        return {name: table[objects].astype(np.int32) for name, objects in solved.items()}, heirs
+        successors = np.where(shared.any(axis=0), table[shared.argmax(axis=0)], np.arange(self._largest + 1))
+        successors[0] = 0
+        return {name: table[objects].astype(np.int32) for name, objects in solved.items()}, successors
 
 
 def _turned_away(view: View) -> View:

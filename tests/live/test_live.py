@@ -153,12 +153,12 @@ def test_no_more_classes_turn_up_than_are_allowed(tmp_path: Path) -> None:
 
 def test_learning_gives_what_the_learner_gives_on_the_same_views() -> None:
     views = wrong_views(8)
-    session, teacher = fed(LiveSession(SCENE, NAMES), views), taught(EMLearner(SCENE, NUM_CLASSES), views).fit()
+    session, learner = fed(LiveSession(SCENE, NAMES), views), taught(EMLearner(SCENE, NUM_CLASSES), views).fit()
     told: list[tuple[str, int, int, float]] = []
     outcome = session.learn(report=lambda *what: told.append(what))
-    np.testing.assert_array_equal(outcome.learnt.codes, teacher.codes_)
-    assert outcome.num_steps == len(teacher.history_) and outcome.converged
-    assert outcome.loss == -teacher.history_[-1] and outcome.learnt.num_views == 8
+    np.testing.assert_array_equal(outcome.learnt.codes, learner.codes_)
+    assert outcome.num_steps == len(learner.history_) and outcome.converged
+    assert outcome.loss == -learner.history_[-1] and outcome.learnt.num_views == 8
     assert all(0 <= done <= total for _, done, total, _ in told) and math.isnan(told[0][3])
     assert told[0][0] == "observe" and told[-1][0] == "calibrate" and told[-1][3] == outcome.loss
 

@@ -201,7 +201,7 @@ def test_solving_repairs_what_matching_could_not_know_and_objects_keep_their_num
     assert table.num_objects == 4
     repair = table.solve()
     assert table.num_objects == 3 and agreement(table, VIEWS) == 1.0
-    assert VIEWS[0].name in repair.changed and len(np.unique(repair.heirs)) < len(repair.heirs)
+    assert VIEWS[0].name in repair.changed and len(np.unique(repair.successors)) < len(repair.successors)
     for k in (2, 3):
         place = VIEWS[4].read_labels() == k
         np.testing.assert_array_equal(table.relabelled(VIEWS[4]).read_labels()[place], before[VIEWS[4].name][place])
@@ -269,7 +269,7 @@ def test_a_repair_keeps_the_calibration_of_what_was_learnt() -> None:
         session.fuse(shuffled(view))
     session._learnt = Learnt("em", session.codes(), 5, temperature=1.7)
     repair = session.repair()
-    assert (repair.heirs != np.arange(len(repair.heirs))).any(), "something was repaired"
+    assert (repair.successors != np.arange(len(repair.successors))).any(), "something was repaired"
     assert session.learnt is not None and (session.learnt.temperature, session.learnt.num_views) == (1.7, 5)
 
 
