@@ -96,7 +96,6 @@ def protocols(desk: Path) -> None:
 
 
 FIRST: dict[str, Callable[[Path], None]] = {
-    "README.md": on_a_robot,
     "docs/clean_objects.md": segmented,
     "docs/evaluation.md": protocols,
     "docs/results.md": apartment,
