@@ -196,7 +196,8 @@ def test_examples_in_the_help_can_be_typed() -> None:
 
 
 def test_a_robot_is_told_to_install_every_library_that_ros_does_not_bring() -> None:
-    (line,) = [line for block in blocks_of("docs/tutorial_robot.md") for line in block.lines if "--break-system-packages" in line]
+    lines = [line for block in blocks_of("docs/tutorial_robot.md") for line in block.lines]
+    (line,) = [line for line in lines if "--break-system-packages" in line]
     assert set(words_of(line)[2:-1]) == core_libraries() - {"numpy"}  # Which rclpy depends on.
 
 
