@@ -48,7 +48,7 @@ def main(demo: Path = ROOT / "demo_out", out: Path = ROOT / "docs/pictures/viewe
         camera = viewer.camera_of(client, client.camera.image_height)
         (uv,), _ = camera.project(np.median(scene.means[result.labels == BOWL], axis=0, keepdims=True))
         page.mouse.click(float(uv[0]), float(uv[1]))
-        page.get_by_text("views spoke for it").wait_for(timeout=120_000)
+        page.get_by_text("views voted for it").wait_for(timeout=120_000)
         page.wait_for_timeout(3_000)
         Image.fromarray(screenshot(page)).save(out, quality=85)
 

@@ -1,4 +1,4 @@
-"""Who may look: where the viewer listens, and which requests it answers.
+"""Access to the viewer: opens the socket that it listens on, and decides which requests it answers.
 
 Every page that a browser shows may send requests to this machine and to its neighbours. So the viewer answers only
 those that were addressed to it by a name that is its own, which a page whose own name was made to point here is not,

@@ -1,4 +1,4 @@
-"""The browsers that look: which of them draws splats itself, and for which they are drawn here."""
+"""Renders for every browser: sends it splats to draw, or images that are drawn here, whichever is faster."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ _PATIENCE = 60.0
 _SMALL = (48, 64)
 
 
-class Screen:
-    """One browser, and what draws for it.
+class ClientRenderer:
+    """Renders for one browser: by the splats that it draws itself, or by images that are drawn here.
 
     Parameters
     ----------
@@ -110,8 +110,8 @@ class Screen:
             frames.close()
 
 
-class Screens:
-    """All browsers that look.
+class ClientRenderers:
+    """Renders for all browsers that are connected to a server.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ class Screens:
     ) -> None:
         self._splats, self._camera_of, self._drawn_by, self._device = Splats(scene), camera_of, drawn_by, device
         self._lock = threading.Lock()
-        self._screens: dict[int, Screen] = {}
+        self._renderers: dict[int, ClientRenderer] = {}
         self._picture: Picture | None = None
         server.on_client_connect(self._join)
         server.on_client_disconnect(self._leave)
@@ -145,56 +145,56 @@ class Screens:
     @property
     def bytes_sent(self) -> int:
         """Of Gaussians, before compression, to those that look now."""
-        return sum(screen.bytes_sent for screen in self._all())
+        return sum(renderer.bytes_sent for renderer in self._all())
 
     @property
     def drawing(self) -> int:
         """Count the browsers that draw by themselves."""
-        return sum(screen.draws for screen in self._all())
+        return sum(renderer.draws for renderer in self._all())
 
     def show(self, picture: Picture) -> None:
         """Have this seen from now on."""
         with self._lock:
             self._picture = picture
-            for screen in self._screens.values():
-                screen.show(picture)
+            for renderer in self._renderers.values():
+                renderer.show(picture)
 
     def close(self) -> None:
         """Send nothing more."""
-        for screen in self._all():
-            screen.close()
+        for renderer in self._all():
+            renderer.close()
 
-    def _all(self) -> list[Screen]:
+    def _all(self) -> list[ClientRenderer]:
         with self._lock:
-            return list(self._screens.values())
+            return list(self._renderers.values())
 
     def _join(self, client: viser.ClientHandle) -> None:
-        screen = Screen(client, self._splats, self._camera_of, self._drawn_by, self._device)
+        renderer = ClientRenderer(client, self._splats, self._camera_of, self._drawn_by, self._device)
         with self._lock:
-            self._screens[client.client_id] = screen
+            self._renderers[client.client_id] = renderer
             if self._picture:
-                screen.show(self._picture)
+                renderer.show(self._picture)
         if self._drawn_by == AUTO:
             try:
-                self._decide(client, screen)
+                self._decide(client, renderer)
             except (RuntimeError, TimeoutError, OSError, ValueError):  # It has left, or cannot even draw the trial.
                 return
 
     def _leave(self, client: viser.ClientHandle) -> None:
         with self._lock:
-            screen = self._screens.pop(client.client_id, None)
-        if screen:
-            screen.close()
+            renderer = self._renderers.pop(client.client_id, None)
+        if renderer:
+            renderer.close()
 
     @staticmethod
-    def _decide(client: viser.ClientHandle, screen: Screen) -> None:
+    def _decide(client: viser.ClientHandle, renderer: ClientRenderer) -> None:
         alone = time_of_picture(client)
         with trial(client):
             slow = time_of_picture(client) - alone > SLOW
         if not slow:
-            screen.send_splats()
+            renderer.send_splats()
             slow = time_of_picture(client) - alone > SLOW
-            screen.take_splats_back() if slow else screen.stop_images()
+            renderer.take_splats_back() if slow else renderer.stop_images()
         if slow:
             client.add_notification(
                 "The server draws",

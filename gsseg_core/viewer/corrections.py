@@ -1,4 +1,4 @@
-"""Corrections by a person: what was drawn in a view becomes a posed mask of its own, and is learnt at once."""
+"""Corrections by a person: turns what is drawn in a picture into a posed mask, and fuses it at once."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class Corrections:
     They are views like any other, fused by a `LiveSession` that has no others. How much a correction weighs against
     what was learnt before goes by how much of a Gaussian it sees: the sum of its weights over what was drawn, divided
     by that of its opacities over the whole image, which is 1 for one that lies open and inside the drawing, and near 0
-    for what lies behind. With e its sum over the corrections, c their codes and q those learnt before,
+    for what lies behind. With e its sum over the corrections, c their class probabilities and q those learnt before,
 
         q' = normalise( q + TRUST e c )
 

@@ -1,4 +1,4 @@
-"""Where a viewer gets codes from that change while it runs: sources that other packages provide.
+"""Sources of class probabilities that change while a viewer runs, which other packages provide.
 
 A source is named by an entry point of the group `gsseg.live_sources`, so that the core knows none of them. It is called
 with the scene, and returns a `LiveSource`. `gsseg view --ros` looks for the name "ros".
@@ -17,7 +17,7 @@ GROUP = "gsseg.live_sources"
 
 
 class LiveUpdate(NamedTuple):
-    """What a source knows now.
+    """Labels and class probabilities of a source at one time.
 
     Attributes
     ----------
@@ -32,10 +32,10 @@ class LiveUpdate(NamedTuple):
 
 
 class LiveSource(Protocol):
-    """Hands out codes as they change."""
+    """Hands out class probabilities as they change."""
 
     def wait(self, timeout: float) -> LiveUpdate | None:
-        """Wait for the next codes, `timeout` seconds at most.
+        """Wait for the next class probabilities, `timeout` seconds at most.
 
         Returns
         -------

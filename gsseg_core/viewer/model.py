@@ -1,4 +1,4 @@
-"""What a viewer shows of a segmentation: which Gaussians, in which colours. Pure numpy; it knows no viewer."""
+"""Decides which Gaussians of a segmentation are shown, and in which colours. Pure numpy; it knows no viewer."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NO_CLASS = {UNOBSERVED: "(unobserved)", REMOVED: "(removed by the filter)"}
 """What the list of classes calls the labels that are no class."""
 
 NOTHING_KNOWN = (120, 120, 120)
-"""The colour of what a mode has nothing to say of."""
+"""Colour of Gaussians without a value in the present mode."""
 
 # From bad to good: dark red, orange, pale yellow, green, dark green; it can be told apart without seeing red and green,
 # since brightness rises to the middle and the ends differ in blue.
@@ -33,7 +33,7 @@ _RAMP = np.array([(122, 1, 30), (230, 120, 40), (250, 230, 140), (90, 180, 140),
 
 
 class Labelling(NamedTuple):
-    """What is known of each Gaussian, wherever it comes from.
+    """Label and class probabilities of each Gaussian, from a segmentation, a live source or corrections.
 
     Attributes
     ----------
@@ -51,12 +51,12 @@ class Labelling(NamedTuple):
 
     @classmethod
     def of(cls, segmentation: Segmentation) -> Labelling:
-        """Take over what a segmentation says."""
+        """Take labels, probabilities and names of a segmentation."""
         return cls(segmentation.labels, segmentation.probabilities, dict(segmentation.class_names))
 
     @classmethod
     def unknown(cls, num_gaussians: int, class_names: Mapping[int, str] | None = None) -> Labelling:
-        """Nothing is known of any Gaussian."""
+        """Label all Gaussians as unobserved."""
         names = {0: BACKGROUND_NAME, **(class_names or {})}
         names = {k: names.get(k, f"class_{k:02d}") for k in range(max(names) + 1)}
         empty = np.zeros((num_gaussians, len(names)), np.float32)
@@ -64,7 +64,7 @@ class Labelling(NamedTuple):
 
 
 class ClassRow(NamedTuple):
-    """A line of the list of classes."""
+    """A class in the list of classes."""
 
     label: int
     name: str
@@ -84,7 +84,7 @@ class ViewModel:
     labelling : Labelling
         What is known of them; replaced as a whole by `relabel`.
     reliability : (N,) float32 or None
-        Mean reliability of the views that spoke for each Gaussian, in [0, 1], NaN where none did; None while unknown.
+        Mean reliability of the views that saw each Gaussian, in [0, 1], NaN where none did; None while unknown.
     mode : str
         One of `MODES`.
     min_confidence : float
@@ -219,12 +219,12 @@ class ViewModel:
 def completed(
     probabilities: np.ndarray,  # (N, K)
 ) -> np.ndarray:
-    """Have rows sum to 1, (N, K) float32: what a source did not tell is shared out among the classes it left at 0."""
+    """Scale rows up to a sum of 1, (N, K) float32: what is missing is divided among the classes that have 0."""
     rest = 1 - probabilities.sum(axis=1, dtype=np.float64)
     known = probabilities.max(axis=1) > 0
-    untold = (probabilities == 0) & (known & (rest > SHARES_TOLERANCE))[:, None]
-    share = rest / np.maximum(untold.sum(axis=1), 1)
-    out: np.ndarray = np.where(untold, share[:, None], probabilities).astype(np.float32)
+    missing = (probabilities == 0) & (known & (rest > SHARES_TOLERANCE))[:, None]
+    share = rest / np.maximum(missing.sum(axis=1), 1)
+    out: np.ndarray = np.where(missing, share[:, None], probabilities).astype(np.float32)
     return out
 
 

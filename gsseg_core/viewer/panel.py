@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 import viser
@@ -17,17 +17,14 @@ import viser
 from gsseg_core.data.dataset import View
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.scene.camera import Camera
-from gsseg_core.text import html_text, printable
-from gsseg_core.viewer.corrections import box, disc, region
-from gsseg_core.viewer.model import MODES, ClassRow
-from gsseg_core.viewer.picking import Picked, Voice
+from gsseg_core.text import counted, html_text, printable
+from gsseg_core.viewer.corrections import Corrections, box, disc, region
+from gsseg_core.viewer.model import MODES, ClassRow, ViewModel
+from gsseg_core.viewer.picking import Picked, ViewVote
 from gsseg_core.viewer.splat_chunks import BANDS
 
-if TYPE_CHECKING:
-    from gsseg_core.viewer.viewer import Viewer
-
 MOST_CLASSES, MOST_VIEWS = 5, 8
-"""Of probabilities and views that the answer to a click names."""
+"""Of the probabilities and votes that the answer to a click names."""
 
 LONGEST_NAME = 80
 """Characters of a name; of a longer one, the first."""
@@ -39,16 +36,52 @@ _STYLE = "padding: 0 0.75em 0.75em; font-size: 0.875em; overflow-wrap: anywhere"
 _ASK = "Click on something in the picture to ask what it is."
 
 
+class PanelHost(Protocol):
+    """What a panel needs of the viewer that it belongs to; see `gsseg_core.viewer.viewer.Viewer` for each."""
+
+    server: viser.ViserServer
+    model: ViewModel
+    views: tuple[View, ...]
+    reliability: dict[str, float]
+    corrections: Corrections
+    added_names: dict[int, str]
+
+    @property
+    def follows(self) -> bool:
+        """Whether class probabilities change while the viewer runs."""
+
+    def change(self, action: Callable[[ViewModel], object]) -> None:
+        """Change what is shown."""
+
+    def set_mode(self, mode: str) -> None:
+        """Colour by something else."""
+
+    def jump(self, client: viser.ClientHandle, view: View, with_mask: bool) -> None:
+        """Look from where a view was taken."""
+
+    def hide_mask(self) -> None:
+        """Take the mask off the picture."""
+
+    def selection_ply(self) -> bytes:
+        """Write what is shown as a 3DGS PLY."""
+
+    def segmentation_npz(self) -> bytes:
+        """Write the corrected segmentation as a `segmentation.npz`."""
+
+    def undo(self) -> bool:
+        """Take the last correction back."""
+
+
 class Panel:
     """All widgets of a viewer, and the callbacks behind them.
 
     Parameters
     ----------
-    viewer : Viewer
+    viewer : PanelHost
         Whose state it shows and changes.
     """
 
-    def __init__(self, viewer: Viewer) -> None:
+    def __init__(self, viewer: PanelHost) -> None:
         self._viewer, self._gui = viewer, viewer.server.gui
         self._rows: dict[int, tuple[ClassRow, viser.GuiButtonHandle, viser.GuiButtonGroupHandle]] = {}
         self._live: viser.GuiHtmlHandle | None = None
@@ -82,11 +115,10 @@ class Panel:
             0.0,
             hint="above 0: show what has at least this probability of a shown class, whatever its label is",
         )
-        self._listen(self._mode, self._choose_mode)
-        self._listen(self._confidence, lambda: self._threshold("min_confidence", self._confidence))
-        self._listen(self._probability, lambda: self._threshold("min_probability", self._probability))
-        show_all = gui.add_button("show all", icon=viser.Icon.EYE)
-        self._press(show_all, self._show_all)
+        self._call(self._choose_mode, self._mode.on_update)
+        self._call(lambda: self._threshold("min_confidence", self._confidence), self._confidence.on_update)
+        self._call(lambda: self._threshold("min_probability", self._probability), self._probability.on_update)
+        self._call(self._show_all, gui.add_button("show all", icon=viser.Icon.EYE).on_click)
         self._list = gui.add_folder("classes")
 
     def _build_views(self) -> None:
@@ -96,7 +128,7 @@ class Panel:
         self._with_mask = gui.add_checkbox("mask over it", True)
         go = gui.add_button("go there", icon=viser.Icon.CAMERA)
         steps = gui.add_button_group("", ("previous", "next"))
-        leave = gui.add_button("take the mask off")
+        self._call(self._viewer.hide_mask, gui.add_button("take the mask off").on_click)
 
         def jump(event: viser.GuiEvent[Any]) -> None:
             if event.client is None:  # It was set from here, and whoever did that goes there.
@@ -116,44 +148,31 @@ class Panel:
                 _set(self._view, self._texts[(_chosen(self._view, self._texts) + step) % len(self._texts)])
                 jump(event)
 
-        self._press(leave, self._viewer.hide_mask)
-
     def _build_correct(self) -> None:
         gui = self._gui
         gui.add_markdown("**Shift + click** or **shift + drag** a box in the picture: what is there is")
         self._target = gui.add_dropdown("class", self._target_names())
         self._new = gui.add_text("new class", "")
-        add = gui.add_button("add the class", icon=viser.Icon.PLUS)
+        self._call(self._add_class, gui.add_button("add the class", icon=viser.Icon.PLUS).on_click)
         self._tool = gui.add_dropdown("a click means", (REGION, DISC))
         self._radius = gui.add_slider("disc, % of height", 0.5, 20.0, 0.5, 3.0)
-        undo = gui.add_button("take the last one back", icon=viser.Icon.ARROW_BACK_UP)
+        self._call(self._undo, gui.add_button("take the last one back", icon=viser.Icon.ARROW_BACK_UP).on_click)
         self._corrected = gui.add_markdown("No corrections yet.")
-        self._press(add, self._add_class)
-        self._press(undo, self._undo)
 
     def _build_save(self) -> None:
-        ply = self._gui.add_button("what is shown, as PLY", icon=viser.Icon.DOWNLOAD)
-        npz = self._gui.add_button("the segmentation, as npz", icon=viser.Icon.DOWNLOAD)
-
-        @ply.on_click
-        def _ply(event: viser.GuiEvent[Any]) -> None:
-            with self.telling(event.client):
-                self._send(event.client, "selection.ply", self._viewer.selection_ply())
-
-        @npz.on_click
-        def _npz(event: viser.GuiEvent[Any]) -> None:
-            with self.telling(event.client):
-                self._send(event.client, "segmentation.npz", self._viewer.segmentation_npz())
-
+        for text, name, content in (
+            ("what is shown, as PLY", "selection.ply", self._viewer.selection_ply),
+            ("the segmentation, as npz", "segmentation.npz", self._viewer.segmentation_npz),
+        ):
+            button = self._gui.add_button(text, icon=viser.Icon.DOWNLOAD)
+            button.on_click(self._sender(name, content))
         if self._viewer.follows:
-            self._live = self._gui.add_html(_paragraph("live: waiting for the first codes"))
+            self._live = self._gui.add_html(_paragraph("live: waiting for the first probabilities"))
 
     # What the viewer tells.
 
-    def refresh(self) -> None:
-        """Have the list of classes agree with the model; widgets that are right stay."""
-        with self._viewer.lock:
-            rows = self._viewer.model.rows()
+    def show_classes(self, rows: Sequence[ClassRow]) -> None:
+        """List the classes; widgets that are right already stay."""
         listed = [(row.label, row.name) for row in rows]
         if listed != [(row.label, row.name) for row, _, _ in self._rows.values()]:
             for _, button, group in self._rows.values():
@@ -165,11 +184,12 @@ class Panel:
         for row in rows:
             known, button, group = self._rows[row.label]
             if row != known:
-                button.label, button.color, button.icon = _text(row), _color(row), _icon(row)
+                for key, value in _look(row).items():
+                    setattr(button, key, value)
                 self._rows[row.label] = row, button, group
 
-    def show_picked(self, picked: Picked | None, voices: Sequence[Voice] | None) -> None:
-        """Answer a click: what it hit, and what the views say of that, if that is known."""
+    def show_picked(self, picked: Picked | None, votes: Sequence[ViewVote] | None) -> None:
+        """Answer a click: the Gaussian that it hit, and the votes for that, if they are known."""
         if picked is None:
             self._answer.content = _paragraph("Nothing is there.")
             return
@@ -182,19 +202,15 @@ class Panel:
             f"Gaussian {i}, {100 * picked.weight:.0f} % of the pixel",
             "probabilities: " + (", ".join(f"{_shown(model.name(k))} {probabilities[k]:.2f}" for k in best) or "none"),
         ]
-        if voices is not None:
-            said = [f"{_shown(v.view)}: {_shown(model.name(v.label))}, {v.weight:.1f} px" for v in voices[:MOST_VIEWS]]
-            count = len({voice.view for voice in voices})
-            lines.append(f"{count} view{'s' * (count != 1)} spoke for it" + (", the loudest:" if said else ""))
-            lines += said
+        if votes is not None:
+            views = counted(len({vote.view for vote in votes}), "view")
+            lines.append(f"{views} voted for it" + (", the largest votes:" if votes else ""))
+            lines += [f"{_shown(v.view)}: {_shown(model.name(v.label))}, {v.weight:.1f} px" for v in votes[:MOST_VIEWS]]
         self._answer.content = _paragraph(*lines, title=_shown(model.name(label)))
 
     def show_progress(self, stage: str, done: int, total: int) -> None:
         """Say how far a long job is."""
-        if done < total:
-            self._answer.content = _paragraph(f"{stage}: {done} of {total} views")
-        else:
-            self._answer.content = _paragraph(_ASK)
+        self._answer.content = _paragraph(f"{stage}: {done} of {total} views" if done < total else _ASK)
 
     def show_live(self, text: str) -> None:
         """Say what the live source has."""
@@ -203,10 +219,8 @@ class Panel:
 
     def tell_corrected(self, changed: int) -> None:
         """Say what the last correction did."""
-        count = len(self._viewer.corrections)
-        self._corrected.content = (
-            f"{count} correction{'s' if count != 1 else ''}; the last one changed {changed:,} Gaussians."
-        )
+        count = counted(len(self._viewer.corrections), "correction")
+        self._corrected.content = f"{count}; the last one changed {changed:,} Gaussians."
 
     @contextmanager
     def telling(self, client: viser.ClientHandle | None) -> Iterator[None]:
@@ -265,13 +279,13 @@ class Panel:
     def _undo(self) -> None:
         if self._viewer.undo():
             count = len(self._viewer.corrections)
-            self._corrected.content = f"{count} correction{'s' if count != 1 else ''} left." if count else "None left."
+            self._corrected.content = f"{counted(count, 'correction')} left." if count else "None left."
 
     def _add_row(self, row: ClassRow) -> tuple[viser.GuiButtonHandle, viser.GuiButtonGroupHandle]:
-        button = self._gui.add_button(_text(row), color=_color(row), icon=_icon(row), hint="switch it on or off")
+        button = self._gui.add_button(**_look(row), hint="switch it on or off")
         group = self._gui.add_button_group("", (ONLY, REMOVE))
         label = row.label
-        self._press(button, lambda: self._viewer.change(lambda model: model.toggle(label)))
+        self._call(lambda: self._viewer.change(lambda model: model.toggle(label)), button.on_click)
 
         @group.on_click
         def _pressed(event: viser.GuiEvent[Any]) -> None:
@@ -292,22 +306,24 @@ class Panel:
         trust = self._viewer.reliability.get(view.name, math.nan)
         return _shown(view.name) + ("" if math.isnan(trust) else f" ({100 * trust:.0f} % reliable)")
 
-    def _listen(self, widget: Any, action: Callable[[], object]) -> None:
-        @widget.on_update
-        def _updated(event: viser.GuiEvent[Any]) -> None:
+    def _call(self, action: Callable[[], object], register: Callable[[Callable[[Any], None]], object]) -> None:
+        """Have a widget call an action, `register` being its `on_click` or `on_update`; errors are told."""
+
+        def called(event: viser.GuiEvent[Any]) -> None:
             with self.telling(event.client):
                 action()
 
-    def _press(self, button: viser.GuiButtonHandle, action: Callable[[], object]) -> None:
-        @button.on_click
-        def _pressed(event: viser.GuiEvent[Any]) -> None:
-            with self.telling(event.client):
-                action()
+        register(called)
 
-    @staticmethod
-    def _send(client: viser.ClientHandle | None, name: str, content: bytes) -> None:
-        if client is not None:
-            client.send_file_download(name, content, save_immediately=True)
+    def _sender(self, name: str, content: Callable[[], bytes]) -> Callable[[viser.GuiEvent[Any]], None]:
+        """Make a callback that sends a file to the browser that asked for it."""
+
+        def send(event: viser.GuiEvent[Any]) -> None:
+            with self.telling(event.client):
+                if event.client is not None:
+                    event.client.send_file_download(name, content(), save_immediately=True)
+
+        return send
 
 
 def _set(widget: Any, value: object) -> None:
@@ -350,13 +366,10 @@ def _paragraph(*lines: str, title: str = "") -> str:
     return f'<div style="{_STYLE}"><strong>{html_text(title)}</strong>{content}</div>'
 
 
-def _text(row: ClassRow) -> str:
-    return f"{_shown(row.name)}  {row.size:,}"
-
-
-def _color(row: ClassRow) -> tuple[int, int, int]:
-    return row.color if row.shown else _OFF
-
-
-def _icon(row: ClassRow) -> viser.IconName:
-    return viser.Icon.EYE if row.shown else viser.Icon.EYE_OFF
+def _look(row: ClassRow) -> dict[str, Any]:
+    """Label, color and icon of the button that switches a class."""
+    return {
+        "label": f"{_shown(row.name)}  {row.size:,}",
+        "color": row.color if row.shown else _OFF,
+        "icon": viser.Icon.EYE if row.shown else viser.Icon.EYE_OFF,
+    }

@@ -1,4 +1,4 @@
-"""From a click to a Gaussian, and from a Gaussian to the views that spoke for it."""
+"""Finds the Gaussian under a click, and the votes of each view for a Gaussian."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _WINDOW = 3
 
 
 class Picked(NamedTuple):
-    """What a ray hit.
+    """The Gaussian that a ray hit.
 
     Attributes
     ----------
@@ -93,8 +93,8 @@ def scene_camera(
     return Camera(name, width, height, K, np.linalg.inv(camera_to_world))
 
 
-class Voice(NamedTuple):
-    """What one view says of one Gaussian.
+class ViewVote(NamedTuple):
+    """Vote of one view for one label of one Gaussian.
 
     Attributes
     ----------
@@ -111,17 +111,17 @@ class Voice(NamedTuple):
     weight: float
 
 
-class Evidence:
-    """Which views saw each Gaussian, under which labels, and how much of it: the votes of each view, kept apart.
+class ViewVotes:
+    """Votes of every view for the labels of every Gaussian, not added up over the views.
 
-    Takes 12 bytes per sighting, and as long to make as a pass of the learner over all views.
+    Takes 12 bytes per (Gaussian, label) pair of a view, and as long to make as a pass of a learner over all views.
 
     Parameters
     ----------
     scene : GaussianScene
         N Gaussians.
     views : sequence of View
-        Those without a mask say nothing.
+        Those without a mask do not vote.
     progress : callable, optional
         Told of every view.
 
@@ -135,28 +135,29 @@ class Evidence:
         self, scene: GaussianScene, views: Sequence[View], *, device: str = "cpu", progress: Progress = silent
     ) -> None:
         self._num_gaussians = len(scene)
-        self._sightings: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+        # By view: Gaussians in ascending order, labels, weights, each of one length.
+        self._votes: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
         for done, view in enumerate(views):
-            progress("collect what each view says", done, len(views))
+            progress("collect the votes of each view", done, len(views))
             if view.has_mask:
                 observation = make_operator(scene, view.camera, device).observe(view.read_labels())
                 ids = observation.ids[observation.rows]
                 order = np.argsort(ids, kind="stable")
                 labels = observation.classes[observation.labels]
-                self._sightings[view.name] = ids[order], labels[order], observation.votes()[order]
-        progress("collect what each view says", len(views), len(views))
+                self._votes[view.name] = ids[order], labels[order], observation.votes()[order]
+        progress("collect the votes of each view", len(views), len(views))
 
     def __len__(self) -> int:
         """Count the views with a mask."""
-        return len(self._sightings)
+        return len(self._votes)
 
-    def voices(self, gaussian: int) -> list[Voice]:
-        """List what the views say of one Gaussian, the loudest first."""
-        voices = []
-        for name, (ids, labels, votes) in self._sightings.items():
+    def of(self, gaussian: int) -> list[ViewVote]:
+        """List the votes for the labels of one Gaussian, the largest first."""
+        found = []
+        for name, (ids, labels, votes) in self._votes.items():
             first, last = np.searchsorted(ids, [gaussian, gaussian + 1])
-            voices += [Voice(name, int(labels[i]), float(votes[i])) for i in range(first, last)]
-        return sorted(voices, key=lambda voice: -voice.weight)
+            found += [ViewVote(name, int(labels[i]), float(votes[i])) for i in range(first, last)]
+        return sorted(found, key=lambda vote: -vote.weight)
 
     def mean_reliability(self, reliability: Mapping[str, float]) -> np.ndarray:
         """Mean reliability of the views that saw each Gaussian, weighed by how much of it each saw.
@@ -172,12 +173,10 @@ class Evidence:
             NaN where no such view saw the Gaussian.
         """
         total, weight = np.zeros(self._num_gaussians), np.zeros(self._num_gaussians)
-        for name, (ids, _, votes) in self._sightings.items():
+        for name, (ids, _, votes) in self._votes.items():
             if name in reliability:
-                mine = np.bincount(ids, weights=votes, minlength=self._num_gaussians)
-                total += reliability[name] * mine
-                weight += mine
-        mean: np.ndarray = np.divide(total, weight, out=np.full(len(total), np.nan), where=weight > 0).astype(
-            np.float32
-        )
-        return mean
+                seen = np.bincount(ids, weights=votes, minlength=self._num_gaussians)
+                total += reliability[name] * seen
+                weight += seen
+        mean: np.ndarray = np.divide(total, weight, out=np.full(len(total), np.nan), where=weight > 0)
+        return mean.astype(np.float32)

@@ -1,4 +1,4 @@
-"""What is shown now: as splats that a browser draws, or as an image that is drawn here."""
+"""A scene with the colours to show it in, as splats for a browser or drawn as an image."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gsseg_core.viewer.splat_chunks import Key, Node, paint
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A scene, and how it should look.
+    """A scene with the visibility and the colour of every Gaussian.
 
     Attributes
     ----------
@@ -45,11 +45,11 @@ class Picture:
         operator: ViewOperator,  # of the scene
     ) -> np.ndarray:
         """Draw it as a view sees it, before black: (H, W, 3) uint8."""
-        image = operator.without(~self.shown).render(self._codes)
+        image = operator.without(~self.shown).render(self._rgb)
         drawn: np.ndarray = (image * 255 + 0.5).clip(0, 255).astype(np.uint8)
         return drawn
 
     @cached_property
-    def _codes(self) -> np.ndarray:
-        codes: np.ndarray = self.colors.astype(np.float32) / 255
-        return codes
+    def _rgb(self) -> np.ndarray:
+        rgb: np.ndarray = self.colors.astype(np.float32) / 255
+        return rgb

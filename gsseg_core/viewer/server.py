@@ -1,4 +1,4 @@
-"""viser's server behind our own door: it listens where it is told, and hears only what the viewer understands.
+"""Starts viser's server on a guarded socket, and drops messages that the viewer has no use for.
 
 viser checks neither who asks nor what a browser says. It takes its server from `websockets`, and that is the one place
 where both can be checked before viser sees it. Another version of viser may do so in another way; then nothing starts.
@@ -94,7 +94,7 @@ def _guarding(listener: Listener) -> Iterator[threading.Event]:
 def understood(
     data: Any,  # bytes of one message
 ) -> bool:
-    """Whether what a browser says is something that the viewer can use.
+    """Whether a browser's message is one that the viewer can use.
 
     Not so where it is no message that a page of ours sends, has other fields or types than viser says, or numbers that
     mean nothing: NaN, infinities, a window without a height, a direction of no length.

@@ -1,4 +1,4 @@
-"""Draws here what a browser looks at, and sends it as an image: for browsers that draw splats slowly."""
+"""Renders images on the server for browsers that draw splats slowly."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CameraOf = Callable[[viser.ClientHandle, int], Camera]
 
 
 class Frames:
-    """Images for one browser: a new one whenever it looks elsewhere, or something else is to be seen.
+    """Renders images for one browser: a new one whenever its camera moves or the picture changes.
 
     A change is answered by a coarse image at once, and by a fine one when no other has followed. What has become
     outdated while an image was drawn is left out, so the browser is never more than one image behind.

@@ -1,4 +1,4 @@
-"""What has to be sent when the picture changes: the scene in pieces, each of which can be switched on and off for free.
+"""Cuts a scene into nodes that a browser can switch on and off for free, and finds which to send after a change.
 
 A viewer draws the scene as many *nodes*. Switching a node takes a few bytes, while a node whose Gaussians change is
 sent again whole, at 32 bytes a Gaussian. So the nodes are cut where the switches are: by class, and by confidence at
@@ -26,7 +26,7 @@ Key = tuple[int, int]
 
 
 class Node(NamedTuple):
-    """A piece of the scene as it should look.
+    """Some Gaussians of the scene with their colours and visibility.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class Node(NamedTuple):
 
 
 class Changes(NamedTuple):
-    """What leads from one picture to the next.
+    """Nodes to send, switch and drop to get from one picture to the next.
 
     Attributes
     ----------
@@ -98,15 +98,15 @@ def paint(
     colors: np.ndarray,  # (N, 3) uint8
     opacities: np.ndarray,  # (N,) uint8
 ) -> dict[Key, Node]:
-    """Say how each node should look."""
+    """Give each node its colours, opacities and visibility."""
     rgba = np.concatenate([colors, opacities[:, None]], axis=1)
     painted = rgba.copy()
     painted[~shown, 3] = 0
     nodes = {}
     for key, members in parts.items():
-        mine = shown[members]
+        visible = bool(shown[members].any())
         # Of a node that is switched off, what it would look like switched on: that is what the browser keeps.
-        nodes[key] = Node(members, painted[members] if mine.any() else rgba[members], bool(mine.any()))
+        nodes[key] = Node(members, painted[members] if visible else rgba[members], visible)
     return nodes
 
 
@@ -123,7 +123,7 @@ def changes(sent: dict[Key, Node], wanted: dict[Key, Node]) -> Changes:
 
 
 def after(sent: dict[Key, Node], wanted: dict[Key, Node], done: Changes) -> dict[Key, Node]:
-    """Say what the browser has once these changes are made."""
+    """List the nodes that the browser has once these changes are made."""
     has = {key: node for key, node in sent.items() if key in wanted}
     for key, visible in done.switch.items():
         has[key] = has[key]._replace(visible=visible)

@@ -1,4 +1,4 @@
-"""The scene in a browser: sends what has changed, and counts it."""
+"""Sends a scene to a browser as splats, and later only what has changed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LARGEST = 200.0
 
 
 class Splats:
-    """A scene as browsers want it, made once for all of them.
+    """Centers and covariances of a scene in the units that browsers get, computed once for all of them.
 
     viser sends covariances as 16-bit floats, which know nothing below 6e-8: a millimetre squared, in metres, is hardly
     there. So the scene is sent in units of its own, and scaled back by each node.
@@ -48,7 +48,7 @@ class Splats:
 
 
 class SplatNodes:
-    """The nodes of a scene in a browser.
+    """Sends the nodes of a scene to one browser, and remembers what it has.
 
     Parameters
     ----------

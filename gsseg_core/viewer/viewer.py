@@ -1,4 +1,4 @@
-"""The viewer in the browser: a viser server, and what happens on its clicks. Needs the extra `view`."""
+"""Serves the viewer to browsers, and handles their clicks. Needs the extra `view`."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.viewer.access import Listener, listen
-from gsseg_core.viewer.clients import AUTO, DRAWN_BY, Screens
+from gsseg_core.viewer.clients import AUTO, DRAWN_BY, ClientRenderers
 from gsseg_core.viewer.corrections import Corrections
 from gsseg_core.viewer.live_source import LiveSource
 from gsseg_core.viewer.model import BY_RELIABILITY, MODES, ViewModel, completed
 from gsseg_core.viewer.panel import Panel
-from gsseg_core.viewer.picking import Evidence, pick, scene_camera
+from gsseg_core.viewer.picking import ViewVotes, pick, scene_camera
 from gsseg_core.viewer.picture import Picture
 from gsseg_core.viewer.server import start_server
 from gsseg_core.viewer.splat_chunks import cut
@@ -51,7 +51,7 @@ class Viewer:
     reliability : mapping from the name of a view to float
         How far each can be trusted, in [0, 1], as far as that is known.
     source : LiveSource, optional
-        Codes that change while the viewer runs.
+        Class probabilities that change while the viewer runs.
     listener : Listener, optional
         Where to listen, and who is answered; it is closed with the viewer. By default, what `listen` gives.
     draw : str
@@ -89,15 +89,15 @@ class Viewer:
         self.corrections = Corrections(model.scene, device=device)
         self.added_names: dict[int, str] = {}
         self._before = model.labelling
-        self._evidence: Evidence | None = None
-        self._evidence_lock = threading.Lock()
-        self.lock = threading.RLock()
+        self._view_votes: ViewVotes | None = None
+        self._view_votes_lock = threading.Lock()
+        self._lock = threading.RLock()
         self._stale, self._closing = threading.Event(), threading.Event()
         self._source = source
         self._listener = listener or listen()
         self.server = start_server(self._listener)
         self.url = self._listener.url
-        self.screens = Screens(self.server, model.scene, self._seen_by, draw, device)
+        self.renderers = ClientRenderers(self.server, model.scene, self._seen_by, draw, device)
         self._set_up_camera()
         self.panel = Panel(self)
         self.server.scene.on_click()(self._on_click)
@@ -119,21 +119,21 @@ class Viewer:
             thread.join()
         if self._source is not None:
             self._source.close()
-        self.screens.close()
+        self.renderers.close()
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
         self._listener.close()
 
     @property
     def follows(self) -> bool:
-        """Whether codes change while it runs."""
+        """Whether class probabilities change while the viewer runs."""
         return self._source is not None
 
     # What the panel calls.
 
     def change(self, action: Callable[[ViewModel], object]) -> None:
         """Change what is shown, and have the browser follow; changes that come fast are shown together."""
-        with self.lock:
+        with self._lock:
             action(self.model)
         self._stale.set()
 
@@ -153,17 +153,17 @@ class Viewer:
                     "view reliability is not known; expected --data, and a report.json of `gsseg segment --learner em` "
                     "beside the segmentation"
                 )
-            self.model.reliability = self.evidence().mean_reliability(self.reliability)
+            self.model.reliability = self.view_votes().mean_reliability(self.reliability)
         self.change(lambda model: setattr(model, "mode", mode))
 
-    def evidence(self) -> Evidence:
-        """Return what each view says of each Gaussian; collected when first asked for."""
-        with self._evidence_lock:
-            if self._evidence is None:
-                self._evidence = Evidence(
+    def view_votes(self) -> ViewVotes:
+        """Return the votes of each view for each Gaussian; collected when first asked for."""
+        with self._view_votes_lock:
+            if self._view_votes is None:
+                self._view_votes = ViewVotes(
                     self.model.scene, self.views, device=self.device, progress=self.panel.show_progress
                 )
-            return self._evidence
+            return self._view_votes
 
     def jump(self, client: viser.ClientHandle, view: View, with_mask: bool) -> None:
         """Look from where a view was taken; lay its mask over the picture."""
@@ -173,7 +173,7 @@ class Viewer:
             client.camera.up_direction = -pose[:3, 1]
             client.camera.position = pose[:3, 3]
             client.camera.look_at = pose[:3, 3] + pose[:3, 2] * self._reach
-            client.camera.fov = float(2 * np.arctan(camera.height / 2 / camera.fy))
+            client.camera.fov = _vertical_fov(camera)
         self.server.scene.remove_by_name(_MASK)
         if with_mask:
             self._hang(view, pose)
@@ -192,12 +192,12 @@ class Viewer:
         EmptySceneError
             Nothing is shown.
         """
-        with self.lock:
+        with self._lock:
             shown = self.model.shown()
         return _as_file(lambda path: self.model.scene.subset(shown).save(path), "selection.ply")
 
     def segmentation_npz(self) -> bytes:
-        """Write what is known of each Gaussian, corrections included, as a `segmentation.npz`."""
+        """Write labels and class probabilities, corrections included, as a `segmentation.npz`."""
         labels, probabilities, names = self.model.labelling
         nothing, none = np.zeros(len(labels), bool), np.empty((0, probabilities.shape[1]), np.float32)
         result = Segmentation(labels, completed(probabilities), names, self.model.scene.digest, nothing, none)
@@ -205,7 +205,7 @@ class Viewer:
 
     def undo(self) -> bool:
         """Take the last correction back; return whether there was one."""
-        with self.lock:
+        with self._lock:
             undone = self.corrections.undo()
             self._relabel()
         return undone
@@ -224,7 +224,7 @@ class Viewer:
             )
             self.panel.show_picked(picked, None)
             if picked is not None and self.views:
-                self.panel.show_picked(picked, self.evidence().voices(picked.gaussian))
+                self.panel.show_picked(picked, self.view_votes().of(picked.gaussian))
 
     def _on_correction_click(self, event: viser.SceneClickEvent) -> None:
         with self.panel.telling(event.client):
@@ -239,7 +239,7 @@ class Viewer:
             self._correct(self.panel.drawn_box(camera, tuple(low.tolist()), tuple(high.tolist())))
 
     def _correct(self, view: View) -> None:
-        with self.lock:
+        with self._lock:
             before = self.model.labelling.labels
             self.corrections.add(view)
             self._relabel()
@@ -248,13 +248,13 @@ class Viewer:
 
     def _label_map(self, camera: Camera) -> np.ndarray:
         """Labels (H, W) of what is shown, -1 where nothing is."""
-        with self.lock:
+        with self._lock:
             labelling, shown = self.model.labelling, self.model.shown()
         # The last channel is for what has no class, so that it is a region as well.
-        codes = np.eye(labelling.probabilities.shape[1] + 1, dtype=np.float32)[np.maximum(labelling.labels, -1)]
-        image = make_operator(self.model.scene, camera, self.device).without(~shown).render(codes)
+        one_hot = np.eye(labelling.probabilities.shape[1] + 1, dtype=np.float32)[np.maximum(labelling.labels, -1)]
+        image = make_operator(self.model.scene, camera, self.device).without(~shown).render(one_hot)
         labels = np.where(image.max(axis=2) > 0, image.argmax(axis=2), -1)
-        labels[labels == codes.shape[1] - 1] = -1
+        labels[labels == one_hot.shape[1] - 1] = -1
         return labels
 
     def camera_of(self, client: viser.ClientHandle, rows: int | None = None) -> Camera:
@@ -280,10 +280,11 @@ class Viewer:
         self._parts = cut(self.model.labelling.labels, self.model.confidence)
 
     def _show(self) -> None:
-        with self.lock:
+        with self._lock:
             picture = Picture(self.model.scene, self._parts, self.model.shown(), self.model.colors())
-        self.screens.show(picture)
-        self.panel.refresh()
+            rows = self.model.rows()
+        self.renderers.show(picture)
+        self.panel.show_classes(rows)
 
     def _keep_showing(self) -> None:
         while self._stale.wait() and not self._closing.is_set():
@@ -300,7 +301,7 @@ class Viewer:
                 self._closing.wait(1.0)
                 continue
             if update is not None:
-                with self.lock:
+                with self._lock:
                     self._before = update.labelling
                     self._relabel()
                 self.panel.show_live(f"{update.num_views} views so far")
@@ -315,9 +316,8 @@ class Viewer:
         if self.views:
             poses = np.array([np.linalg.inv(view.camera.world_to_camera) for view in self.views])
             self.server.scene.set_up_direction(-poses[:, :3, 1].mean(axis=0))
-            first = self.views[0].camera
             start.position, start.look_at = poses[0, :3, 3], poses[0, :3, 3] + poses[0, :3, 2] * self._reach
-            start.fov = float(2 * np.arctan(first.height / 2 / first.fy))
+            start.fov = _vertical_fov(self.views[0].camera)
         else:
             start.look_at = (low + high) / 2
             start.position = (low + high) / 2 + np.array([1.2, 1.2, 0.9]) * self._reach
@@ -343,6 +343,11 @@ class Viewer:
             wxyz=vtf.SO3.from_matrix(pose[:3, :3]).wxyz,
             position=pose[:3, 3] + pose[:3, :3] @ middle * distance,
         )
+
+
+def _vertical_fov(camera: Camera) -> float:
+    """Field of view in radians, as viser takes it."""
+    return float(2 * np.arctan(camera.height / 2 / camera.fy))
 
 
 def _as_file(write: Callable[[Path], Any], name: str) -> bytes:

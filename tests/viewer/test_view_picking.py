@@ -14,7 +14,7 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import REMOVED, UNOBSERVED
 from gsseg_core.viewer.corrections import Corrections, box, disc, region, share_seen
 from gsseg_core.viewer.model import Labelling
-from gsseg_core.viewer.picking import Evidence, pick, scene_camera
+from gsseg_core.viewer.picking import ViewVotes, pick, scene_camera
 
 SCENE, TRUTH = balls_on_a_table()
 CAMERA = ring(5)[0]
@@ -66,24 +66,24 @@ def test_a_camera_of_a_viewer_sees_what_the_viewer_sees() -> None:
     assert np.allclose(camera.K, CAMERA.K) and np.allclose(camera.world_to_camera, CAMERA.world_to_camera)
 
 
-def test_voices_are_the_votes_of_each_view_the_loudest_first() -> None:
+def test_view_votes_are_listed_by_view_the_largest_first() -> None:
     views = clean_views(4)
-    evidence = Evidence(SCENE, [*views, View(CAMERA)])  # the last one has no mask, and no say
-    assert len(evidence) == 4
+    view_votes = ViewVotes(SCENE, [*views, View(CAMERA)])  # the last one has no mask, and no vote
+    assert len(view_votes) == 4
     i = int(np.flatnonzero(TRUTH == 2)[5])
-    voices = evidence.voices(i)
-    assert [v.weight for v in voices] == sorted((v.weight for v in voices), reverse=True)
+    found = view_votes.of(i)
+    assert [v.weight for v in found] == sorted((v.weight for v in found), reverse=True)
     for view in views:
         labels = view.read_labels()
         votes = make_operator(SCENE, view.camera).adjoint(np.eye(4, dtype=np.float32)[labels])[i]
-        mine = {v.label: v.weight for v in voices if v.view == view.name}
-        assert mine == pytest.approx({k: votes[k] for k in range(4) if votes[k] > 0}, rel=1e-4, abs=1e-6)
-    assert evidence.voices(len(SCENE) - 1) == []  # out of sight
+        of_view = {v.label: v.weight for v in found if v.view == view.name}
+        assert of_view == pytest.approx({k: votes[k] for k in range(4) if votes[k] > 0}, rel=1e-4, abs=1e-6)
+    assert view_votes.of(len(SCENE) - 1) == []  # out of sight
 
 
 def test_mean_reliability_weighs_views_by_how_much_they_saw() -> None:
     views = clean_views(3)
-    mean = Evidence(SCENE, views).mean_reliability({views[0].name: 1.0, views[2].name: 0.25})
+    mean = ViewVotes(SCENE, views).mean_reliability({views[0].name: 1.0, views[2].name: 0.25})
     seen = np.stack([make_operator(SCENE, views[v].camera).visibility() for v in (0, 2)])
     known = seen.sum(axis=0) > 1e-3
     expected = (seen[0] + 0.25 * seen[1])[known] / seen.sum(axis=0)[known]

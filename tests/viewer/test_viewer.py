@@ -28,7 +28,7 @@ from gsseg_core.viewer.model import BY_RELIABILITY, TRUE_COLOURS, Labelling, Vie
 
 pytest.importorskip("viser")
 
-from gsseg_core.viewer import clients as view_screens
+from gsseg_core.viewer import clients
 from gsseg_core.viewer.clients import AUTO, BROWSER, SERVER
 from gsseg_core.viewer.viewer import Viewer
 
@@ -113,14 +113,14 @@ def test_the_page_loads_and_splats_are_drawn(shown: Shown) -> None:
 
 
 def test_a_class_toggle_changes_the_picture_and_sends_no_gaussian(shown: Shown) -> None:
-    before, sent = shown.picture(), shown.viewer.screens.bytes_sent
+    before, sent = shown.picture(), shown.viewer.renderers.bytes_sent
     shown.press("red ball 60")
     shown.wait(lambda: not shown.looks_like(1), "the red ball to go")
     assert shown.looks_like(2)
     shown.press("red ball 60")
     shown.wait(lambda: shown.looks_like(1), "the red ball to come back")
     shown.wait(lambda: np.abs(shown.picture() - before).max(axis=2).mean() < 2, "the picture as it was")
-    assert shown.viewer.screens.bytes_sent == sent
+    assert shown.viewer.renderers.bytes_sent == sent
 
 
 def test_a_class_is_isolated_and_another_is_removed(shown: Shown) -> None:
@@ -156,12 +156,12 @@ def test_true_colours_and_reliability_change_the_picture(shown: Shown) -> None:
     shown.viewer.set_mode("class")
 
 
-def test_a_click_tells_the_class_its_probabilities_and_the_views_that_spoke_for_it(shown: Shown) -> None:
+def test_a_click_tells_the_class_its_probabilities_and_the_views_that_voted_for_it(shown: Shown) -> None:
     for k in (1, 3):
         shown.page.mouse.click(*shown.pixel_of(k))
         shown.says(f"{NAMES[k]}, class {k}")
         shown.says(f"probabilities: {NAMES[k]} 0.90")
-        shown.says("3 views spoke for it")
+        shown.says("3 views voted for it")
         shown.says(f"view0: {NAMES[k]}")
     shown.page.mouse.click(5, 200)
     shown.says("Nothing is there.")
@@ -273,10 +273,10 @@ def test_who_is_to_draw_must_be_known() -> None:
 def test_a_browser_gets_images_until_it_has_shown_that_it_draws_fast(
     chromium: Browser, monkeypatch: pytest.MonkeyPatch, limit: float, draws: bool
 ) -> None:
-    monkeypatch.setattr(view_screens, "SLOW", limit)
+    monkeypatch.setattr(clients, "SLOW", limit)
     taken: list[bool] = []
-    stop = view_screens.Screen.stop_images
-    monkeypatch.setattr(view_screens.Screen, "stop_images", lambda screen: (stop(screen), taken.append(True)))
+    stop = clients.ClientRenderer.stop_images
+    monkeypatch.setattr(clients.ClientRenderer, "stop_images", lambda renderer: (stop(renderer), taken.append(True)))
     viewer = Viewer(ViewModel(SCENE, LEARNT), clean_views(1), listener=listen(port=18080), draw=AUTO)
     with closing(viewer), opened_page(chromium, 960, 640, tolerated="computeBoundingSphere") as page:
         page.goto(viewer.url)
@@ -286,7 +286,7 @@ def test_a_browser_gets_images_until_it_has_shown_that_it_draws_fast(
             shown.wait(lambda: taken, "the browser to draw")
         else:
             shown.says("This browser draws slowly")
-        assert viewer.screens.drawing == draws and bool(viewer.screens.bytes_sent) == draws
+        assert viewer.renderers.drawing == draws and bool(viewer.renderers.bytes_sent) == draws
         viewer.change(lambda model: model.isolate(2))
         shown.wait(lambda: shown.looks_like(2) and not shown.looks_like(1), "the mug alone")
 
