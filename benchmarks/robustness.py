@@ -36,7 +36,7 @@ from gsseg_core.export.view_pictures import draw_worst_views
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import Learner
-from gsseg_core.learn.mask_reliability import OtherViews, check_views
+from gsseg_core.learn.mask_reliability import check_views
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
@@ -319,7 +319,7 @@ def measure_reliability(benches: Sequence[Bench], pictures: Path, aside: Path) -
         plots[bench.name] = {"views": list(zip(true.tolist(), told.tolist(), strict=True))}
         # The real scene may be looked at, but not handed on.
         folder = pictures if bench.name.startswith("demo") else aside
-        save_small(folder / "worst_views.png", draw_worst_views(OtherViews(learner), checks, 2))
+        save_small(folder / "worst_views.png", draw_worst_views(learner.scene, learner.views, checks, 2))
     share = Axis("true share of right pixels", 0, 1, 0.25)
     draw_panels(pictures / "reliability.svg", plots, share, replace(share, name="reliability"), lines=False)
     header = ["scene", "views", "rank correlation", "worst found", "bias", "mean error", "largest error", "seconds"]

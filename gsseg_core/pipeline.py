@@ -5,19 +5,19 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from gsseg_core.data.dataset import Dataset, View, spread
 from gsseg_core.data.hints import mask_hint
 from gsseg_core.data.label_images import write_mask
-from gsseg_core.errors import NoUsableViewsError, SettingsError
+from gsseg_core.errors import NoUsableViewsError
 from gsseg_core.export.class_plys import class_file_name, write_classes
 from gsseg_core.export.pictures import save_png
-from gsseg_core.export.summary import build_report
+from gsseg_core.export.summary import RunReport, RunSettings
 from gsseg_core.export.view_pictures import (
     Drawn,
     draw_views,
@@ -29,13 +29,13 @@ from gsseg_core.export.view_pictures import (
 from gsseg_core.files.earlier_outputs import earlier_render, earlier_segment
 from gsseg_core.files.json_files import write_json
 from gsseg_core.files.run_folder import StagedRun, staged_run
-from gsseg_core.learn.calibrate import calibrate
+from gsseg_core.learn.calibrate import Calibration, calibrate
 from gsseg_core.learn.em.em_learner import EMLearner
-from gsseg_core.learn.learner import MEMORY_BUDGET, NO_MASK, Learner, Progress, silent
+from gsseg_core.learn.learner import MEMORY_BUDGET, NO_MASK, Learner
 from gsseg_core.learn.mask_reliability import OtherViews, ViewCheck, hold_against, reliability_report
-from gsseg_core.learn.registry import DISTRIBUTED, make_learner
-from gsseg_core.objects.object_table import IDS, PER_VIEW, find_objects
-from gsseg_core.progress import Stopwatch
+from gsseg_core.learn.registry import make_learner
+from gsseg_core.objects.object_table import PER_VIEW, ObjectTable, find_objects
+from gsseg_core.progress import Progress, Stopwatch, silent
 from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, spread_if_scarce
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.report.findings import Evidence
@@ -44,8 +44,65 @@ from gsseg_core.report.pictures import ViewImages
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
+if TYPE_CHECKING:
+    from distributed import Client
+
 PICTURED_VIEWS = 12
 """Views that `segment` draws, spread evenly over the dataset."""
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """What a run learns from.
+
+    Attributes
+    ----------
+    scene : GaussianScene
+        What is segmented.
+    root : Path
+        Folder of the dataset.
+    train, pictured : list of View
+        Those to learn from, and those to draw.
+    class_names : mapping from class to name
+        Classes as they are learnt, numbered without gaps.
+    class_ids : tuple of int, optional
+        Ids of these classes in the dataset; None where the classes are objects.
+    objects : ObjectTable, optional
+        The objects that the ids of the views were found to be.
+    """
+
+    scene: GaussianScene
+    root: Path
+    train: list[View]
+    pictured: list[View]
+    class_names: Mapping[int, str]
+    class_ids: tuple[int, ...] | None
+    objects: ObjectTable | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Assessment:
+    """What is known of the views once they have been learnt from.
+
+    Attributes
+    ----------
+    views : mapping from name to View
+        Those that were used.
+    checks : list of ViewCheck, optional
+        Their masks beside what the other views predict; None where the learner cannot tell.
+    calibration : Calibration
+        The temperature.
+    objective : list of float
+        The learner's objective after each step.
+    report : mapping
+        `views` in `report.json`.
+    """
+
+    views: Mapping[str, View]
+    checks: list[ViewCheck] | None
+    calibration: Calibration
+    objective: list[float]
+    report: Mapping[str, Any]
 
 
 def segment_places(class_names: Mapping[int, str], views: Iterable[View]) -> list[str]:
@@ -114,154 +171,182 @@ def segment(
     GssegError
         Whatever is wrong with the input; see `gsseg_core.errors`. What was in `out` before is whole and unchanged.
     """
-    with staged_run(out, "segment", earlier=earlier_segment, places=segment_places({}, [])) as run:
-        return _segment(
-            run,
-            scene_path,
-            data,
-            labels=labels,
-            learner=learner,
-            views=views,
-            refine=refine,
-            graph=graph,
-            device=device,
-            memory_budget=memory_budget,
-            seed=seed,
-            scheduler=scheduler,
-            ids=ids,
-            progress=progress,
-        )
-
-
-def _segment(
-    run: StagedRun,
-    scene_path: str | os.PathLike[str],
-    data: str | os.PathLike[str],
-    *,
-    labels: str,
-    learner: str,
-    views: int | None,
-    refine: RefineSettings | None,
-    graph: bool,
-    device: str,
-    memory_budget: int,
-    seed: int,
-    scheduler: str | None,
-    ids: str,
-    progress: Progress,
-) -> dict[str, Any]:
-    """Do what `segment` does, and leave it to the caller to make the run the result."""
-    if scheduler is not None and learner not in DISTRIBUTED:
-        raise SettingsError(
-            f"scheduler {scheduler}: the learner {learner} takes one view after the other, each at the codes that the "
-            f"one before it left, so there is nothing to share out; expected one of {', '.join(DISTRIBUTED)}"
-        )
-    if ids not in IDS:
-        raise SettingsError(f"ids is {ids!r}; expected one of {', '.join(IDS)}")
-    refine = refine or RefineSettings()
+    settings = RunSettings(
+        learner, labels, views, device, memory_budget, seed, scheduler, ids,
+        refine or RefineSettings(), GraphSettings() if graph else None,
+    )  # fmt: skip
     watch = Stopwatch()
-    table = None
-    with ExitStack() as stack:
-        with watch.stage("load"):
-            client = None
-            if scheduler is not None:
-                from gsseg_core.learn.distributed.dask_cluster import connected
-
-                client = stack.enter_context(connected(scheduler))
-            scene = GaussianScene.load(scene_path)
-            dataset, class_ids = Dataset(data, labels), None
-            if ids != PER_VIEW:
-                dataset, class_ids = dataset.numbered(), dataset.class_ids
-            train = spread(dataset.views("train"), views)
-            class_names = {} if ids == PER_VIEW else dataset.class_names
-        if ids == PER_VIEW:
-            with watch.stage("associate"):
-                table = find_objects(scene, train, device=device, progress=progress)
-                train, class_names = [table.relabelled(view) for view in train], table.class_names
-        chosen = spread(dataset.views("all"), PICTURED_VIEWS)
-        run.claim(segment_places(class_names, chosen))
-        with watch.stage("observe"):
-            teacher = make_learner(
-                learner, scene, max(class_names) + 1,
-                seed=seed, device=device, memory_budget=memory_budget, client=client,
-            )  # fmt: skip
-            teacher.observe_all(train, progress)
-        with watch.stage("learn"):
-            try:
-                teacher.fit(progress)
-            except NoUsableViewsError as error:
-                blank = set(teacher.rejected.values()) == {NO_MASK}
-                hint = mask_hint(dataset.root, labels, [view.name for view in train]) if blank else ""
-                raise NoUsableViewsError(f"{data}: {error}{hint}") from error
-        if type(teacher) is not EMLearner:
-            with watch.stage("calibrate"):  # while there still are workers
-                calibration = calibrate(teacher, progress=progress)
-    learnt: dict[str, Any] = {
-        "views": {"used": len(teacher.views), "rejected": teacher.reject_summary(), "names": teacher.rejected},
-        "objective": teacher.history_,
-    }
-    more = _settings_of(teacher)
-    worst: np.ndarray | None = None
-    masks, checks, held_out = dict(teacher.views), list[ViewCheck](), False
-    if type(teacher) is EMLearner:
-        with watch.stage("check views"):
-            others = OtherViews(teacher, progress)
-            checks, held_out = others.check_all(progress), True
-            learnt["views"]["reliability"] = reliability_report(checks, class_names)
-            worst = draw_worst_views(others, checks)
-        with watch.stage("calibrate"):
-            calibration = calibrate(teacher, others, progress)
-        del others
-    codes, evidence = teacher.codes_, teacher.evidence()
-    del teacher  # Its votes take as much memory as all that follows.
-    with watch.stage("refine"):
-        if graph:
-            codes = spread_if_scarce(scene, codes, evidence)
-        result = Segmentation.from_codes(scene, codes, class_names, refine).calibrated(calibration.temperature)
+    with staged_run(out, "segment", earlier=earlier_segment, places=segment_places({}, [])) as run:
+        settings.check()
+        with ExitStack() as workers:
+            with watch.stage("load"):
+                client = _connect(scheduler, workers)
+                inputs = _load(scene_path, data, settings)
+            if ids == PER_VIEW:
+                with watch.stage("associate"):
+                    inputs = _associate(inputs, device, progress)
+            run.claim(segment_places(inputs.class_names, inputs.pictured))
+            fitted = _learn(inputs, settings, client, watch, progress)
+            assessment = _assess(fitted, inputs.class_names, watch, progress)
+        codes, evidence = fitted.codes_, fitted.evidence()
+        settings = replace(
+            settings,
+            graph=settings.graph if is_scarce(evidence) else None,
+            learner_settings=getattr(fitted, "settings", None),
+        )
+        del fitted  # Its votes take as much memory as all that follows.
+        result = _refine(inputs, codes, evidence, assessment.calibration.temperature, settings, watch)
         del codes
-    if refine.carve:
+        report = _write(run, inputs, assessment, result, settings, watch).as_dict()
+        write_json(run.folder / "report.json", report)
+    return report
+
+
+def _connect(scheduler: str | None, workers: ExitStack) -> Client | None:
+    """Connect to a Dask scheduler, if one is asked for, until the stack is closed."""
+    if scheduler is None:
+        return None
+    from gsseg_core.learn.distributed.dask_cluster import connected
+
+    return workers.enter_context(connected(scheduler))
+
+
+def _load(scene_path: str | os.PathLike[str], data: str | os.PathLike[str], settings: RunSettings) -> Inputs:
+    """Read a scene and the views of a dataset, whose classes are numbered without gaps."""
+    scene, dataset = GaussianScene.load(scene_path), Dataset(data, settings.labels)
+    # Ids that are a view's own are no classes; objects take their place.
+    class_ids = None if settings.ids == PER_VIEW else dataset.class_ids
+    if class_ids is not None:
+        dataset = dataset.numbered()
+    return Inputs(
+        scene,
+        dataset.root,
+        spread(dataset.views("train"), settings.views),
+        spread(dataset.views("all"), PICTURED_VIEWS),
+        {} if class_ids is None else dataset.class_names,
+        class_ids,
+    )
+
+
+def _associate(inputs: Inputs, device: str, progress: Progress) -> Inputs:
+    """Find which ids of the views are the same object, and number the objects."""
+    objects = find_objects(inputs.scene, inputs.train, device=device, progress=progress)
+    train = [objects.relabelled(view) for view in inputs.train]
+    return replace(inputs, train=train, class_names=objects.class_names, objects=objects)
+
+
+def _learn(
+    inputs: Inputs, settings: RunSettings, client: Client | None, watch: Stopwatch, progress: Progress
+) -> Learner:
+    """Fit the learner that the settings name to the train views."""
+    with watch.stage("observe"):
+        learner = make_learner(
+            settings.learner, inputs.scene, max(inputs.class_names) + 1, seed=settings.seed, device=settings.device,
+            memory_budget=settings.memory_budget, client=client,
+        )  # fmt: skip
+        learner.observe_all(inputs.train, progress)
+    with watch.stage("learn"):
+        try:
+            learner.fit(progress)
+        except NoUsableViewsError as error:
+            blank = set(learner.rejected.values()) == {NO_MASK}
+            names = [view.name for view in inputs.train]
+            hint = mask_hint(inputs.root, settings.labels, names) if blank else ""
+            raise NoUsableViewsError(f"{inputs.root}: {error}{hint}") from error
+    return learner
+
+
+def _assess(learner: Learner, class_names: Mapping[int, str], watch: Stopwatch, progress: Progress) -> Assessment:
+    """Compare each mask with what the other views predict, where the learner can tell, and calibrate."""
+    checks, others, reliability = None, None, {}
+    if type(learner) is EMLearner:
+        with watch.stage("check views"):
+            others = OtherViews(learner, progress)
+            checks = others.check_all(progress)
+            reliability = {"reliability": reliability_report(checks, class_names)}
+    with watch.stage("calibrate"):
+        calibration = calibrate(learner, others, progress)
+    views = {"used": len(learner.views), "rejected": learner.reject_summary(), "names": learner.rejected, **reliability}
+    return Assessment(dict(learner.views), checks, calibration, learner.history_, views)
+
+
+def _refine(
+    inputs: Inputs,
+    codes: np.ndarray,  # (N, K) float32
+    evidence: np.ndarray,  # (N,) float32
+    temperature: float,
+    settings: RunSettings,
+    watch: Stopwatch,
+) -> Segmentation:
+    """Make calibrated labels of learnt class probabilities: graph where views are few, KNN, filter or carving."""
+    with watch.stage("refine"):
+        if settings.graph:
+            codes = spread_if_scarce(inputs.scene, codes, evidence)
+        result = Segmentation.from_codes(inputs.scene, codes, inputs.class_names, settings.refine)
+        result = result.calibrated(temperature)
+    if settings.refine.carve:
         # Only now: the kernels of the carving take a while to compile, and most runs do without.
         from gsseg_core.objects.silhouette_carving import carved
 
         with watch.stage("carve"):
-            cameras = [view.camera for view in spread(train, refine.carve_views)]
-            result = carved(scene, result, cameras, device)
-    named = result if class_ids is None else result.with_ids(class_ids)
+            cameras = [view.camera for view in spread(inputs.train, settings.refine.carve_views)]
+            result = carved(inputs.scene, result, cameras, settings.device)
+    return result
+
+
+def _write(
+    run: StagedRun,
+    inputs: Inputs,
+    assessment: Assessment,
+    result: Segmentation,
+    settings: RunSettings,
+    watch: Stopwatch,
+) -> RunReport:
+    """Write all files of a run but `report.json`, and report it."""
+    scene, folder = inputs.scene, run.folder
+    named = result if inputs.class_ids is None else result.with_ids(inputs.class_ids)
     with watch.stage("export"):
-        named.save(run.folder / "segmentation.npz", run.id)
-        plys = write_classes(scene, named, run.folder / "classes", run.id)
+        named.save(folder / "segmentation.npz", run.id)
+        plys = write_classes(scene, named, folder / "classes", run.id)
     with watch.stage("pictures"):
-        images = ViewImages(scene, device)
-        drawn = draw_views(scene, result, chosen, device=device)
-        if not held_out:
-            drawn = _held_against_masks(drawn, masks, result.num_classes, checks)
-        pictures = write_pictures(result, _keeping_images(drawn, images), run.folder / "pictures", run.id)
-        if worst is not None:
-            pictures.append(run.folder / "pictures" / "worst_views.png")
-            save_png(pictures[-1], worst, run.id)
-    report = build_report(
+        images, evidence, pictures = _picture(run, inputs, assessment, result, settings.device)
+    report = RunReport.of(
         scene,
         named,
-        **learnt,
-        settings={
-            "learner": learner, "labels": labels, "views": views, "device": device, "memory_budget": memory_budget,
-            "seed": seed, "scheduler": scheduler, "ids": ids, "refine": asdict(refine),
-            "graph": asdict(GraphSettings()) if graph and is_scarce(evidence) else None, **more,
-        },
-        plys={k: str(path.relative_to(run.folder)) for k, path in plys.items()},
-        pictures=[str(path.relative_to(run.folder)) for path in pictures],
+        views=assessment.report,
+        settings=settings.as_dict(),
+        objective=assessment.objective,
+        plys={k: str(path.relative_to(folder)) for k, path in plys.items()},
+        pictures=[str(path.relative_to(folder)) for path in pictures],
         seconds=watch.seconds,
-    )  # fmt: skip
-    report["run"] = run.id
-    report["calibration"] = calibration.as_dict()
-    if table is not None:
-        report["ids"] = table.summary()
+        run=run.id,
+        calibration=assessment.calibration.as_dict(),
+        ids=None if inputs.objects is None else inputs.objects.summary(),
+    )
     with watch.stage("report page"):
-        write_report_page(run.folder / "report.html", report, scene, result, Evidence(checks, masks, held_out), images)
-    report["page"] = "report.html"
-    report["seconds"]["report page"] = round(watch.seconds["report page"], 3)
-    write_json(run.folder / "report.json", report)
-    return report
+        write_report_page(folder / "report.html", report.as_dict(), scene, result, evidence, images)
+    return replace(report, page="report.html", seconds=watch.seconds)
+
+
+def _picture(
+    run: StagedRun, inputs: Inputs, assessment: Assessment, result: Segmentation, device: str
+) -> tuple[ViewImages, Evidence, list[Path]]:
+    """Write the pictures; what the report page can use of them is kept."""
+    views, folder, images = assessment.views, run.folder / "pictures", ViewImages(inputs.scene, device)
+    checks = list(assessment.checks or ())
+
+    def noted() -> Iterator[Drawn]:
+        for drawn in draw_views(inputs.scene, result, inputs.pictured, device=device):
+            images.keep(drawn.view, drawn.image)
+            if assessment.checks is None and drawn.view.name in views:
+                checks.append(hold_against(views[drawn.view.name], drawn.labels, result.num_classes))
+            yield drawn
+
+    pictures = write_pictures(result, noted(), folder, run.id)
+    if assessment.checks:
+        pictures.append(folder / "worst_views.png")
+        save_png(pictures[-1], draw_worst_views(inputs.scene, views, assessment.checks, device=device), run.id)
+    return images, Evidence(checks, views, assessment.checks is not None), pictures
 
 
 def render(
@@ -303,25 +388,3 @@ def render(
         progress("render", len(views), len(views))
         write_overview(numbered, overlays, [view.name for view in views], run.folder / "overlays", run.id)
     return [Path(out) / name for name in names]
-
-
-def _keeping_images(drawn: Iterable[Drawn], images: ViewImages) -> Iterator[Drawn]:
-    """Pass drawn views on; what was rendered for them, the report page need not render again."""
-    for one in drawn:
-        images.keep(one.view, one.image)
-        yield one
-
-
-def _held_against_masks(
-    drawn: Iterable[Drawn], masks: Mapping[str, View], num_classes: int, checks: list[ViewCheck]
-) -> Iterator[Drawn]:
-    """Pass drawn views on, and note how the masks of those that were learnt from compare."""
-    for one in drawn:
-        if one.view.name in masks:
-            checks.append(hold_against(masks[one.view.name], one.labels, num_classes))
-        yield one
-
-
-def _settings_of(learner: Learner) -> Mapping[str, Any]:
-    settings = getattr(learner, "settings", None)
-    return {} if settings is None else {"learner_settings": asdict(settings)}

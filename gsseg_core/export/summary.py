@@ -4,59 +4,144 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
+from gsseg_core.errors import SettingsError
+from gsseg_core.learn.registry import DISTRIBUTED
+from gsseg_core.objects.object_table import IDS
 from gsseg_core.objects.oriented_boxes import object_boxes
+from gsseg_core.refine.label_propagation import GraphSettings
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 
 
-def build_report(
-    scene: GaussianScene,
-    result: Segmentation,
-    *,
-    views: Mapping[str, Any],
-    settings: Mapping[str, Any],
-    seconds: Mapping[str, float],
-    plys: Mapping[int, str],
-    objective: Sequence[float] = (),
-    pictures: Sequence[str] = (),
-) -> dict[str, Any]:
-    """Put together what a run found, from what, with which settings, and how long it took.
+@dataclass(frozen=True)
+class RunSettings:
+    """All that determines a run; its fields are `settings` in `report.json`.
 
-    Parameters
+    Attributes
     ----------
-    scene : GaussianScene
-        What was segmented.
-    result : Segmentation
-        What came out.
+    learner, labels, views, device, memory_budget, seed, scheduler, ids
+        As `gsseg_core.pipeline.segment` takes them.
+    refine : RefineSettings
+        The refinement.
+    graph : GraphSettings, optional
+        Of the graph along which probabilities spread; None where they do not.
+    learner_settings : dataclass, optional
+        Those of the learner, if it has any.
+    """
+
+    learner: str
+    labels: str
+    views: int | None
+    device: str
+    memory_budget: int
+    seed: int
+    scheduler: str | None
+    ids: str
+    refine: RefineSettings
+    graph: GraphSettings | None
+    learner_settings: Any = None
+
+    def check(self) -> None:
+        """Raise `SettingsError` where they do not go together."""
+        if self.scheduler is not None and self.learner not in DISTRIBUTED:
+            raise SettingsError(
+                f"scheduler {self.scheduler}: the learner {self.learner} takes one view after the other, each at the "
+                "codes that the one before it left, so there is nothing to share out; expected one of "
+                f"{', '.join(DISTRIBUTED)}"
+            )
+        if self.ids not in IDS:
+            raise SettingsError(f"ids is {self.ids!r}; expected one of {', '.join(IDS)}")
+
+    def as_dict(self) -> dict[str, Any]:
+        """Give them as `report.json` does."""
+        settings = asdict(self)
+        if self.learner_settings is None:
+            del settings["learner_settings"]
+        return settings
+
+
+@dataclass(frozen=True, eq=False)
+class RunReport:
+    """What a run found, from what, with which settings, and how long it took; its fields are those of `report.json`.
+
+    Attributes
+    ----------
+    scene : mapping
+        Path, size and digest of what was segmented.
     views : mapping
         How many were used, and why others were not.
     settings : mapping
         All that determined the result.
-    seconds : mapping
-        Seconds per stage.
-    plys : mapping from class id to str
-        File of each class that has one.
     objective : sequence of float
         The learner's objective after each step.
+    gaussians : mapping from what became of them to int
+        How many.
+    classes : sequence of mappings
+        Id, name, size, mean confidence, file and box of each.
     pictures : sequence of str
         Files.
+    seconds : mapping from stage to float
+        How long each took.
+    versions : mapping from package to str
+        What it ran on.
+    run : str, optional
+        Id of the run.
+    calibration : mapping, optional
+        The temperature, and what it was fitted to.
+    ids : mapping, optional
+        Objects that ids which are a view's own were found to be.
+    page : str, optional
+        File of the report page.
     """
-    return {
-        "scene": {"path": str(scene.path), "gaussians": len(scene), "digest": scene.digest},
-        "views": dict(views),
-        "settings": dict(settings),
-        "objective": list(objective),
-        "gaussians": gaussian_counts(result),
-        "classes": _class_table(scene, result, plys),
-        "pictures": list(pictures),
-        "seconds": {name: round(value, 3) for name, value in seconds.items()},
-        "versions": _versions(),
-    }
+
+    scene: Mapping[str, Any]
+    views: Mapping[str, Any]
+    settings: Mapping[str, Any]
+    objective: Sequence[float]
+    gaussians: Mapping[str, int]
+    classes: Sequence[Mapping[str, Any]]
+    pictures: Sequence[str]
+    seconds: Mapping[str, float]
+    versions: Mapping[str, str]
+    run: str | None = None
+    calibration: Mapping[str, Any] | None = None
+    ids: Mapping[str, Any] | None = None
+    page: str | None = None
+
+    @classmethod
+    def of(
+        cls,
+        scene: GaussianScene,
+        result: Segmentation,
+        *,
+        plys: Mapping[int, str],
+        objective: Sequence[float] = (),
+        pictures: Sequence[str] = (),
+        **others: Any,
+    ) -> RunReport:
+        """Report a segmentation of a scene; `plys` is the file of each class that has one, `others` are fields."""
+        return cls(
+            scene={"path": str(scene.path), "gaussians": len(scene), "digest": scene.digest},
+            objective=objective,
+            gaussians=gaussian_counts(result),
+            classes=_class_table(scene, result, plys),
+            pictures=pictures,
+            versions=_versions(),
+            **others,
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Give the content of `report.json`; what a run does not have is left out."""
+        content = {field.name: getattr(self, field.name) for field in fields(self)}
+        seconds = {name: round(value, 3) for name, value in self.seconds.items()}
+        return {name: value for name, value in {**content, "seconds": seconds}.items() if value is not None}
 
 
 def gaussian_counts(result: Segmentation) -> dict[str, int]:

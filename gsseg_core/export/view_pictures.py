@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ import numpy as np
 from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.export.pictures import contact_sheet, legend, overlay, palette, save_png
-from gsseg_core.learn.mask_reliability import OtherViews, ViewCheck, worst_views
+from gsseg_core.learn.mask_reliability import ViewCheck, worst_views
 from gsseg_core.raster.view_operator import ViewOperator, make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
@@ -118,29 +118,39 @@ def write_overview(
     return paths
 
 
-def draw_worst_views(others: OtherViews, checks: Sequence[ViewCheck], count: int = 4) -> np.ndarray:
+def draw_worst_views(
+    scene: GaussianScene,
+    views: Mapping[str, View],
+    checks: Sequence[ViewCheck],
+    count: int = 4,
+    *,
+    device: str = "cpu",
+) -> np.ndarray:
     """Draw the worst views: the mask, what the other views predict, and in red where the two differ.
 
     Parameters
     ----------
-    others : OtherViews
-        Of the learner.
+    scene : GaussianScene
+        What the views show.
+    views : mapping from name to View
+        At least those that were checked.
     checks : sequence of ViewCheck
-        Of all its views, or of some; at least one.
+        Of all views, or of some, with what was predicted; at least one.
     count : int
         Views at most, one a row.
+    device : str
+        Where the scene is rendered.
 
     Returns
     -------
     (H, W, 3) uint8
     """
-    learner, images, captions = others.learner, [], []
-    colors = palette(learner.num_classes)
+    images, captions = [], []
+    colors = palette(len(checks[0].counts))
     for check in worst_views(checks, count):
-        view = learner.views[check.name]
-        image = background_image(learner.scene, make_operator(learner.scene, view.camera, learner.device))
-        mask = view.read_labels()
-        predicted = others.predict(view) if check.predicted is None else check.predicted.unpack()
+        view = views[check.name]
+        image = background_image(scene, make_operator(scene, view.camera, device))
+        mask, predicted = view.read_labels(), check.prediction()
         different = ((mask != predicted) & (mask != UNKNOWN) & (predicted != UNKNOWN)).astype(np.int32)
         images += [overlay(image, mask, colors), overlay(image, predicted, colors)]
         images.append(overlay(image, different, _DIFFERENT))

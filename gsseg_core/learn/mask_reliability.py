@@ -82,6 +82,11 @@ class ViewCheck:
         share: np.ndarray = np.divide(right, shown, out=np.full(len(shown), np.nan), where=shown > 0)
         return share
 
+    def prediction(self) -> np.ndarray:
+        """Unpack what the other views predict, (H, W) int32."""
+        assert self.predicted is not None, f"check of {self.name} came without its prediction"
+        return self.predicted.unpack()
+
     def confusions(self, count: int = CONFUSIONS) -> list[tuple[int, int, float]]:
         """Give what was most often taken for something else: class predicted, label seen, share of checked pixels."""
         wrong = self.counts.copy()

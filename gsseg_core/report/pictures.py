@@ -88,7 +88,7 @@ def draw_triple(
     colors: np.ndarray,  # (K, 3)
 ) -> Triple:
     """Lay a view's mask, and what is predicted, over its image, and show where they differ."""
-    image, mask, predicted = images.of(view), view.read_labels(), _predicted(check)
+    image, mask, predicted = images.of(view), view.read_labels(), check.prediction()
     grey = image.mean(axis=2, keepdims=True)
     unknown = (mask == UNKNOWN) | (predicted == UNKNOWN)
     tint = np.where(unknown[..., None], _UNKNOWN, np.where((mask != predicted)[..., None], _DIFFER, _AGREE))
@@ -121,7 +121,7 @@ def thumbnails(
         for check in _candidates(evidence, k):
             view = evidence.views[check.name]
             if check.name not in agreed:
-                mask, predicted = view.read_labels(), _predicted(check)
+                mask, predicted = view.read_labels(), check.prediction()
                 agreed[check.name] = PackedLabels(np.where(mask == predicted, mask, UNKNOWN))
             own = agreed[check.name].unpack() == k
             score = own.sum() * (CUT if _touches_margin(own) else 1) * (1 if images.at_hand(view) else 0.5)
@@ -199,11 +199,6 @@ def _extent(
 
 def _touches_margin(own: np.ndarray) -> bool:
     return bool(own[0].any() or own[-1].any() or own[:, 0].any() or own[:, -1].any())
-
-
-def _predicted(check: ViewCheck) -> np.ndarray:
-    assert check.predicted is not None, f"check of {check.name} came without its prediction"
-    return check.predicted.unpack()
 
 
 def _read_photo(view: View) -> np.ndarray | None:

@@ -19,7 +19,7 @@ from std_msgs.msg import Header
 
 from gsseg_core.errors import GssegError
 from gsseg_core.export.class_plys import write_classes
-from gsseg_core.export.summary import build_report
+from gsseg_core.export.summary import RunReport
 from gsseg_core.files.confined_files import pinned_folder
 from gsseg_core.files.earlier_outputs import earlier_segment
 from gsseg_core.files.json_files import write_json
@@ -248,15 +248,16 @@ class Services:
                 plys = write_classes(session.scene, result, staged.folder / "classes", staged.id)
                 names = {k: str(path.relative_to(staged.folder)) for k, path in plys.items()}
                 report = finish(report_message(run, selection, refine, settings.map_frame), run)
-                content = build_report(
+                content = RunReport.of(
                     session.scene,
                     result,
                     views={"used": report.num_views, "rejected": dict(Counter(session.rejected) + run.dropped)},
                     settings={"learner": report.learner, "device": settings.device, "refine": asdict(refine)},
                     seconds=run.watch.seconds,
                     plys=names,
+                    run=staged.id,
                 )
-                write_json(staged.folder / "report.json", {**content, "run": staged.id})
+                write_json(staged.folder / "report.json", content.as_dict())
         response.report = finish(report, run)
         response.directory, response.files = str(directory), ["segmentation.npz", *names.values(), "report.json"]
 

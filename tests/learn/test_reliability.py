@@ -123,6 +123,6 @@ def test_the_same_views_give_the_same_figures() -> None:
 
 def test_picture_has_a_row_of_three_for_each_of_the_worst_views() -> None:
     learner = learner_with_bad_frames()
-    one, two = (draw_worst_views(OtherViews(learner), list(checks().values()), count) for count in (1, 2))
+    one, two = (draw_worst_views(SCENE, learner.views, list(checks().values()), count) for count in (1, 2))
     assert one.dtype == np.uint8 and one.shape[1] == two.shape[1] > 3 * 64
     assert two.shape[0] - one.shape[0] > 48

@@ -11,7 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from small_scenes import NAMES, balls_on_a_table, clean_views
 
-from gsseg_core.export.summary import build_report
+from gsseg_core.export.summary import RunReport
 from gsseg_core.live.session import LiveSession
 from gsseg_core.objects.oriented_boxes import OrientedBox, class_box, object_boxes, oriented_box
 from gsseg_core.refine.settings import RefineSettings
@@ -192,6 +192,6 @@ def test_a_box_as_a_dictionary_is_plain_json(segmented: tuple[GaussianScene, Seg
 
 
 def test_the_report_of_a_run_has_the_boxes_of_its_objects(segmented: tuple[GaussianScene, Segmentation]) -> None:
-    report = build_report(*segmented, views={}, settings={}, seconds={}, plys={})
+    report = RunReport.of(*segmented, views={}, settings={}, seconds={}, plys={}).as_dict()
     boxes = {entry["id"]: entry["box"] for entry in report["classes"]}
     assert boxes == {0: None} | {k: box.as_dict() for k, box in object_boxes(*segmented).items()}
