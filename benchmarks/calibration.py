@@ -87,7 +87,7 @@ def main() -> int:
         roads = [row for bench in benches for row in compare_roads(bench)]
         scores = measure_test(benches, options.out.parent / "pictures")
     header = HEADER.format(machine=machine())
-    ways = ["scene", "learner", "accuracy", "as blended", "at the masks' word", "through confusion", "best possible"]
+    ways = ["scene", "learner", "accuracy", "as blended", "masks taken as true", "through confusion", "best possible"]
     names = [
         "scene", "learner", "mIoU", "labels changed", "temperature", "ECE as blended", "ECE", "AURC as blended", "AURC",
         "ECE of Gaussians as learnt", "ECE of Gaussians",

@@ -22,7 +22,7 @@ shows. All have KNN clustering; "+ graph" is `gsseg_core.refine.label_propagatio
 sixth of the Gaussians are seen with less than 1 px (`--no-graph`: never); [method.md](method.md#the-graph) has its
 formula.
 `python benchmarks/graph_term.py` measures what the rule stands on, true and wrong masks, mIoU and calibration, on train
-views that are held out. Where everything was seen often, the graph leaves the codes as they are.
+views that are held out. Where everything was seen often, the graph leaves the probabilities as they are.
 
 The live session and the ROS node do without the graph: from so few views their labels differ from the command's.
 """

@@ -274,7 +274,7 @@ the test views. Peak memory is that of the largest process so far.
 
 REFINEMENT = """## KNN and filter
 
-On the codes that `em` learnt from the wrong masks.
+On the class probabilities that `em` learnt from the wrong masks.
 
 {table}
 

@@ -46,8 +46,8 @@ times the time of `em` without them.
 
 RELIABILITY = """## Which masks to trust
 
-`check_views` predicts each view's mask from all the other views: one step of EM from the learnt codes without the
-summand of this view. A view's reliability is the share of its pixels whose label is the one predicted. Here every
+`check_views` predicts each view's mask from all the other views: one step of EM from the learnt probabilities without
+the summand of this view. A view's reliability is the share of its pixels whose label is the one predicted. Here every
 view has errors of random strength, up to those above, and a fifth of the views is bad: ids exchanged by half of the
 objects or more, all ids passed on, half of the objects missed or more, or the mask 30 to 60 px, times a random share,
 beside its image.
