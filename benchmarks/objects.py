@@ -204,9 +204,9 @@ which others hid a part, show in full, and so do those just under a neighbour's 
   label maps that the segmentation itself renders, so errors of single masks carve nothing away; no retraining. What no
   view reaches stays. It replaces the filter. Where objects touch, it may take a little of the object itself: see the
   foot of the can.
-- **Splitting straddlers** (`straddlers`) puts two halves in place of each Gaussian that both fills its
-  object and sticks out, and has each carved by itself. It changes the Gaussians of the scene, so it is a function of
-  the library and no part of the command.
+- **Splitting straddlers** (`benchmarks/straddlers.py`) puts two halves in place of each Gaussian that both fills its
+  object and sticks out, and has each carved by itself. It changes the Gaussians of the scene, so it is no part of
+  the command.
 
 ## How much there is to gain
 
