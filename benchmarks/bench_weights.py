@@ -126,10 +126,10 @@ class StoringLearner(EMLearner):
 
     def _prepare(self, view: View, seen: SeenLabels) -> StoredWeights:
         operator = make_operator(self.scene, view.camera)
-        labels, meaning = self._heard(seen, operator)
+        labels, evidence = self._heard(seen, operator)
         observation = StoredWeights(operator, labels)
-        if meaning is not None:
-            observation.meaning = meaning
+        if evidence is not None:
+            observation.evidence = evidence
         return observation
 
 

@@ -192,12 +192,12 @@ class View:
         if self._mask is not None:
             return self._mask.largest
         seen = self.read_seen()
-        return int(seen.labels.max()) if seen.meaning is None else seen.meaning.largest
+        return int(seen.labels.max()) if seen.evidence is None else seen.evidence.largest
 
     def class_ids(self) -> set[int]:
         """Classes that the mask says something of."""
         seen = self.read_seen()
-        ids = np.unique(seen.labels) if seen.meaning is None else seen.meaning.concerned
+        ids = np.unique(seen.labels) if seen.evidence is None else seen.evidence.concerned
         return set(ids.tolist()) - {UNKNOWN}
 
     def read_labels(self) -> npt.NDArray[np.int32]:
@@ -246,7 +246,7 @@ class View:
 
     def _check_seen(self, seen: SeenLabels, source: str) -> None:
         self.camera.check_mask_size(seen.labels.shape[1], seen.labels.shape[0], source)
-        self._check_ids(seen.labels if seen.meaning is None else seen.meaning.concerned, source)
+        self._check_ids(seen.labels if seen.evidence is None else seen.evidence.concerned, source)
 
     def _check_ids(self, labels: npt.NDArray[np.integer[Any]], source: str) -> None:
         if labels.size and self._knows_all(int(labels.min()), int(labels.max())):

@@ -1,6 +1,6 @@
-"""What the labels of a mask say of the classes: one class, several with a share each, or only which ones it is not.
+"""Label evidence: what each label of a mask says of the classes, as a belief function, and votes resolved from it.
 
-A label of a plain mask is a class. In general a label is a *prototype*, all pixels of which say the same: a mass m_c on
+A label of a plain mask is a class. In general a label is a *prototype* of pixels with the same evidence: a mass m_c on
 each of some classes, and what is left of 1, the rest r, on a set of classes A (a belief function, Shafer 1976). Where
 the segmenter looked for all classes, A is all of them: the rest is ignorance. Where it looked only for the classes S, A
 is all others: the rest says "none of these", and not which other one. How plausible a class is, the sum of the masses
@@ -8,9 +8,10 @@ of all sets that it is in, is the label's likelihood, and all that learning asks
 
     pl(c) = m_c + r [c in A].
 
-The segmenter's own vocabulary are *words*: the classes that have a mass, and "none of these" if it says so. Error
-models are learnt of words, so they do not grow with the number of prototypes. Votes go to what a label names, m_c; the
-rest is no vote for anybody, but counts against those that were looked for and not found, m_c - r [c in S].
+The segmenter's *vocabulary* is what it can answer: the classes that have a mass, and "none of these" if some label says
+so. Confusion matrices have a column for each word of it, so they do not grow with the number of prototypes. Votes go to
+the classes that a label names, m_c; the rest is a vote for no class, but counts against those that were looked for and
+not found, m_c - r [c in S].
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ _ROUNDS = 50
 
 
 @dataclass(frozen=True, eq=False)
-class Meaning:
-    """What each of the labels of one mask says of the classes.
+class LabelEvidence:
+    """Evidence of each label of one mask on the classes.
 
     Attributes
     ----------
@@ -54,7 +55,7 @@ class Meaning:
         return rest
 
     @cached_property
-    def says_none(self) -> bool:
+    def has_none_of_these(self) -> bool:
         """Whether some label says "none of those that were looked for"."""
         return self.supervised is not None and bool((self.rest > 0).any())
 
@@ -66,8 +67,8 @@ class Meaning:
         return bool((self.mass.max(axis=1, initial=0) == 1).all())
 
     @cached_property
-    def says(self) -> np.ndarray:
-        """Whether a label says anything at all, (L,) bool."""
+    def informative(self) -> np.ndarray:
+        """Whether a label holds any evidence, (L,) bool."""
         if self.mass is None or self.supervised is not None:
             return np.ones(len(self.rest), bool)
         return np.asarray(self.mass.any(axis=1))
@@ -75,31 +76,31 @@ class Meaning:
     def without(
         self,
         labels: np.ndarray,  # (L,) bool
-    ) -> Meaning:
-        """Have these labels say nothing, in a mask in which all classes were looked for."""
+    ) -> LabelEvidence:
+        """Return the evidence without that of these labels, of a mask in which all classes were looked for."""
         mass = np.eye(len(self.classes), dtype=np.float32) if self.mass is None else self.mass
-        return Meaning(self.classes, np.where(labels[:, None], np.float32(0), mass))
+        return LabelEvidence(self.classes, np.where(labels[:, None], np.float32(0), mass))
 
     @property
-    def words(self) -> np.ndarray:
-        """The segmenter's words, (W,) int32: classes, and then `UNKNOWN` (-1) for "none of these" if it is said."""
-        return np.append(self.classes, np.int32(UNKNOWN)) if self.says_none else self.classes
+    def vocabulary(self) -> np.ndarray:
+        """Words that the segmenter uses, (W,) int32: classes, then `UNKNOWN` (-1) for "none of these" if it occurs."""
+        return np.append(self.classes, np.int32(UNKNOWN)) if self.has_none_of_these else self.classes
 
     @cached_property
-    def shares(self) -> np.ndarray | None:
-        """How plausible each word is under each label, (L, W) float32; None where label l is word l."""
+    def word_plausibility(self) -> np.ndarray | None:
+        """Plausibility of each word under each label, (L, W) float32; None where label l is word l."""
         if self.mass is None:
             return None
-        shares: np.ndarray = self.mass
+        plausible: np.ndarray = self.mass
         if self.supervised is None:
-            shares = self.mass + self.rest[:, None]
-        elif self.says_none:
-            shares = np.column_stack([self.mass, self.rest])
-        return shares
+            plausible = self.mass + self.rest[:, None]
+        elif self.has_none_of_these:
+            plausible = np.column_stack([self.mass, self.rest])
+        return plausible
 
     @cached_property
     def votes(self) -> CSRRows:
-        """What a pixel of each label votes: the mass of a class, less the rest if it was looked for; float64."""
+        """Votes of a pixel of each label: the mass of a class, less the rest if it was looked for; float64."""
         if self.mass is None:
             return CSRRows(np.arange(len(self.classes) + 1), self.classes.astype(np.uint32), np.ones(len(self.classes)))
         votes = np.zeros((len(self.mass), len(self.concerned)))
@@ -119,30 +120,31 @@ class Meaning:
         """The largest class that the mask says something of, `UNKNOWN` if there is none."""
         return int(self.concerned.max(initial=UNKNOWN))
 
-    def right(self, num_classes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Pair classes with their right word: classes (T,), positions in `words` (T,); those without one are left out.
+    def correct_words(self, num_classes: int) -> tuple[np.ndarray, np.ndarray]:
+        """Pair classes (T,) with positions (T,) of their correct word in the vocabulary, for classes that have one.
 
         A class that was not looked for is rightly called "none of these". One that was looked for, and does not occur,
         has no word.
         """
         own = np.arange(len(self.classes))
-        if not self.says_none:
+        if not self.has_none_of_these:
             return self.classes, own
         others = np.setdiff1d(np.arange(num_classes, dtype=np.int32), self.concerned)
         return np.append(self.classes, others), np.append(own, np.full(len(others), len(self.classes)))
 
     def plausibility(self, num_classes: int) -> np.ndarray:
-        """How plausible each class is under each label, by a segmenter that makes no errors: (L, K) float32."""
-        classes, words = self.right(num_classes)
-        shares = np.eye(len(self.words), dtype=np.float32) if self.shares is None else self.shares
-        out = np.zeros((len(shares), num_classes), np.float32)
+        """Plausibility of each class under each label, from a segmenter that makes no errors: (L, K) float32."""
+        classes, words = self.correct_words(num_classes)
+        given = self.word_plausibility
+        by_word = np.eye(len(self.vocabulary), dtype=np.float32) if given is None else given
+        out = np.zeros((len(by_word), num_classes), np.float32)
         if self.mass is not None and self.supervised is None:
             out += self.rest[:, None]
-        out[:, classes] = shares[:, words]
+        out[:, classes] = by_word[:, words]
         return out
 
     def named(self) -> np.ndarray:
-        """Say which class each label names if it has to name one, (L,) int32; `UNKNOWN` where the rest weighs more."""
+        """Find the class of most mass for each label, (L,) int32; `UNKNOWN` where the rest weighs more."""
         if self.mass is None:
             return self.classes
         if not len(self.classes):
@@ -153,36 +155,36 @@ class Meaning:
         return named.astype(np.int32)
 
 
-def standing(
+def resolved_votes(
     votes: CSRRows,  # int64
     possible: np.ndarray,  # (K,) bool: ids that are classes
 ) -> CSRRows:
-    """Keep of votes for and against classes what can be said with them, at least 0; all if none is against.
+    """Resolve signed votes into votes of at least 0; they stay as they are if none is negative.
 
-    A class whose looks went against it is out. If all classes but one were looked for at a Gaussian, that one stands
-    for "none of these", with as many votes as the one that was looked for least.
+    A class with more votes against it than for it is dropped. If all classes but one were looked for at a Gaussian,
+    that one is what "none of these" means, and gets as many votes as the class that was looked for least.
     """
     if votes.data.min(initial=0) >= 0:
         return votes
     counts, ids = np.empty(len(votes.indptr) - 1, np.int64), np.flatnonzero(possible)
-    _count_standing(*votes, ids, counts)
+    _count_resolved(*votes, ids, counts)
     start = starts(counts)
     out = CSRRows(start, np.empty(start[-1], np.uint32), np.empty(start[-1], np.int64))
-    _keep_standing(*votes, ids, *out)
+    _write_resolved(*votes, ids, *out)
     return out
 
 
-def guess(
+def impute_probabilities(
     codes: np.ndarray,  # (N, K) float32, changed in place
     votes: np.ndarray,  # (N, K) int64
     possible: np.ndarray,  # (K,) bool: ids that are classes
-    rows: np.ndarray | None = None,  # Gaussians that were seen, and never under a class; found if not given
+    rows: np.ndarray | None = None,  # Gaussians with votes only against classes; found if not given
 ) -> None:
-    """Where all that is known of a Gaussian is what it is not, share it among the classes that are left.
+    """Impute probabilities of Gaussians with votes only against classes: those that are left share them.
 
-    In proportion to how frequent they are in the scene, on top of the code that the row has from its neighbours. The
-    background is that to which no class applies, so its frequency is known only if every class was looked for in some
-    view. If one never was, only neighbours count, and without them the row stays zero: unknown.
+    They do so in proportion to how frequent they are in the scene, on top of the probabilities that the row has from
+    its neighbours. The background is that to which no class applies, so its frequency is known only if every class was
+    looked for in some view. If one never was, only neighbours count, and without them the row stays zero: unknown.
     """
     if rows is None:
         rows = np.flatnonzero(~codes.any(axis=1) & votes.any(axis=1))
@@ -201,14 +203,14 @@ def _frequency(
 ) -> np.ndarray:
     """Estimate how frequent each class is, (K,): the likeliest proportions, by expectation maximisation.
 
-    Objects are told by one look, the background by one for every class. So those that are known have too few of it,
-    and what the others may be has to count. (Dempster, Laird & Rubin 1977, on grouped data.)
+    One vote names an object, but the background takes a vote against every class. So it is too rare among the Gaussians
+    that are known, and what the others may be has to count. (Dempster, Laird & Rubin 1977, on grouped data.)
     """
-    patterns, many = np.unique(np.packbits(candidates, axis=1), axis=0, return_counts=True)
+    patterns, counts = np.unique(np.packbits(candidates, axis=1), axis=0, return_counts=True)
     may_be = np.unpackbits(patterns, axis=1, count=candidates.shape[1])
     frequency = np.full(len(known), 1 / len(known))
     for _ in range(_ROUNDS):
-        frequency = known + many @ _scaled(may_be * frequency)
+        frequency = known + counts @ _scaled(may_be * frequency)
         frequency /= frequency.sum()
     return frequency
 
@@ -223,50 +225,50 @@ def _scaled(
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def decided(
+def is_resolved(
     votes: np.ndarray,  # (N, K) int64
     possible: np.ndarray,  # (K,) bool: ids that are classes
 ) -> np.ndarray:
-    """Tell which Gaussians were seen under a class, or have only one class left, (N,) bool."""
+    """Tell which Gaussians have a vote for a class, or only one class left, (N,) bool."""
     out = np.empty(votes.shape[0], np.bool_)
     for i in nb.prange(votes.shape[0]):
-        said, against, free = False, False, 0
+        named, against, free = False, False, 0
         for k in range(votes.shape[1]):
-            said |= votes[i, k] > 0
+            named |= votes[i, k] > 0
             against |= votes[i, k] < 0
             free += votes[i, k] == 0 and possible[k]
-        out[i] = said or (against and free == 1)
+        out[i] = named or (against and free == 1)
     return out
 
 
 @nb.njit(nogil=True, cache=True)
-def _remaining(
+def _only_class_left(
     classes: np.ndarray,  # of one row
     votes: np.ndarray,  # of it
     ids: np.ndarray,  # of all classes, ascending
 ) -> tuple[int, int]:
     """Return the one class without votes where all others have some, and any against; -1 if there is no such class."""
-    said, least, against, place = 0, 2**63 - 1, False, 0
+    voted, least, against, place = 0, 2**63 - 1, False, 0
     for z in range(votes.shape[0]):
         if votes[z] != 0:
-            said += 1
+            voted += 1
             least = min(least, abs(votes[z]))
             against |= votes[z] < 0
             # Both ascend, so the first id that is not there is the one that is missing.
             place += place < ids.shape[0] and ids[place] == classes[z]
-    return (ids[place] if against and said == ids.shape[0] - 1 else -1), least
+    return (ids[place] if against and voted == ids.shape[0] - 1 else -1), least
 
 
 @nb.njit(nogil=True, cache=True)
-def stand(
+def resolve_row(
     classes: np.ndarray,  # (n,) of one row
     votes: np.ndarray,  # (n,) int64, of it
     ids: np.ndarray,  # of all classes, ascending
-    kept_classes: np.ndarray,  # out; there must be room for all that is kept, n + 1 at most
+    kept_classes: np.ndarray,  # out; capacity for all that is kept, n + 1 at most
     kept_votes: np.ndarray,  # out, likewise
 ) -> int:
-    """Write what `standing` keeps of one row; return how many entries that is."""
-    free, least = _remaining(classes, votes, ids)
+    """Resolve the votes of one row as `resolved_votes` does; return the number of entries written."""
+    free, least = _only_class_left(classes, votes, ids)
     n = 0
     for z in range(votes.shape[0]):
         if 0 <= free < classes[z]:
@@ -282,7 +284,7 @@ def stand(
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _count_standing(
+def _count_resolved(
     start: np.ndarray,  # (N + 1,)
     classes: np.ndarray,  # (Z,)
     votes: np.ndarray,  # (Z,)
@@ -290,12 +292,12 @@ def _count_standing(
     counts: np.ndarray,  # (N,) out
 ) -> None:
     for i in nb.prange(counts.shape[0]):
-        mine = slice(start[i], start[i + 1])
-        counts[i] = (votes[mine] > 0).sum() + (_remaining(classes[mine], votes[mine], ids)[0] >= 0)
+        row = slice(start[i], start[i + 1])
+        counts[i] = (votes[row] > 0).sum() + (_only_class_left(classes[row], votes[row], ids)[0] >= 0)
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _keep_standing(
+def _write_resolved(
     start: np.ndarray,  # (N + 1,)
     classes: np.ndarray,  # (Z,)
     votes: np.ndarray,  # (Z,)
@@ -305,5 +307,5 @@ def _keep_standing(
     kept_votes: np.ndarray,  # out
 ) -> None:
     for i in nb.prange(start.shape[0] - 1):
-        mine = slice(start[i], start[i + 1])
-        stand(classes[mine], votes[mine], ids, kept_classes[kept_start[i] :], kept_votes[kept_start[i] :])
+        row = slice(start[i], start[i + 1])
+        resolve_row(classes[row], votes[row], ids, kept_classes[kept_start[i] :], kept_votes[kept_start[i] :])

@@ -95,10 +95,10 @@ def read_supervises(
             raise SupervisesFileError(
                 f"{path}: {quoted(stem)} has {clipped(ids)}; expected a list of ids 0 to {MAX_LABEL}"
             )
-        strangers = [i for i in ids if class_names is not None and i not in class_names]
-        if strangers:
+        unknown_ids = [i for i in ids if class_names is not None and i not in class_names]
+        if unknown_ids:
             raise SupervisesFileError(
-                f"{path}: {quoted(stem)} has the class {strangers[0]}; expected ids of classes.json"
+                f"{path}: {quoted(stem)} has the class {unknown_ids[0]}; expected ids of classes.json"
             )
         entries[stem] = tuple(sorted(set(ids)))
     pngs = [stem for stem, mask in masks.items() if mask.suffix.lower() == ".png"]

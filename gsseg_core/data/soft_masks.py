@@ -1,8 +1,8 @@
 """Soft and partial masks: probabilities become a map of prototypes, which all that works on labels can work on.
 
-A pixel's probabilities are rounded to sixteenths, and pixels that then say the same share one label, a prototype; what
-it says is in its `Meaning`. A mask that is certain everywhere loses nothing, and comes out as the plain mask it is. How
-much each of the others loses is bounded: no probability changes by as much as one step, see `quantise`.
+A pixel's probabilities are rounded to sixteenths, and pixels that are then alike share one label, a prototype, with its
+`LabelEvidence`. A mask that is certain everywhere loses nothing, and comes out as the plain mask it is. How much each
+of the others loses is bounded: no probability changes by as much as one step, see `quantise`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.data.label_evidence import Meaning
+from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN, PackedLabels
 from gsseg_core.errors import MaskFormatError, MaskSizeError, UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
@@ -36,13 +36,13 @@ class SeenLabels(NamedTuple):
     """What a mask holds: labels (H, W) int32, `UNKNOWN` where it says nothing, and what they mean (None: classes)."""
 
     labels: npt.NDArray[np.int32]
-    meaning: Meaning | None = None
+    evidence: LabelEvidence | None = None
 
     def named(self) -> npt.NDArray[np.int32]:
         """Give the class that each pixel names, (H, W) int32; `UNKNOWN` where the mask leaves it open."""
-        if self.meaning is None:
+        if self.evidence is None:
             return self.labels
-        return np.append(self.meaning.named(), np.int32(UNKNOWN))[self.labels]
+        return np.append(self.evidence.named(), np.int32(UNKNOWN))[self.labels]
 
     def numbered(self, ids: npt.NDArray[np.int32], source: str) -> SeenLabels:
         """Put the place of each class among some ids, ascending, where its id is.
@@ -54,29 +54,31 @@ class SeenLabels(NamedTuple):
         """
         table = np.full(MAX_LABEL + 2, len(ids), np.int32)  # The last one is for unknown pixels.
         table[ids], table[UNKNOWN] = np.arange(len(ids)), UNKNOWN
-        concerned = self.labels if self.meaning is None else self.meaning.concerned
+        concerned = self.labels if self.evidence is None else self.evidence.concerned
         numbers = table[concerned]
         if (numbers == len(ids)).any():
             raise UnknownLabelError(
                 f"{source}: mask holds the labels {clipped(np.unique(concerned[numbers == len(ids)]).tolist())}; "
                 f"expected ids of the {len(ids)} classes in use"
             )
-        if self.meaning is None:
+        if self.evidence is None:
             return SeenLabels(numbers)
-        classes, mass, supervised = self.meaning.classes, self.meaning.mass, self.meaning.supervised
-        return SeenLabels(self.labels, Meaning(table[classes], mass, None if supervised is None else table[supervised]))
+        classes, mass, supervised = self.evidence.classes, self.evidence.mass, self.evidence.supervised
+        return SeenLabels(
+            self.labels, LabelEvidence(table[classes], mass, None if supervised is None else table[supervised])
+        )
 
 
 class PackedMask:
     """A soft or partial mask in memory, its prototypes compressed like a plain one's labels."""
 
     def __init__(self, seen: SeenLabels) -> None:
-        self._labels, self._meaning = PackedLabels(seen.labels), seen.meaning
-        self.largest = self._labels.largest if seen.meaning is None else seen.meaning.largest
+        self._labels, self._evidence = PackedLabels(seen.labels), seen.evidence
+        self.largest = self._labels.largest if seen.evidence is None else seen.evidence.largest
 
     def unpack(self) -> SeenLabels:
         """Return what was packed; the labels in memory of their own."""
-        return SeenLabels(self._labels.unpack(), self._meaning)
+        return SeenLabels(self._labels.unpack(), self._evidence)
 
 
 def quantise(
@@ -198,10 +200,10 @@ def restrict(
     """
     looked_for = np.array(sorted(set(supervised)), np.int32)
     ids = np.unique(labels)
-    strangers = [i for i in ids.tolist() if i not in looked_for and i not in (0, UNKNOWN)]
-    if strangers:
+    unknown_ids = [i for i in ids.tolist() if i not in looked_for and i not in (0, UNKNOWN)]
+    if unknown_ids:
         raise UnknownLabelError(
-            f"{source}: mask holds the labels {str(strangers)[1:-1][:60]}; expected those that it supervises, "
+            f"{source}: mask holds the labels {str(unknown_ids)[1:-1][:60]}; expected those that it supervises, "
             f"{str(looked_for.tolist())[1:-1][:60]}, and 0 for none of these"
         )
     prototypes = ids[ids != UNKNOWN].astype(np.int32)
@@ -209,7 +211,7 @@ def restrict(
     mass = (prototypes[:, None] == named).astype(np.float32)
     table = np.full(int(ids.max(initial=0)) + 2, UNKNOWN, np.int32)
     table[prototypes] = np.arange(len(prototypes))
-    return SeenLabels(table[labels], Meaning(named, mass, looked_for))
+    return SeenLabels(table[labels], LabelEvidence(named, mass, looked_for))
 
 
 def _rounded(
@@ -245,7 +247,7 @@ def _tidied(
     if supervised is None and (mass.max(axis=1, initial=0) == 1).all():
         plain = np.append(classes[mass.argmax(axis=1)] if len(mass) else classes[:0], np.int32(UNKNOWN))
         return SeenLabels(plain[labels])
-    return SeenLabels(labels, Meaning(classes, mass, supervised))
+    return SeenLabels(labels, LabelEvidence(classes, mass, supervised))
 
 
 def _checked_classes(classes: Sequence[int], count: int, source: str) -> npt.NDArray[np.int32]:

@@ -33,11 +33,11 @@ def read_split(path: Path, views: Collection[str], within: Path | None = None) -
     for name, stems in split.items():
         if not isinstance(stems, list) or not all(isinstance(stem, str) for stem in stems):
             raise SplitFileError(f'{path}: "{name}" is {clipped(stems)}; expected a list of image stems')
-        strangers = [stem for stem in stems if stem not in views]
-        if strangers:
+        unknown_stems = [stem for stem in stems if stem not in views]
+        if unknown_stems:
             raise SplitFileError(
-                f'{path}: "{name}" names views without a camera ({len(strangers)}, the first '
-                f"{quoted(strangers[0])}); expected stems such as {quoted(next(iter(views)))}"
+                f'{path}: "{name}" names views without a camera ({len(unknown_stems)}, the first '
+                f"{quoted(unknown_stems[0])}); expected stems such as {quoted(next(iter(views)))}"
             )
     stem, count = Counter(split["train"] + split["test"] or [""]).most_common(1)[0]
     if count > 1:

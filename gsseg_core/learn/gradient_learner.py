@@ -133,11 +133,11 @@ class _CrossEntropy(torch.autograd.Function):
     def forward(ctx: Any, probabilities: torch.Tensor, observation: Observation) -> torch.Tensor:
         codes, scale = probabilities.detach().numpy(), 1.0 / (observation.num_pixels * probabilities.shape[1])
         ctx.shape, ctx.observation = probabilities.shape, observation
-        if observation.meaning.mass is None:
+        if observation.evidence.mass is None:
             where = observation.ids[observation.rows], observation.classes[observation.labels]
             said, rest = codes[where], (observation.classes == 0).astype(np.float32)
         else:
-            plausible = observation.meaning.plausibility(codes.shape[1])
+            plausible = observation.evidence.plausibility(codes.shape[1])
             said, rest = (codes[observation.ids] @ plausible.T)[observation.rows, observation.labels], plausible[:, 0]
         shares = observation.shares(said, rest)
         ctx.gradient = -scale * shares.sightings
@@ -146,9 +146,9 @@ class _CrossEntropy(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, upstream: torch.Tensor) -> tuple[torch.Tensor, None]:
         gradient, observation = np.zeros(ctx.shape, np.float32), ctx.observation
-        if observation.meaning.mass is None:
+        if observation.evidence.mass is None:
             gradient[observation.ids[observation.rows], observation.classes[observation.labels]] = ctx.gradient
         else:
-            plausible = observation.meaning.plausibility(ctx.shape[1])
+            plausible = observation.evidence.plausibility(ctx.shape[1])
             gradient[observation.ids] = observation.dense(ctx.gradient) @ plausible
         return upstream * torch.from_numpy(gradient), None

@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 
 from gsseg_core.data.dataset import View
-from gsseg_core.data.label_evidence import decided, guess
+from gsseg_core.data.label_evidence import impute_probabilities, is_resolved
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
 from gsseg_core.learn.em.em_kernels import share_votes
@@ -197,7 +197,7 @@ class Learner(ABC):
         """Votes as probabilities, (N, K) float32; a row of zeros where no labelled pixel saw the Gaussian."""
         codes, possible = np.empty(self._votes.shape, np.float32), self._possible()
         if share_votes(self._votes, possible, codes):
-            guess(codes, self._votes, possible)
+            impute_probabilities(codes, self._votes, possible)
         return codes
 
     def evidence(self) -> np.ndarray:
@@ -251,7 +251,7 @@ class Learner(ABC):
         return seen
 
     def _check_labels(self, view: View, seen: SeenLabels) -> None:
-        largest = int(seen.labels.max()) if seen.meaning is None else seen.meaning.largest
+        largest = int(seen.labels.max()) if seen.evidence is None else seen.evidence.largest
         if largest >= self.num_classes:
             raise UnknownLabelError(
                 f"{view.mask_path or view.name}: mask holds the label {largest}; expected at most "
@@ -281,7 +281,7 @@ class Learner(ABC):
         if not self.views:
             reasons = ", ".join(f"{count} {why}" for why, count in self.reject_summary().items()) or "none was given"
             raise NoUsableViewsError(f"no view to learn from ({reasons}); expected posed views with label images")
-        self.observed_ = decided(self._votes, self._possible())
+        self.observed_ = is_resolved(self._votes, self._possible())
 
     def _finish(self) -> None:
         """Leave codes only where something was seen that they can be told by."""
@@ -290,7 +290,7 @@ class Learner(ABC):
         seen = (self._votes[unsure] < 0).any(axis=1)
         self.codes_[unsure[~seen]] = 0.0
         if seen.any():
-            guess(self.codes_, self._votes, self._possible(), unsure[seen])
+            impute_probabilities(self.codes_, self._votes, self._possible(), unsure[seen])
             self.observed_[unsure] = self.codes_[unsure].any(axis=1)
 
     def _possible(self) -> np.ndarray:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from gsseg_core.data.dataset import View
-from gsseg_core.data.label_evidence import Meaning
+from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import TOLERANCE, SeenLabels
 from gsseg_core.errors import GssegError, PathTakenError
@@ -115,11 +115,11 @@ class State:
             }
             arrays["codes"] = self.learnt.codes
         for i, view in enumerate(self.views):
-            arrays[f"labels_{i}"], meaning = view.read_seen()
-            if meaning is not None and meaning.mass is not None:
-                arrays[f"classes_{i}"], arrays[f"mass_{i}"] = meaning.classes, meaning.mass
-                if meaning.supervised is not None:
-                    arrays[f"supervised_{i}"] = meaning.supervised
+            arrays[f"labels_{i}"], evidence = view.read_seen()
+            if evidence is not None and evidence.mass is not None:
+                arrays[f"classes_{i}"], arrays[f"mass_{i}"] = evidence.classes, evidence.mass
+                if evidence.supervised is not None:
+                    arrays[f"supervised_{i}"] = evidence.supervised
             arrays[f"pose_{i}"] = np.stack([np.pad(view.camera.K, (0, 1)), view.camera.world_to_camera])
         with write_atomically(path, suffix=".npz") as temporary, open(temporary, "wb") as file:
             np.savez_compressed(file, allow_pickle=False, header=np.array(json.dumps(header)), **arrays)
@@ -195,7 +195,7 @@ def _read_view(file: NpzArrays, i: int, entry: dict[str, Any], num_classes: int)
         camera = Camera(str(entry["name"]), width, height, pose[0, :3, :3], pose[1])
         labels = file.expect(f"labels_{i}", np.int32, (height, width))
         if f"mass_{i}" in file.names:
-            view = View.from_seen(camera, SeenLabels(labels, _read_meaning(file, i, labels)))
+            view = View.from_seen(camera, SeenLabels(labels, _read_evidence(file, i, labels)))
         else:
             view = View.from_arrays(camera, labels)
     except GssegError as error:
@@ -205,11 +205,11 @@ def _read_view(file: NpzArrays, i: int, entry: dict[str, Any], num_classes: int)
     return view
 
 
-def _read_meaning(
+def _read_evidence(
     file: NpzArrays,
     i: int,
     labels: np.ndarray,  # (H, W)
-) -> Meaning:
+) -> LabelEvidence:
     classes = file.expect(f"classes_{i}", np.int32, (None,))
     mass = file.expect(f"mass_{i}", np.float32, (int(labels.max()) + 1, len(classes)))
     supervised = file.expect(f"supervised_{i}", np.int32, (None,)) if f"supervised_{i}" in file.names else None
@@ -222,4 +222,4 @@ def _read_meaning(
         raise UnfitError(f"array labels_{i} holds {labels.min()}; expected {UNKNOWN} for unknown pixels, or more")
     if not np.all((mass >= 0) & (mass <= 1)) or not np.all(mass.sum(axis=1) <= 1 + TOLERANCE):
         raise UnfitError(f"array mass_{i} holds no probabilities; expected rows from 0 that sum to 1 at most")
-    return Meaning(classes, mass, supervised)
+    return LabelEvidence(classes, mass, supervised)

@@ -20,7 +20,7 @@ import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import View, spread
-from gsseg_core.data.label_evidence import Meaning
+from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN, PackedLabels
 from gsseg_core.learn.em.em_learner import EMLearner, codes_without
 from gsseg_core.learn.learner import Progress, silent
@@ -48,8 +48,8 @@ class ViewCheck:
         label (column).
     predicted : PackedLabels, optional
         What the other views predict, (H, W), for pictures.
-    meaning : Meaning, optional
-        Of a soft or partial mask; `classes` are its words.
+    evidence : LabelEvidence, optional
+        Of a soft or partial mask; `classes` are its vocabulary.
     unheard : float
         Share of the pixels with a label from which nothing was learnt, since they lie in regions in doubt; see
         `gsseg_core.learn.em.rejected_regions`.
@@ -60,7 +60,7 @@ class ViewCheck:
     classes: np.ndarray
     counts: np.ndarray
     predicted: PackedLabels | None = None
-    meaning: Meaning | None = None
+    evidence: LabelEvidence | None = None
     unheard: float = 0.0
 
     @property
@@ -101,7 +101,7 @@ class ViewCheck:
     @property
     def _right(self) -> tuple[np.ndarray, np.ndarray]:
         """Where in the counts class and label agree."""
-        return (self.meaning or Meaning(self.classes)).right(len(self.counts))
+        return (self.evidence or LabelEvidence(self.classes)).correct_words(len(self.counts))
 
 
 class OtherViews:
@@ -159,8 +159,8 @@ class OtherViews:
         if view.name in self._sampled:
             self._samples[view.name] = sample_pixels(image, view.read_labels())
         check = hold_against(view, _strongest(image), self.learner.num_classes)
-        says, areas = self.learner.error_models_[view.name].meaning.says, self.learner.observation(view.name).areas
-        return replace(check, unheard=float(areas[~says].sum() / areas.sum()))
+        evidence, areas = self.learner.error_models_[view.name].evidence, self.learner.observation(view.name).areas
+        return replace(check, unheard=float(areas[~evidence.informative].sum() / areas.sum()))
 
     def sample(self, view: View) -> Sample:
         """Take pixels of a view's mask with what the others predict of them, to fit the temperature to."""
@@ -249,16 +249,16 @@ def hold_against(
 ) -> ViewCheck:
     """Hold a view's mask against any prediction of its labels, `UNKNOWN` (-1) where that says nothing."""
     seen = view.read_seen()
-    labels, meaning = seen.named(), seen.meaning
+    labels, evidence = seen.named(), seen.evidence
     # Where a partial mask names no class, it says "none of these", its last word.
-    unnamed = (seen.labels >= 0) & (labels < 0) if meaning is not None and meaning.says_none else np.False_
+    unnamed = (seen.labels >= 0) & (labels < 0) if evidence is not None and evidence.has_none_of_these else np.False_
     known = (labels >= 0) | unnamed
-    classes = np.unique(labels[labels >= 0]).astype(np.int32) if meaning is None else meaning.words
+    classes = np.unique(labels[labels >= 0]).astype(np.int32) if evidence is None else evidence.vocabulary
     both = known & (predicted >= 0)
     words = np.where(labels >= 0, np.searchsorted(classes[classes >= 0], labels), len(classes) - 1)
     cells = predicted[both] * np.int64(len(classes)) + words[both]
     counts = np.bincount(cells, minlength=num_classes * len(classes)).reshape(num_classes, len(classes))
-    return ViewCheck(view.name, int(known.sum()), classes, counts, PackedLabels(predicted), meaning)
+    return ViewCheck(view.name, int(known.sum()), classes, counts, PackedLabels(predicted), evidence)
 
 
 def _name(class_names: Mapping[int, str], label: int) -> str:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.data.label_evidence import Meaning
+from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.errors import MaskSizeError, SceneValueError, SettingsError
 from gsseg_core.raster.cpu.label_pairs import add_votes
 from gsseg_core.raster.devices import checked_device
@@ -88,7 +88,7 @@ class Observation(ABC):
         Labels that occur in the mask, ascending.
     areas : (L,) int64
         Pixels of each label.
-    meaning : Meaning
+    evidence : LabelEvidence
         What the labels say of the classes; of a plain mask, that they are classes.
     """
 
@@ -109,9 +109,9 @@ class Observation(ABC):
         return int(self.areas.sum())
 
     @cached_property
-    def meaning(self) -> Meaning:
+    def evidence(self) -> LabelEvidence:
         """What the labels say of the classes."""
-        return Meaning(self.classes)
+        return LabelEvidence(self.classes)
 
     @cached_property
     def order(self) -> np.ndarray:
@@ -145,7 +145,7 @@ class Observation(ABC):
         sign: int = 1,
     ) -> None:
         """Add the votes to those of other views, or take them away, in whole units."""
-        add_votes(total, self.ids, self.start, self.labels, *self.meaning.votes, self.votes(), units, sign)
+        add_votes(total, self.ids, self.start, self.labels, *self.evidence.votes, self.votes(), units, sign)
 
     @abstractmethod
     def shares(
@@ -261,7 +261,7 @@ class ViewOperator(ABC):
     def observe(
         self,
         labels: np.ndarray,  # (H, W) int32, negative = unknown
-        meaning: Meaning | None = None,
+        evidence: LabelEvidence | None = None,
     ) -> Observation:
         """Tie the view to its mask.
 
@@ -269,7 +269,7 @@ class ViewOperator(ABC):
         ----------
         labels : (H, W) int32
             Classes, negative where nothing is known; or prototypes 0 to L - 1, each of which occurs.
-        meaning : Meaning, optional
+        evidence : LabelEvidence, optional
             What prototypes mean.
 
         Raises
@@ -279,14 +279,14 @@ class ViewOperator(ABC):
         """
         self._check_size(labels, 2)
         observation = self._observe(labels)
-        if meaning is not None:
-            observation.meaning = meaning
+        if evidence is not None:
+            observation.evidence = evidence
         return observation
 
     def vote(
         self,
         labels: np.ndarray,  # (H, W) int32
-        meaning: Meaning | None,
+        evidence: LabelEvidence | None,
         total: np.ndarray,  # (N, K) int64, added to
         units: float,
         sign: int = 1,
@@ -295,7 +295,7 @@ class ViewOperator(ABC):
 
         Parameters
         ----------
-        labels, meaning
+        labels, evidence
             The mask, as for `observe`.
         total : (N, K) int64
             Votes in units, of K classes, among them all that the mask speaks of.
@@ -315,7 +315,7 @@ class ViewOperator(ABC):
             The labels are not of the camera's size.
         """
         self._check_size(labels, 2)
-        return self._vote(labels, meaning, total, units, sign)
+        return self._vote(labels, evidence, total, units, sign)
 
     def without(
         self,
@@ -381,8 +381,10 @@ class ViewOperator(ABC):
     @abstractmethod
     def _observe(self, labels: np.ndarray) -> Observation: ...
 
-    def _vote(self, labels: np.ndarray, meaning: Meaning | None, total: np.ndarray, units: float, sign: int) -> bool:
-        observation = self.observe(labels, meaning)
+    def _vote(
+        self, labels: np.ndarray, evidence: LabelEvidence | None, total: np.ndarray, units: float, sign: int
+    ) -> bool:
+        observation = self.observe(labels, evidence)
         observation.vote(total, units, sign)
         return len(observation.ids) > 0
 

@@ -41,11 +41,11 @@ def random_probabilities(
 
 def said(seen: SeenLabels, num_classes: int) -> np.ndarray:
     """Mass of each class in each pixel, (K, H, W); NaN where the mask says nothing."""
-    if seen.meaning is None:
+    if seen.evidence is None:
         table = np.eye(num_classes, dtype=np.float32)
     else:
-        table = np.zeros((len(seen.meaning.mass), num_classes), np.float32)
-        table[:, seen.meaning.classes] = seen.meaning.mass
+        table = np.zeros((len(seen.evidence.mass), num_classes), np.float32)
+        table[:, seen.evidence.classes] = seen.evidence.mass
     return np.where(seen.labels >= 0, np.moveaxis(table[seen.labels], -1, 0), np.nan)
 
 
@@ -65,8 +65,8 @@ def test_no_probability_changes_by_as_much_as_one_step(seed: int, classes: int, 
 def test_too_many_prototypes_are_rounded_more_coarsely_and_never_lost() -> None:
     probabilities = random_probabilities(3, 8, (80, 90), sharp=1.5)
     seen = quantise(probabilities)
-    assert seen.meaning is not None and len(seen.meaning.mass) <= MOST_PROTOTYPES
-    steps = [s for s in STEPS if np.allclose(seen.meaning.mass * s, np.rint(seen.meaning.mass * s))][-1]
+    assert seen.evidence is not None and len(seen.evidence.mass) <= MOST_PROTOTYPES
+    steps = [s for s in STEPS if np.allclose(seen.evidence.mass * s, np.rint(seen.evidence.mass * s))][-1]
     known = seen.labels >= 0
     assert steps < STEPS[0] and np.abs(said(seen, 8) - probabilities)[:, known].max() < 1 / steps
     assert known.mean() > 0.5
@@ -78,7 +78,7 @@ def test_a_sure_segmenter_gives_the_plain_mask(seed: int) -> None:
     labels = np.random.default_rng(seed).integers(-1, 5, (7, 8))
     probabilities = (np.arange(5)[:, None, None] == labels).astype(np.float16)
     seen = quantise(probabilities)
-    assert seen.meaning is None
+    assert seen.evidence is None
     np.testing.assert_array_equal(seen.labels, labels)
 
 
@@ -88,10 +88,10 @@ def test_the_order_of_the_classes_does_not_matter(seed: int) -> None:
     probabilities, ids = random_probabilities(seed), np.array([4, 0, 9, 2, 7])
     order = np.random.default_rng(seed).permutation(5)
     one, two = quantise(probabilities, ids), quantise(probabilities[order], ids[order])
-    assert one.meaning is not None and two.meaning is not None
+    assert one.evidence is not None and two.evidence is not None
     np.testing.assert_array_equal(one.labels, two.labels)
-    np.testing.assert_array_equal(one.meaning.mass, two.meaning.mass)
-    np.testing.assert_array_equal(one.meaning.classes, two.meaning.classes)
+    np.testing.assert_array_equal(one.evidence.mass, two.evidence.mass)
+    np.testing.assert_array_equal(one.evidence.classes, two.evidence.classes)
 
 
 @given(st.integers(0, 10_000), st.integers(0, 31))
@@ -101,14 +101,14 @@ def test_plausibility_and_votes_are_those_of_the_definition(seed: int, looked_fo
     supervised = [k for k in range(5) if looked_for >> k & 1]
     probabilities = random_probabilities(seed)[supervised or slice(None)]
     seen = quantise(probabilities, supervised or None)
-    if seen.meaning is None:
+    if seen.evidence is None:
         return
-    meaning, num_classes = seen.meaning, 6
-    plausible, votes = meaning.plausibility(num_classes), meaning.votes.dense(num_classes)
-    for label, mass in enumerate(meaning.mass):
+    evidence, num_classes = seen.evidence, 6
+    plausible, votes = evidence.plausibility(num_classes), evidence.votes.dense(num_classes)
+    for label, mass in enumerate(evidence.mass):
         rest = 1 - float(mass.sum())
         for k in range(num_classes):
-            m = float(mass[meaning.classes == k].sum())
+            m = float(mass[evidence.classes == k].sum())
             free = k not in supervised if supervised else True
             assert plausible[label, k] == pytest.approx(m + rest * free, abs=1e-6)
             assert votes[label, k] == pytest.approx(m - rest * (bool(supervised) and k in supervised), abs=1e-6)
@@ -116,17 +116,17 @@ def test_plausibility_and_votes_are_those_of_the_definition(seed: int, looked_fo
 
 def test_what_was_not_looked_for_gets_neither_votes_nor_doubt() -> None:
     seen = restrict(np.array([[0, 2, UNKNOWN]]), [2, 3])
-    assert seen.meaning is not None
-    np.testing.assert_array_equal(seen.meaning.votes.dense(5), [[0, 0, -1, -1, 0], [0, 0, 1, 0, 0]])
-    np.testing.assert_array_equal(seen.meaning.plausibility(5), [[1, 1, 0, 0, 1], [0, 0, 1, 0, 0]])
+    assert seen.evidence is not None
+    np.testing.assert_array_equal(seen.evidence.votes.dense(5), [[0, 0, -1, -1, 0], [0, 0, 1, 0, 0]])
+    np.testing.assert_array_equal(seen.evidence.plausibility(5), [[1, 1, 0, 0, 1], [0, 0, 1, 0, 0]])
     np.testing.assert_array_equal(seen.named(), [[UNKNOWN, 2, UNKNOWN]])
 
 
 def test_one_detector_says_its_class_or_not_its_class() -> None:
     seen = combine_detections({3: np.array([[0.0, 0.25, 1.0]], np.float32)})
-    assert seen.meaning is not None
-    np.testing.assert_allclose(seen.meaning.votes.dense(5)[seen.labels[0], 3], [-1, -0.5, 1])
-    np.testing.assert_allclose(seen.meaning.plausibility(5)[seen.labels[0], 0], [1, 0.75, 0])
+    assert seen.evidence is not None
+    np.testing.assert_allclose(seen.evidence.votes.dense(5)[seen.labels[0], 3], [-1, -0.5, 1])
+    np.testing.assert_allclose(seen.evidence.plausibility(5)[seen.labels[0], 0], [1, 0.75, 0])
 
 
 def test_detectors_that_contradict_each_other_are_weighed_by_their_odds() -> None:
@@ -146,7 +146,7 @@ def test_packing_keeps_everything() -> None:
     seen = quantise(random_probabilities(5), range(1, 6))
     packed = PackedMask(seen)
     np.testing.assert_array_equal(packed.unpack().labels, seen.labels)
-    assert packed.unpack().meaning is seen.meaning and packed.largest == 5
+    assert packed.unpack().evidence is seen.evidence and packed.largest == 5
 
 
 @pytest.mark.parametrize(
@@ -207,7 +207,7 @@ def test_npz_is_read_as_what_it_was_made_of(tmp_path: Path) -> None:
     view = dataset_with(tmp_path, write)
     seen, expected = view.read_seen(), quantise(probabilities[1:3], [2, 1], unknown=unknown)
     np.testing.assert_array_equal(seen.labels, expected.labels)
-    np.testing.assert_array_equal(seen.meaning.mass, expected.meaning.mass)  # type: ignore[union-attr]
+    np.testing.assert_array_equal(seen.evidence.mass, expected.evidence.mass)  # type: ignore[union-attr]
     assert view.has_mask and view.mask_bits == 8 and view.largest_label == 2
     labels = view.read_labels()
     assert set(np.unique(labels)) <= {UNKNOWN, 1, 2} and (labels[:5] == UNKNOWN).all()
@@ -228,7 +228,7 @@ def test_images_of_detections_are_read_in_8_and_16_bits_and_float(tmp_path: Path
     expected = combine_detections(dict(enumerate(chances, 1)), unknown=chances[0] < 0.1)
     np.testing.assert_array_equal(seen.labels == UNKNOWN, expected.labels == UNKNOWN)
     assert np.nanmax(np.abs(said(seen, 4) - said(expected, 4))) <= 1 / STEPS[0]
-    np.testing.assert_array_equal(seen.meaning.supervised, [1, 2, 3])  # type: ignore[union-attr]
+    np.testing.assert_array_equal(seen.evidence.supervised, [1, 2, 3])  # type: ignore[union-attr]
 
 
 def test_supervises_json_tells_what_label_images_say_something_of(tmp_path: Path) -> None:

@@ -88,7 +88,7 @@ def assert_same(one: Learner, other: Learner) -> None:
         assert list(one.error_models_) == list(other.error_models_)
         for name, model in one.error_models_.items():
             np.testing.assert_array_equal(model.confusion, other.error_models_[name].confusion)
-            np.testing.assert_array_equal(model.meaning.says, other.error_models_[name].meaning.says)
+            np.testing.assert_array_equal(model.evidence.informative, other.error_models_[name].evidence.informative)
 
 
 @pytest.mark.parametrize("kind", ["em", "votes"])
@@ -118,7 +118,7 @@ def test_em_on_workers_equals_em_here_bit_for_bit(client: Any, errors: bool) -> 
     here.observe_all(with_a_useless_one())
     assert_same(there, here)
     assert there.reject_summary() == {"all pixels unknown": 1}
-    assert there.error_models_[VIEWS[4].name].meaning.says.all() != errors  # the clutter is not heard
+    assert there.error_models_[VIEWS[4].name].evidence.informative.all() != errors  # the clutter is not heard
 
 
 def test_votes_on_workers_equal_votes_here_as_views_come_and_go(client: Any) -> None:

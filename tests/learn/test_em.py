@@ -172,7 +172,9 @@ def test_steps_agree_with_a_slow_twin_written_from_the_equations(changes: dict[s
     settings = EMSettings(**changes, prior_k=9)
     learner = taught(EMLearner(SCENE, NUM_CLASSES, settings), views).fit()
     assert learner.rounds_ == rounds
-    assert learner.error_models_[views[1].name].meaning.says.all() != (settings.errors and settings.least_agreement > 0)
+    assert learner.error_models_[views[1].name].evidence.informative.all() != (
+        settings.errors and settings.least_agreement > 0
+    )
     codes, objectives, confusions = slow_em(SCENE, views, settings, rounds)
     # Where a Gaussian shows in a trace of a pixel only, its votes are rounded to whole units.
     firm = learner._votes.sum(axis=1) > 2**14

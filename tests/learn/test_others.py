@@ -10,7 +10,7 @@ from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import View
-from gsseg_core.data.label_evidence import Meaning, standing
+from gsseg_core.data.label_evidence import LabelEvidence, resolved_votes
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.em.leave_one_out import counted_by_others
 from gsseg_core.learn.learner import UNITS
@@ -30,18 +30,18 @@ def observed(views: list[View], name: str) -> tuple[EMLearner, Observation]:
 def slow_count(
     votes: np.ndarray,  # (N, K) int64
     observation: Observation,
-    meaning: Meaning,
+    evidence: LabelEvidence,
     power: float,
     most: float,
 ) -> np.ndarray:
     """Readable twin of `counted_by_others`, Gaussian by Gaussian."""
     counts = np.zeros((NUM_CLASSES, len(observation.classes)))
-    own, voted = observation.votes().astype(np.float64), meaning.votes.dense(NUM_CLASSES)
+    own, voted = observation.votes().astype(np.float64), evidence.votes.dense(NUM_CLASSES)
     for m, i in enumerate(observation.ids):
         mine = slice(observation.start[m], observation.start[m + 1])
         label, pixels = observation.labels[mine], own[mine]
         others = votes[i] - np.rint(pixels[:, None] * voted[label] * UNITS).astype(np.int64).sum(axis=0)
-        others = standing(CSRRows.from_dense(others[None]), POSSIBLE).dense(NUM_CLASSES)[0]
+        others = resolved_votes(CSRRows.from_dense(others[None]), POSSIBLE).dense(NUM_CLASSES)[0]
         if not others.any():
             continue
         code = (others / others.sum()) ** power
@@ -58,9 +58,9 @@ def test_counts_by_the_others_are_those_of_a_slow_twin(seed: int, power: float, 
     learner, observation = observed(views, views[1].name)
     shape = learner._votes.shape
     votes = learner._votes + rng.integers(0, int(UNITS), shape) * (rng.random(shape) < 0.2)
-    meaning = observation.meaning.without(rng.random(len(observation.classes)) < 0.3)
-    found = counted_by_others(CSRRows.from_dense(votes), observation, POSSIBLE, meaning, power, most)
-    np.testing.assert_allclose(found, slow_count(votes, observation, meaning, power, most), rtol=1e-4, atol=1e-4)
+    evidence = observation.evidence.without(rng.random(len(observation.classes)) < 0.3)
+    found = counted_by_others(CSRRows.from_dense(votes), observation, POSSIBLE, evidence, power, most)
+    np.testing.assert_allclose(found, slow_count(votes, observation, evidence, power, most), rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("looked_for", [[1], [1, 2], [2, 3]])
@@ -72,8 +72,8 @@ def test_votes_against_classes_leave_what_can_be_said_with_them(looked_for: list
         views.append(View.from_arrays(view.camera, found, supervised=looked_for))
     learner, observation = observed(views, views[2].name)
     assert (learner._votes < 0).any()
-    counts = counted_by_others(CSRRows.from_dense(learner._votes), observation, POSSIBLE, observation.meaning, 4.0)
-    expected = slow_count(learner._votes, observation, observation.meaning, 4.0, np.inf)
+    counts = counted_by_others(CSRRows.from_dense(learner._votes), observation, POSSIBLE, observation.evidence, 4.0)
+    expected = slow_count(learner._votes, observation, observation.evidence, 4.0, np.inf)
     np.testing.assert_allclose(counts, expected, rtol=1e-4, atol=1e-4)
     assert counts.any()
 
@@ -81,6 +81,4 @@ def test_votes_against_classes_leave_what_can_be_said_with_them(looked_for: list
 def test_a_view_alone_has_nobody_beside_it() -> None:
     view = clean_views(1)[0]
     learner, observation = observed([view], view.name)
-    assert not counted_by_others(
-        CSRRows.from_dense(learner._votes), observation, POSSIBLE, observation.meaning, 4.0
-    ).any()
+    assert not counted_by_others(CSRRows.from_dense(learner._votes), observation, POSSIBLE, observation.evidence, 4.0).any()

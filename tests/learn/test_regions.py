@@ -46,17 +46,17 @@ def test_connected_pixels_are_those_of_scipy(labels: np.ndarray) -> None:
 def test_regions_mean_what_the_labels_were_and_only_large_ones_stand_alone(labels: np.ndarray) -> None:
     seen = by_region(SeenLabels(labels))
     np.testing.assert_array_equal(seen.named(), np.maximum(labels, UNKNOWN))
-    if seen.meaning is None:
+    if seen.evidence is None:
         assert (labels < 0).all()
         return
-    assert seen.meaning.is_certain and seen.meaning.says.all()
-    np.testing.assert_array_equal(np.unique(seen.labels[seen.labels >= 0]), np.arange(len(seen.meaning.says)))
+    assert seen.evidence.is_certain and seen.evidence.informative.all()
+    np.testing.assert_array_equal(np.unique(seen.labels[seen.labels >= 0]), np.arange(len(seen.evidence.informative)))
     connected, _, area = connected_pixels(labels)
     large = np.flatnonzero(area >= SMALLEST)
     alone = [np.unique(seen.labels[connected == part]) for part in large]
     assert all(len(region) == 1 for region in alone)
     assert len(np.unique(alone)) == len(large)
-    assert len(seen.meaning.says) <= len(large) + 3
+    assert len(seen.evidence.informative) <= len(large) + 3
 
 
 def test_of_very_many_regions_the_largest_stand_alone() -> None:
@@ -64,24 +64,24 @@ def test_of_very_many_regions_the_largest_stand_alone() -> None:
     labels = ((y + x) % 2).astype(np.int32)
     labels[:8, :24] = 2
     seen = by_region(SeenLabels(labels))
-    assert seen.meaning is not None and len(seen.meaning.says) == MOST + 2
+    assert seen.evidence is not None and len(seen.evidence.informative) == MOST + 2
     assert (seen.labels == seen.labels[0, 0]).sum() == 8 * 24
 
 
 def test_what_one_view_alone_claims_against_all_others_is_not_heard() -> None:
     views = clean_views(8)
     clean = taught(EMLearner(SCENE, NUM_CLASSES), views).fit()
-    assert all(model.meaning.says.all() for model in clean.error_models_.values())
+    assert all(model.evidence.informative.all() for model in clean.error_models_.values())
     cluttered = [with_clutter(view, 1 + i % 3) for i, view in enumerate(views)]
     heard, unheard = (
         taught(EMLearner(SCENE, NUM_CLASSES, EMSettings(least_agreement=least)), cluttered).fit()
         for least in (0.0, EMSettings.least_agreement)
     )
     for view in cluttered:
-        meaning = unheard.error_models_[view.name].meaning
+        evidence = unheard.error_models_[view.name].evidence
         labels = by_region(view.read_seen()).labels
-        assert not meaning.says[labels[-1, 0]]
-        assert (~meaning.says).sum() == 1
+        assert not evidence.informative[labels[-1, 0]]
+        assert (~evidence.informative).sum() == 1
     assert mean_iou(unheard) > mean_iou(heard)
     assert mean_iou(unheard) > mean_iou(clean) - 0.01
 
@@ -115,7 +115,7 @@ def test_a_region_is_in_doubt_only_where_the_others_saw_enough_of_it(seen: float
 
 def test_a_single_view_is_heard_whatever_it_says() -> None:
     learner = taught(EMLearner(SCENE, NUM_CLASSES), [with_clutter(clean_views(1)[0])]).fit()
-    assert all(model.meaning.says.all() for model in learner.error_models_.values())
+    assert all(model.evidence.informative.all() for model in learner.error_models_.values())
     assert learner.observed_.any()
 
 
@@ -127,7 +127,7 @@ def test_soft_and_partial_masks_are_heard_whatever_they_say() -> None:
     odd = with_clutter(views[1]).read_labels()
     views[1] = View.from_arrays(views[1].camera, np.where(odd == 3, 3, 0), supervised=[3])
     models = taught(EMLearner(SCENE, NUM_CLASSES), views).fit().error_models_
-    assert all(model.meaning.says.all() for model in models.values())
+    assert all(model.evidence.informative.all() for model in models.values())
 
 
 def test_views_come_and_go_exactly_with_regions_too() -> None:

@@ -23,7 +23,7 @@ from small_scenes import (
 from gsseg_core.cli.main import main
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import View
-from gsseg_core.data.label_evidence import Meaning, guess, standing
+from gsseg_core.data.label_evidence import LabelEvidence, impute_probabilities, resolved_votes
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.errors import UnknownLabelError
@@ -60,8 +60,8 @@ def in_prototypes(view: View) -> View:
     order = np.arange(len(classes))[::-1]
     place = np.full(NUM_CLASSES + 1, UNKNOWN)
     place[classes[order]] = np.arange(len(classes))
-    meaning = Meaning(classes, np.eye(len(classes), dtype=np.float32)[order])
-    return View.from_seen(view.camera, SeenLabels(place[labels].astype(np.int32), meaning))
+    evidence = LabelEvidence(classes, np.eye(len(classes), dtype=np.float32)[order])
+    return View.from_seen(view.camera, SeenLabels(place[labels].astype(np.int32), evidence))
 
 
 def learnt(name: str, views: list[View], num_classes: int = NUM_CLASSES) -> Learner:
@@ -93,11 +93,11 @@ def test_soft_votes_are_weights_times_masses_by_a_slow_twin() -> None:
     probabilities = np.moveaxis(np.random.default_rng(1).dirichlet(np.ones(3), size=(48, 64)), -1, 0)[:2]
     view = View.from_probabilities(clean_views(1)[0].camera, probabilities, [3, 1])
     seen = view.read_seen()
-    assert seen.meaning is not None
+    assert seen.evidence is not None
     W = np.zeros((48 * 64, len(SCENE)))
     entries = make_operator(SCENE, view.camera).weights()
     W[entries.pixels, entries.gaussians] = entries.weights
-    said = seen.meaning.votes.dense(NUM_CLASSES)[seen.labels.ravel()]
+    said = seen.evidence.votes.dense(NUM_CLASSES)[seen.labels.ravel()]
     learner = taught(VoteLearner(SCENE, NUM_CLASSES), [view])
     np.testing.assert_allclose(learner._votes * VOTE_UNIT, W.T @ said, atol=2e-3)
 
@@ -127,15 +127,15 @@ def test_other_numbers_for_the_objects_change_nothing(name: str) -> None:
     two = []
     for view in one:
         seen = view.read_seen()
-        assert seen.meaning is not None
-        ids = order[seen.meaning.classes]
-        looked_for = seen.meaning.supervised
-        meaning = Meaning(
+        assert seen.evidence is not None
+        ids = order[seen.evidence.classes]
+        looked_for = seen.evidence.supervised
+        evidence = LabelEvidence(
             np.sort(ids).astype(np.int32),
-            seen.meaning.mass[:, np.argsort(ids)],  # type: ignore[index]
+            seen.evidence.mass[:, np.argsort(ids)],  # type: ignore[index]
             None if looked_for is None else np.sort(order[looked_for]).astype(np.int32),
         )
-        two.append(View.from_seen(view.camera, SeenLabels(seen.labels, meaning)))
+        two.append(View.from_seen(view.camera, SeenLabels(seen.labels, evidence)))
     a, b = learnt(name, one), learnt(name, two)
     np.testing.assert_allclose(a.codes_, b.codes_[:, order], atol=2e-3)
 
@@ -218,7 +218,7 @@ def test_what_stands_of_votes_is_what_a_slow_twin_keeps(rows: list[list[int]], i
             free = [k for k in np.flatnonzero(possible) if row[k] == 0]
             if len(free) == 1 and (row < 0).any():
                 expected[i, free[0]] = np.abs(row[row != 0]).min()
-    np.testing.assert_array_equal(standing(CSRRows.from_dense(votes), possible).dense(5), expected)
+    np.testing.assert_array_equal(resolved_votes(CSRRows.from_dense(votes), possible).dense(5), expected)
 
 
 def test_where_several_classes_are_left_they_share_by_how_frequent_they_are() -> None:
@@ -227,7 +227,7 @@ def test_where_several_classes_are_left_they_share_by_how_frequent_they_are() ->
     votes = np.array([[0, -2, -2]] * 60 + [[0, 3, -1]] * 10 + [[0, -1, 3]] * 10 + [[0, -1, 0]] * 4 + [[0, 0, 0]])
     codes = np.eye(3, dtype=np.float32)[[0] * 60 + [1] * 10 + [2] * 10 + [0] * 5]
     codes[80:] = 0
-    guess(codes, votes, possible)
+    impute_probabilities(codes, votes, possible)
     np.testing.assert_allclose(codes[80:84, 0] / codes[80:84, 2], 6, rtol=1e-3)
     np.testing.assert_array_equal(codes[80:84, 1], 0)
     np.testing.assert_array_equal(codes[84], 0)

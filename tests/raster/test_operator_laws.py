@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from operator_backends import CPU
 from operator_cases import dense, make_camera, make_scene, moved, random_mask, random_view, rigid, spread
 
-from gsseg_core.data.label_evidence import Meaning
+from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.learn.learner import UNITS
 from gsseg_core.scene.camera import Camera
 
@@ -202,18 +202,18 @@ def test_votes_are_the_adjoint_of_the_one_hot_mask(backend, view):
 def test_votes_that_keep_nothing_of_a_view_are_those_of_its_observation_to_the_last_bit(backend, view, soft):
     scene, camera = random_view(**view)
     operator = backend.make(scene, camera)
-    mask, meaning = random_mask(view["seed"], camera.width, camera.height, ids=(0, 2, 3, 8)), None
+    mask, evidence = random_mask(view["seed"], camera.width, camera.height, ids=(0, 2, 3, 8)), None
     if soft:  # Prototypes, which speak for several classes and against others.
         present, places = np.unique(mask, return_inverse=True)
         mask = places.reshape(mask.shape).astype(np.int32) - (present[0] < 0)
         mass = np.random.default_rng(view["seed"]).dirichlet(np.ones(3), mask.max() + 1)[:, :2]
-        meaning = Meaning(np.array([1, 5], np.int32), mass.astype(np.float32), np.array([1, 4, 5], np.int32))
-    observation = operator.observe(mask, meaning)
+        evidence = LabelEvidence(np.array([1, 5], np.int32), mass.astype(np.float32), np.array([1, 4, 5], np.int32))
+    observation = operator.observe(mask, evidence)
     expected, found = np.zeros((2, len(scene), 9), np.int64)
     observation.vote(expected, UNITS)
-    assert operator.vote(mask, meaning, found, UNITS) == (len(observation.ids) > 0)
+    assert operator.vote(mask, evidence, found, UNITS) == (len(observation.ids) > 0)
     np.testing.assert_array_equal(found, expected)
-    operator.vote(mask, meaning, found, UNITS, -1)
+    operator.vote(mask, evidence, found, UNITS, -1)
     assert not found.any()
 
 

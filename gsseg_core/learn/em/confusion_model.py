@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsseg_core.data.label_evidence import Meaning
+from gsseg_core.data.label_evidence import LabelEvidence
 
 
 @dataclass
@@ -15,7 +15,7 @@ class ErrorModel:
 
     Attributes
     ----------
-    meaning : Meaning
+    evidence : LabelEvidence
         Of the L labels that occur in the view's mask; they are made of W words.
     confusion : (K, W) float32
         R_v: rows are true classes, columns the words seen; rows sum to 1.
@@ -27,48 +27,50 @@ class ErrorModel:
         Pixels with a label that says something.
     """
 
-    meaning: Meaning
+    evidence: LabelEvidence
     confusion: np.ndarray
     right: np.ndarray
     outliers: float
     num_pixels: int
 
     @classmethod
-    def trusting(cls, meaning: Meaning, num_classes: int, outliers: float, num_pixels: int) -> ErrorModel:
+    def trusting(cls, evidence: LabelEvidence, num_classes: int, outliers: float, num_pixels: int) -> ErrorModel:
         """Believe that every label is right."""
-        confusion, right = np.zeros((num_classes, len(meaning.words)), np.float32), meaning.right(num_classes)
+        confusion = np.zeros((num_classes, len(evidence.vocabulary)), np.float32)
+        right = evidence.correct_words(num_classes)
         confusion[right] = 1.0
-        return cls(meaning, confusion, np.zeros(len(right[0])), outliers, num_pixels)
+        return cls(evidence, confusion, np.zeros(len(right[0])), outliers, num_pixels)
 
     @classmethod
     def from_counts(
         cls,
-        meaning: Meaning,
+        evidence: LabelEvidence,
         counts: np.ndarray,  # (K, L) px of each class under each label
         prior: float,
         outliers: float,
         num_pixels: int,
     ) -> ErrorModel:
         """Start from what the codes so far say of the mask."""
-        if meaning.shares is not None:
-            shares = meaning.shares[meaning.says]
-            counts = counts[:, meaning.says] @ (shares / shares.sum(axis=1, keepdims=True))
-        right = prior * counts[meaning.right(len(counts))[0]].sum(axis=1)
-        uniform = np.full(counts.shape, 1.0 / len(meaning.words), np.float32)
-        model = cls(meaning, uniform, right, outliers, num_pixels)
+        if evidence.word_plausibility is not None:
+            shares = evidence.word_plausibility[evidence.informative]
+            counts = counts[:, evidence.informative] @ (shares / shares.sum(axis=1, keepdims=True))
+        right = prior * counts[evidence.correct_words(len(counts))[0]].sum(axis=1)
+        uniform = np.full(counts.shape, 1.0 / len(evidence.vocabulary), np.float32)
+        model = cls(evidence, uniform, right, outliers, num_pixels)
         model.maximise(counts)
         return model
 
     @property
     def classes(self) -> np.ndarray:
         """The words seen, (W,) int32: classes, and then `UNKNOWN` (-1) for "none of these", if it occurs."""
-        return self.meaning.words
+        return self.evidence.vocabulary
 
     @property
     def likelihood(self) -> np.ndarray:
         """C_v: probability of each label given the class, (K, L) float32."""
         words: np.ndarray = (1 - self.outliers) * self.confusion + np.float32(self.outliers / len(self.classes))
-        return words if self.meaning.shares is None else np.asarray(words @ self.meaning.shares.T)
+        plausible = self.evidence.word_plausibility
+        return words if plausible is None else np.asarray(words @ plausible.T)
 
     @property
     def told(self) -> tuple[np.ndarray, np.ndarray]:
@@ -77,15 +79,15 @@ class ErrorModel:
         All classes are as plausible there, so they would not change where the steps end, only how soon they do.
         """
         likelihood = np.ascontiguousarray(self.likelihood.T)
-        return likelihood, np.where(self.meaning.says[:, None], likelihood, np.float32(0))
+        return likelihood, np.where(self.evidence.informative[:, None], likelihood, np.float32(0))
 
     def expected(
         self,
         counts: np.ndarray,  # (K, L) sum of the shares of each class under each label
     ) -> np.ndarray:
         """Count the pixels (K, W) in which each class was there and each word was meant."""
-        if self.meaning.shares is not None:
-            counts = counts[:, self.meaning.says] @ self.meaning.shares[self.meaning.says]
+        if self.evidence.word_plausibility is not None:
+            counts = counts[:, self.evidence.informative] @ self.evidence.word_plausibility[self.evidence.informative]
         expected: np.ndarray = counts * (1 - self.outliers) * self.confusion
         return expected
 
@@ -95,7 +97,7 @@ class ErrorModel:
     ) -> None:
         """Set R_v to its best for expected counts; classes that the view does not show keep their row."""
         counts = counts.astype(np.float64)
-        counts[self.meaning.right(len(counts))] += self.right
+        counts[self.evidence.correct_words(len(counts))] += self.right
         total = counts.sum(axis=1, keepdims=True)
         shown = total[:, 0] > 0
         self.confusion[shown] = counts[shown] / total[shown]

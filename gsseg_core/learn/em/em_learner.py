@@ -57,7 +57,7 @@ from functools import partial
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows, starts
-from gsseg_core.data.label_evidence import standing
+from gsseg_core.data.label_evidence import resolved_votes
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn.em.boundary_alignment import scene_edges, settle_outlines
@@ -179,7 +179,7 @@ class EMLearner(Learner):
         if settings.judges:
             doubted, doubts = self._judge(votes, tell)
             votes = votes.with_data(votes.data - doubted).nonzero()
-        stands = standing(votes, self._possible())
+        stands = resolved_votes(votes, self._possible())
         self.observed_ = np.diff(stands.indptr) > 0
         counted, prior = stands.united(self._smooth(stands))
         # Votes are the first step; with the prior counted in, the objective is finite from the start. What is zero now
@@ -213,7 +213,7 @@ class EMLearner(Learner):
     def _heard(self, seen: SeenLabels, operator: ViewOperator) -> SeenLabels:
         """Move outlines to edges, if the mask has any; tell regions apart, if they may be in doubt."""
         settings = self.settings
-        if settings.errors and settings.edge_px and seen.meaning is None:
+        if settings.errors and settings.edge_px and seen.evidence is None:
             # Where outlines go is decided, not computed to a precision: all devices have to see the very same edges.
             drawing = operator if self.device == "cpu" else make_operator(self.scene, operator.camera)
             seen = SeenLabels(settle_outlines(seen.labels, scene_edges(drawing, self.scene), settings.edge_px))
@@ -258,14 +258,14 @@ class EMLearner(Learner):
         return models
 
     def _first_model(self, votes: CSRRows, observation: Observation, doubtful: np.ndarray | None) -> ErrorModel:
-        settings, meaning = self.settings, observation.meaning
+        settings, evidence = self.settings, observation.evidence
         if not settings.errors:
-            return ErrorModel.trusting(meaning, self.num_classes, settings.outliers, observation.num_pixels)
+            return ErrorModel.trusting(evidence, self.num_classes, settings.outliers, observation.num_pixels)
         if doubtful is not None:
-            meaning = meaning.without(doubtful)
-        pixels = int(observation.areas[meaning.says].sum())
-        counts = counted_by_others(votes, observation, self._possible(), meaning, settings.majority)
-        return ErrorModel.from_counts(meaning, counts, settings.error_prior, settings.outliers, pixels)
+            evidence = evidence.without(doubtful)
+        pixels = int(observation.areas[evidence.informative].sum())
+        counts = counted_by_others(votes, observation, self._possible(), evidence, settings.majority)
+        return ErrorModel.from_counts(evidence, counts, settings.error_prior, settings.outliers, pixels)
 
     def _gains(
         self,

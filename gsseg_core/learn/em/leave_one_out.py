@@ -6,7 +6,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.data.label_evidence import Meaning, stand
+from gsseg_core.data.label_evidence import LabelEvidence, resolve_row
 from gsseg_core.learn.em.em_kernels import BLOCKS, take_row
 from gsseg_core.learn.learner import UNITS
 from gsseg_core.raster.view_operator import Observation
@@ -16,7 +16,7 @@ def counted_by_others(
     votes: CSRRows,  # int64, of all views
     observation: Observation,
     possible: np.ndarray,  # (K,) bool: ids that are classes
-    meaning: Meaning,
+    evidence: LabelEvidence,
     power: float = 1.0,
     most: float = np.inf,
 ) -> np.ndarray:
@@ -30,7 +30,7 @@ def counted_by_others(
         The view.
     possible : (K,) bool
         Ids that are classes.
-    meaning : Meaning
+    evidence : LabelEvidence
         What the view has voted with.
     power : float
         Codes are raised to it, and scaled to sum 1 again, before they are counted: above 1, majorities stand out.
@@ -39,7 +39,7 @@ def counted_by_others(
     """
     return _count(
         *votes, observation.order, observation.ids, observation.start, observation.labels, observation.votes(),
-        *meaning.votes, np.flatnonzero(possible), power, most, len(possible), len(observation.classes),
+        *evidence.votes, np.flatnonzero(possible), power, most, len(possible), len(observation.classes),
     )  # fmt: skip
 
 
@@ -93,7 +93,7 @@ def _count(
             for z in range(many):
                 least = min(least, others[z])
             if least < 0:
-                many = stand(which[:many], others[:many], possible, kept_which, kept_others)
+                many = resolve_row(which[:many], others[:many], possible, kept_which, kept_others)
                 which[:many], others[:many] = kept_which[:many], kept_others[:many]
             total, largest = np.int64(0), np.int64(0)
             for z in range(many):

@@ -13,7 +13,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.data.label_evidence import Meaning
+from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.learn.em.em_kernels import take_votes
@@ -33,7 +33,7 @@ MOST = 500
 
 def by_region(seen: SeenLabels) -> SeenLabels:
     """Give every region of a mask a label of its own, which means the class that it had; a soft mask stays as it is."""
-    if seen.meaning is not None or not (seen.labels >= 0).any():
+    if seen.evidence is not None or not (seen.labels >= 0).any():
         return seen
     connected, first, area = connected_pixels(seen.labels)
     label = seen.labels.ravel()[first]
@@ -46,7 +46,7 @@ def by_region(seen: SeenLabels) -> SeenLabels:
     mass = np.zeros((int(regions.max()) + 1, len(classes)), np.float32)
     mass[regions, position] = 1
     labels = np.append(regions, UNKNOWN).astype(np.int32)[connected]
-    return SeenLabels(labels, Meaning(classes.astype(np.int32), mass))
+    return SeenLabels(labels, LabelEvidence(classes.astype(np.int32), mass))
 
 
 def connected_pixels(
@@ -86,13 +86,14 @@ def in_doubt(
     least : float
         Share of what lies under a label, by weight, that has to be of its class by the votes of the others.
     """
-    meaning = observation.meaning
-    if not meaning.is_certain:
+    evidence = observation.evidence
+    if not evidence.is_certain:
         return np.zeros(len(observation.classes), bool)
-    counts, label = counted_by_others(votes, observation, possible, meaning, most=1), np.arange(len(meaning.says))
+    counts = counted_by_others(votes, observation, possible, evidence, most=1)
+    label = np.arange(len(evidence.informative))
     covered = counts.sum(axis=0)
     enough = covered >= COVERED * np.bincount(observation.labels, weights=observation.votes(), minlength=len(label))
-    doubtful: np.ndarray = enough & (counts[meaning.named(), label] < least * covered)
+    doubtful: np.ndarray = enough & (counts[evidence.named(), label] < least * covered)
     return doubtful
 
 
@@ -103,7 +104,7 @@ def take_back(
     total: np.ndarray,  # (Z,) int64, changed in place
 ) -> None:
     """Take what a view has voted with some of its labels away from a total of the same rows as the votes."""
-    order, said = observation.order, observation.meaning.without(~doubtful).votes
+    order, said = observation.order, observation.evidence.without(~doubtful).votes
     ids = observation.ids[order]
     seen = order, observation.start, observation.labels
     take_votes(votes.indptr[ids], votes.indptr[ids + 1], votes.indices, total, *seen, *said, observation.votes(), UNITS)

@@ -10,7 +10,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import starts
-from gsseg_core.data.label_evidence import Meaning
+from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.raster.cpu.blending import AHEAD
 from gsseg_core.raster.cpu.lifting import Labels, cut_labels, lift
 from gsseg_core.raster.cpu.tiling import Tiles
@@ -76,7 +76,7 @@ class LiftedMask:
         self,
         ids: np.ndarray,  # (M,)
         tiles: Tiles,
-        meaning: Meaning,
+        evidence: LabelEvidence,
         total: np.ndarray,  # (N, K) int64, added to
         units: float,
         sign: int,
@@ -90,7 +90,7 @@ class LiftedMask:
         _put_beside(tiles.start, facts, self.sums, mask.present, said)
         _vote(
             ids, tiles.gaussian_start, tiles.gaussian_entries, said, facts, self.sums, mask.present, len(self.classes),
-            *meaning.votes, units, sign, total,
+            *evidence.votes, units, sign, total,
         )  # fmt: skip
 
 

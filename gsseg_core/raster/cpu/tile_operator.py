@@ -7,7 +7,7 @@ import copy
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.data.label_evidence import Meaning
+from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.raster.cpu import products
 from gsseg_core.raster.cpu.label_pairs import take
 from gsseg_core.raster.cpu.lifted_mask import LiftedMask
@@ -100,7 +100,9 @@ class TileOperator(ViewOperator):
         lifted = LiftedMask(self.camera, self._table, self._tiles, labels)
         return TileObservation(self.camera, self.ids, self._table, self._tiles, lifted)
 
-    def _vote(self, labels: np.ndarray, meaning: Meaning | None, total: np.ndarray, units: float, sign: int) -> bool:
+    def _vote(
+        self, labels: np.ndarray, evidence: LabelEvidence | None, total: np.ndarray, units: float, sign: int
+    ) -> bool:
         lifted = LiftedMask(self.camera, self._table, self._tiles, labels)
-        lifted.vote(self.ids, self._tiles, meaning or Meaning(lifted.classes), total, units, sign)
+        lifted.vote(self.ids, self._tiles, evidence or LabelEvidence(lifted.classes), total, units, sign)
         return lifted.sees
