@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
+from gsseg_core import kernel_cache as _kernel_cache  # noqa: F401 - before any kernel is defined
+
 _NONE = np.uint32(2**32 - 1)
 
 

@@ -1,7 +1,8 @@
 """Where compiled kernels are kept from one run to the next, and what is done where they cannot be kept.
 
 numba looks for a folder when a kernel is defined, that is, when its module is imported, and raises an error if it may
-write to none. So `gsseg_core` looks before, and where there is none the kernels do without.
+write to none. So each room with kernels imports this module first, which looks before numba does; where there is no
+such folder, the kernels do without.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import gsseg_core
-from gsseg_core.cli.arguments import COMMANDS, build_parser
+from gsseg_core.cli.arguments import build_parser, command_module
 from gsseg_core.cli.completion import subparsers
 
 REPOSITORY = Path(__file__).parents[2]
@@ -30,7 +30,7 @@ def command_line() -> str:
         "130.\n",
     ]
     for name, parser in subparsers(build_parser()).items():
-        module = COMMANDS[name]
+        module = command_module(name)
         parts += [f"## gsseg {name}\n", " ".join(module.DESCRIPTION.split()) + "\n"]
         parts.append(f"```text\n{parser.format_usage().removeprefix('usage: ').rstrip()}\n```\n")
         rows = [_argument(parser, action) for action in parser._actions if action.dest != "help"]
@@ -63,7 +63,7 @@ def python() -> str:
     more = [name for name in gsseg_core.__all__ if name not in listed]
     for title, names in {**API, **({"More": more} if more else {})}.items():
         parts.append(f"## {title}\n")
-        parts += [f"::: gsseg_core.{gsseg_core._HOMES[name]}.{name}\n" for name in names]
+        parts += [f"::: {getattr(gsseg_core, name).__module__}.{name}\n" for name in names]
     parts += ["## A robot without ROS\n", "::: gsseg_core.live.session.LiveSession\n"]
     parts += ["## The client of the ROS node\n", "::: gsseg_ros.client.SegmentationClient\n"]
     return "\n".join(parts)

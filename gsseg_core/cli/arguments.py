@@ -3,38 +3,29 @@
 from __future__ import annotations
 
 import argparse
-import difflib
+import importlib
 import re
 import textwrap
-from collections.abc import Sequence
-from importlib.metadata import version
+from collections.abc import Collection, Sequence
 from types import ModuleType
 from typing import Any
 
-from gsseg_core.cli import completion as cli_completion
-from gsseg_core.cli import demo as cli_demo
-from gsseg_core.cli import doctor as cli_doctor
-from gsseg_core.cli import eval as cli_eval
-from gsseg_core.cli import pick as cli_pick
-from gsseg_core.cli import remove as cli_remove
-from gsseg_core.cli import render as cli_render
-from gsseg_core.cli import segment as cli_segment
-from gsseg_core.cli import view as cli_view
-
-# In the order of `gsseg --help`. A command's module has HELP, one line; DESCRIPTION; EXAMPLES; `add_arguments(parser)`;
-# and `run(options)`, which returns the exit code. All that is slow to import is imported in `run`, so that
-# `gsseg --help` is at once.
-COMMANDS: dict[str, ModuleType] = {
-    "segment": cli_segment,
-    "render": cli_render,
-    "eval": cli_eval,
-    "pick": cli_pick,
-    "view": cli_view,
-    "remove": cli_remove,
-    "demo": cli_demo,
-    "doctor": cli_doctor,
-    "completion": cli_completion,
+COMMANDS = {
+    "segment": "learn from masks, refine, write labels and one PLY per object",
+    "render": "render label maps and overlays of a segmentation",
+    "eval": "score label maps: mIoU, mAcc, boundary IoU",
+    "pick": "pick one object by a mask or clicks in one view, and write it as a PLY",
+    "view": "look at a scene in the browser, class by class, and correct labels",
+    "remove": "write the scene without some of its objects",
+    "demo": "make a small scene with known truth and segment it",
+    "doctor": "say what this machine has and lacks, and how to get it",
+    "completion": "print a script for tab completion",
 }
+"""Each command and its line in `gsseg --help`, in this order.
+
+The module of its name has DESCRIPTION; EXAMPLES; `add_arguments(parser)`; and `run(options)`, which returns the exit
+code. It is imported only for a command that is given, and imports in `run` what is slow to import.
+"""
 
 _EPILOG = """\
 first steps:
@@ -62,28 +53,47 @@ class _Parser(argparse.ArgumentParser):
             name = argument.split("=")[0]
             if not re.match(r"--?[A-Za-z]\S*$", name) or any(option.startswith(name) for option in known):
                 continue
+            import difflib
+
             near = difflib.get_close_matches(name, known, 1)
             self.error(f"unknown option {name}" + (f"; did you mean {near[0]}?" if near else ""))
 
 
-def build_parser() -> argparse.ArgumentParser:
-    """Build the parser of the whole command line, from which help, tab completion and docs/ are made, too."""
+class _Version(argparse.Action):
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from importlib.metadata import version
+
+        print(f"gsseg {version('gsseg')}")
+        parser.exit()
+
+
+def command_module(name: str) -> ModuleType:
+    """Import the module of a command."""
+    return importlib.import_module(f"gsseg_core.cli.{name}")
+
+
+def build_parser(full: Collection[str] = COMMANDS.keys()) -> argparse.ArgumentParser:
+    """Build the parser of the command line, from which help, tab completion and docs/ are made, too.
+
+    Parameters
+    ----------
+    full : collection of str
+        The commands whose arguments are needed; of the others there is but the name.
+    """
     parser = _Parser(
         prog="gsseg",
         description="Segment a trained 3D Gaussian Splatting scene, all objects at once, from\nposed 2D masks.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--version", action="version", version=f"gsseg {version('gsseg')}")
+    parser.add_argument("--version", action=_Version, nargs=0, help="show program's version number and exit")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for name, module in COMMANDS.items():
-        command = commands.add_parser(
-            name,
-            help=module.HELP,
-            description=textwrap.fill(" ".join(module.DESCRIPTION.split()), 78),
-            epilog=f"examples:\n{module.EXAMPLES.strip(chr(10))}",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        module.add_arguments(command)
-        command.set_defaults(run=module.run)
+    for name, line in COMMANDS.items():
+        command = commands.add_parser(name, help=line, formatter_class=argparse.RawDescriptionHelpFormatter)
+        if name in full:
+            module = command_module(name)
+            command.description = textwrap.fill(" ".join(module.DESCRIPTION.split()), 78)
+            command.epilog = f"examples:\n{module.EXAMPLES.strip(chr(10))}"
+            module.add_arguments(command)
+            command.set_defaults(run=module.run)
     return parser

@@ -9,7 +9,6 @@ from gsseg_core.errors import SettingsError
 
 SHELLS = ("bash", "zsh", "fish")
 
-HELP = "print a script for tab completion"
 DESCRIPTION = """
 Prints a script that completes commands, options, their choices, files and folders. It is made from the same
 description as this help, so make it again after an update.

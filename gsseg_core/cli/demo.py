@@ -8,7 +8,6 @@ from gsseg_core.cli.shared import add_quiet, load_kernels
 from gsseg_core.cli.terminal import tell
 from gsseg_core.progress import progress_bars
 
-HELP = "make a small scene with known truth and segment it"
 DESCRIPTION = """
 Makes a table with eight objects as Gaussians, posed views, and masks that are wrong as real ones are; segments it,
 and scores the result against the truth. Needs no data.

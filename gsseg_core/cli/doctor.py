@@ -6,7 +6,6 @@ import argparse
 
 from gsseg_core.cli.terminal import note, tell
 
-HELP = "say what this machine has and lacks, and how to get it"
 DESCRIPTION = """
 Prints the versions of gsseg, Python and its packages, the devices, whether the kernels run and where they are cached,
 which options are installed, and what is there of ROS 2. For everything that is missing it says what to type.

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from gsseg_core.cli.terminal import tell
 
-HELP = "score label maps: mIoU, mAcc, boundary IoU"
 DESCRIPTION = """
 Scores predicted label maps against true ones of the same names: IoU, accuracy and boundary IoU of each class, and
 their means over the classes that occur. Pixels whose truth is unknown do not count.

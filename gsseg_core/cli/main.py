@@ -50,9 +50,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(arguments: Sequence[str] | None) -> int:
     from gsseg_core.cli.arguments import build_parser
+
+    given = sys.argv[1:] if arguments is None else arguments
+    options = build_parser(given).parse_args(given)
+
     from gsseg_core.freed_memory import keep_freed_memory
 
-    options = build_parser().parse_args(sys.argv[1:] if arguments is None else arguments)
     keep_freed_memory()
     if arguments is not None:
         code: int = options.run(options)

@@ -10,7 +10,6 @@ from gsseg_core.cli.shared import add_scene, load_kernels
 from gsseg_core.cli.terminal import tell
 from gsseg_core.errors import SettingsError
 
-HELP = "pick one object by a mask or clicks in one view, and write it as a PLY"
 DESCRIPTION = """
 Finds the Gaussians of one object that is shown in one view, by a mask (best) or by clicks, and writes it as
 DIR/object.ply, with the indices in DIR/pick.npz and a picture of the view. Needs no other masks.

@@ -9,7 +9,6 @@ from gsseg_core.cli.terminal import tell
 from gsseg_core.data.names import class_ids, listed
 from gsseg_core.text import clipped, counted
 
-HELP = "write the scene without some of its objects"
 DESCRIPTION = """
 Writes a valid 3DGS PLY of all Gaussians but those of the given classes. What an object hid, no camera has seen: where
 it stood there may be holes, and nothing is made up to fill them.

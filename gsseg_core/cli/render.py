@@ -9,7 +9,6 @@ from gsseg_core.cli.terminal import tell
 from gsseg_core.progress import progress_bars
 from gsseg_core.text import counted
 
-HELP = "render label maps and overlays of a segmentation"
 DESCRIPTION = """
 Renders the label map of each view of a split as DIR/<stem>.png, in the encoding of the masks, and pictures of it
 in DIR/overlays.

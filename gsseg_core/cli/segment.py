@@ -9,7 +9,6 @@ from gsseg_core.cli.terminal import tell
 from gsseg_core.progress import progress_bars
 from gsseg_core.refine.settings import RefineSettings
 
-HELP = "learn from masks, refine, write labels and one PLY per object"
 DESCRIPTION = """
 Learns from the masks of the train views which Gaussian belongs to which class, refines that by the neighbours in
 space, and writes OUT/segmentation.npz, one PLY per class, a report and pictures.

@@ -19,7 +19,6 @@ from gsseg_core.errors import SettingsError
 if TYPE_CHECKING:
     from gsseg_core.viewer.access import Listener
 
-HELP = "look at a scene in the browser, class by class, and correct labels"
 DESCRIPTION = """
 Serves a page in which the scene is drawn in true colours, by class or by confidence; classes can be shown alone,
 corrected and exported. With --ros it follows a node while that learns.

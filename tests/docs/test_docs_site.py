@@ -42,6 +42,6 @@ def test_the_reference_names_every_command_class_and_interface(site: Path) -> No
 
     text = {name: (site / f"{name}.html").read_text(encoding="utf-8") for name in ("cli", "api", "ros")}
     assert all(f"gsseg {name}</h2>" in re.sub(r"<a class=\"headerlink.*?</a>", "", text["cli"]) for name in COMMANDS)
-    assert all(f'id="gsseg_core.{gsseg_core._HOMES[name]}.{name}"' in text["api"] for name in gsseg_core.__all__)
+    assert all(f'id="{getattr(gsseg_core, name).__module__}.{name}"' in text["api"] for name in gsseg_core.__all__)
     for path in REPOSITORY.glob("msg_defs/*/*.*"):
         assert f"{path.parent.name}/{path.stem}" in text["ros"]
