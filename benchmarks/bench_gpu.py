@@ -18,7 +18,8 @@ import numpy as np
 from machine import DATA, asked_anew, once, processor, timed, version
 from room import build_room
 
-from gsseg_core.data.dataset import Dataset, View, spread
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View, spread
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.raster.view_operator import make_operator

@@ -27,7 +27,8 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View
 from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.metrics import Evaluation

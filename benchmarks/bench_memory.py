@@ -12,7 +12,7 @@ from machine import describe, peak_memory
 from workloads import RoomSize, make_room
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner import MEMORY_BUDGET
 from gsseg_core.raster.view_operator import make_operator

@@ -32,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests/helpers"))
 from browser import opened_page, started_chromium, why_missing
 from playwright.sync_api import Page
 
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.viewer.access import listen
 from gsseg_core.viewer.clients import BROWSER, SERVER

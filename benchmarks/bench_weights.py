@@ -22,8 +22,9 @@ from machine import DATA, asked_anew, describe, timed
 from numba.core import types
 from workloads import REAL, RoomSize, make_room, true_labels
 
-from gsseg_core.data.dataset import Dataset, View, spread
+from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.soft_masks import SeenLabels
+from gsseg_core.data.view import View, spread
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.raster.cpu import label_pairs as sightings
 from gsseg_core.raster.cpu.blending import open_rays

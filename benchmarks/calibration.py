@@ -23,7 +23,8 @@ from plots import Axis, draw_panels
 from results import machine, markdown
 from scipy.optimize import minimize_scalar
 
-from gsseg_core.data.dataset import Dataset, View, spread
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View, spread
 from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.learn.calibrate import calibrate, votes_without
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings

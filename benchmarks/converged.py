@@ -18,7 +18,8 @@ import numpy as np
 from machine import DATA, describe
 from workloads import REAL, RoomSize, make_room, true_labels
 
-from gsseg_core.data.dataset import Dataset, View, spread
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View, spread
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.warm_up import warm_up

@@ -28,7 +28,8 @@ from plots import Axis, draw_panels
 from results import machine, markdown, points
 from scipy import ndimage
 
-from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View
 from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.learn.em.em_learner import EMLearner

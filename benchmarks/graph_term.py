@@ -20,7 +20,8 @@ from few_views import Bench, split
 from machine import DATA, REPOSITORY
 from results import markdown
 
-from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View
 from gsseg_core.demo.mask_errors import MaskErrors, corrupt
 from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.files.atomic import write_atomically

@@ -17,7 +17,8 @@ from stages import measure_stages
 from workloads import RoomSize, make_room, split, true_labels, write_room
 
 from gsseg_core import pipeline
-from gsseg_core.data.dataset import Dataset, View, spread
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View, spread
 from gsseg_core.freed_memory import keep_freed_memory
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import UNITS, Learner

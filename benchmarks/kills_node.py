@@ -18,7 +18,7 @@ from ros_robot import CLASSES, Robot, core_session, renamed
 from small_scenes import balls_on_a_table, clean_views
 from whole_outputs import Fault, faults_of, hash_of, leftovers, listing, read_folder
 
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 
 TURNED = (0, 2, 3, 1)
 VIEWS = {"first": 3, "second": 30}

@@ -20,7 +20,8 @@ from machine import DATA
 from results import markdown, points, score
 from view_errors import corrupt_views
 
-from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View
 from gsseg_core.demo.mask_errors import MaskErrors
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numba as nb
 import numpy as np
 
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_core.objects.silhouettes import BEHIND, depths, surface
 from gsseg_core.raster.cpu.blending import in_tile, open_rays
 from gsseg_core.raster.cpu.projection import project

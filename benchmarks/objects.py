@@ -21,7 +21,8 @@ from object_ceiling import best_selection
 from results import machine, markdown, points
 from straddlers import split, straddlers
 
-from gsseg_core.data.dataset import Dataset, View, spread
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View, spread
 from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.export.pictures import contact_sheet, save_png
 from gsseg_core.export.view_pictures import background_image

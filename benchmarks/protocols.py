@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.view import View
 from gsseg_core.errors import CameraFileError, MaskFormatError, MaskSizeError
 from gsseg_core.files.input_files import open_image
 from gsseg_core.metrics import Evaluation

@@ -21,7 +21,7 @@ from results import score
 from robustness import Bench, open_benches
 from view_errors import corrupt_views, errors_at
 
-from gsseg_core.data.dataset import View, spread
+from gsseg_core.data.view import View, spread
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.warm_up import warm_up

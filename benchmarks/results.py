@@ -24,7 +24,8 @@ import numpy as np
 from jobs import hard_votes
 from machine import processor
 
-from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View
 from gsseg_core.export.pictures import contact_sheet, overlay, palette, save_png
 from gsseg_core.export.view_pictures import background_image
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings

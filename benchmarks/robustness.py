@@ -29,7 +29,8 @@ from robustness_text import BAR, CURVES, HEADER, RELIABILITY
 from scipy.stats import spearmanr
 from view_errors import STRONGEST, PoseErrors, corrupt_views, errors_at, typical_depth
 
-from gsseg_core.data.dataset import Dataset, View, spread
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View, spread
 from gsseg_core.demo.mask_errors import MaskErrors
 from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.export.view_pictures import draw_worst_views

@@ -25,8 +25,9 @@ from results import markdown, points, score
 from scipy.ndimage import distance_transform_edt
 from scipy.special import ndtr
 
-from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.view import View
 from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.scene.gaussian_scene import GaussianScene

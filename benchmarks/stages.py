@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from machine import asked_anew, drop_from_page_cache, once, timed
 
-from gsseg_core.data.dataset import Dataset, View, spread
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View, spread
 from gsseg_core.export.class_plys import export_classes
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner import UNITS

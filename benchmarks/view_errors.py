@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_core.demo.mask_errors import MaskErrors, corrupt
 from gsseg_core.errors import SettingsError
 from gsseg_core.scene.camera import Camera

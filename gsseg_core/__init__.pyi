@@ -1,5 +1,5 @@
 from .data.dataset import Dataset as Dataset
-from .data.dataset import View as View
+from .data.view import View as View
 from .errors import GssegError as GssegError
 from .export.class_plys import export_classes as export_classes
 from .learn.em.em_learner import EMLearner as EMLearner

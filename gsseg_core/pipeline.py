@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from gsseg_core.data.dataset import Dataset, View, spread
+from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.hints import mask_hint
 from gsseg_core.data.label_images import write_mask
+from gsseg_core.data.view import View, spread
 from gsseg_core.errors import NoUsableViewsError
 from gsseg_core.export.class_plys import class_file_name, write_classes
 from gsseg_core.export.pictures import save_png

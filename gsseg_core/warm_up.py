@@ -9,7 +9,7 @@ import numpy as np
 from numba.core import event
 
 from gsseg_core import kernel_cache
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.mask_reliability import OtherViews
 from gsseg_core.learn.vote_learner import VoteLearner

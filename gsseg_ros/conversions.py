@@ -26,7 +26,7 @@ from gsseg_core.scene.camera import Camera
 from gsseg_ros.frames import Similarity, quaternion_from_rotation, rigid, rotation_from_quaternion
 
 _NS = 1_000_000_000
-_LARGEST_LABEL = 2**16 - 2  # As in files, see `gsseg_core.data.label_images.read_classes`.
+_LARGEST_LABEL = 2**16 - 2  # As in files, see `gsseg_core.data.class_names.read_classes`.
 _UNIT_TOLERANCE = 1e-3
 _LONGEST_TOKEN = 64  # The full name of a topic must stay below 256 characters.
 

@@ -17,8 +17,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from gsseg_core.data.dataset import Dataset, View, spread
+from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import write_mask
+from gsseg_core.data.view import View, spread
 from gsseg_core.demo.run import gaussian_ious
 from gsseg_core.demo.table_scene import DemoScene, build_demo
 from gsseg_core.errors import GssegError

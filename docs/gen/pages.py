@@ -9,6 +9,8 @@ from pathlib import Path
 import gsseg_core
 from gsseg_core.cli.arguments import build_parser, command_module
 from gsseg_core.cli.completion import subparsers
+from gsseg_core.data.camera_formats.table import CAMERA_FORMATS
+from gsseg_core.scene.scene_formats import SCENE_FORMATS
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -64,9 +66,16 @@ def python() -> str:
     for title, names in {**API, **({"More": more} if more else {})}.items():
         parts.append(f"## {title}\n")
         parts += [f"::: {getattr(gsseg_core, name).__module__}.{name}\n" for name in names]
+    parts += ["## Files that are read\n", _formats()]
     parts += ["## A robot without ROS\n", "::: gsseg_core.live.session.LiveSession\n"]
     parts += ["## The client of the ROS node\n", "::: gsseg_ros.client.SegmentationClient\n"]
     return "\n".join(parts)
+
+
+def _formats() -> str:
+    scenes = [f"| scene | {known.name} | `{' or '.join(known.suffixes)}` |" for known in SCENE_FORMATS]
+    cameras = [f"| cameras | {known.name} | `{known.looked_for}` |" for known in CAMERA_FORMATS]
+    return "\n".join(["| what | format | recognised by |", "|---|---|---|", *scenes, *cameras, ""])
 
 
 def ros_interfaces() -> str:

@@ -8,8 +8,8 @@ from gsseg_core.cli.terminal import note, tell
 
 DESCRIPTION = """
 Prints the versions of gsseg, Python and its packages, the devices, whether the kernels run and where they are cached,
-which options are installed, and what is there of ROS 2. For everything that is missing it says what to type.
-The exit code is 0 if gsseg works without the options, and 2 if not.
+the formats of scenes and cameras that are read, which options are installed, and what is there of ROS 2. For everything
+that is missing it says what to type. The exit code is 0 if gsseg works without the options, and 2 if not.
 """
 EXAMPLES = """
   gsseg doctor

@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Score, and print a table."""
-    from gsseg_core.data.label_images import read_classes
+    from gsseg_core.data.class_names import read_classes
     from gsseg_core.errors import ClassesFileError
     from gsseg_core.files.atomic import check_writable
     from gsseg_core.files.input_files import is_there

@@ -1,4 +1,4 @@
-"""What this machine has of what gsseg needs: packages, devices, compiled kernels, ROS; and how to get the rest.
+"""What this machine has of what gsseg needs: packages, devices, compiled kernels, formats, ROS; how to get the rest.
 
 Nothing of ROS is imported here, only looked for.
 """
@@ -13,6 +13,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata
 
@@ -66,7 +67,7 @@ def examine(say: Callable[[str], object] = lambda text: None) -> list[Finding]:
     say : callable
         Told if kernels have to be compiled, which takes a minute.
     """
-    return [*_versions(), *_packages(), *_devices(), *_kernels(say), *_extras(), *_ros()]
+    return [*_versions(), *_packages(), *_devices(), *_kernels(say), *_formats(), *_extras(), *_ros()]
 
 
 def works(findings: list[Finding]) -> bool:
@@ -172,6 +173,17 @@ def _kernels(say: Callable[[str], object]) -> Iterator[Finding]:
         state = f"none: cannot write to {' or '.join(kernel_cache.candidates())}"
         fix = f"{kernel_cache.REMEDY}; else every run compiles for a minute or two"
         yield Finding("kernels", "cache", state, "-", fix)
+
+
+def _formats() -> Iterator[Finding]:
+    with suppress(ImportError):  # What is missing is said above.
+        from gsseg_core.data.camera_formats.table import CAMERA_FORMATS
+        from gsseg_core.scene.scene_formats import SCENE_FORMATS
+
+        for scenes in SCENE_FORMATS:
+            yield Finding("scene formats", scenes.name, " or ".join(scenes.suffixes))
+        for cameras in CAMERA_FORMATS:
+            yield Finding("camera formats", cameras.name, cameras.looked_for)
 
 
 def _ros() -> Iterator[Finding]:

@@ -36,7 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Pick, and say what was written."""
-    from gsseg_core.data.dataset import Dataset, View
+    from gsseg_core.data.dataset import Dataset
+    from gsseg_core.data.view import View
     from gsseg_core.export.pictures import overlay, palette, save_png
     from gsseg_core.export.view_pictures import background_image
     from gsseg_core.files.earlier_outputs import earlier_pick

@@ -6,8 +6,6 @@ import argparse
 from pathlib import Path
 
 from gsseg_core.cli.terminal import tell
-from gsseg_core.data.names import class_ids, listed
-from gsseg_core.text import clipped, counted
 
 DESCRIPTION = """
 Writes a valid 3DGS PLY of all Gaussians but those of the given classes. What an object hid, no camera has seen: where
@@ -38,10 +36,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Remove, and say what is left."""
+    from gsseg_core.data.class_names import class_ids, listed
     from gsseg_core.files.atomic import check_writable
     from gsseg_core.objects.removal import without_objects
     from gsseg_core.scene.gaussian_scene import GaussianScene
     from gsseg_core.segmentation import Segmentation
+    from gsseg_core.text import clipped, counted
 
     check_writable(options.out)
     scene = GaussianScene.load(options.scene)

@@ -18,8 +18,13 @@ def add_scene(parser: argparse.ArgumentParser) -> None:
         metavar="DATASET",
         help="folder with cameras, labels/<stem>.png, classes.json, split.json",
     )
-    parser.add_argument("--device", type=_device, default="cpu", help=f"{DEVICES} (default: cpu)")
+    add_device(parser)
     add_quiet(parser)
+
+
+def add_device(parser: argparse.ArgumentParser) -> None:
+    """Add `--device`."""
+    parser.add_argument("--device", type=_device, default="cpu", help=f"{DEVICES} (default: cpu)")
 
 
 def add_quiet(parser: argparse.ArgumentParser) -> None:

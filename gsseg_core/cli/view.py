@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from gsseg_core.cli.shared import add_quiet, load_kernels
+from gsseg_core.cli.shared import add_device, add_quiet, load_kernels
 from gsseg_core.cli.terminal import tell
 from gsseg_core.errors import SettingsError
 
@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="who draws: the browser; the server, which sends it images; or (default) the browser if it is fast",
     )
     parser.add_argument("--open", action="store_true", help="open the page, too")
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="default: cpu")
+    add_device(parser)
     add_quiet(parser)
 
 

@@ -8,21 +8,23 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Collection
+from contextlib import suppress
+from itertools import product
 from pathlib import Path
 
+from gsseg_core.data.camera_formats.table import CAMERA_FORMATS
 from gsseg_core.data.label_images import mask_bits
 from gsseg_core.data.mask_files import SUPERVISES, mask_files
 from gsseg_core.errors import GssegError
+from gsseg_core.files.input_files import READABLE_IMAGES
 
-_CAMERA_FILES = ("cameras.json", "transforms.json")
-_COLMAP_FILES = ("cameras.bin", "cameras.txt")
 # Camera files of other programs, and how one gets from each to one that is read.
 _FOREIGN_CAMERAS = {
     "transforms_train.json": "its cameras are nerfstudio's: copy it to transforms.json, with the image size as w and h",
     "poses_bounds.npy": "it is LLFF's: run nerfstudio's ns-process-data, or COLMAP, on the photos",
     "database.db": "it is COLMAP's database without a model: run `colmap mapper`, and give the folder with its sparse/",
 }
-_IMAGES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".npy", ".npz", ".json"}
+_MASKS = READABLE_IMAGES | {".npy", ".npz", ".json"}
 _MORE = "docs/masks.md has all forms"
 _DEPTH = 3
 _MOST_FOLDERS = 200
@@ -39,11 +41,12 @@ def camera_hint(folder: Path) -> str:
     near = [path for path in [*_folders(folder), folder.parent] if _has_cameras(path)]
     if near and not is_dataset:
         return f"; found cameras in {near[0]}: type --data {_quoted(near[0])}"
-    found = [path for path in (_camera_file(below) for below in _folders(folder)) if path is not None]
-    if found:
-        # Masks are here and cameras below, as ns-process-data leaves them: the cameras have to come up.
-        place = folder / ("sparse" if found[0].is_dir() else found[0].name)
-        return f"; found cameras in {found[0]}: type ln -s {_quoted(found[0].resolve())} {_quoted(place)}"
+    for below, known in product(_folders(folder), CAMERA_FORMATS):
+        with suppress(GssegError):
+            if found := known.find_in(below):
+                # Masks are here and cameras below, as ns-process-data leaves them: the cameras have to come up.
+                place = folder / (known.folders[-1] if known.folders else found.name)
+                return f"; found cameras in {found}: type ln -s {_quoted(found.resolve())} {_quoted(place)}"
     for name, advice in _FOREIGN_CAMERAS.items():
         if (folder / name).is_file():
             return f"; found {name}: {advice}"
@@ -82,7 +85,7 @@ def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
             f" ({photos[0].name}/ holds photos; a 2D segmenter makes masks of them)" if photos else ""
         )
     there = sorted(path for path in (root / labels).iterdir() if path.name != SUPERVISES)
-    found = [path for path in there if path.suffix.lower() in _IMAGES or _has_detections(path)]
+    found = [path for path in there if path.suffix.lower() in _MASKS or _has_detections(path)]
     if not found:
         return f"{looked}, but {labels}/ holds no mask"
     if found[0].is_file() and found[0].suffix.lower() not in (".png", ".npz"):
@@ -94,14 +97,9 @@ def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
 
 
 def _has_cameras(folder: Path) -> bool:
-    return any(_camera_file(place) is not None for place in (folder, folder / "sparse/0", folder / "sparse"))
-
-
-def _camera_file(folder: Path) -> Path | None:
-    """Find the file with cameras in a folder, or the folder itself if it is a COLMAP model."""
-    if any((folder / name).is_file() for name in _COLMAP_FILES):
-        return folder
-    return next((folder / name for name in _CAMERA_FILES if (folder / name).is_file()), None)
+    with suppress(GssegError):
+        return any(known.find(folder) for known in CAMERA_FORMATS)
+    return False
 
 
 def _parent_of_missing(folder: Path) -> list[Path]:
@@ -129,7 +127,7 @@ def _subfolders(folder: Path) -> list[Path]:
 
 def _stems(folder: Path) -> set[str]:
     try:
-        return {path.stem for path in folder.iterdir() if path.suffix.lower() in _IMAGES}
+        return {path.stem for path in folder.iterdir() if path.suffix.lower() in _MASKS}
     except OSError:
         return set()
 

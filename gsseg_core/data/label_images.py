@@ -1,4 +1,4 @@
-"""Label images and class names.
+"""Label images: read from PNG, written, and kept in memory compressed.
 
 In memory labels are int32, 0 the background and `UNKNOWN` (-1) "no evidence here"; in files the largest number of the
 encoding, 255 or 65535, stands for unknown.
@@ -7,7 +7,6 @@ encoding, 255 or 65535, stands for unknown.
 from __future__ import annotations
 
 import os
-import re
 import struct
 import zlib
 from pathlib import Path
@@ -18,15 +17,11 @@ import numpy.typing as npt
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from gsseg_core.data.names import flaw_of_class_name
-from gsseg_core.errors import ClassesFileError, MaskFormatError, SettingsError
+from gsseg_core.errors import MaskFormatError, SettingsError
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.input_files import check_pixels, open_image, open_input, reason
-from gsseg_core.files.json_files import kind_of, read_json
-from gsseg_core.text import quoted
 
 UNKNOWN = -1
-BACKGROUND_NAME = "background"
 
 _PNG_KINDS = {0: "gray", 2: "RGB", 3: "palette", 4: "gray + alpha", 6: "RGBA"}
 
@@ -163,30 +158,3 @@ class PackedLabels:
     def unpack(self) -> npt.NDArray[np.int32]:
         """Return the labels, (H, W) int32, in memory of their own."""
         return np.frombuffer(zlib.decompress(self._data), self._dtype).reshape(self._shape).astype(np.int32)
-
-
-def read_classes(path: str | os.PathLike[str], within: Path | None = None) -> dict[int, str]:
-    """Read `classes.json`, an object from id to name; sorted by id, 0 being "background" unless named otherwise.
-
-    With `within`, the file must lie below that folder, links followed (else `PathNotAllowedError`).
-
-    Raises
-    ------
-    ClassesFileError
-        The file is missing or broken, an id is not a whole number from 0 to 65534, or a name is not one line of text
-        of at most 200 characters.
-    """
-    path = Path(path)
-    content = read_json(path, ClassesFileError, within)
-    if not isinstance(content, dict):
-        raise ClassesFileError(f'{path}: holds {kind_of(content)}; expected an object such as {{"1": "chair"}}')
-    names = {0: BACKGROUND_NAME}
-    for key, name in content.items():
-        if not re.fullmatch(r"0|[1-9][0-9]{0,4}", key) or int(key) >= 2**16 - 1:
-            raise ClassesFileError(f"{path}: id {quoted(key)} is unusable; expected whole numbers from 0 to 65534")
-        if not isinstance(name, str):
-            raise ClassesFileError(f"{path}: id {key} has the name {quoted(name)}; expected text")
-        if flaw := flaw_of_class_name(name):
-            raise ClassesFileError(f"{path}: id {key} has the name {flaw}")
-        names[int(key)] = name
-    return dict(sorted(names.items()))

@@ -25,7 +25,7 @@ from gsseg_core.text import clipped, quoted
 
 SUPERVISES = "supervises.json"
 _PROBABILITIES, _CLASSES, _UNKNOWN = "probabilities", "classes", "unknown"
-_IMAGES = (".png", ".tif", ".tiff")
+_DETECTIONS = (".png", ".tif", ".tiff")
 _ANY = "*"
 
 
@@ -184,7 +184,7 @@ def _read_detections(folder: Path, camera: Camera | None, within: Path | None) -
     detections: dict[int, npt.NDArray[np.generic]] = {}
     unknown = None
     for path in sorted(folder.iterdir()):
-        if path.suffix.lower() not in _IMAGES:
+        if path.suffix.lower() not in _DETECTIONS:
             continue
         if path.stem == _UNKNOWN:
             unknown = _read_image(path, camera, within) > 0

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.view import View
 from gsseg_core.export.pictures import contact_sheet, legend, overlay, palette, save_png
 from gsseg_core.learn.mask_reliability import ViewCheck, worst_views
 from gsseg_core.raster.view_operator import ViewOperator, make_operator

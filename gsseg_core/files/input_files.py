@@ -20,6 +20,12 @@ from gsseg_core.files.confined_files import OPENED, require_below
 from gsseg_core.files.limits import LIMITS
 from gsseg_core.text import clipped
 
+READABLE_IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
+"""Suffixes of images that `open_image` reads."""
+
+IMAGE_SUFFIXES = READABLE_IMAGES | {".exr", ".heic"}
+"""Suffixes that an image may have in the list of a camera file; what else follows a dot belongs to its name."""
+
 _KINDS = {
     stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket",
     stat.S_IFCHR: "a device", stat.S_IFBLK: "a device",

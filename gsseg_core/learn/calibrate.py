@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gsseg_core.data.dataset import View, spread
+from gsseg_core.data.view import View, spread
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner import UNITS, Learner, Progress, silent
 from gsseg_core.learn.mask_reliability import OtherViews

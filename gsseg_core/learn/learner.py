@@ -10,9 +10,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from gsseg_core.data.dataset import View
 from gsseg_core.data.label_evidence import impute_probabilities, is_resolved
 from gsseg_core.data.soft_masks import SeenLabels
+from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
 from gsseg_core.learn.em.em_kernels import share_votes
 from gsseg_core.learn.learner_state import State

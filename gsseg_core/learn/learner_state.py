@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from gsseg_core.data.dataset import View
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import TOLERANCE, SeenLabels
+from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, PathTakenError
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.limits import LIMITS, MAX_LABEL

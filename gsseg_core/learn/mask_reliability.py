@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.data.dataset import View, spread
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN, PackedLabels
+from gsseg_core.data.view import View, spread
 from gsseg_core.learn.em.em_learner import EMLearner, codes_without
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.learn.temperature import VIEWS, Sample, sample_pixels

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.learn.learner_state import State
 from gsseg_core.live.results import Outcome, Rejection

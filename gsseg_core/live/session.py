@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gsseg_core.data.dataset import Dataset, View, spread
-from gsseg_core.data.label_images import BACKGROUND_NAME
+from gsseg_core.data.class_names import BACKGROUND_NAME
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View, spread
 from gsseg_core.errors import (
     GssegError,
     NoCodesError,

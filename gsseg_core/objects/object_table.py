@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from gsseg_core.data.dataset import View
-from gsseg_core.data.label_images import BACKGROUND_NAME, UNKNOWN
+from gsseg_core.data.class_names import BACKGROUND_NAME
+from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.view import View
 from gsseg_core.errors import UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.learn.learner import Progress, silent

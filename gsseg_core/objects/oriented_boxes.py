@@ -28,6 +28,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 
+from gsseg_core.errors import SceneValueError
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.quaternions import rotations
 from gsseg_core.segmentation import Segmentation
@@ -131,14 +132,14 @@ def oriented_box(
 
     Raises
     ------
-    ValueError
+    SceneValueError
         There is no Gaussian, or the shapes do not go together.
     """
     count = len(means)
     shapes = (np.shape(means), np.shape(covariances), np.shape(weights))
     if count == 0 or shapes != ((count, 3), (count, 3, 3), (count,)):
-        raise ValueError(
-            f"means, covariances, weights have shapes {shapes}; expected (M, 3), (M, 3, 3), (M,), M at least 1"
+        raise SceneValueError(
+            f"box: means, covariances, weights have shapes {shapes}; expected (M, 3), (M, 3, 3), (M,), M at least 1"
         )
     every = -(-count // SAMPLE)
     points, shape, weights = (np.asarray(values[::every], np.float64) for values in (means, covariances, weights))

@@ -28,8 +28,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import UNKNOWN, read_mask
+from gsseg_core.data.view import View
 from gsseg_core.errors import MaskFormatError, NoUsableViewsError, SettingsError
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.objects.clicks import Pixel, click_labels

@@ -6,7 +6,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from gsseg_core.data.names import listed
+from gsseg_core.data.class_names import listed
 from gsseg_core.errors import EmptySceneError, SettingsError
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_core.learn.mask_reliability import ViewCheck, worst_views
 
 SHOWN = 1 / 2000

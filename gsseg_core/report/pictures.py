@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import UNKNOWN, PackedLabels
+from gsseg_core.data.view import View
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.export.pictures import outline, overlay
 from gsseg_core.export.view_pictures import background_image

@@ -16,7 +16,8 @@ from numpy.lib.recfunctions import structured_to_unstructured
 from gsseg_core.errors import EmptySceneError, ScenePropertyError, SceneValueError
 from gsseg_core.files.limits import LIMITS
 from gsseg_core.scene import spherical_harmonics
-from gsseg_core.scene.ply import read_vertices, write_vertices
+from gsseg_core.scene.ply import write_vertices
+from gsseg_core.scene.scene_formats import read_scene
 
 _MEANS = ("x", "y", "z")
 DC = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -75,14 +76,15 @@ class GaussianScene:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], within: Path | None = None) -> GaussianScene:
-        """Load a 3DGS PLY: SH degree 0 to 3, ascii or binary, float or double, properties in any order.
+        """Load a scene of any of `gsseg_core.scene.scene_formats.SCENE_FORMATS`.
 
-        With `within`, the file must lie below that folder, links followed.
+        A 3DGS PLY has SH degree 0 to 3, is ascii or binary, float or double, with properties in any order. With
+        `within`, the file must lie below that folder, links followed.
 
         Raises
         ------
         SceneFileError
-            The file is missing, truncated or not a PLY.
+            The file is missing, truncated, or of no known format.
         ScenePropertyError
             Properties of 3DGS are missing or are lists.
         SceneValueError
@@ -93,7 +95,7 @@ class GaussianScene:
             The file lies outside `within`.
         """
         path = Path(path)
-        return cls._from_vertices(read_vertices(path, within), path)
+        return cls._from_vertices(read_scene(path, within), path)
 
     @classmethod
     def from_arrays(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-import shlex
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -50,8 +49,7 @@ def read_vertices(path: str | os.PathLike[str], within: Path | None = None) -> n
         with open_input(path, within) as file, io.TextIOWrapper(file, "ascii") if _is_text(file) else file as stream:
             ply = plyfile.PlyData.read(stream)
     except OSError as error:
-        hint = scene_hint(path) if within is None else ""  # It looks around, wherever links lead.
-        raise SceneFileError(f"{path}: cannot be read ({reason(error)}); expected a 3DGS PLY{hint}") from error
+        raise SceneFileError(f"{path}: cannot be read ({reason(error)}); expected a 3DGS PLY") from error
     except (plyfile.PlyParseError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError) as error:
         raise SceneFileError(
             f"{path}: truncated or not a PLY file ({reason(error)}); expected a whole 3DGS PLY"
@@ -112,20 +110,3 @@ def write_vertices(path: str | os.PathLike[str], vertices: npt.NDArray[Any], run
     ply = plyfile.PlyData([plyfile.PlyElement.describe(vertices, "vertex", comments=comments)], byte_order="<")
     with write_atomically(path) as temporary:
         ply.write(str(temporary))
-
-
-def scene_hint(path: Path) -> str:
-    """Tell where a PLY lies, if a folder or nothing was found in the place of a scene."""
-    if path.is_dir():
-        # Trainers write point_cloud/iteration_30000/point_cloud.ply; the one of most steps is wanted.
-        found = sorted(path.glob("*.ply")) or sorted(path.glob("point_cloud/iteration_*/*.ply"), key=_iteration)
-        return f"; it is a folder: type {shlex.quote(str(found[-1]))}" if found else "; it is a folder without a PLY"
-    if not path.exists():
-        near = sorted(path.parent.glob("*.ply")) if path.parent.is_dir() else []
-        return f"; found {', '.join(file.name for file in near[:4])} in {path.parent}" if near else ""
-    return ""
-
-
-def _iteration(path: Path) -> int:
-    number = path.parent.name.rpartition("_")[2]
-    return int(number) if number.isdecimal() else -1

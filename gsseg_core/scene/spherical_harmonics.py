@@ -11,6 +11,8 @@ from math import pi, sqrt
 import numpy as np
 import numpy.typing as npt
 
+from gsseg_core.errors import SceneValueError
+
 MAX_DEGREE = 3
 C0 = sqrt(1 / (4 * pi))
 _C1 = sqrt(3 / (4 * pi))
@@ -34,9 +36,14 @@ def basis(
     -------
     ndarray (N, (degree + 1)^2) float32
         One column per harmonic, band after band.
+
+    Raises
+    ------
+    SceneValueError
+        There are no such harmonics.
     """
     if not 0 <= degree <= MAX_DEGREE:
-        raise ValueError(f"degree is {degree}; expected 0 to {MAX_DEGREE}")
+        raise SceneValueError(f"spherical harmonics: degree is {degree}; expected 0 to {MAX_DEGREE}")
     x, y, z = np.asarray(directions, np.float32).T
     columns = [np.full_like(x, C0)]
     if degree >= 1:

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from scipy import ndimage
 
-from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.live.session import LiveSession
 from gsseg_core.raster.cpu.projection import project

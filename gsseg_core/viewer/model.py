@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsseg_core.data.label_images import BACKGROUND_NAME
+from gsseg_core.data.class_names import BACKGROUND_NAME
 from gsseg_core.errors import StateFileError, UnknownLabelError
 from gsseg_core.export.pictures import palette
 from gsseg_core.files.json_files import read_json

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 import viser
 
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.scene.camera import Camera
 from gsseg_core.text import counted, html_text, printable

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.camera import Camera

@@ -14,7 +14,7 @@ import numpy as np
 import viser
 import viser.transforms as vtf
 
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.export.view_pictures import background_image

@@ -14,7 +14,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from gsseg_core.data.names import flaw_of_class_name
+from gsseg_core.data.class_names import flaw_of_class_name
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.objects.object_table import PER_VIEW

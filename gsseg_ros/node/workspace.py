@@ -14,7 +14,7 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 
-from gsseg_core.data.names import class_ids
+from gsseg_core.data.class_names import class_ids
 from gsseg_core.errors import PathNotAllowedError, SettingsError
 from gsseg_core.live.per_view_session import PerViewSession
 from gsseg_core.live.session import LiveSession

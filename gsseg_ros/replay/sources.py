@@ -17,7 +17,8 @@ import numpy.typing as npt
 from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import Header
 
-from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, NoUsableViewsError
 from gsseg_core.files.input_files import open_image
 from gsseg_ros.conversions import camera_info, mask_image, pose_from_matrix, rgb_image

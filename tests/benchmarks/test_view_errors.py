@@ -7,7 +7,7 @@ import pytest
 from small_scenes import balls_on_a_table, clean_views, make_grid, ring
 from view_errors import STRONGEST, PoseErrors, corrupt_views, errors_at, jitter, typical_depth
 
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_core.demo.mask_errors import MaskErrors
 from gsseg_core.errors import SettingsError
 

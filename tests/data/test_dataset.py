@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN, write_mask
+from gsseg_core.data.view import View
 from gsseg_core.errors import (
     CameraFileError,
     ClassesFileError,

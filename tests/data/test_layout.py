@@ -16,7 +16,7 @@ from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.hints import camera_hint, mask_hint
 from gsseg_core.data.label_images import read_mask
-from gsseg_core.scene.ply import scene_hint
+from gsseg_core.scene.scene_formats import scene_hint
 
 
 @pytest.fixture
@@ -193,7 +193,7 @@ def test_a_folder_in_the_place_of_a_scene_leads_to_the_ply_of_most_steps(
     assert error.endswith(f"it is a folder: type {data}/model/point_cloud/iteration_30000/point_cloud.ply")
     assert error_of(capsys, data, scene="scen.ply").endswith(f"found scene.ply in {data}")
     (data / "nothing").mkdir()
-    assert scene_hint(data / "nothing") == "; it is a folder without a PLY"
+    assert scene_hint(data / "nothing") == "; it is a folder without a scene"
     assert scene_hint(data / "no/where/scene.ply") == ""
 
 

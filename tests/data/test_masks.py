@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
-from gsseg_core.data.label_images import UNKNOWN, read_classes, read_mask, write_mask
+from gsseg_core.data.class_names import read_classes
+from gsseg_core.data.label_images import UNKNOWN, read_mask, write_mask
 from gsseg_core.errors import ClassesFileError, MaskFormatError, SettingsError, WriteError
 
 

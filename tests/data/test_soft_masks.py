@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from small_scenes import HEIGHT, NAMES, NUM_CLASSES, WIDTH, ring, write_dataset
 
-from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN, write_mask
 from gsseg_core.data.soft_masks import (
     MOST_PROTOTYPES,
@@ -23,6 +23,7 @@ from gsseg_core.data.soft_masks import (
     quantise,
     restrict,
 )
+from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, MaskFormatError, MaskSizeError, SupervisesFileError, UnknownLabelError
 
 CAMERA = ring(1)[0]

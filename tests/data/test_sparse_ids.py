@@ -15,8 +15,9 @@ from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, ring, write_datas
 
 from gsseg_core import pipeline
 from gsseg_core.cli.main import main
-from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import read_mask, write_mask
+from gsseg_core.data.view import View
 from gsseg_core.errors import UnknownLabelError
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.raster.view_operator import make_operator

@@ -15,8 +15,9 @@ from scipy.spatial.transform import Rotation
 from small_scenes import NAMES, write_dataset
 
 from gsseg_core.cli.main import main
-from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import read_mask
+from gsseg_core.data.view import View
 from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.scene.gaussian_scene import GaussianScene
 

@@ -16,8 +16,9 @@ from PIL import Image
 from small_scenes import balls_on_a_table, ring, write_dataset
 
 from gsseg_core.data.camera_files import read_cameras
+from gsseg_core.data.class_names import read_classes
 from gsseg_core.data.dataset import Dataset
-from gsseg_core.data.label_images import read_classes, read_mask
+from gsseg_core.data.label_images import read_mask
 from gsseg_core.data.mask_files import read_soft_mask
 from gsseg_core.errors import (
     CameraFileError,

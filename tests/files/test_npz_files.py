@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from small_scenes import HEIGHT, NAMES, NUM_CLASSES, WIDTH, balls_on_a_table, clean_views, ring, taught
 
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, MaskFormatError, MaskSizeError, StateFileError, UnknownLabelError
 from gsseg_core.files import npz_files
 from gsseg_core.files.limits import Limits

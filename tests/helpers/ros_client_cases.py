@@ -19,7 +19,8 @@ from small_scenes import NAMES, write_dataset
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
-from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View
 from gsseg_ros.client import SegmentationClient, SegmentationError
 
 FOREVER: dict[str, Any] = {"learner": "gradient", "max_steps": 10_000_000}

@@ -19,7 +19,7 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_ros.node.inputs import Inputs
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.segment_node import SegmentNode

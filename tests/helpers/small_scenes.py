@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import write_mask
+from gsseg_core.data.view import View
 from gsseg_core.export.pictures import palette
 from gsseg_core.learn.learner import Learner
 from gsseg_core.metrics import Evaluation

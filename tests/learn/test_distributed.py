@@ -22,7 +22,8 @@ from patience import PATIENCE
 from small_scenes import NUM_CLASSES, balls_on_a_table, taught, with_clutter, write_dataset, wrong_views
 
 from gsseg_core.cli.main import main
-from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View
 from gsseg_core.errors import MaskFormatError, SchedulerError
 from gsseg_core.learn.distributed import dask_cluster as scheduler
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings

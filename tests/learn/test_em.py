@@ -25,7 +25,7 @@ from small_scenes import (
 from threadpoolctl import threadpool_limits
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn.em.em_kernels import GAIN_UNIT, collect, improve, promised
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings, codes_without

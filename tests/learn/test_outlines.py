@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as arrays
 from scipy import ndimage
 from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, mean_iou
 
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_core.demo.mask_errors import resize
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn.em.boundary_alignment import _along_outlines, _reach_across, scene_edges, settle_outlines

@@ -11,8 +11,8 @@ import pytest
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, taught
 from view_errors import corrupt_views
 
-from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.view import View
 from gsseg_core.demo.mask_errors import MaskErrors
 from gsseg_core.export.view_pictures import draw_worst_views
 from gsseg_core.learn.em.em_learner import EMLearner

@@ -11,8 +11,9 @@ import pytest
 from patience import PATIENCE
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, taught, write_dataset, wrong_views
 
-from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.view import View
 from gsseg_core.errors import (
     MaskFormatError,
     NoCodesError,

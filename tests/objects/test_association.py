@@ -23,8 +23,9 @@ from small_scenes import (
 )
 
 from gsseg_core.cli.main import main
-from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN, read_mask, write_mask
+from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError, UnknownLabelError
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner_state import Learnt

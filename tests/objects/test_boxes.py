@@ -11,6 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from small_scenes import NAMES, balls_on_a_table, clean_views
 
+from gsseg_core.errors import SceneValueError
 from gsseg_core.export.summary import RunReport
 from gsseg_core.live.session import LiveSession
 from gsseg_core.objects.oriented_boxes import OrientedBox, class_box, object_boxes, oriented_box
@@ -148,9 +149,9 @@ def test_sides_go_from_the_longest_to_the_shortest() -> None:
 
 
 def test_no_gaussian_and_shapes_that_do_not_fit_are_errors() -> None:
-    with pytest.raises(ValueError, match="M at least 1"):
+    with pytest.raises(SceneValueError, match="M at least 1"):
         oriented_box(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0))
-    with pytest.raises(ValueError, match=r"expected \(M, 3\), \(M, 3, 3\), \(M,\)"):
+    with pytest.raises(SceneValueError, match=r"expected \(M, 3\), \(M, 3, 3\), \(M,\)"):
         oriented_box(np.zeros((4, 3)), np.zeros((4, 3, 3)), np.zeros(3))
 
 

@@ -27,8 +27,8 @@ from small_scenes import (
 from straddlers import DISTANCE, half_opacity, split, straddlers
 
 from gsseg_core.cli.main import main
-from gsseg_core.data.dataset import View
-from gsseg_core.data.names import class_ids
+from gsseg_core.data.class_names import class_ids
+from gsseg_core.data.view import View
 from gsseg_core.errors import EmptySceneError, MaskSizeError, SceneValueError, SettingsError
 from gsseg_core.export.class_plys import export_classes
 from gsseg_core.objects.removal import without_objects

@@ -10,8 +10,8 @@ import pytest
 import small_scenes
 
 from gsseg_core.cli.main import main
-from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import write_mask
+from gsseg_core.data.view import View
 from gsseg_core.errors import MaskFormatError, NoUsableViewsError, SettingsError
 from gsseg_core.objects.pick import Pick, pick_mask, read_object_mask
 from gsseg_core.scene.camera import Camera

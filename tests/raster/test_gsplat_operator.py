@@ -22,7 +22,7 @@ from operator_backends import PLAIN, why_missing
 from operator_cases import dense, make_scene, random_mask, random_view
 from small_scenes import NUM_CLASSES, balls_on_a_table, ring, taught, true_labels
 
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.gradient_learner import GradientLearner, GradientSettings

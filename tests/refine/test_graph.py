@@ -8,7 +8,7 @@ import small_scenes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.refine.label_propagation import Graph, GraphSettings, graph_of, is_scarce, propagate, spread_if_scarce

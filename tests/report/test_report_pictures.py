@@ -9,8 +9,8 @@ import numpy as np
 from report_cases import painted
 from small_scenes import balls_on_a_table, look_at
 
-from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.view import View
 from gsseg_core.export.pictures import palette
 from gsseg_core.learn.mask_reliability import hold_against
 from gsseg_core.report.findings import Evidence

@@ -14,7 +14,8 @@ from ros_helpers import Ros
 from ros_robot import CLASSES, Goal, Robot, assert_same, private_ros, renamed
 from small_scenes import clean_views, taught, write_dataset, wrong_views
 
-from gsseg_core.data.dataset import Dataset, View, spread
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View, spread
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.live.session import LiveSession

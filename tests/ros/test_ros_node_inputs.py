@@ -12,7 +12,8 @@ from ros_helpers import Ros, ros_fixture  # noqa: F401
 from ros_robot import SECOND, STEP, Robot, assert_same, core_session, messages, renamed
 from small_scenes import clean_views, look_at
 
-from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation

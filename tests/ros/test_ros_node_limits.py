@@ -17,7 +17,7 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from gsseg_msgs.srv import RenderView, Segment
 
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_core.scene.camera import Camera
 from gsseg_ros.node import services
 from gsseg_ros.node.segment_node import SegmentNode

@@ -15,7 +15,7 @@ from ros_helpers import Ros, wait_until
 from ros_robot import CLASSES, LATCHED, Robot, core_session, messages
 from small_scenes import balls_on_a_table, clean_views
 
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.live.session import LiveSession

@@ -15,7 +15,7 @@ from ros_helpers import Ros, ros_fixture  # noqa: F401
 from ros_robot import SECOND, STEP, Robot, messages
 from small_scenes import balls_on_a_table, clean_views, look_at, true_labels
 
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_core.segmentation import Segmentation
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")

@@ -15,7 +15,7 @@ from ros_node_here import NodeHere, node_here
 from ros_robot import LATCHED, SERVICES, Robot, core_session, renamed, viewpoint
 from small_scenes import clean_views
 
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_ros.node import segment_node
 

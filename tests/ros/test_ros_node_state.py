@@ -16,7 +16,8 @@ from ros_robot import CLASSES, SERVICES, Robot, assert_same, core_session, viewp
 from small_scenes import clean_views, ring
 
 from gsseg_core.cli import main as cli
-from gsseg_core.data.dataset import Dataset, View
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import lpmv
 
+from gsseg_core.errors import SceneValueError
 from gsseg_core.scene.spherical_harmonics import C0, basis, to_rgb
 
 
@@ -46,7 +47,7 @@ def test_first_band_has_the_signs_of_3dgs() -> None:
 
 
 def test_degrees_beyond_three_are_refused() -> None:
-    with pytest.raises(ValueError, match="degree is 4; expected 0 to 3"):
+    with pytest.raises(SceneValueError, match="degree is 4; expected 0 to 3"):
         basis(np.eye(3), 4)
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from small_scenes import NAMES, balls_on_a_table, clean_views, ring, true_labels
 
-from gsseg_core.data.dataset import View
 from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.camera import Camera

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, SchedulerError
 from gsseg_core.learn.distributed.dask_cluster import PATIENCE, UNREACHABLE, check_workers, find_workers, name_of
 from gsseg_core.learn.distributed.dask_worker import (

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.lib.recfunctions import repack_fields
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.data.dataset import View
+from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError
 from gsseg_core.files.input_files import open_input
 from gsseg_core.learn.em.confusion_model import ErrorModel

@@ -1,4 +1,4 @@
-"""Names of classes and views: which are usable, and which class is meant by one.
+"""Names of classes and views: read from `classes.json`, checked, and looked up.
 
 What is named ends up in file names, pictures, reports and on terminals, long after it was read. So a name is looked at
 where it comes in, before anything is learnt.
@@ -6,11 +6,17 @@ where it comes in, before anything is learnt.
 
 from __future__ import annotations
 
+import os
+import re
 import unicodedata
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 
-from gsseg_core.errors import SettingsError
+from gsseg_core.errors import ClassesFileError, SettingsError
+from gsseg_core.files.json_files import kind_of, read_json
 from gsseg_core.text import clipped, quoted
+
+BACKGROUND_NAME = "background"
 
 MAX_CLASS_NAME = 200
 """Characters of a class name."""
@@ -19,6 +25,33 @@ MAX_VIEW_NAME = 240
 """Bytes of a view's name, in UTF-8: files are called after it, and a file name has 255 at most."""
 
 _LISTED = 20
+
+
+def read_classes(path: str | os.PathLike[str], within: Path | None = None) -> dict[int, str]:
+    """Read `classes.json`, an object from id to name; sorted by id, 0 being "background" unless named otherwise.
+
+    With `within`, the file must lie below that folder, links followed (else `PathNotAllowedError`).
+
+    Raises
+    ------
+    ClassesFileError
+        The file is missing or broken, an id is not a whole number from 0 to 65534, or a name is not one line of text
+        of at most 200 characters.
+    """
+    path = Path(path)
+    content = read_json(path, ClassesFileError, within)
+    if not isinstance(content, dict):
+        raise ClassesFileError(f'{path}: holds {kind_of(content)}; expected an object such as {{"1": "chair"}}')
+    names = {0: BACKGROUND_NAME}
+    for key, name in content.items():
+        if not re.fullmatch(r"0|[1-9][0-9]{0,4}", key) or int(key) >= 2**16 - 1:
+            raise ClassesFileError(f"{path}: id {quoted(key)} is unusable; expected whole numbers from 0 to 65534")
+        if not isinstance(name, str):
+            raise ClassesFileError(f"{path}: id {key} has the name {quoted(name)}; expected text")
+        if flaw := flaw_of_class_name(name):
+            raise ClassesFileError(f"{path}: id {key} has the name {flaw}")
+        names[int(key)] = name
+    return dict(sorted(names.items()))
 
 
 def flaw_of_class_name(name: str) -> str:

@@ -1,0 +1,1 @@
+"""Files that cameras of a dataset come from, one module for each format behind one table."""

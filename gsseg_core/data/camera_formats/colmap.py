@@ -1,0 +1,115 @@
+"""Cameras of COLMAP: the model in `sparse/0` or `sparse`, binary or text."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import struct
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+import numpy as np
+
+from gsseg_core.data.camera_formats.entries import camera_of, stem_of
+from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError
+from gsseg_core.files.input_files import is_there, open_input, reason
+from gsseg_core.scene.camera import Camera
+from gsseg_core.text import clipped
+
+if TYPE_CHECKING:
+    import pycolmap
+
+# Models that are a pinhole once their distortion is zero; a fisheye is not.
+_MODELS = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
+_LEAST_CAMERA = 48
+"""Bytes of a camera in a binary model, of three parameters."""
+
+
+def read_colmap(path: Path, within: Path | None) -> list[Camera]:
+    """Read a COLMAP model; its poses are world-to-camera in OpenCV axes, its pixel centres at +0.5, as ours."""
+    model = _load(path, within)
+    cameras = []
+    for image_id, image in sorted(model.images.items()):
+        try:
+            name = image.name
+        except UnicodeDecodeError as error:
+            raise CameraFileError(f"{path}, image {image_id}: its name is not UTF-8 text") from error
+        where = f"{path}, image '{clipped(name)}'"
+        lens = model.cameras[image.camera_id]
+        if lens.model_name not in _MODELS or any(lens.params[i] for i in lens.extra_params_idxs()):
+            raise IntrinsicsError(
+                f"{where}: camera is {lens.model_name} ({lens.params_info}: {clipped(lens.params_to_string())}); "
+                "expected one without distortion: undistort the images first"
+            )
+        focal, principal = (lens.focal_length_x, lens.focal_length_y), (lens.principal_point_x, lens.principal_point_y)
+        motion = image.cam_from_world()
+        if not motion.rotation.quat.any():  # pycolmap makes it the identity
+            raise PoseError(f"{where}: the pose has a quaternion of zero; expected a unit quaternion")
+        pose = np.vstack([motion.matrix(), (0, 0, 0, 1)])
+        cameras.append(camera_of(where, stem_of(name), (lens.width, lens.height), focal, principal, pose))
+    return cameras
+
+
+def _load(path: Path, within: Path | None) -> pycolmap.Reconstruction:
+    """Load the cameras and images of a COLMAP model, without its points.
+
+    The points are not needed and take long to read, and pycolmap does not return from a truncated list of them. Nor
+    does it notice that a binary file ends too early, or a count is impossible, so that is found out here.
+    """
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise CameraFileError(f"{path}: to read a COLMAP model, install pycolmap") from error
+    suffix = ".bin" if (path / "cameras.bin").is_file() else ".txt"
+    cameras, images = (path / f"{name}{suffix}" for name in ("cameras", "images"))
+    if not is_there(images, CameraFileError):
+        raise CameraFileError(f"{path}: COLMAP model has {cameras.name} but no {images.name}")
+    with tempfile.TemporaryDirectory() as folder:
+        # What was checked is what pycolmap reads, so it gets a copy.
+        for file, copy in ((cameras, _copy_cameras), (images, _copy_images)):
+            try:
+                with open_input(file, within) as source, open(Path(folder) / file.name, "wb") as target:
+                    (copy if suffix == ".bin" else shutil.copyfileobj)(source, target)
+            except OSError as error:
+                raise CameraFileError(f"{file}: cannot be read ({reason(error)})") from error
+            except (struct.error, ValueError) as error:
+                raise CameraFileError(f"{file}: is truncated; expected a whole COLMAP model") from error
+        (Path(folder) / f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
+        try:
+            model = pycolmap.Reconstruction(folder)
+        except Exception as error:  # whatever its C++ parser makes of a broken file
+            why = clipped(str(error).strip().replace(folder, str(path)), 300)
+            raise CameraFileError(f"{path}: not a readable COLMAP model ({why})") from error
+    size = 8 + sum(24 + 8 * len(lens.params) for lens in model.cameras.values())
+    if suffix == ".bin" and cameras.stat().st_size < size:
+        raise CameraFileError(f"{cameras}: is truncated; expected at least {size} bytes")
+    return model
+
+
+def _copy_cameras(source: BinaryIO, target: BinaryIO) -> None:
+    """Copy a binary list of cameras; `ValueError` if it is shorter than its count says."""
+    content = source.read()
+    (count,) = struct.unpack_from("<Q", content)
+    if len(content) < 8 + _LEAST_CAMERA * count:
+        raise ValueError(f"{count} cameras")
+    target.write(content)
+
+
+def _copy_images(source: BinaryIO, target: BinaryIO) -> None:
+    """Copy a binary list of images without their points; `ValueError` or `struct.error` if it ends too early."""
+    size = os.fstat(source.fileno()).st_size
+    count = source.read(8)
+    target.write(count)
+    for _ in range(struct.unpack("<Q", count)[0]):
+        # Id, quaternion, translation and camera id; the name up to its 0; the number of points, and the points.
+        pose, name = source.read(64), bytearray()
+        while (letter := source.read(1)) != b"\0":
+            if not letter:
+                raise ValueError("no end of a name")
+            name += letter
+        (points,) = struct.unpack("<Q", source.read(8))
+        if source.tell() + 24 * points > size:
+            raise ValueError(f"{points} points")
+        source.seek(24 * points, os.SEEK_CUR)
+        target.write(pose + bytes(name) + bytes(9))

@@ -1,0 +1,105 @@
+"""Entries of camera files: JSON objects whose fields are read with errors that say where, and made into a camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path, PureWindowsPath
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError
+from gsseg_core.files.input_files import IMAGE_SUFFIXES
+from gsseg_core.files.json_files import kind_of
+from gsseg_core.scene.camera import Camera
+from gsseg_core.text import clipped, quoted
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One camera or image of a file, as a JSON object; `where` it stands begins every message about it."""
+
+    where: str
+    fields: dict[str, Any]
+
+    def __contains__(self, key: str) -> bool:
+        """Whether there is such a field."""
+        return key in self.fields
+
+    def number(self, key: str) -> float:
+        """Read a number."""
+        return float(self.array(key, ()))
+
+    def size(self, key: str) -> int:
+        """Read a number of pixels."""
+        number = self.number(key)
+        if not number.is_integer():
+            raise IntrinsicsError(f"{self.where}: '{key}' is {number:g}; expected a whole number of pixels")
+        return int(number)
+
+    def array(self, key: str, *shapes: tuple[int, ...]) -> npt.NDArray[np.float64]:
+        """Read numbers in one of some shapes."""
+        value = self._value(key)
+        try:
+            array = np.array(value, np.float64)
+        except (TypeError, ValueError, OverflowError):
+            array = None
+        if array is None or array.shape not in shapes:
+            names = (" x ".join(map(str, shape)) + " numbers" if shape else "a number" for shape in shapes)
+            raise CameraFileError(f"{self.where}: '{key}' is {clipped(value)}; expected {' or '.join(names)}")
+        return array
+
+    def stem(self, key: str) -> str:
+        """Read the name of an image, and give its stem."""
+        name = self._value(key)
+        if not isinstance(name, str) or not stem_of(name):
+            raise CameraFileError(f"{self.where}: '{key}' is {quoted(name)}; expected the name of an image")
+        return stem_of(name)
+
+    def _value(self, key: str) -> Any:
+        if key not in self.fields:
+            raise CameraFileError(f"{self.where}: lacks '{key}' (has {clipped(', '.join(self.fields)) or 'nothing'})")
+        return self.fields[key]
+
+
+def entries(path: Path, content: object, expected: str) -> list[Entry]:
+    """Read the objects of a JSON list."""
+    if not isinstance(content, list) or not all(isinstance(entry, dict) for entry in content):
+        found = kind_of(content) + (" with entries of other kinds" if isinstance(content, list) else "")
+        raise CameraFileError(f"{path}: holds {found}; expected {expected}, each an object")
+    return [Entry(f"{path}, entry {i}", entry) for i, entry in enumerate(content)]
+
+
+def camera_of(
+    where: str,
+    name: str,
+    size: tuple[int, int],  # width, height
+    focal: tuple[float, float],
+    principal: tuple[float, float],
+    pose: npt.NDArray[np.float64],  # (4, 4) world to camera
+) -> Camera:
+    """Make a camera; its errors say where it stands."""
+    K = np.array([[focal[0], 0, principal[0]], [0, focal[1], principal[1]], [0, 0, 1]], np.float64)
+    try:
+        return Camera(name, *size, K, pose)
+    except (PoseError, IntrinsicsError) as error:
+        raise type(error)(f"{where}: {error}") from None
+
+
+def inverse_pose(
+    rotation: npt.NDArray[np.float64],  # (3, 3)
+    position: npt.NDArray[np.float64],  # (3,)
+) -> npt.NDArray[np.float64]:
+    """World-to-camera (4, 4) of a camera-to-world rotation and position; not rigid where the rotation is none."""
+    pose = np.eye(4)
+    pose[:3, :3] = rotation.T
+    with np.errstate(all="ignore"):  # A camera refuses what is NaN or too large.
+        pose[:3, 3] = -rotation.T @ position
+    return pose
+
+
+def stem_of(name: str) -> str:
+    """File name without folders and without the suffix of an image; a dot in a name that lacks one is kept."""
+    path = PureWindowsPath(name)  # takes both kinds of slash
+    return path.stem if path.suffix.lower() in IMAGE_SUFFIXES else path.name

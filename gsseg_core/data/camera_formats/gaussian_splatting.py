@@ -1,0 +1,22 @@
+"""Cameras of the original 3DGS trainer: `cameras.json`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gsseg_core.data.camera_formats.entries import camera_of, entries, inverse_pose
+from gsseg_core.errors import CameraFileError
+from gsseg_core.files.json_files import read_json
+from gsseg_core.scene.camera import Camera
+
+
+def read_3dgs(path: Path, within: Path | None) -> list[Camera]:
+    """Read `cameras.json`: camera-to-world poses in OpenCV axes; the principal point is the image's centre."""
+    cameras = []
+    for entry in entries(path, read_json(path, CameraFileError, within), "a list of cameras"):
+        width, height = entry.size("width"), entry.size("height")
+        focal = entry.number("fx"), entry.number("fy")
+        pose = inverse_pose(entry.array("rotation", (3, 3)), entry.array("position", (3,)))
+        name = entry.stem("img_name")
+        cameras.append(camera_of(entry.where, name, (width, height), focal, (width / 2, height / 2), pose))
+    return cameras

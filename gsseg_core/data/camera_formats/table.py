@@ -1,0 +1,62 @@
+"""The table of camera formats: how each is recognised in a dataset folder, and who reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from gsseg_core.data.camera_formats.colmap import read_colmap
+from gsseg_core.data.camera_formats.gaussian_splatting import read_3dgs
+from gsseg_core.data.camera_formats.nerfstudio import read_nerfstudio
+from gsseg_core.errors import CameraFileError
+from gsseg_core.files.input_files import is_there
+from gsseg_core.scene.camera import Camera
+
+
+@dataclass(frozen=True)
+class CameraFormat:
+    """A format of cameras.
+
+    Attributes
+    ----------
+    name : str
+        What messages call it: the program that writes it.
+    read : callable
+        Reads the cameras in the order of the file. It gets the file, or the folder of a format with `folders`, and a
+        folder below which all that is read must lie, or None.
+    files : tuple of str
+        A dataset that has one of these files is of this format.
+    folders : tuple of str
+        Sub-folders of the dataset in which they are looked for, in this order; none for the dataset itself.
+    """
+
+    name: str
+    read: Callable[[Path, Path | None], list[Camera]]
+    files: tuple[str, ...]
+    folders: tuple[str, ...] = ()
+
+    def find(self, dataset: Path) -> Path | None:
+        """Find what `read` reads of a dataset folder; None if it has no cameras of this format."""
+        places = [self.find_in(dataset / name) for name in self.folders or ("",)]
+        return next((place for place in places if place is not None), None)
+
+    def find_in(self, folder: Path) -> Path | None:
+        """Find what `read` reads in the very folder with the files."""
+        for name in self.files:
+            if is_there(folder / name, CameraFileError):
+                return folder if self.folders else folder / name
+        return None
+
+    @property
+    def looked_for(self) -> str:
+        """What marks this format, for messages."""
+        return " or ".join(self.files) + (f" in {' or '.join(self.folders)}" if self.folders else "")
+
+
+CAMERA_FORMATS = [
+    CameraFormat("3DGS", read_3dgs, ("cameras.json",)),
+    CameraFormat("nerfstudio", read_nerfstudio, ("transforms.json",)),
+    CameraFormat("COLMAP", read_colmap, ("cameras.bin", "cameras.txt"), ("sparse/0", "sparse")),
+]
+"""All formats, the first that is there being read; who adds one, adds it here."""

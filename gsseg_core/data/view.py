@@ -1,0 +1,274 @@
+"""Views: a camera with its mask and photo, the mask in a file or in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gsseg_core.data.label_images import UNKNOWN, mask_bits, mask_header, read_mask
+from gsseg_core.data.mask_files import read_soft_mask
+from gsseg_core.data.soft_masks import PackedMask, SeenLabels, combine_detections, quantise, restrict
+from gsseg_core.errors import MaskFormatError, SettingsError, UnknownLabelError
+from gsseg_core.files.limits import MAX_LABEL
+from gsseg_core.scene.camera import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera and what was seen from it. Labels of a file are read when asked for; those in memory are compressed.
+
+    Attributes
+    ----------
+    camera : Camera
+        Where from.
+    mask_path : pathlib.Path or None
+        The mask: a label image (.png), probabilities (.npz) or a folder of detections, see docs/masks.md; None if there
+        is none or it is in memory.
+    image_path : pathlib.Path or None
+        The photo, if there is one.
+    class_names : mapping from id to name, or None
+        If given, labels must be among its ids.
+    supervised : tuple of int, or None
+        If given, the label image says something of these classes only: its 0 means "none of these".
+    within : pathlib.Path or None
+        If given, the folder below which the mask must lie, links followed.
+    numbering : tuple of int, or None
+        If given, the mask holds these ids, ascending, and labels are read as places among them; see
+        `Dataset.numbered`. `class_names` are by place.
+    """
+
+    camera: Camera
+    mask_path: Path | None = None
+    image_path: Path | None = None
+    class_names: Mapping[int, str] | None = field(default=None, repr=False)
+    supervised: tuple[int, ...] | None = None
+    within: Path | None = None
+    numbering: tuple[int, ...] | None = None
+    _mask: PackedMask | None = field(default=None, repr=False)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        camera: Camera,
+        labels: npt.ArrayLike,  # (H, W)
+        class_names: Mapping[int, str] | None = None,
+        *,
+        supervised: Collection[int] | None = None,
+    ) -> View:
+        """Build a view from labels (H, W) of whole numbers, `UNKNOWN` (-1) where nothing is known.
+
+        Parameters
+        ----------
+        camera : Camera
+            Where from.
+        labels : (H, W) of int
+            The mask.
+        class_names : mapping from id to name, optional
+            Labels must be among its ids.
+        supervised : collection of int, optional
+            The segmenter looked for these classes only, and 0 means "none of these".
+
+        Raises
+        ------
+        MaskFormatError, MaskSizeError, UnknownLabelError
+            The labels are not whole numbers, not of the camera's size, or not among the classes.
+        """
+        array = np.asarray(labels)
+        if array.ndim != 2 or array.dtype.kind not in "iu":
+            raise MaskFormatError(
+                f"view '{camera.name}': labels are {array.dtype} of shape {array.shape}; expected integers (H, W)"
+            )
+        source = f"view '{camera.name}'"
+        view = cls(camera, class_names=class_names)
+        camera.check_mask_size(array.shape[1], array.shape[0], source)
+        view._check_ids(array, source)
+        if supervised is None:
+            return replace(view, _mask=PackedMask(SeenLabels(array)))
+        return cls.from_seen(camera, restrict(array, supervised, source), class_names)
+
+    @classmethod
+    def from_probabilities(
+        cls,
+        camera: Camera,
+        probabilities: npt.ArrayLike,  # (C, H, W)
+        classes: Sequence[int] | None = None,
+        *,
+        unknown: npt.NDArray[np.bool_] | None = None,  # (H, W)
+        class_names: Mapping[int, str] | None = None,
+    ) -> View:
+        """Build a view from the probabilities of one segmenter, rounded as `gsseg_core.data.soft_masks.quantise` says.
+
+        Parameters
+        ----------
+        camera : Camera
+            Where from.
+        probabilities : (C, H, W) of float
+            In [0, 1], summing to at most 1 in each pixel.
+        classes : sequence of C int, optional
+            What the segmenter looked for; what is left to 1 then means "none of these". Without, [c] is class c, and
+            what is left is unknown.
+        unknown : (H, W) bool, optional
+            Where the segmenter says nothing.
+        class_names : mapping from id to name, optional
+            Classes must be among its ids.
+
+        Raises
+        ------
+        MaskFormatError, MaskSizeError, UnknownLabelError
+            Values, sizes or classes are unusable.
+        """
+        source = f"view '{camera.name}'"
+        seen = quantise(np.asarray(probabilities), classes, unknown=unknown, source=source)
+        return cls.from_seen(camera, seen, class_names)
+
+    @classmethod
+    def from_detections(
+        cls,
+        camera: Camera,
+        detections: Mapping[int, npt.NDArray[Any]],  # class -> (H, W)
+        *,
+        unknown: npt.NDArray[np.bool_] | None = None,  # (H, W)
+        class_names: Mapping[int, str] | None = None,
+    ) -> View:
+        """Build a view from detectors of one class each: bool, or probabilities, by class.
+
+        Of a class that is not among them the view says nothing. A detector that ran and found nothing gives zeros.
+
+        Raises
+        ------
+        MaskFormatError, MaskSizeError, UnknownLabelError
+            Values, sizes or classes are unusable.
+        """
+        source = f"view '{camera.name}'"
+        return cls.from_seen(camera, combine_detections(detections, unknown=unknown, source=source), class_names)
+
+    @classmethod
+    def from_seen(cls, camera: Camera, seen: SeenLabels, class_names: Mapping[int, str] | None = None) -> View:
+        """Build a view from labels and what they mean.
+
+        Raises
+        ------
+        MaskSizeError, UnknownLabelError
+            The labels are not of the camera's size, or mean classes that there are not.
+        """
+        view = cls(camera, class_names=class_names)
+        view._check_seen(seen, f"view '{camera.name}'")
+        return replace(view, _mask=PackedMask(seen))
+
+    @property
+    def name(self) -> str:
+        """Stem of the image's file name."""
+        return self.camera.name
+
+    @property
+    def has_mask(self) -> bool:
+        """Whether there are labels to read."""
+        return self.mask_path is not None or self._mask is not None
+
+    @property
+    def mask_bits(self) -> int | None:
+        """Bits per label of a label image, 8 or 16 (of other masks: as many as labels need); None without a mask."""
+        if self.mask_path is not None and self.mask_path.suffix.lower() == ".png":
+            return mask_bits(self.mask_path, self.within)
+        return (8 if self.largest_label < 255 else 16) if self.has_mask else None
+
+    @property
+    def largest_label(self) -> int:
+        """The largest class that the mask says something of, `UNKNOWN` (-1) if it says nothing at all."""
+        if self._mask is not None:
+            return self._mask.largest
+        seen = self.read_seen()
+        return int(seen.labels.max()) if seen.evidence is None else seen.evidence.largest
+
+    def class_ids(self) -> set[int]:
+        """Classes that the mask says something of."""
+        seen = self.read_seen()
+        ids = np.unique(seen.labels) if seen.evidence is None else seen.evidence.concerned
+        return set(ids.tolist()) - {UNKNOWN}
+
+    def read_labels(self) -> npt.NDArray[np.int32]:
+        """Read the class that each pixel names, (H, W) int32; `UNKNOWN` (-1) where the mask names none.
+
+        Raises
+        ------
+        MaskFormatError
+            The mask is missing or broken.
+        MaskSizeError
+            The mask has another size than the camera.
+        UnknownLabelError
+            A label is not among the classes.
+        """
+        return self.read_seen().named()
+
+    def read_seen(self) -> SeenLabels:
+        """Read all that the mask says: labels, which for a soft or partial one are prototypes, and what they mean.
+
+        Raises
+        ------
+        MaskFormatError, MaskSizeError, UnknownLabelError
+            As `read_labels`.
+        """
+        source = str(self.mask_path or f"view '{self.name}'")
+        if self.numbering is not None:
+            names = dict(zip(self.numbering, self.class_names.values(), strict=True)) if self.class_names else None
+            by_id = replace(self, class_names=names, numbering=None)
+            return by_id.read_seen().numbered(np.array(self.numbering, np.int32), source)
+        if self._mask is not None:
+            seen = self._mask.unpack()
+        elif self.mask_path is not None:
+            seen = self._read_file(self.mask_path)
+        else:
+            raise MaskFormatError(f"{source}: has no mask; expected a label image {self.name}.png")
+        self._check_seen(seen, source)
+        return seen
+
+    def _read_file(self, path: Path) -> SeenLabels:
+        if path.suffix.lower() != ".png":
+            return read_soft_mask(path, self.class_names, self.camera, self.within)
+        header = mask_header(path, self.within)  # Before any pixel is read.
+        self.camera.check_mask_size(header.width, header.height, str(path))
+        labels = read_mask(path, self.within).labels
+        return SeenLabels(labels) if self.supervised is None else restrict(labels, self.supervised, str(path))
+
+    def _check_seen(self, seen: SeenLabels, source: str) -> None:
+        self.camera.check_mask_size(seen.labels.shape[1], seen.labels.shape[0], source)
+        self._check_ids(seen.labels if seen.evidence is None else seen.evidence.concerned, source)
+
+    def _check_ids(self, labels: npt.NDArray[np.integer[Any]], source: str) -> None:
+        if labels.size and self._knows_all(int(labels.min()), int(labels.max())):
+            return  # As usual; to list the labels of an image takes ten times as long.
+        ids = np.unique(labels)
+        if self.class_names is None:
+            unknown = ids[(ids < UNKNOWN) | (ids > MAX_LABEL)].tolist()
+            expected = f"0 to {MAX_LABEL}, or {UNKNOWN} for unknown"
+        else:
+            unknown = [i for i in ids.tolist() if i != UNKNOWN and i not in self.class_names]
+            expected = f"ids from {min(self.class_names)} to {max(self.class_names)} that classes.json names"
+        if unknown:
+            raise UnknownLabelError(f"{source}: mask holds the labels {str(unknown)[1:-1][:60]}; expected {expected}")
+
+    def _knows_all(self, lowest: int, largest: int) -> bool:
+        """Tell whether all ids from one to another, and `UNKNOWN`, may occur."""
+        if self.class_names is None or lowest < UNKNOWN or largest > MAX_LABEL:
+            return lowest >= UNKNOWN and largest <= MAX_LABEL
+        return all(i in self.class_names for i in range(max(lowest, 0), largest + 1))
+
+
+def spread(views: Sequence[View], count: int | None) -> list[View]:
+    """Choose some views, spread evenly over all of them; all if there are no more, or `count` is None.
+
+    Raises
+    ------
+    SettingsError
+        None is asked for.
+    """
+    if count is None or count >= len(views):
+        return list(views)
+    if count < 1:
+        raise SettingsError(f"views is {count}; expected at least 1")
+    return [views[i] for i in np.linspace(0, len(views) - 1, count).round().astype(int)]
