@@ -81,4 +81,6 @@ def test_votes_against_classes_leave_what_can_be_said_with_them(looked_for: list
 def test_a_view_alone_has_nobody_beside_it() -> None:
     view = clean_views(1)[0]
     learner, observation = observed([view], view.name)
-    assert not counted_by_others(CSRRows.from_dense(learner._votes), observation, POSSIBLE, observation.evidence, 4.0).any()
+    assert not counted_by_others(
+        CSRRows.from_dense(learner._votes), observation, POSSIBLE, observation.evidence, 4.0
+    ).any()
