@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.errors import SceneFileError
+from gsseg_core.files.input_files import reason
 from gsseg_core.scene.ply import read_vertices
 
 
@@ -63,13 +64,17 @@ def read_scene(path: str | os.PathLike[str], within: Path | None = None) -> npt.
     """
     path = Path(path)
     suited = [known for known in SCENE_FORMATS if path.suffix.lower() in known.suffixes]
+    scene_format = (suited or SCENE_FORMATS)[0]
     try:
-        return (suited or SCENE_FORMATS)[0].read(path, within)
-    except SceneFileError as error:
+        return scene_format.read(path, within)
+    except (SceneFileError, OSError) as error:
+        what = str(error)
+        if isinstance(error, OSError):
+            what = f"{path}: cannot be read ({reason(error)}); expected a {scene_format.name}"
         formats = ", ".join(f"{known.name} ({' or '.join(known.suffixes)})" for known in SCENE_FORMATS)
         known = "" if suited else f"; gsseg reads {formats}"
         hint = scene_hint(path) if within is None else ""  # It looks around, wherever links lead.
-        raise SceneFileError(f"{error}{known}{hint}") from error.__cause__
+        raise SceneFileError(f"{what}{known}{hint}") from error
 
 
 def scene_hint(path: Path) -> str:

@@ -10,6 +10,10 @@ from pathlib import Path
 
 import pytest
 from patience import PATIENCE
+from segmented_place import contents, segment
+
+from gsseg_core.cli.main import main
+from gsseg_core.learn.vote_learner import VoteLearner
 
 # Like `bin/gsseg`. A finder that finds nothing counts imports, and interrupts a copy of the process at every so many.
 COPIES = """
@@ -98,3 +102,43 @@ def test_ctrl_c_while_kernels_compile_ends_with_130_and_not_a_word(tmp_path: Pat
         process.send_signal(signal.SIGINT)
         assert process.communicate(timeout=PATIENCE) == (b"", b"")
     assert process.returncode == 130
+
+
+def test_an_interrupt_while_learning_ends_with_130_and_changes_nothing(
+    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = contents(place / "out")
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(VoteLearner, "fit", interrupted)
+    assert main(segment(place, "--learner", "votes")) == 130
+    assert capsys.readouterr().err == ""
+    assert contents(place / "out") == before
+
+
+def test_ctrl_c_in_a_real_process_ends_with_130_and_no_traceback(place: Path) -> None:
+    before = contents(place / "out")
+    # The learner waits, so that the signal meets it at work; the warm-up, which tells nobody, goes on.
+    program = (
+        "import sys, time\nfrom gsseg_core.cli.main import main\n"
+        "from gsseg_core.learn.vote_learner import VoteLearner\n"
+        "def fit(self, progress=None):\n"
+        "    if progress: progress('learn', 0, 9); print('at work', file=sys.stderr); time.sleep(60)\n"
+        "VoteLearner.fit = fit\n"
+        "sys.exit(main())"
+    )
+    arguments = [option for option in segment(place, "--learner", "votes") if option != "--quiet"]
+    with subprocess.Popen(
+        [sys.executable, "-c", program, *arguments], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL
+    ) as process:
+        assert process.stderr is not None
+        stderr = b""
+        while b"at work" not in stderr and process.poll() is None:
+            stderr += os.read(process.stderr.fileno(), 4096)
+        process.send_signal(signal.SIGINT)
+        stderr += process.stderr.read()
+    assert process.returncode == 130, stderr
+    assert b"Traceback" not in stderr and b"gsseg" not in stderr and stderr.endswith(b"\n")
+    assert contents(place / "out") == before
