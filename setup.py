@@ -25,7 +25,10 @@ setup(
     author="gsseg developers",
     license="Apache-2.0",
     packages=find_packages(include=["gsseg_core*", "gsseg_ros*"]),
-    package_data={"gsseg_core": ["__init__.pyi"], "gsseg_core.report": ["page.css", "page.js"]},
+    package_data={
+        "gsseg_core": ["__init__.pyi"],
+        "gsseg_core.report": ["page.css", "page.html.j2", "page.js", "sections.html.j2"],
+    },
     # What ROS looks for, at the places where it looks: the same after pip, colcon and colcon --symlink-install.
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/gsseg_ros"]),
@@ -39,6 +42,7 @@ setup(
     ],
     python_requires=">=3.10,<3.14",
     install_requires=[
+        "jinja2>=3.1",
         "lazy_loader>=0.4",
         "numba>=0.61",
         "numpy>=2.0",

@@ -42,6 +42,7 @@ from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.report.findings import Evidence
 from gsseg_core.report.page import write_report_page
 from gsseg_core.report.pictures import ViewImages
+from gsseg_core.report.sections import PageInputs
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
@@ -325,7 +326,7 @@ def _write(
         ids=None if inputs.objects is None else inputs.objects.summary(),
     )
     with watch.stage("report page"):
-        write_report_page(folder / "report.html", report.as_dict(), scene, result, evidence, images)
+        write_report_page(folder / "report.html", PageInputs(report.as_dict(), scene, result, evidence, images))
     return replace(report, page="report.html", seconds=watch.seconds)
 
 

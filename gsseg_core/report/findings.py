@@ -11,6 +11,7 @@ import numpy as np
 
 from gsseg_core.data.view import View
 from gsseg_core.learn.mask_reliability import ViewCheck, worst_views
+from gsseg_core.text import counted
 
 SHOWN = 1 / 2000
 """A view shows a class that fills at least this share of its checked pixels; less is an edge's blur."""
@@ -119,12 +120,12 @@ def warnings_of(
     warnings = []
     if views["used"] < FEW_VIEWS:
         warnings.append(
-            f"Learnt from {_count(views['used'], 'view')} only. With fewer than {FEW_VIEWS}, "
+            f"Learnt from {counted(views['used'], 'view')} only. With fewer than {FEW_VIEWS}, "
             "what a mask got wrong cannot be told from what is there."
         )
     if views["rejected"]:
         reasons = ", ".join(f"{count} {why}" for why, count in views["rejected"].items())
-        warnings.append(f"{_count(sum(views['rejected'].values()), 'view')} could not be used: {reasons}.")
+        warnings.append(f"{counted(sum(views['rejected'].values()), 'view')} could not be used: {reasons}.")
     doubtful = [v for v in views.get("reliability", []) if v["reliability"] is not None and v["reliability"] < TRUSTED]
     if doubtful:
         whose = "masks disagree" if len(doubtful) > 1 else "masks disagrees"
@@ -136,12 +137,12 @@ def warnings_of(
     names = dict(enumerate(entry["name"] for entry in report["classes"]))
     empty = [entry["name"] for entry in report["classes"] if entry["id"] and not entry["gaussians"]]
     if empty:
-        warnings.append(f"{_count(len(empty), 'class', 'classes')} got no Gaussian: {_some(empty)}.")
+        warnings.append(f"{counted(len(empty), 'class', 'classes')} got no Gaussian: {_some(empty)}.")
     if ious is not None:
         weak = [names[k] for k in np.argsort(ious).tolist() if k in names and ious[k] < KNOWN_CLASS]
         if weak:
             warnings.append(
-                f"Of {_count(len(weak), 'class', 'classes')} masks and prediction overlap by less than half "
+                f"Of {counted(len(weak), 'class', 'classes')} masks and prediction overlap by less than half "
                 f"(IoU below {KNOWN_CLASS:g}): {_some(weak)}."
             )
     total = max(report["scene"]["gaussians"], 1)
@@ -157,10 +158,6 @@ def mean_reliability(report: Mapping[str, Any]) -> float:
     """Mean over the views of which anything is known; NaN without any."""
     known = [v["reliability"] for v in report["views"].get("reliability", []) if v["reliability"] is not None]
     return sum(known) / len(known) if known else math.nan
-
-
-def _count(number: int, one: str, many: str | None = None) -> str:
-    return f"{number:,} {one if number == 1 else many or one + 's'}"
 
 
 def _some(names: Sequence[str]) -> str:

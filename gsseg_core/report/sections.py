@@ -1,244 +1,215 @@
-"""Sections of the report page as HTML. Whatever comes from a file or a user goes through `text`."""
+"""What each section of the report page tells; `sections.html.j2` has the macro that shows it."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 
+from gsseg_core.export.pictures import palette
 from gsseg_core.report import charts
-from gsseg_core.report.findings import TRUSTED, largest_confusions, most_confused
-from gsseg_core.segmentation import Segmentation
-from gsseg_core.text import html_text as text
+from gsseg_core.report.findings import TRUSTED, Evidence, class_ious, largest_confusions, most_confused
+from gsseg_core.report.pictures import PICTURE_PX, THUMBNAIL_PX, ViewImages, draw_triple, jpeg_uri, thumbnails
+from gsseg_core.report.preview import look_from, make_preview, up_of
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 from gsseg_core.text import percent
 
+LOOKS = 8
+"""Views from which the preview can be looked at."""
+MOST_THUMBNAILS = 200
+"""Classes with a picture, those with the most Gaussians: the page should stay small."""
 BINS = 25
 MATRIX_CLASSES = 24
 """The matrix shows this many of the classes that are confused most."""
 PAIRS = 10
 WORST = 8
 
+_NO_CLASS = ((UNOBSERVED, "seen by no mask", (128, 131, 138)), (REMOVED, "removed by the filter", (214, 64, 159)))
 
-def embedded_json(value: object) -> str:
-    """Write JSON that cannot end the element that it stands in."""
-    return json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-
-
-def cards(figures: Iterable[tuple[str, str, str]]) -> str:
-    """Show the main figures: what, how much, and a remark."""
-    return (
-        '<dl class="cards">'
-        + "".join(
-            f"<div><dt>{text(what)}</dt><dd><strong>{text(value)}</strong><small>{text(more)}</small></dd></div>"
-            for what, value, more in figures
-        )
-        + "</dl>"
-    )
+Content = Mapping[str, Any]
 
 
-def notices(warnings: Sequence[str]) -> str:
-    """List what the user should look at."""
-    if not warnings:
-        return '<p class="notice good">Nothing in this run asks for a second look.</p>'
-    items = "".join(f"<li>{text(warning)}</li>" for warning in warnings)
-    return f'<div class="notice"><strong>Look at this</strong><ul>{items}</ul></div>'
+@dataclass(frozen=True, eq=False)
+class PageInputs:
+    """What the report page is made from.
 
-
-def legend(
-    names: Mapping[int, str],
-    colors: np.ndarray,  # (K, 3)
-    counts: np.ndarray,  # (K,)
-    others: Sequence[tuple[int, str, tuple[int, int, int], int]],
-) -> str:
-    """List the classes with their colours; switches for the preview beside them.
-
-    Parameters
+    Attributes
     ----------
-    names : mapping from id to name
-        Of the classes.
-    colors, counts : (K, 3) uint8, (K,) int
-        Of the classes.
-    others : sequence of (label in the preview, name, colour, count)
-        Gaussians that belong to no class.
+    report : mapping
+        What `report.json` holds.
+    scene : GaussianScene
+        What was segmented.
+    segmentation : Segmentation
+        What came out.
+    evidence : Evidence
+        Masks beside predictions of them.
+    images : ViewImages
+        What was seen.
     """
-    entries = [(k, name, tuple(colors[k].tolist()), int(counts[k])) for k, name in names.items() if counts[k]]
+
+    report: Mapping[str, Any]
+    scene: GaussianScene
+    segmentation: Segmentation
+    evidence: Evidence
+    images: ViewImages
+
+    @cached_property
+    def colors(self) -> np.ndarray:
+        """Colours of the classes, (K, 3) uint8."""
+        return palette(self.segmentation.num_classes)
+
+    @cached_property
+    def confusion(self) -> np.ndarray | None:
+        """Pixels by class predicted and label of the mask, (K, K) int64; None where no mask was checked."""
+        return self.evidence.confusion(self.segmentation.num_classes) if self.evidence.checks else None
+
+    @cached_property
+    def ious(self) -> np.ndarray | None:
+        """IoU of each class with the masks, (K,), NaN for a class that is nowhere; None where no mask was checked."""
+        return None if self.confusion is None else class_ious(self.confusion)
+
+    @property
+    def reliability(self) -> list[Mapping[str, Any]]:
+        """What `report.json` says of the reliability of views, the worst first; empty where that is not known."""
+        return self.report["views"].get("reliability") or []
+
+
+def preview(run: PageInputs) -> Content:
+    """Gaussians to look at in 3D, what to colour and hide, and where to look from."""
+    scene, segmentation, views, first = run.scene, run.segmentation, run.evidence.views, run.segmentation.num_classes
+    shown = make_preview(scene, segmentation)
+    # The more classes a view shows, the better it is to begin with.
+    ranked = sorted(
+        run.evidence.checks,
+        key=lambda check: (-(check.counts.sum(axis=1) > 0).sum(), -np.nan_to_num(check.reliability)),
+    )
+    cameras = [views[check.name].camera for check in ranked[:LOOKS]]
+    poster = draw_triple(ranked[0], views[ranked[0].name], run.images, run.colors).prediction if ranked else None
+    counts = segmentation.counts()
+    legend = [(k, name, run.colors[k].tolist(), counts[k]) for k, name in segmentation.class_names.items()]
+    for i, (label, name, color) in enumerate(_NO_CLASS):
+        legend.append((first + i, name, color, (segmentation.labels == label).sum()))
+    return {
+        "data": {
+            **shown.header(),
+            "cameras": look_from(cameras, shown),
+            "up": up_of(view.camera for view in views.values()),
+            "colors": [*run.colors.tolist(), *(color for _, _, color in _NO_CLASS)],
+            "hidden": [first + 1],
+        },
+        "records": shown.as_text(),
+        "legend": [entry for entry in legend if entry[3]],
+        "cameras": [camera.name for camera in cameras],
+        "poster": jpeg_uri(poster, 640) if poster is not None else "",
+        "extent": f"{len(shown.records):,} of {len(scene):,} Gaussians" if shown.left_out else "All Gaussians",
+    }
+
+
+def views_shown(run: PageInputs) -> Content | None:
+    """Show some views three times: their mask, the prediction, and where the two differ."""
+    confusions = {view["name"]: view["confusions"] for view in run.reliability}
+    source = "what the other views predict" if run.evidence.held_out else "what was learnt, from this view too"
+    captions = ("its mask", source, "red where the two differ")
+    views = []
+    for what, check in run.evidence.examples():
+        triple = draw_triple(check, run.evidence.views[check.name], run.images, run.colors)
+        views.append(
+            {
+                "name": check.name,
+                "remark": f"{what}: {percent(check.reliability)} the same",
+                "pictures": list(zip(captions, (jpeg_uri(image, PICTURE_PX) for image in triple), strict=True)),
+                "confusions": confusions.get(check.name, []),
+            }
+        )
+    return {"views": views} if views else None
+
+
+def classes(run: PageInputs) -> Content:
+    """Size, confidence, agreement with the masks, and a picture of each class."""
+    entries, evidence, ious = run.report["classes"], run.evidence, run.ious
+    largest = sorted(range(len(entries)), key=lambda k: -entries[k]["gaussians"])[:MOST_THUMBNAILS]
+    found = thumbnails(largest, evidence, run.images, run.colors)
+    views = evidence.views_showing(len(run.colors)) if evidence.checks else None
     rows = [
-        f'<li><label><input type="checkbox" class="js-only" data-label="{label}" checked>{swatch(color)}'
-        f'<bdi>{text(name)}</bdi></label><span class="count">{count:,}</span>'
-        f'<button type="button" class="only js-only" data-label="{label}" aria-label="only {text(name)}">only</button>'
-        "</li>"
-        for label, name, color, count in [*entries, *others]
+        {
+            **entry,
+            "color": run.colors[k].tolist(),
+            "picture": (found[k][0], jpeg_uri(found[k][1], THUMBNAIL_PX)) if k in found else None,
+            "views": None if views is None else int(views[k]),
+            "iou": None if ious is None or np.isnan(ious[k]) else float(ious[k]),
+        }
+        for k, entry in enumerate(entries)
+        if k or entry["gaussians"]  # Masks need not show any background.
     ]
-    return f'<ul class="legend">{"".join(rows)}</ul>'
+    return {"classes": rows, "num_views": len(evidence.checks), "held_out": evidence.held_out}
 
 
-def swatch(color: Sequence[int]) -> str:
-    """Draw a patch of a colour."""
-    red, green, blue = color
-    return (
-        '<svg class="swatch" viewBox="0 0 14 14" aria-hidden="true">'
-        f'<rect width="14" height="14" rx="4" fill="rgb({red},{green},{blue})"/></svg>'
-    )
-
-
-def triple(name: str, remark: str, confusions: str, pictures: Sequence[tuple[str, str]]) -> str:
-    """Show a view three times; `pictures` are (caption, data URI)."""
-    shown = "".join(
-        f'<figure><img src="{uri}" alt="view {text(name)}: {text(caption)}">'
-        f"<figcaption>{text(caption)}</figcaption></figure>"
-        for caption, uri in pictures
-    )
-    return (
-        f'<article class="triple"><h3><bdi>{text(name)}</bdi> <small>{text(remark)}</small></h3>'
-        f'<div class="pictures">{shown}</div><p class="faint">{text(confusions)}</p></article>'
-    )
-
-
-def class_table(
-    classes: Sequence[Mapping[str, Any]],
-    colors: np.ndarray,  # (K, 3)
-    thumbnails: Mapping[int, tuple[str, str]],
-    views: np.ndarray | None,  # (K,)
-    num_views: int,
-    ious: np.ndarray | None,  # (K,)
-) -> str:
-    """Make one row a class, in the order of the arrays; `thumbnails` are (view, data URI) by place in it."""
-    header = ["", "class", "Gaussians", "mean confidence", "views that show it", "IoU with the masks", "file"]
-    head = "".join(f'<th scope="col">{name}</th>' for name in header)
-    rows = []
-    for k, entry in enumerate(classes):
-        confidence = entry["mean_confidence"]
-        if k == 0 and not entry["gaussians"]:
-            continue  # Masks need not show any background.
-        iou = None if ious is None or np.isnan(ious[k]) else float(ious[k])
-        view, uri = thumbnails.get(k, ("", ""))
-        picture = f'<img class="thumb" src="{uri}" alt="" title="in view {text(view)}">' if uri else ""
-        link = f'<a href="{quote(entry["ply"])}">PLY</a>' if entry["ply"] else "-"
-        cells = [
-            ("thumbnail", "", picture),
-            ("name", "", f"{swatch(colors[k].tolist())}<bdi>{text(entry['name'])}</bdi> <small>{entry['id']}</small>"),
-            ("number", header[2], f"{entry['gaussians']:,}"),
-            ("share", header[3], _share(confidence)),
-            ("number", header[4], "-" if views is None else f"{int(views[k])} <small>of {num_views}</small>"),
-            ("share", header[5], _share(iou)),
-            ("link", header[6], link),
-        ]
-        row = "".join(f'<td class="{kind}" data-name="{what}">{cell}</td>' for kind, what, cell in cells)
-        rows.append(f"<tr>{row}</tr>")
-    return f'<table class="classes"><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
-
-
-def confidence_chart(segmentation: Segmentation) -> str:
-    """Draw how sure the labelled Gaussians are, apart by where their label comes from."""
-    labelled = segmentation.labels >= 0
-    confidence, clustered = segmentation.confidence[labelled], segmentation.clustered[labelled]
-    series = [
-        (name, np.histogram(confidence[part], BINS, (0, 1))[0])
-        for name, part in (("learnt", ~clustered), ("from their neighbours", clustered))
-    ]
-    keys = "".join(f'<span class="key"><i class="s{i}"></i>{name}</span>' for i, (name, _) in enumerate(series))
-    return charts.histogram(series, 0.0, 1.0) + f'<p class="keys">{keys}</p>'
-
-
-def confusion_section(
-    confusion: np.ndarray,  # (K, K)
-    names: Mapping[int, str],
-) -> str:
-    """Draw the matrix of the classes that are confused most, and name the largest confusions."""
-    shown = most_confused(confusion, MATRIX_CLASSES)
-    total = np.maximum(confusion.sum(axis=1, keepdims=True), 1)
-    shares = (confusion / total)[np.ix_(shown, shown)]
+def confusion(run: PageInputs) -> Content | None:
+    """Matrix of the classes that are confused most, and the largest confusions."""
+    counts, names = run.confusion, run.segmentation.class_names
+    if counts is None:
+        return None
+    shown = most_confused(counts, MATRIX_CLASSES)
+    total = np.maximum(counts.sum(axis=1, keepdims=True), 1)
+    shares = (counts / total)[np.ix_(shown, shown)]
     shares[shares < 0.002] = 0
     titles = [
         [f"{names[k]} called {names[y]}: {percent(float(shares[i, j]))} of its pixels" for j, y in enumerate(shown)]
         for i, k in enumerate(shown)
     ]
-    everything = max(int(confusion.sum()), 1)
-    rows = [
-        [_bdi(names[k]), _bdi(names[y]), f"{pixels:,}", percent(pixels / everything)]
-        for k, y, pixels in largest_confusions(confusion, PAIRS)
+    everything = max(int(counts.sum()), 1)
+    return {
+        "matrix": charts.heatmap(shares, [names[k] for k in shown], titles),
+        "most": len(shown) if len(shown) < (counts.sum(axis=1) > 0).sum() else None,
+        "pairs": [
+            (names[k], names[y], pixels, pixels / everything) for k, y, pixels in largest_confusions(counts, PAIRS)
+        ],
+    }
+
+
+def reliability(run: PageInputs) -> Content | None:
+    """How far each view's mask can be trusted, the worst first."""
+    views = run.reliability
+    titles = [f"{view['name']}: {percent(view['reliability'])}" for view in views]
+    chart = charts.columns([view["reliability"] for view in views], titles, TRUSTED)
+    return {"chart": chart, "worst": views[:WORST], "others": views[WORST:], "trusted": TRUSTED} if views else None
+
+
+def confidence(run: PageInputs) -> Content:
+    """How sure the labelled Gaussians are, apart by where their label comes from."""
+    segmentation = run.segmentation
+    labelled = segmentation.labels >= 0
+    sure, clustered = segmentation.confidence[labelled], segmentation.clustered[labelled]
+    series = [
+        (name, np.histogram(sure[part], BINS, (0, 1))[0])
+        for name, part in (("learnt", ~clustered), ("from their neighbours", clustered))
     ]
-    matrix = charts.heatmap(shares, [names[k] for k in shown], titles)
-    less = "" if len(shown) >= (confusion.sum(axis=1) > 0).sum() else f" The {len(shown)} classes confused most."
-    return (
-        '<p class="faint">Rows: what is predicted. Columns: what the masks say. Stronger is a larger share of the '
-        f"row's pixels; off the diagonal the two differ.{less}</p>"
-        f'<div class="beside"><div class="scroll" tabindex="0">{matrix}</div>'
-        + plain_table(["predicted", "in the mask", "pixels", "of all"], rows, "pairs")
-        + "</div>"
-    )
+    return {
+        "temperature": segmentation.temperature,
+        "chart": charts.histogram(series, 0.0, 1.0),
+        "keys": [name for name, _ in series],
+    }
 
 
-def views_section(reliability: Sequence[Mapping[str, Any]]) -> str:
-    """Draw the views by reliability, and list them, the worst first."""
-    titles = [f"{view['name']}: {percent(view['reliability'])}" for view in reliability]
-    drawn = charts.columns([view["reliability"] for view in reliability], titles, TRUSTED)
-    header = ["view", "reliability", "not learnt from", "most often taken for something else"]
-    rows = [
-        [
-            _bdi(view["name"]),
-            _share(view["reliability"], "fill" if (view["reliability"] or 0) >= TRUSTED else "bad"),
-            percent(view["unheard"]) if view["unheard"] else "-",
-            "; ".join(map(_taken, view["confusions"])) or "-",
-        ]
-        for view in reliability
-    ]
-    worst = plain_table(header, rows[:WORST], "views")
-    rest = plain_table(header, rows[WORST:], "views") if rows[WORST:] else ""
-    more = f"<details><summary>The other {len(rows) - WORST} views</summary>{rest}</details>" if rest else ""
-    return (
-        f'{drawn}<p class="faint axis-note">the worst on the left; the line is at {percent(TRUSTED)}</p>{worst}{more}'
-    )
+def time(run: PageInputs) -> Content:
+    """Seconds per stage."""
+    seconds = run.report["seconds"]
+    return {"chart": charts.stacked_bar(list(seconds.items())), "seconds": seconds, "total": sum(seconds.values())}
 
 
-def confusions_of(confusions: Sequence[Mapping[str, Any]]) -> str:
-    """Say in words what was taken for what in a view; not yet escaped."""
-    said = [f"{percent(c['share'])} of the pixels are {c['true']}, called {c['seen']}" for c in confusions]
-    return "; ".join(said)
-
-
-def timings(seconds: Mapping[str, float]) -> str:
-    """Draw seconds per stage, and list them."""
-    total = sum(seconds.values()) or 1.0
-    rows = [
-        [f'<i class="s{i % 8}"></i>{text(name)}', f"{value:.2f} s", percent(value / total)]
-        for i, (name, value) in enumerate(seconds.items())
-    ]
-    rows.append(["total", f"{sum(seconds.values()):.2f} s", ""])
-    return charts.stacked_bar(list(seconds.items())) + plain_table(["stage", "seconds", "share"], rows, "timings")
-
-
-def settings_list(settings: Mapping[str, Any]) -> str:
-    """List settings, or anything else by name, nested ones as `outer.inner`."""
-    pairs = (f"<div><dt>{text(name)}</dt><dd>{text(value)}</dd></div>" for name, value in _flat(settings))
-    return f'<dl class="settings">{"".join(pairs)}</dl>'
-
-
-def plain_table(header: Sequence[str], rows: Iterable[Sequence[str]], css_class: str) -> str:
-    """Make a table of cells that are HTML already."""
-    head = "".join(f'<th scope="col">{name}</th>' for name in header)
-    body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
-    return (
-        f'<div class="scroll"><table class="{css_class}"><thead><tr>{head}</tr></thead>'
-        f"<tbody>{body}</tbody></table></div>"
-    )
-
-
-def _share(value: float | None, css_class: str = "fill") -> str:
-    if value is None:
-        return "-"
-    return f"<span>{percent(value)}</span>{charts.bar(value, percent(value), css_class)}"
-
-
-def _taken(confusion: Mapping[str, Any]) -> str:
-    return f"{_bdi(confusion['true'])} called {_bdi(confusion['seen'])} ({percent(confusion['share'])})"
-
-
-def _bdi(name: object) -> str:
-    return f"<bdi>{text(name)}</bdi>"
+def settings(run: PageInputs) -> Content:
+    """All that one needs to compare two runs, or to repeat one; nested settings as `outer.inner`."""
+    report = run.report
+    scene = {"scene digest": report["scene"]["digest"][:16]}
+    found = {f"ids.{name}": report["ids"][name] for name in ("objects", "segments")} if "ids" in report else {}
+    return {
+        "settings": list(_flat({**scene, **report["settings"], **found})),
+        "versions": list(_flat(report["versions"])),
+    }
 
 
 def _flat(settings: Mapping[str, Any], outer: str = "") -> Iterable[tuple[str, Any]]:

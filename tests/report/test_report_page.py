@@ -16,11 +16,11 @@ from report_cases import NASTY, Outline, run_with_nasty_names, segmented
 from small_scenes import balls_on_a_table
 
 from gsseg_core.errors import WriteError
-from gsseg_core.report import sections as report_html
 from gsseg_core.report.findings import Evidence
-from gsseg_core.report.page import report_page, write_report_page
+from gsseg_core.report.page import environment, report_page, write_report_page
 from gsseg_core.report.pictures import ViewImages
-from gsseg_core.text import html_text, printable
+from gsseg_core.report.sections import PageInputs
+from gsseg_core.text import printable
 
 SCENE, TRUTH = balls_on_a_table()
 
@@ -106,7 +106,7 @@ def test_a_run_of_which_no_mask_can_be_shown_gets_a_page_too(out: Path) -> None:
     report = json.loads((out / "report.json").read_text())
     del report["views"]["reliability"]
     result, _ = segmented()
-    page = Outline(report_page(report, SCENE, result, Evidence([], {}, False), ViewImages(SCENE)))
+    page = Outline(report_page(PageInputs(report, SCENE, result, Evidence([], {}, False), ViewImages(SCENE))))
     sections = {section["id"] for section in page.tagged("section")}
     assert sections == {"preview", "classes", "confidence", "time", "settings"}
     assert not page.tagged("img")
@@ -117,8 +117,8 @@ def test_a_page_that_cannot_be_written_leaves_the_earlier_one(
 ) -> None:
     report = json.loads((out / "report.json").read_text())
     result, evidence = segmented()
-    path = tmp_path / "report.html"
-    write_report_page(path, report, SCENE, result, evidence, ViewImages(SCENE))
+    path, inputs = tmp_path / "report.html", PageInputs(report, SCENE, result, evidence, ViewImages(SCENE))
+    write_report_page(path, inputs)
     before = path.read_bytes()
 
     def full(*_: object) -> None:
@@ -126,25 +126,28 @@ def test_a_page_that_cannot_be_written_leaves_the_earlier_one(
 
     monkeypatch.setattr(os, "replace", full)
     with pytest.raises(WriteError, match=r"report\.html: cannot be written \(No space left"):
-        write_report_page(path, report, SCENE, result, evidence, ViewImages(SCENE))
+        write_report_page(path, inputs)
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
 
 
-def test_package_carries_the_style_sheet_and_the_script() -> None:
+def test_packages_carry_the_files_that_are_no_modules() -> None:
     root = Path(__file__).parents[2]
-    declared = re.search(r"package_data=\{\"gsseg_core.report\": \[(.*?)\]\}", (root / "setup.py").read_text())
+    declared = re.search(r"package_data=\{(.*?)\}", (root / "setup.py").read_text(), re.DOTALL)
     assert declared is not None
+    names = {name for name in re.findall(r'"(.*?)"', declared[1]) if not name.startswith("gsseg_core")}
     others = {
         path.name for path in (root / "gsseg_core").rglob("*.*") if path.suffix not in (".py", ".pyc", ".nbi", ".nbc")
     }
-    assert {"page.css", "page.js"} <= others == set(re.findall(r'"(.*?)"', declared[1]))
+    assert {"page.css", "page.html.j2", "page.js"} <= others == names
 
 
 @given(st.text() | st.text(alphabet="<>&\"'/!-\x00\x7f\ud800"))
 def test_any_name_stays_text_in_elements_in_attributes_and_in_json(name: str) -> None:
-    page = Outline(f'<p title="{html_text(name)}">{html_text(name)}</p>')
-    assert [tag for tag, _ in page.elements] == ["p"]
+    template = '<p title="{{ name }}">{{ name }}</p><script>{{ {"name": name} | tojson }}</script>'
+    text = environment().from_string(template).render(name=name)
+    page = Outline(text)
+    assert [tag for tag, _ in page.elements] == ["p", "script"]
     assert "".join(page.said) == page.elements[0][1]["title"]
     assert "".join(page.said) == printable(name)
-    script = report_html.embedded_json({"name": name})
-    assert "<" not in script and json.loads(script) == {"name": name}
+    embedded = text.partition("<script>")[2].removesuffix("</script>")
+    assert "<" not in embedded and json.loads(embedded) == {"name": name}
