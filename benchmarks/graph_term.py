@@ -19,10 +19,10 @@ import numpy as np
 from few_views import Bench, split
 from machine import DATA, REPOSITORY
 from results import markdown
+from wrong_masks import WrongMasks, corrupt
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
-from gsseg_core.demo.mask_errors import MaskErrors, corrupt
 from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.learn.calibrate import calibrate
@@ -64,7 +64,7 @@ def main() -> int:
 
 def compare(bench: Bench, missed_label: int | None) -> Iterator[list[str]]:
     """Learn from so many views, and score with the graph and without."""
-    rng, errors = np.random.default_rng(SEED), MaskErrors(missed_label=missed_label)
+    rng, errors = np.random.default_rng(SEED), WrongMasks(missed_label=missed_label)
     wrong = [View.from_arrays(view.camera, corrupt(view.read_labels(), rng, errors)) for view in bench.train]
     for count in [*(count for count in COUNTS if count < len(bench.train)), len(bench.train)]:
         chosen = np.linspace(0, len(bench.train) - 1, count).round().astype(int)

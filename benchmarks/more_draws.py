@@ -19,16 +19,16 @@ from pathlib import Path
 from machine import DATA
 from results import markdown, points, score
 from view_errors import corrupt_views
+from wrong_masks import WrongMasks
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
-from gsseg_core.demo.mask_errors import MaskErrors
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
 DRAWS = (1, 3, 6)
-EDGES_OFF = MaskErrors(missed=0.0, swapped=0.0, missed_label=None)
+EDGES_OFF = WrongMasks(missed=0.0, swapped=0.0, missed_label=None)
 
 
 def main() -> int:

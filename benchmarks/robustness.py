@@ -28,10 +28,10 @@ from results import machine, markdown, points, score
 from robustness_text import BAR, CURVES, HEADER, RELIABILITY
 from scipy.stats import spearmanr
 from view_errors import STRONGEST, PoseErrors, corrupt_views, errors_at, typical_depth
+from wrong_masks import WrongMasks
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View, spread
-from gsseg_core.demo.mask_errors import MaskErrors
 from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.export.view_pictures import draw_worst_views
 from gsseg_core.files.atomic import write_atomically
@@ -49,7 +49,7 @@ LEARNERS = (EM, PLAIN, GRADIENT, VOTES, HARD)
 SETTINGS = {PLAIN: EMSettings(errors=False), STILL: EMSettings(edge_px=0)}
 STRENGTHS = (0.25, 0.5, 0.75, 1.0)
 BAD_SHARE = 0.2
-REALISTIC = MaskErrors()
+REALISTIC = WrongMasks()
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Bench:
     strengths, gradient_strengths : sequence of float
         Where the curves have points, and where the gradient learner, which is slow, has some.
     missed_label : int or None
-        What is written where an object was missed, as in `MaskErrors`.
+        What is written where an object was missed, as in `WrongMasks`.
     given : list of View
         The train views with wrong masks that came with the scene, if any.
     """
@@ -88,7 +88,7 @@ class Bench:
     given: Sequence[View] = ()
 
     @property
-    def realistic(self) -> MaskErrors:
+    def realistic(self) -> WrongMasks:
         """A quarter of the objects wrong in every view, edges off by up to 3 px."""
         return replace(REALISTIC, missed_label=self.missed_label)
 

@@ -7,7 +7,7 @@ HEADER = """# Robustness
 Made by `python benchmarks/robustness.py{quick}`, which measures everything here again, in {minutes} minutes.
 Machine: {machine}.
 
-Masks are drawn wrong from true ones (`gsseg_core/demo/mask_errors.py`, `benchmarks/view_errors.py`), each kind of error
+Masks are drawn wrong from true ones (`benchmarks/wrong_masks.py`, `benchmarks/view_errors.py`), each kind of error
 at a strength from 0 to 1. Learners see the wrong masks of train views only; rendered label maps of the test views are
 scored against the true ones, without refinement (mIoU, as in [results.md](results.md)). "FlashSplat's rule" is votes
 made hard, on the same operator from the same views. The demo scene is the one of `make demo-local`: 30 views of 400 x

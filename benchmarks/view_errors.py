@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from wrong_masks import WrongMasks, corrupt
 
 from gsseg_core.data.view import View
-from gsseg_core.demo.mask_errors import MaskErrors, corrupt
 from gsseg_core.errors import SettingsError
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -83,7 +83,7 @@ def jitter(camera: Camera, rng: np.random.Generator, settings: PoseErrors) -> Ca
 
 def errors_at(
     kind: str, strength: float, *, missed_label: int | None = 0, depth: float = 1.0
-) -> tuple[MaskErrors, PoseErrors]:
+) -> tuple[WrongMasks, PoseErrors]:
     """Give the settings for one kind of error at a strength, and no other error.
 
     Parameters
@@ -93,7 +93,7 @@ def errors_at(
     strength : float
         From 0, no error at all, to 1.
     missed_label : int or None
-        As in `MaskErrors`.
+        As in `WrongMasks`.
     depth : float
         How far away what the cameras see lies, in scene units; errors of poses go with it. See `typical_depth`.
 
@@ -106,7 +106,7 @@ def errors_at(
         raise SettingsError(f"kind of error is {kind!r}; expected one of {', '.join(STRONGEST)}")
     if not 0 <= strength <= 1:
         raise SettingsError(f"strength of {kind} is {strength}; expected a number in [0, 1]")
-    none = MaskErrors(missed=0.0, swapped=0.0, edge_px=0, missed_label=missed_label)
+    none = WrongMasks(missed=0.0, swapped=0.0, edge_px=0, missed_label=missed_label)
     masks = {
         "missed objects": replace(none, missed=0.5 * strength),
         "wrong ids": replace(none, swapped=0.5 * strength),
@@ -121,7 +121,7 @@ def errors_at(
     return masks.get(kind, none), poses
 
 
-def corrupt_views(views: Iterable[View], seed: int, masks: MaskErrors, poses: PoseErrors | None = None) -> list[View]:
+def corrupt_views(views: Iterable[View], seed: int, masks: WrongMasks, poses: PoseErrors | None = None) -> list[View]:
     """Draw one wrong version of each view, held in memory.
 
     Parameters
@@ -130,7 +130,7 @@ def corrupt_views(views: Iterable[View], seed: int, masks: MaskErrors, poses: Po
         With masks.
     seed : int
         The same one gives the same errors.
-    masks : MaskErrors
+    masks : WrongMasks
         How wrong the masks are.
     poses : PoseErrors, optional
         How wrong the poses are; right by default.

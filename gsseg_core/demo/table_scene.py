@@ -8,7 +8,6 @@ sizes and opacities, some inside the solids, some floating in the air.
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,6 +21,7 @@ from gsseg_core.data.label_images import write_mask
 from gsseg_core.demo.mask_errors import MaskErrors, corrupt
 from gsseg_core.demo.solids import Box, Cone, Ellipsoid, Solid, dot
 from gsseg_core.files.atomic import write_atomically
+from gsseg_core.files.json_files import write_json
 from gsseg_core.files.run_folder import staged_run
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -102,16 +102,15 @@ def build_demo(folder: str | os.PathLike[str], seed: int = 0) -> DemoScene:
         scene.save(run.folder / "scene.ply")
         with write_atomically(run.folder / "truth.npz") as temporary:
             np.savez_compressed(temporary, labels=truth)
-        _write_json(run.folder / "cameras.json", [_as_3dgs(camera) for camera in cameras])
-        _write_json(run.folder / "classes.json", dict(enumerate(CLASS_NAMES)))
-        _write_json(run.folder / "split.json", {"train": train, "test": test})
+        write_json(run.folder / "cameras.json", [_as_3dgs(camera) for camera in cameras])
+        write_json(run.folder / "classes.json", dict(enumerate(CLASS_NAMES)))
+        write_json(run.folder / "split.json", {"train": train, "test": test})
         for camera in cameras:
             labels = _cast_view(parts, camera)
             write_mask(run.folder / "labels_true" / f"{camera.name}.png", labels, bits=8)
             if camera.name in train:
-                write_mask(
-                    run.folder / "labels" / f"{camera.name}.png", corrupt(labels, mask_rng, MaskErrors()), bits=8
-                )
+                wrong = corrupt(labels, mask_rng, MaskErrors())
+                write_mask(run.folder / "labels" / f"{camera.name}.png", wrong, bits=8)
     return DemoScene(root, scene, truth, dict(enumerate(CLASS_NAMES)), train, test)
 
 
@@ -391,8 +390,3 @@ def _shade(
     # Of degree 1 a colour varies with the cosine to one direction; the viewer looks along -mirrored at the highlight.
     sh[:, 1:] = (-sheen * basis(mirrored, 1)[:, 1:].T / (3 * C0 * C0)).T[..., None]
     return sh
-
-
-def _write_json(path: Path, content: object) -> None:
-    with write_atomically(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

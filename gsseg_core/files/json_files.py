@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from gsseg_core.errors import GssegError
 from gsseg_core.files.atomic import write_atomically
@@ -41,7 +39,7 @@ def kind_of(content: object) -> str:
     return _KINDS[type(content)]
 
 
-def write_json(path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:
+def write_json(path: str | os.PathLike[str], content: object) -> None:
     """Write JSON atomically."""
     with write_atomically(path) as temporary:
         temporary.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from small_scenes import balls_on_a_table, clean_views, make_grid, ring
 from view_errors import STRONGEST, PoseErrors, corrupt_views, errors_at, jitter, typical_depth
+from wrong_masks import WrongMasks
 
 from gsseg_core.data.view import View
-from gsseg_core.demo.mask_errors import MaskErrors
 from gsseg_core.errors import SettingsError
 
 MASK_KINDS = [kind for kind in STRONGEST if kind != "jittered poses"]
@@ -86,7 +86,7 @@ def test_turns_and_moves_are_drawn_apart() -> None:
 
 
 def test_wrong_poses_do_not_change_the_draws_of_the_masks() -> None:
-    masks = MaskErrors(missed=0.3, swapped=0.3)
+    masks = WrongMasks(missed=0.3, swapped=0.3)
     still, moved = (corrupt_views(VIEWS, 3, masks, poses) for poses in (None, PoseErrors(1.0, 0.1)))
     for first, second in zip(still, moved, strict=True):
         np.testing.assert_array_equal(first.read_labels(), second.read_labels())

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, taught
 from view_errors import corrupt_views
+from wrong_masks import WrongMasks
 
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
-from gsseg_core.demo.mask_errors import MaskErrors
 from gsseg_core.export.view_pictures import draw_worst_views
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.mask_reliability import OtherViews, ViewCheck, check_views, reliability_report, worst_views
@@ -25,7 +25,7 @@ BAD = {"view3", "view7"}
 
 @cache
 def learner_with_bad_frames() -> EMLearner:
-    spoilt = corrupt_views(CLEAN, 0, MaskErrors(missed=0, swapped=0, edge_px=0, bad_frame=1.0))
+    spoilt = corrupt_views(CLEAN, 0, WrongMasks(missed=0, swapped=0, edge_px=0, bad_frame=1.0))
     views = [bad if bad.name in BAD else clean for bad, clean in zip(spoilt, CLEAN, strict=True)]
     learner = EMLearner(SCENE, NUM_CLASSES)
     taught(learner, views).fit()

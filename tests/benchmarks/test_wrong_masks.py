@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,12 +13,13 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from scipy import ndimage
 from small_scenes import make_grid
+from wrong_masks import WrongMasks, corrupt
 
 from gsseg_core.data.label_images import UNKNOWN
-from gsseg_core.demo.mask_errors import MaskErrors, corrupt
+from gsseg_core.demo import mask_errors
 from gsseg_core.errors import SettingsError
 
-NONE = MaskErrors(missed=0, swapped=0, edge_px=0)
+NONE = WrongMasks(missed=0, swapped=0, edge_px=0)
 
 
 def test_no_errors_leave_the_labels_as_they_are() -> None:
@@ -29,10 +31,18 @@ def test_no_errors_leave_the_labels_as_they_are() -> None:
 
 def test_the_same_seed_gives_the_same_errors_and_another_one_others() -> None:
     labels = make_grid()
-    settings = MaskErrors(holes=0.5, blobs=3)
+    settings = WrongMasks(holes=0.5, blobs=3)
     first, again, other = (corrupt(labels, np.random.default_rng(seed), settings) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
+
+
+def test_errors_of_the_demo_are_drawn_as_here() -> None:
+    labels = make_grid()
+    settings: dict[str, Any] = {"missed": 0.3, "swapped": 0.3, "edge_px": 2, "missed_label": None}
+    of_demo = mask_errors.corrupt(labels, np.random.default_rng(4), mask_errors.MaskErrors(**settings))
+    np.testing.assert_array_equal(corrupt(labels, np.random.default_rng(4), WrongMasks(**settings)), of_demo)
+    assert (of_demo != labels).any()
 
 
 def test_views_drawn_from_one_generator_differ() -> None:
@@ -46,7 +56,7 @@ def test_objects_are_missed_and_swapped_as_often_as_asked() -> None:
     middles = labels > 0
     missed = swapped = 0.0
     for _ in range(100):
-        wrong = corrupt(labels, rng, MaskErrors(missed=0.15, swapped=0.1, edge_px=0, missed_label=99))
+        wrong = corrupt(labels, rng, WrongMasks(missed=0.15, swapped=0.1, edge_px=0, missed_label=99))
         assert (wrong[~middles] == 0).all()
         missed += (wrong[middles] == 99).mean() / 100
         swapped += ((wrong != labels) & (wrong != 99))[middles].mean() / 100
@@ -57,14 +67,14 @@ def test_objects_are_missed_and_swapped_as_often_as_asked() -> None:
 
 def test_every_object_has_one_label_again() -> None:
     labels = make_grid()
-    wrong = corrupt(labels, np.random.default_rng(3), MaskErrors(missed=0.4, swapped=0.4, edge_px=0))
+    wrong = corrupt(labels, np.random.default_rng(3), WrongMasks(missed=0.4, swapped=0.4, edge_px=0))
     for k in range(1, 31):
         assert len(np.unique(wrong[labels == k])) == 1
 
 
 def test_edges_move_by_every_amount_up_to_the_largest_and_no_further() -> None:
     labels = make_grid(rows=10, columns=10)
-    wrong = corrupt(labels, np.random.default_rng(0), MaskErrors(missed=0, swapped=0, edge_px=3))
+    wrong = corrupt(labels, np.random.default_rng(0), WrongMasks(missed=0, swapped=0, edge_px=3))
     widths = [np.ptp(np.flatnonzero((wrong == k).any(axis=0))) + 1 for k in range(1, 101)]
     assert set(widths) == {16 + 2 * shift for shift in range(-3, 4)}
     # Distance to the nearest pixel of the other side, so no pixel further than 3 px from an outline changes.
@@ -76,16 +86,16 @@ def test_what_a_shrunk_object_gives_up_goes_to_its_neighbours() -> None:
     labels = np.repeat(np.array([[4, 7]], np.int32), 20, axis=1).repeat(10, axis=0)
     rng = np.random.default_rng(0)
     for _ in range(10):
-        wrong = corrupt(labels, rng, MaskErrors(missed=0, swapped=0, edge_px=5))
+        wrong = corrupt(labels, rng, WrongMasks(missed=0, swapped=0, edge_px=5))
         assert set(np.unique(wrong)) <= {4, 7}
 
 
 def test_holes_and_blobs_come_where_they_are_asked_for() -> None:
     labels = make_grid()
-    holed = corrupt(labels, np.random.default_rng(0), MaskErrors(0, 0, 0, holes=1, hole_px=4))
+    holed = corrupt(labels, np.random.default_rng(0), WrongMasks(0, 0, 0, holes=1, hole_px=4))
     assert (holed[labels == 0] == 0).all()
     assert all((holed[labels == k] == 0).any() for k in range(1, 31))
-    blobbed = corrupt(labels, np.random.default_rng(0), MaskErrors(0, 0, 0, blobs=5, blob_px=6))
+    blobbed = corrupt(labels, np.random.default_rng(0), WrongMasks(0, 0, 0, blobs=5, blob_px=6))
     changed = blobbed != labels
     assert 0 < changed.sum() < 20 * np.pi * 12**2
     assert (blobbed[changed] > 0).all()
@@ -93,8 +103,8 @@ def test_holes_and_blobs_come_where_they_are_asked_for() -> None:
 
 def test_one_kind_of_error_does_not_change_the_draws_of_another() -> None:
     labels = make_grid()
-    plain = corrupt(labels, np.random.default_rng(5), MaskErrors(edge_px=0))
-    blobbed = corrupt(labels, np.random.default_rng(5), MaskErrors(edge_px=0, blobs=2, blob_px=5))
+    plain = corrupt(labels, np.random.default_rng(5), WrongMasks(edge_px=0))
+    blobbed = corrupt(labels, np.random.default_rng(5), WrongMasks(edge_px=0, blobs=2, blob_px=5))
     assert 0 < (plain != blobbed).mean() < 0.05
 
 
@@ -137,7 +147,7 @@ def test_what_is_missed_gets_the_label_of_most_pixels_where_none_is_given() -> N
 
 
 def test_a_seed_gives_the_masks_that_it_gave_before_there_were_more_kinds() -> None:
-    rng, settings = np.random.default_rng(11), MaskErrors(holes=0.3, blobs=2)
+    rng, settings = np.random.default_rng(11), WrongMasks(holes=0.3, blobs=2)
     sums = [zlib.crc32(corrupt(make_grid(), rng, settings).tobytes()) for _ in range(3)]
     assert sums == [2270022631, 720714654, 242888160]
 
@@ -149,7 +159,7 @@ def test_unknown_stays_unknown_and_labels_stay_labels_on_any_map(
 ) -> None:
     rng = np.random.default_rng(seed)
     labels = rng.integers(UNKNOWN, classes, (height, width))
-    wrong = corrupt(labels, rng, MaskErrors(0.3, 0.3, 4, 0.5, blobs=2, exchanged=0.5, bad_frame=0.2, shift_px=3))
+    wrong = corrupt(labels, rng, WrongMasks(0.3, 0.3, 4, 0.5, blobs=2, exchanged=0.5, bad_frame=0.2, shift_px=3))
     assert wrong.shape == labels.shape
     assert (wrong[labels == UNKNOWN] == UNKNOWN).all()
     assert np.isin(wrong, [UNKNOWN, 0, *np.unique(labels)]).all()
@@ -169,4 +179,4 @@ def test_unknown_stays_unknown_and_labels_stay_labels_on_any_map(
 )
 def test_impossible_settings_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(SettingsError, match=next(iter(wrong))):
-        MaskErrors(**wrong)  # type: ignore[arg-type]
+        WrongMasks(**wrong)  # type: ignore[arg-type]
