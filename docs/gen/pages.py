@@ -73,7 +73,7 @@ def python() -> str:
 
 
 def _formats() -> str:
-    scenes = [f"| scene | {known.name} | `{' or '.join(known.suffixes)}` |" for known in SCENE_FORMATS]
+    scenes = [f"| scene | {known.name} | `{known.looked_for}` |" for known in SCENE_FORMATS]
     cameras = [f"| cameras | {known.name} | `{known.looked_for}` |" for known in CAMERA_FORMATS]
     return "\n".join(["| what | format | recognised by |", "|---|---|---|", *scenes, *cameras, ""])
 

@@ -1,4 +1,4 @@
-"""What Ctrl-C does to the program `gsseg`: it ends with exit code 130, in silence.
+"""Ctrl-C in the program `gsseg`: it ends with exit code 130, in silence.
 
 Python raises KeyboardInterrupt wherever it happens to be, and in an import, in a callback from C or at the end of the
 program nobody can catch that. So there the program leaves at once, which no file minds: all are written beside and

@@ -180,10 +180,9 @@ def _formats() -> Iterator[Finding]:
         from gsseg_core.data.camera_formats.table import CAMERA_FORMATS
         from gsseg_core.scene.scene_formats import SCENE_FORMATS
 
-        for scenes in SCENE_FORMATS:
-            yield Finding("scene formats", scenes.name, " or ".join(scenes.suffixes))
-        for cameras in CAMERA_FORMATS:
-            yield Finding("camera formats", cameras.name, cameras.looked_for)
+        for group, formats in (("scene formats", SCENE_FORMATS), ("camera formats", CAMERA_FORMATS)):
+            for known in formats:
+                yield Finding(group, known.name, known.looked_for)
 
 
 def _ros() -> Iterator[Finding]:

@@ -84,7 +84,7 @@ def listed(names: Iterable[str]) -> str:
 
 
 def class_ids(wanted: Iterable[str], class_names: Mapping[int, str]) -> list[int]:
-    """Ids of the classes that are meant, in the order asked for, each once.
+    """Look up classes by id or name: their ids in the order asked for, each once.
 
     A number is the id of a class where there is one; everything else is a name.
 

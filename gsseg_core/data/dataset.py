@@ -20,7 +20,7 @@ from gsseg_core.files.input_files import READABLE_IMAGES, is_there
 
 
 class Dataset:
-    """A folder with cameras and masks in `labels/`: `<stem>.png`, or `<stem>.npz` and folders, see docs/masks.md.
+    """A dataset folder: cameras, and masks in `labels/`, `<stem>.png` or others of docs/masks.md.
 
     Photos in `images/<stem>.jpg` (or .png, .tif, .webp, .bmp), `classes.json` and `split.json` are optional.
 
@@ -103,7 +103,7 @@ class Dataset:
         return tuple(self.class_names)
 
     def numbered(self, ids: Collection[int] | None = None) -> Dataset:
-        """Give the classes numbers without gaps, so that one large id costs no more memory than any other.
+        """Renumber the classes without gaps, so that one large id costs no more memory than any other.
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""What a dataset folder of another layout looks like, and what to type then: the ends of error messages.
+"""Hints at the end of error messages: where the cameras or masks are that a dataset folder lacks, and what to type.
 
 Nothing here decides anything: the folder was refused already. What is told is what lies near to what was looked for.
 """
@@ -31,7 +31,7 @@ _MOST_FOLDERS = 200
 
 
 def camera_hint(folder: Path) -> str:
-    """Tell where cameras lie near a dataset folder that has none; "" where there is nothing to tell."""
+    """Hint at cameras near a dataset folder that has none; "" where there are none."""
     if folder.is_file():
         return f"; it is a file: type --data {_quoted(folder.parent)}"
     if not folder.is_dir():
@@ -55,7 +55,7 @@ def camera_hint(folder: Path) -> str:
 
 
 def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
-    """Tell where masks of the cameras' names lie, if a dataset has none where they were looked for.
+    """Hint at masks of the cameras' names, if a dataset has none where they were looked for.
 
     Parameters
     ----------

@@ -56,7 +56,7 @@ class LabelEvidence:
 
     @cached_property
     def has_none_of_these(self) -> bool:
-        """Whether some label says "none of those that were looked for"."""
+        """Whether some label means "none of the classes that were looked for"."""
         return self.supervised is not None and bool((self.rest > 0).any())
 
     @cached_property
@@ -112,12 +112,12 @@ class LabelEvidence:
 
     @property
     def concerned(self) -> np.ndarray:
-        """Classes that the mask says something of, (S,) int32 ascending."""
+        """Classes on which the mask has evidence, (S,) int32 ascending."""
         return self.classes if self.supervised is None else self.supervised
 
     @property
     def largest(self) -> int:
-        """The largest class that the mask says something of, `UNKNOWN` if there is none."""
+        """Largest class on which the mask has evidence, `UNKNOWN` if there is none."""
         return int(self.concerned.max(initial=UNKNOWN))
 
     def correct_words(self, num_classes: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,7 @@
-"""Where the masks of a dataset are, and reading those that are no label images: probabilities and detections.
+"""Files of masks: found by view, and read where they are no label images but probabilities or detections.
 
 `<stem>.npz` holds what one segmenter says, `<stem>/<class id>.png` (or .tif) what detectors of one class each say, and
-`supervises.json` which classes label images say something of. docs/masks.md has examples.
+`supervises.json` which classes were looked for in label images. docs/masks.md has examples.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def read_supervises(
     class_names: Mapping[int, str] | None,
     within: Path | None = None,
 ) -> dict[str, tuple[int, ...]]:
-    """Read which classes each label image says something of: `{"*": [1, 3], "frame_0007": [2]}`; none if there is none.
+    """Read which classes were looked for in each label image: `{"*": [1, 3], "frame_0007": [2]}`; none without a file.
 
     A stem's own entry goes before that of "*", which is for all label images without one.
 
@@ -152,7 +152,7 @@ def _read_probabilities(
 
 
 def _check_claims(path: Path, arrays: NpzArrays, class_names: Mapping[int, str] | None, camera: Camera | None) -> None:
-    """Refuse arrays for what their headers say, before they are read."""
+    """Check the headers of the arrays, before any is read."""
     claimed = arrays.header(_PROBABILITIES)
     if len(claimed.shape) != 3 or claimed.dtype.kind != "f":
         raise MaskFormatError(f"{path}: probabilities are {claimed}; expected float16 or float32 (K, H, W)")

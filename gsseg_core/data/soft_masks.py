@@ -1,4 +1,4 @@
-"""Soft and partial masks: probabilities become a map of prototypes, which all that works on labels can work on.
+"""Soft and partial masks: probabilities and detections become a label image of prototypes with their evidence.
 
 A pixel's probabilities are rounded to sixteenths, and pixels that are then alike share one label, a prototype, with its
 `LabelEvidence`. A mask that is certain everywhere loses nothing, and comes out as the plain mask it is. How much each
@@ -33,19 +33,19 @@ _SURE = np.float32(1 - 1e-4)
 
 
 class SeenLabels(NamedTuple):
-    """What a mask holds: labels (H, W) int32, `UNKNOWN` where it says nothing, and what they mean (None: classes)."""
+    """Labels of a mask, (H, W) int32 with `UNKNOWN` where nothing is known, and their evidence (None: they are classes)."""
 
     labels: npt.NDArray[np.int32]
     evidence: LabelEvidence | None = None
 
     def named(self) -> npt.NDArray[np.int32]:
-        """Give the class that each pixel names, (H, W) int32; `UNKNOWN` where the mask leaves it open."""
+        """Reduce the mask to one class per pixel, (H, W) int32; `UNKNOWN` where it leaves the class open."""
         if self.evidence is None:
             return self.labels
         return np.append(self.evidence.named(), np.int32(UNKNOWN))[self.labels]
 
     def numbered(self, ids: npt.NDArray[np.int32], source: str) -> SeenLabels:
-        """Put the place of each class among some ids, ascending, where its id is.
+        """Renumber the classes by their place among some ids, ascending.
 
         Raises
         ------
@@ -102,7 +102,7 @@ def quantise(
         The segmenter looked for these classes and no others: the rest means "none of these". Without, [c] is class c,
         no class is left out, and the rest is unknown.
     unknown : (H, W) bool, optional
-        Where the segmenter says nothing at all.
+        Where the segmenter gives no evidence.
     source : str
         What messages call the mask.
 
@@ -139,7 +139,7 @@ def combine_detections(
     unknown: npt.NDArray[np.bool_] | None = None,  # (H, W)
     source: str = "detections",
 ) -> SeenLabels:
-    """Make prototypes of what several detectors say, each of which looked for one class and knows of no other.
+    """Make prototypes of the outputs of several detectors, each of which looked for one class only.
 
     Where detectors contradict each other, each is taken as evidence of its own: a pixel is of class k, and of no other
     that was looked for, with a probability in proportion to p_k prod_{c != k} (1 - p_c), and none of these with
@@ -149,9 +149,9 @@ def combine_detections(
     ----------
     detections : mapping from class to (H, W) of bool or float
         Probability of this class in each pixel, in [0, 1]. A detector that ran and found nothing gives zeros; of a
-        class that is not here nothing is said.
+        class that is not here nothing is known.
     unknown : (H, W) bool, optional
-        Where nothing is said at all.
+        Where no detector gives evidence.
     source : str
         What messages call the mask.
 
@@ -189,7 +189,7 @@ def restrict(
     supervised: Collection[int],
     source: str = "labels",
 ) -> SeenLabels:
-    """Read a plain mask as that of a segmenter that looked for some classes only; its 0 means "none of these".
+    """Give a plain mask the evidence of a segmenter that looked for some classes only; its 0 means "none of these".
 
     0 is a class as any other if it is among them.
 
@@ -233,7 +233,7 @@ def _tidied(
     supervised: npt.NDArray[np.int32] | None,
     unknown: npt.NDArray[np.bool_] | None,  # (H, W)
 ) -> SeenLabels:
-    """Leave out what says nothing, and give a plain mask back as one."""
+    """Drop prototypes without evidence; what is then certain everywhere becomes a plain mask."""
     if unknown is not None:
         labels[unknown] = UNKNOWN
     says = np.bincount(labels[labels >= 0], minlength=len(mass)) > 0
@@ -298,7 +298,7 @@ def _check_unknown(unknown: npt.NDArray[np.generic], shape: tuple[int, ...], sou
 def _group(
     rows: np.ndarray,  # (P, C) uint8
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Give different rows numbers, in the order in which they first occur: (P,), and where each occurs first."""
+    """Number different rows in order of first occurrence: the number of each row (P,), and the first row of each."""
     count, size = rows.shape[0], 64
     while size < 2 * count:
         size *= 2

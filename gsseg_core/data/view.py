@@ -20,7 +20,7 @@ from gsseg_core.scene.camera import Camera
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A camera and what was seen from it. Labels of a file are read when asked for; those in memory are compressed.
+    """A camera with the mask and photo of its view. A mask in a file is read when asked for, one in memory is packed.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class View:
     class_names : mapping from id to name, or None
         If given, labels must be among its ids.
     supervised : tuple of int, or None
-        If given, the label image says something of these classes only: its 0 means "none of these".
+        If given, the segmenter looked for these classes only: 0 in its label image means "none of these".
     within : pathlib.Path or None
         If given, the folder below which the mask must lie, links followed.
     numbering : tuple of int, or None
@@ -113,7 +113,7 @@ class View:
             What the segmenter looked for; what is left to 1 then means "none of these". Without, [c] is class c, and
             what is left is unknown.
         unknown : (H, W) bool, optional
-            Where the segmenter says nothing.
+            Where there is no evidence.
         class_names : mapping from id to name, optional
             Classes must be among its ids.
 
@@ -137,7 +137,7 @@ class View:
     ) -> View:
         """Build a view from detectors of one class each: bool, or probabilities, by class.
 
-        Of a class that is not among them the view says nothing. A detector that ran and found nothing gives zeros.
+        On a class that is not among them the view has no evidence. A detector that ran and found nothing gives zeros.
 
         Raises
         ------
@@ -149,12 +149,12 @@ class View:
 
     @classmethod
     def from_seen(cls, camera: Camera, seen: SeenLabels, class_names: Mapping[int, str] | None = None) -> View:
-        """Build a view from labels and what they mean.
+        """Build a view from labels with their evidence.
 
         Raises
         ------
         MaskSizeError, UnknownLabelError
-            The labels are not of the camera's size, or mean classes that there are not.
+            The labels are not of the camera's size, or have evidence on classes that there are not.
         """
         view = cls(camera, class_names=class_names)
         view._check_seen(seen, f"view '{camera.name}'")
@@ -179,20 +179,20 @@ class View:
 
     @property
     def largest_label(self) -> int:
-        """The largest class that the mask says something of, `UNKNOWN` (-1) if it says nothing at all."""
+        """Largest class on which the mask has evidence, `UNKNOWN` (-1) if there is none."""
         if self._mask is not None:
             return self._mask.largest
         seen = self.read_seen()
         return int(seen.labels.max()) if seen.evidence is None else seen.evidence.largest
 
     def class_ids(self) -> set[int]:
-        """Classes that the mask says something of."""
+        """Classes on which the mask has evidence."""
         seen = self.read_seen()
         ids = np.unique(seen.labels) if seen.evidence is None else seen.evidence.concerned
         return set(ids.tolist()) - {UNKNOWN}
 
     def read_labels(self) -> npt.NDArray[np.int32]:
-        """Read the class that each pixel names, (H, W) int32; `UNKNOWN` (-1) where the mask names none.
+        """Read the mask as one class per pixel, (H, W) int32; `UNKNOWN` (-1) where it names none.
 
         Raises
         ------
@@ -206,7 +206,7 @@ class View:
         return self.read_seen().named()
 
     def read_seen(self) -> SeenLabels:
-        """Read all that the mask says: labels, which for a soft or partial one are prototypes, and what they mean.
+        """Read the labels of the mask with their evidence; those of a soft or partial mask are prototypes.
 
         Raises
         ------
@@ -253,7 +253,7 @@ class View:
             raise UnknownLabelError(f"{source}: mask holds the labels {str(unknown)[1:-1][:60]}; expected {expected}")
 
     def _knows_all(self, lowest: int, largest: int) -> bool:
-        """Tell whether all ids from one to another, and `UNKNOWN`, may occur."""
+        """Tell whether all ids from one to another are classes, or `UNKNOWN`."""
         if self.class_names is None or lowest < UNKNOWN or largest > MAX_LABEL:
             return lowest >= UNKNOWN and largest <= MAX_LABEL
         return all(i in self.class_names for i in range(max(lowest, 0), largest + 1))

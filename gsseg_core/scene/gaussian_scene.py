@@ -168,7 +168,7 @@ class GaussianScene:
 
     @classmethod
     def _from_vertices(cls, vertices: npt.NDArray[np.void], path: Path | None) -> GaussianScene:
-        """Validate and activate."""
+        """Build a scene from PLY vertices, validated and activated."""
         source = "scene" if path is None else str(path)
         sh_names = _check_properties(vertices, source)
         if len(vertices) == 0:
@@ -251,7 +251,7 @@ class GaussianScene:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 (hex) of the geometry: positions, opacities, scales and rotations as stored, colours apart."""
+        """SHA-256 (hex) of the geometry: positions, opacities, scales and rotations as stored, not colours."""
         geometry = _columns(self.vertices, _MEANS + _OPACITY + _SCALES + _QUATS)
         return hashlib.sha256(np.ascontiguousarray(geometry, "<f4").data).hexdigest()
 

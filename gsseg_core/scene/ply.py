@@ -69,7 +69,7 @@ def read_vertices(path: str | os.PathLike[str], within: Path | None = None) -> n
 
 
 def _is_text(file: BinaryIO) -> bool:
-    """Read the header, and go back; raises `ValueError` if the file is too short for what is counted there."""
+    """Tell from its header whether a PLY is text; raises `ValueError` if the file is too short for its counts."""
     if b"end_header" not in file.read(_MAX_HEADER):
         raise ValueError(f"no end of its header in the first {_MAX_HEADER:,} bytes")
     file.seek(0)

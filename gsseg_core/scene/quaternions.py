@@ -1,4 +1,4 @@
-"""Which way Gaussians are turned."""
+"""Rotation matrices of unit quaternions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Number = TypeVar("Number", bound=np.floating[Any])
 def rotations(
     quats: npt.NDArray[Number],  # (M, 4) w, x, y, z, unit
 ) -> npt.NDArray[Number]:
-    """Rotation matrices (M, 3, 3), of the same precision; their columns are the axes in the world."""
+    """Rotation matrices (M, 3, 3) of quaternions, of the same precision; columns are the local axes in the world."""
     w, x, y, z = quats.T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],

@@ -1,4 +1,4 @@
-"""What is made of a scene once, and kept for as long as the scene is."""
+"""A cache of values that are computed once for a scene, and kept as long as it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 
 class PerScene(Generic[T]):
-    """One value for each scene; whoever asks while another thread makes it waits for that one."""
+    """Cache of one value per scene; whoever asks while another thread computes it waits for that one."""
 
     def __init__(self) -> None:
         self._known: WeakKeyDictionary[GaussianScene, T] = WeakKeyDictionary()
@@ -25,7 +25,7 @@ class PerScene(Generic[T]):
         make: Callable[[], T],
         fits: Callable[[T], bool] = lambda _: True,
     ) -> T:
-        """Return the value of a scene, made anew where there is none that fits."""
+        """Return the value of a scene; `make` computes it where none is cached that fits."""
         with self._making:
             known = self._known.get(scene)
             if known is None or not fits(known):

@@ -35,6 +35,11 @@ class SceneFormat:
     read: Callable[[Path, Path | None], npt.NDArray[np.void]]
     suffixes: tuple[str, ...]
 
+    @property
+    def looked_for(self) -> str:
+        """What marks this format, for messages."""
+        return " or ".join(self.suffixes)
+
 
 SCENE_FORMATS = [SceneFormat("3DGS PLY", read_vertices, (".ply",))]
 """All formats, the first being that of a file whose suffix nobody knows; who adds one, adds it here."""
@@ -71,7 +76,7 @@ def read_scene(path: str | os.PathLike[str], within: Path | None = None) -> npt.
         what = str(error)
         if isinstance(error, OSError):
             what = f"{path}: cannot be read ({reason(error)}); expected a {scene_format.name}"
-        formats = ", ".join(f"{known.name} ({' or '.join(known.suffixes)})" for known in SCENE_FORMATS)
+        formats = ", ".join(f"{known.name} ({known.looked_for})" for known in SCENE_FORMATS)
         known = "" if suited else f"; gsseg reads {formats}"
         hint = scene_hint(path) if within is None else ""  # It looks around, wherever links lead.
         raise SceneFileError(f"{what}{known}{hint}") from error
