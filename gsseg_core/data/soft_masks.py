@@ -33,7 +33,7 @@ _SURE = np.float32(1 - 1e-4)
 
 
 class SeenLabels(NamedTuple):
-    """Labels of a mask, (H, W) int32 with `UNKNOWN` where nothing is known, and their evidence (None: they are classes)."""
+    """Labels of a mask (H, W) int32, `UNKNOWN` where nothing is known, and their evidence; None if they are classes."""
 
     labels: npt.NDArray[np.int32]
     evidence: LabelEvidence | None = None
@@ -298,7 +298,7 @@ def _check_unknown(unknown: npt.NDArray[np.generic], shape: tuple[int, ...], sou
 def _group(
     rows: np.ndarray,  # (P, C) uint8
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Number different rows in order of first occurrence: the number of each row (P,), and the first row of each."""
+    """Assign numbers to different rows in order of first occurrence: number of each row (P,), and first row of each."""
     count, size = rows.shape[0], 64
     while size < 2 * count:
         size *= 2
