@@ -5,6 +5,7 @@ Usage: python benchmarks/bench_load.py
 
 from __future__ import annotations
 
+import argparse
 import os
 import platform
 import statistics
@@ -21,6 +22,7 @@ COUNT, RUNS = 1_000_000, 5
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__).parse_args()
     rng = np.random.default_rng(0)
     sh = rng.normal(size=(COUNT, 16, 3)).astype(np.float32)
     means, scales = rng.normal(size=(COUNT, 3)), rng.uniform(0.01, 0.1, (COUNT, 3))

@@ -8,6 +8,7 @@ here: the nearest of 40 random Gaussians, 3 % of them at random, and about one c
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import os
 import platform
@@ -34,6 +35,7 @@ DATA = Path(os.environ.get("GSSEG_DATA", Path(__file__).resolve().parents[1] / "
 
 def main() -> None:
     """Measure and print one table."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     path = DATA / "replica_apartment" / "scene.ply"
     if not path.is_file():
         print(f"skipped: no {path}; set GSSEG_DATA to the folder that holds replica_apartment/")

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import json
 import os
@@ -69,8 +70,12 @@ def seconds_of(command: list[str], **environment: str) -> float:
 
 def main() -> None:
     """Do the job and print the answer."""
-    module, function = sys.argv[1].rsplit(".", 1)
-    answer = getattr(importlib.import_module(module), function)(**json.loads(sys.argv[2]))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("job", help="module.function")
+    parser.add_argument("arguments", help="its keyword arguments, as JSON")
+    options = parser.parse_args()
+    module, function = options.job.rsplit(".", 1)
+    answer = getattr(importlib.import_module(module), function)(**json.loads(options.arguments))
     print(json.dumps(answer))
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import forked  # noqa: F401 - first: it says how numba runs, and where small scenes are
 import mutations
 import numpy as np
 from mutations import Mutation

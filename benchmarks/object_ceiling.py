@@ -2,7 +2,7 @@
 
 Each object keeps any subset of its own Gaussians. Those are taken out, and put back, one after the other whenever that
 raises the IoU of the object with its true masks, until nothing changes. It is the `visible` score of
-`gsseg_core.objects.silhouettes`, but for two things: the threshold at an alpha of one half is a steep logistic, so that
+`object_scores`, but for two things: the threshold at an alpha of one half is a steep logistic, so that
 two Gaussians that hide each other can both go, and whether a pixel is hidden is asked of each Gaussian rather than of
 the object's mean depth. It finds a local optimum: a bound from below on what selection can reach.
 """

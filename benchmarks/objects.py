@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from machine import DATA, REPOSITORY
 from object_ceiling import best_selection
+from object_scores import ObjectScores, objects_of
 from results import machine, markdown, points
 from straddlers import split, straddlers
 
@@ -28,7 +29,7 @@ from gsseg_core.export.pictures import contact_sheet, save_png
 from gsseg_core.export.view_pictures import background_image
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.objects.silhouette_carving import KEPT, Silhouette, shares
-from gsseg_core.objects.silhouettes import ObjectScores, objects_of, surface
+from gsseg_core.objects.silhouettes import surface
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -186,7 +187,7 @@ The silhouette of an object is where its own Gaussians, rendered alone, accumula
 with the true mask of the object: IoU, and boundary IoU with bands as wide as 2 % of the image diagonal. Pixels are
 summed over the views per object; means are over all objects that the truth shows. The background is no object.
 
-A mask shows only what is visible of an object. So there are two scores, both by `gsseg_core.objects.silhouettes`:
+A mask shows only what is visible of an object. So there are two scores, both by `benchmarks/object_scores.py`:
 
 - **visible**: a pixel of another label does not count where the object lies behind the surface of the scene, that is
   where its depth is above that of the whole scene by more than 2 %. What sticks out in front or beside counts.

@@ -104,7 +104,7 @@ class Evaluation:
     @property
     def iou(self) -> np.ndarray:
         """(K,) float64, intersection over union of each class; NaN for a class in neither truth nor prediction."""
-        return _iou(self._area)
+        return iou(*self._area)
 
     @property
     def accuracy(self) -> np.ndarray:
@@ -114,7 +114,7 @@ class Evaluation:
     @property
     def boundary_iou(self) -> np.ndarray:
         """(K,) float64, IoU of each class's boundary band: its pixels nearer to its edge than 2 % of the diagonal."""
-        return _iou(self._band)
+        return iou(*self._band)
 
     @property
     def mean_iou(self) -> float:
@@ -164,6 +164,11 @@ class Evaluation:
                 for k in np.flatnonzero(self._area.any(axis=0)).tolist()
             ],
         }
+
+
+def iou(both: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Intersection over union of what is counted in both, in the first and in the second; NaN where neither has any."""
+    return _ratio(both, first + second - both)
 
 
 def boundary_band(
@@ -249,11 +254,6 @@ def _count(
 
 def _grow(counts: np.ndarray, size: int) -> np.ndarray:
     return np.pad(counts, ((0, 0), (0, size - counts.shape[1])))
-
-
-def _iou(counts: np.ndarray) -> np.ndarray:
-    both, truth, prediction = counts
-    return _ratio(both, truth + prediction - both)
 
 
 def _ratio(part: np.ndarray, whole: np.ndarray) -> np.ndarray:

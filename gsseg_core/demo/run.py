@@ -10,7 +10,7 @@ import numpy as np
 from gsseg_core import pipeline
 from gsseg_core.demo.table_scene import DemoScene, build_demo
 from gsseg_core.learn.learner import Progress, silent
-from gsseg_core.metrics import evaluate_folders
+from gsseg_core.metrics import evaluate_folders, iou
 from gsseg_core.progress import Stopwatch
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.text import counted, percent, seconds_table, table
@@ -57,10 +57,8 @@ def run_demo(out: str | os.PathLike[str], *, seed: int = 0, progress: Progress =
 
 def gaussian_ious(demo: DemoScene, segmentation: Path) -> list[float]:
     """IoU of each class with the truth, over the Gaussians that belong to something."""
-    labels = Segmentation.load(segmentation, demo.scene).labels
-    real = demo.truth >= 0
-    ious = []
-    for k in demo.class_names:
-        mine, true = (labels == k) & real, demo.truth == k
-        ious.append(float((mine & true).sum() / max(np.count_nonzero(mine | true), 1)))
+    labels, truth = Segmentation.load(segmentation, demo.scene).labels, demo.truth
+    real = truth >= 0
+    parts = truth[real & (labels == truth)], truth[real], labels[real & (labels >= 0)]
+    ious: list[float] = iou(*(np.bincount(part, minlength=len(demo.class_names)) for part in parts)).tolist()
     return ious

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import sparse
 
+from gsseg_core.metrics import iou
 from gsseg_core.raster.view_operator import Observation
 
 
@@ -155,10 +156,9 @@ class Profiles:
             Share of each segment that lies on Gaussians of which anything is known.
         """
         common, known = self.common(gaussians, weights, objects)
-        union = known[:, None] + common.sum(axis=0) - common
-        iou = np.divide(common, union, out=np.zeros_like(common), where=union > 0)
+        overlap = np.nan_to_num(iou(common, known[:, None], common.sum(axis=0)))
         whole = sums(weights, 1)
-        return iou.argmax(axis=1), np.divide(known, whole, out=np.zeros_like(known), where=whole > 0)
+        return overlap.argmax(axis=1), np.divide(known, whole, out=np.zeros_like(known), where=whole > 0)
 
 
 def _by_object(weights: sparse.csr_matrix, objects: np.ndarray, num: int) -> sparse.csr_matrix:

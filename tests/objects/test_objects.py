@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from object_ceiling import best_selection
+from object_scores import ObjectScores, objects_of
 from scipy.spatial.transform import Rotation
 from small_scenes import (
     HEIGHT,
@@ -17,7 +18,6 @@ from small_scenes import (
     NUM_CLASSES,
     WIDTH,
     balls_on_a_table,
-    build,
     clean_views,
     look_at,
     ring,
@@ -33,7 +33,7 @@ from gsseg_core.errors import EmptySceneError, MaskSizeError, SceneValueError, S
 from gsseg_core.export.class_plys import export_classes
 from gsseg_core.objects.removal import without_objects
 from gsseg_core.objects.silhouette_carving import Silhouette, carve, carved, shares
-from gsseg_core.objects.silhouettes import BEHIND, ObjectScores, depths, objects_of, surface
+from gsseg_core.objects.silhouettes import BEHIND, depths, surface
 from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.camera import Camera
@@ -183,34 +183,6 @@ def test_a_label_map_of_another_size_is_refused() -> None:
     camera = ring(1)[0]
     with pytest.raises(MaskSizeError, match=rf"view0.*shape \(3, 4\); expected \({HEIGHT}, {WIDTH}\)"):
         Silhouette.of(SCENE, make_operator(SCENE, camera), np.zeros((3, 4), np.int32))
-    with pytest.raises(MaskSizeError, match=r"truth has shape \(3, 4\)"):
-        ObjectScores(2).add({}, camera, np.zeros((3, 4), np.int32), np.zeros((HEIGHT, WIDTH)))
-
-
-def test_a_silhouette_counts_what_sticks_out_and_not_what_is_hidden() -> None:
-    """A small disc, wholly behind a larger one or beside it."""
-    camera = look_at("front", np.array([0.0, -4.0, 0.0]))
-    means = np.array([[0, 0, 0], [0, 1.0, 0]])
-    scene = build(np.array([1, 2]), means, np.array([[0.5, 0.02, 0.5], [0.2, 0.02, 0.2]]))
-    truth = true_labels(scene, np.array([1, 2]), camera)
-    depth = surface(scene, make_operator(scene, camera)).depth
-    objects = objects_of(scene, np.array([1, 2]))
-    assert not (truth == 2).any()
-    truth[0, 0] = 2  # so that object 2 is scored; the scene is empty there
-    both = ObjectScores(3)
-    both.add(objects, camera, truth, depth)
-    covered = int((surface(objects[2], make_operator(objects[2], camera)).coverage > 0.5).sum())
-    assert covered > 5
-    assert both.whole.iou[2] == 0 and both.whole._counts[0, 2, 2] == covered
-    assert both.visible._counts[0, 2, 2] == 0
-    assert np.isnan(both.whole.iou[0]) and both.whole.iou[1] == both.visible.iou[1] > 0.9
-    scene.means[1] = [1.5, 0, 0]
-    beside = ObjectScores(3)
-    beside.add(objects_of(scene, np.array([1, 2])), camera, truth, surface(scene, make_operator(scene, camera)).depth)
-    assert beside.visible._counts[0, 2, 2] > 5
-    lost = ObjectScores(3)
-    lost.add({}, camera, truth, depth)
-    assert lost.visible.iou[1] == 0 and np.isnan(lost.visible.iou[0])
 
 
 def test_halves_cover_what_the_whole_did_at_every_opacity() -> None:
