@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy import ndimage
 
+from gsseg_core.data.class_names import class_name
 from gsseg_core.data.label_images import UNKNOWN, read_mask
 from gsseg_core.errors import MaskFormatError, MaskSizeError, NoUsableViewsError
 from gsseg_core.files.run_folder import settle
@@ -155,7 +156,7 @@ class Evaluation:
             "classes": [
                 {
                     "id": k,
-                    "name": names.get(k, f"class_{k:02d}"),
+                    "name": class_name(names, k),
                     "iou": _plain(iou[k]),
                     "accuracy": _plain(accuracy[k]),
                     "boundary_iou": _plain(boundary[k]),

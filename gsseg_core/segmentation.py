@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsseg_core.csr_rows import largest
+from gsseg_core.data.class_names import class_name
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.npz_files import UnfitError, check_shares, class_names_of, open_npz, temperature_of
 from gsseg_core.files.run_folder import settle
@@ -110,7 +111,7 @@ class Segmentation:
         settings: RefineSettings,
     ) -> Segmentation:
         """Label learnt codes, after KNN clustering unless that is switched off, and leave the filter to the caller."""
-        names = {k: class_names.get(k, f"class_{k:02d}") for k in range(codes.shape[1])}
+        names = {k: class_name(class_names, k) for k in range(codes.shape[1])}
         probabilities, clustered = codes, np.zeros(len(codes), bool)
         observed: np.ndarray = largest(codes)[0] > 0
         if settings.cluster:

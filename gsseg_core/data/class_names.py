@@ -54,6 +54,11 @@ def read_classes(path: str | os.PathLike[str], within: Path | None = None) -> di
     return dict(sorted(names.items()))
 
 
+def class_name(names: Mapping[int, str], k: int) -> str:
+    """Name of a class, one like "class_07" where it has none."""
+    return names.get(k, f"class_{k:02d}")
+
+
 def flaw_of_class_name(name: str) -> str:
     """Say what is wrong with the name of a class, as the end of "has the name ...", or "" if it is usable."""
     if not name.strip():

@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 
 from gsseg_core.data.camera_files import read_cameras
-from gsseg_core.data.class_names import BACKGROUND_NAME, read_classes
+from gsseg_core.data.class_names import BACKGROUND_NAME, class_name, read_classes
 from gsseg_core.data.mask_files import SUPERVISES, mask_files, read_supervises
 from gsseg_core.data.split_file import read_split
 from gsseg_core.data.view import View
@@ -90,7 +90,7 @@ class Dataset:
         if self._declared is not None:
             return self._declared
         ids = {0}.union(*(view.class_ids() for view in self.views() if view.has_mask))
-        return {i: f"class_{i:02d}" if i else BACKGROUND_NAME for i in sorted(ids)}
+        return {i: class_name({0: BACKGROUND_NAME}, i) for i in sorted(ids)}
 
     @property
     def num_classes(self) -> int:
@@ -118,7 +118,7 @@ class Dataset:
         ids = self.class_ids if ids is None else tuple(int(i) for i in ids)
         if ids == tuple(range(len(ids))):
             return self
-        names = dict(enumerate(self.class_names.get(i, f"class_{i:02d}") for i in ids))
+        names = dict(enumerate(class_name(self.class_names, i) for i in ids))
         declared = None if self._declared is None else names
         other = copy.copy(self)
         other.__dict__["class_names"] = names

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
+from gsseg_core.data.class_names import class_name
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN, PackedLabels
 from gsseg_core.data.view import View, spread
@@ -262,4 +263,4 @@ def hold_against(
 
 
 def _name(class_names: Mapping[int, str], label: int) -> str:
-    return class_names.get(label, f"class_{label:02d}") if label >= 0 else "none of these"
+    return class_name(class_names, label) if label >= 0 else "none of these"

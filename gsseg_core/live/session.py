@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsseg_core.data.class_names import BACKGROUND_NAME
+from gsseg_core.data.class_names import BACKGROUND_NAME, class_name
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View, spread
 from gsseg_core.errors import (
@@ -99,7 +99,7 @@ class LiveSession:
     def class_names(self) -> dict[int, str]:
         """Names by id, of every class; one without a name is called like "class_07"."""
         with self._lock:
-            return {k: self._names.get(k, f"class_{k:02d}") for k in range(self._live.num_classes)}
+            return {k: class_name(self._names, k) for k in range(self._live.num_classes)}
 
     @property
     def version(self) -> int:

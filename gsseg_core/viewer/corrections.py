@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy import ndimage
 
+from gsseg_core.data.class_names import class_name
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError
@@ -172,7 +173,7 @@ class Corrections:
         filtered = (labels[touched] == REMOVED) & (best == before.probabilities[touched].argmax(axis=1))
         labels[touched] = np.where(filtered, REMOVED, best)
         known = {**(names or {}), **before.class_names}
-        return Labelling(labels, probabilities, {k: known.get(k, f"class_{k:02d}") for k in range(num_classes)})
+        return Labelling(labels, probabilities, {k: class_name(known, k) for k in range(num_classes)})
 
 
 def share_seen(scene: GaussianScene, view: View, device: str = "cpu") -> np.ndarray:

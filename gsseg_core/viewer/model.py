@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsseg_core.data.class_names import BACKGROUND_NAME
+from gsseg_core.data.class_names import BACKGROUND_NAME, class_name
 from gsseg_core.errors import StateFileError, UnknownLabelError
 from gsseg_core.export.pictures import palette
 from gsseg_core.files.json_files import read_json
@@ -58,7 +58,7 @@ class Labelling(NamedTuple):
     def unknown(cls, num_gaussians: int, class_names: Mapping[int, str] | None = None) -> Labelling:
         """Label all Gaussians as unobserved."""
         names = {0: BACKGROUND_NAME, **(class_names or {})}
-        names = {k: names.get(k, f"class_{k:02d}") for k in range(max(names) + 1)}
+        names = {k: class_name(names, k) for k in range(max(names) + 1)}
         empty = np.zeros((num_gaussians, len(names)), np.float32)
         return cls(np.full(num_gaussians, UNOBSERVED, np.int32), empty, names)
 
@@ -137,7 +137,7 @@ class ViewModel:
 
     def name(self, label: int) -> str:
         """Name of a label, also of those that are no class."""
-        return NO_CLASS.get(label) or self.labelling.class_names.get(label, f"class_{label:02d}")
+        return NO_CLASS.get(label) or class_name(self.labelling.class_names, label)
 
     def color(self, label: int) -> tuple[int, int, int]:
         """Colour of a label."""

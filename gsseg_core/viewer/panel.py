@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 import viser
 
+from gsseg_core.data.class_names import class_name
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.scene.camera import Camera
@@ -300,7 +301,7 @@ class Panel:
     def _target_names(self) -> tuple[str, ...]:
         """Names by class id, as they are shown."""
         known = {**self._viewer.added_names, **self._viewer.model.labelling.class_names}
-        return _distinct([_shown(known.get(k, f"class_{k:02d}")) for k in range(max(known) + 1)])
+        return _distinct([_shown(class_name(known, k)) for k in range(max(known) + 1)])
 
     def _view_text(self, view: View) -> str:
         trust = self._viewer.reliability.get(view.name, math.nan)

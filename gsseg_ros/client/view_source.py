@@ -13,6 +13,7 @@ from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import GetParameters
 from sensor_msgs.msg import PointCloud2
 
+from gsseg_core.data.class_names import class_name
 from gsseg_core.errors import StateMismatchError
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import UNOBSERVED
@@ -118,7 +119,7 @@ class RosSource:
 
     def _labelling(self, report: Any, before: Mapping[str, PointCloud2 | None]) -> Labelling:
         names = {summary.class_id: summary.name for summary in report.classes}
-        names = {k: names.get(k, f"class_{k:02d}") for k in range(max(names, default=0) + 1)}
+        names = {k: class_name(names, k) for k in range(max(names, default=0) + 1)}
         labels = np.full(len(self._scene), UNOBSERVED, np.int32)
         probabilities = np.zeros((len(self._scene), len(names)), np.float32)
         # ~/cloud has all objects; the background is in a cloud of its own.
