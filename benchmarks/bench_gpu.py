@@ -22,7 +22,7 @@ from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View, spread
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn.em.em_learner import EMLearner
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.warm_up import warm_up
 

@@ -33,7 +33,7 @@ from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.metrics import Evaluation
 from gsseg_core.objects.object_table import find_objects
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.warm_up import warm_up

@@ -38,7 +38,7 @@ from sensor_msgs.msg import PointCloud2
 
 from gsseg_core import pipeline
 from gsseg_core.data.label_images import write_mask
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_ros.child_nodes import NODES
 
 DATA = Path(os.environ.get("GSSEG_DATA") or Path(__file__).parents[2] / "shared" / "data") / "replica_apartment"

@@ -33,7 +33,7 @@ from browser import opened_page, started_chromium, why_missing
 from playwright.sync_api import Page
 
 from gsseg_core.data.view import View
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.viewer.access import listen
 from gsseg_core.viewer.clients import BROWSER, SERVER
 from gsseg_core.viewer.model import Labelling, ViewModel

@@ -26,13 +26,15 @@ from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View, spread
 from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu import label_pairs as sightings
 from gsseg_core.raster.cpu.blending import open_rays
 from gsseg_core.raster.cpu.lifted_mask import LiftedMask
 from gsseg_core.raster.cpu.splat import WIDTH, aim, blend_block
 from gsseg_core.raster.cpu.tile_observation import TileObservation
 from gsseg_core.raster.cpu.tiling import TILE
-from gsseg_core.raster.view_operator import Shares, ViewOperator, make_operator
+from gsseg_core.raster.observation import Shares
+from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.simd import FAST, LANES, add_scaled, add_scaled_where, first_bit, intrinsic, load_row, store_row
 from gsseg_core.warm_up import warm_up

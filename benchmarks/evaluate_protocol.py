@@ -22,7 +22,7 @@ from results import markdown, points
 from gsseg_core.data.camera_files import read_cameras
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.objects.pick import pick_mask
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation

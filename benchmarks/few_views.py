@@ -35,7 +35,8 @@ from gsseg_core.files.atomic import write_atomically
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.metrics import Evaluation
 from gsseg_core.objects.pick import Pick, pick_clicks, pick_mask
-from gsseg_core.raster.view_operator import ViewOperator, make_operator
+from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.refine.label_propagation import GraphSettings, graph_of, propagate
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene

@@ -24,10 +24,10 @@ from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import UNITS, Learner
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.metrics import Evaluation
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu.lifted_mask import LiftedMask
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.tiling import assign
-from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.warm_up import warm_up

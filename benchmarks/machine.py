@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from gsseg_core.raster.view_operator import Observation, Shares
+    from gsseg_core.raster.observation import Observation, Shares
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("GSSEG_DATA") or REPOSITORY.parent / "shared" / "data")

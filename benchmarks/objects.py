@@ -30,7 +30,7 @@ from gsseg_core.export.view_pictures import background_image
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.objects.silhouette_carving import KEPT, Silhouette, shares
 from gsseg_core.objects.silhouettes import surface
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation

@@ -14,9 +14,9 @@ from machine import REPOSITORY, timed
 from report import Report
 from workloads import MASKS, RoomSize, Sizes, make_room
 
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.tiling import assign
-from gsseg_core.raster.view_operator import make_operator
 
 ENVIRONMENT = REPOSITORY / ".venv-peers"
 BIASES = [-0.3, 0.0, 0.3]

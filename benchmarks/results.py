@@ -32,7 +32,7 @@ from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.metrics import Evaluation, evaluate_folders
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.knn_filter import cluster, statistical_filter
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene

@@ -18,10 +18,10 @@ from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner import UNITS
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.session import LiveSession
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu.depth_sort import sort_by_depth
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.tiling import assign
-from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.refine.knn_filter import cluster, statistical_filter
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.camera import Camera

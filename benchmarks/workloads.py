@@ -12,7 +12,7 @@ from room import Room, build_room
 
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.demo.mask_errors import corrupt
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 
 REAL = ("replica_apartment", "fern")

@@ -10,8 +10,8 @@ from .learn.vote_learner import VoteLearner as VoteLearner
 from .metrics import Evaluation as Evaluation
 from .objects.oriented_boxes import OrientedBox as OrientedBox
 from .objects.oriented_boxes import object_boxes as object_boxes
+from .raster.backends import make_operator as make_operator
 from .raster.view_operator import ViewOperator as ViewOperator
-from .raster.view_operator import make_operator as make_operator
 from .refine.settings import RefineSettings as RefineSettings
 from .scene.camera import Camera as Camera
 from .scene.gaussian_scene import GaussianScene as GaussianScene

@@ -13,7 +13,7 @@ from gsseg_core.data.view import View
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.mask_reliability import OtherViews
 from gsseg_core.learn.vote_learner import VoteLearner
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation

@@ -12,7 +12,7 @@ from small_scenes import NAMES, NUM_CLASSES, OUT_OF_SIGHT, balls_on_a_table, cle
 from gsseg_core import segmentation
 from gsseg_core.errors import StateFileError, StateMismatchError, WriteError
 from gsseg_core.learn.vote_learner import VoteLearner
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 

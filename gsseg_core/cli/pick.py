@@ -43,7 +43,7 @@ def run(options: argparse.Namespace) -> int:
     from gsseg_core.files.earlier_outputs import earlier_pick
     from gsseg_core.files.run_folder import staged_run
     from gsseg_core.objects.pick import pick_clicks, pick_mask, read_object_mask
-    from gsseg_core.raster.view_operator import make_operator
+    from gsseg_core.raster.backends import make_operator
     from gsseg_core.scene.gaussian_scene import GaussianScene
 
     cameras = {camera.name: camera for camera in Dataset(options.data).cameras}

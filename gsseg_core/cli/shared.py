@@ -6,7 +6,7 @@ import argparse
 
 from gsseg_core.cli.terminal import note
 from gsseg_core.errors import SettingsError
-from gsseg_core.raster.devices import DEVICES, checked_device
+from gsseg_core.raster.backends import devices, rasteriser_of
 
 
 def add_scene(parser: argparse.ArgumentParser) -> None:
@@ -24,7 +24,7 @@ def add_scene(parser: argparse.ArgumentParser) -> None:
 
 def add_device(parser: argparse.ArgumentParser) -> None:
     """Add `--device`."""
-    parser.add_argument("--device", type=_device, default="cpu", help=f"{DEVICES} (default: cpu)")
+    parser.add_argument("--device", type=_device, default="cpu", help=f"{devices()} (default: cpu)")
 
 
 def add_quiet(parser: argparse.ArgumentParser) -> None:
@@ -41,6 +41,7 @@ def load_kernels(quiet: bool, device: str = "cpu") -> None:
 
 def _device(text: str) -> str:
     try:
-        return checked_device(text)
+        rasteriser_of(text)
     except SettingsError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
+    return text

@@ -15,7 +15,8 @@ from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.export.pictures import contact_sheet, legend, overlay, palette, save_png
 from gsseg_core.learn.mask_reliability import ViewCheck, worst_views
-from gsseg_core.raster.view_operator import ViewOperator, make_operator
+from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 

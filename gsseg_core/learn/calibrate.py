@@ -19,7 +19,7 @@ from gsseg_core.learn.learner import UNITS, Learner, Progress, silent
 from gsseg_core.learn.mask_reliability import OtherViews
 from gsseg_core.learn.temperature import VIEWS, Sample, fit_temperature, sample_pixels
 from gsseg_core.learn.vote_learner import VoteLearner
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 
 
 class Calibration(NamedTuple):

@@ -10,7 +10,7 @@ import torch
 
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn.learner import MEMORY_BUDGET, Learner, Progress, silent
-from gsseg_core.raster.view_operator import Observation
+from gsseg_core.raster.observation import Observation
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 

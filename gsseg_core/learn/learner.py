@@ -18,7 +18,9 @@ from gsseg_core.learn.em.em_kernels import share_votes
 from gsseg_core.learn.learner_state import State
 from gsseg_core.progress import Progress as Progress
 from gsseg_core.progress import silent as silent
-from gsseg_core.raster.view_operator import Observation, ViewOperator, make_operator
+from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.observation import Observation
+from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 VOTE_UNIT = 2.0**-24

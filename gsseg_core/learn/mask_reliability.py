@@ -26,7 +26,7 @@ from gsseg_core.data.view import View, spread
 from gsseg_core.learn.em.em_learner import EMLearner, codes_without
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.learn.temperature import VIEWS, Sample, sample_pixels
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 
 CONFUSIONS = 3
 """Most confusions that the report of a view names."""

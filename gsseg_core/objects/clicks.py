@@ -24,7 +24,7 @@ from scipy import ndimage
 
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import NoUsableViewsError, SettingsError
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.quaternions import rotations

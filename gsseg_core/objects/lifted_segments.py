@@ -8,7 +8,7 @@ import numpy as np
 from scipy import sparse
 
 from gsseg_core.metrics import iou
-from gsseg_core.raster.view_operator import Observation
+from gsseg_core.raster.observation import Observation
 
 
 @dataclass(frozen=True, eq=False)

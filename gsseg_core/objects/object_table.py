@@ -17,7 +17,7 @@ from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.objects.association import AssociationSettings, associate
 from gsseg_core.objects.lifted_segments import Lifted, Profiles, sums
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 PER_VIEW = "per-view"

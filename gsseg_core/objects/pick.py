@@ -33,7 +33,7 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import MaskFormatError, NoUsableViewsError, SettingsError
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.objects.clicks import Pixel, click_labels
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.label_propagation import GraphSettings, graph_of, propagate
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene

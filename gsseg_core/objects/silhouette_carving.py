@@ -28,11 +28,12 @@ import numpy as np
 
 from gsseg_core.errors import MaskSizeError
 from gsseg_core.objects.silhouettes import BEHIND, depths, surface
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu.blending import in_block, open_rays, stride_of, tile_of_turn
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.splat import WIDTH, aim, blend_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles, assign
-from gsseg_core.raster.view_operator import ViewOperator, make_operator
+from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation

@@ -22,9 +22,9 @@ import torch
 
 from gsseg_core.csr_rows import starts
 from gsseg_core.errors import SceneValueError, SettingsError
-from gsseg_core.raster.cpu.projection import ALPHA_MIN, DILATION, NEAR
-from gsseg_core.raster.cpu.splat import ALPHA_MAX, T_MIN
-from gsseg_core.raster.view_operator import Blended, Observation, Shares, ViewOperator, Weights
+from gsseg_core.raster.constants import ALPHA_MAX, ALPHA_MIN, DILATION, NEAR, T_MIN, TINY
+from gsseg_core.raster.observation import Observation, Shares
+from gsseg_core.raster.view_operator import Blended, ViewOperator, Weights
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -33,8 +33,6 @@ TILE = 16
 
 CHUNK = 32
 """Channels that go through gsplat at once. Its backward pass keeps them in shared memory, and 32 fit on every GPU."""
-
-_TINY = 1e-30  # the floor of a likelihood, as on the CPU
 
 
 @functools.cache
@@ -271,6 +269,11 @@ class GsplatOperator(ViewOperator):
         return GsplatObservation(self, labels)
 
 
+def view_operator(scene: GaussianScene, camera: Camera, device: str) -> GsplatOperator:
+    """Make the operator of a view on a GPU."""
+    return GsplatOperator(scene, camera, device, load_gsplat(device))
+
+
 class GsplatObservation(Observation):
     """A view and its mask on a GPU."""
 
@@ -348,8 +351,8 @@ class GsplatObservation(Observation):
             labelled = one_hot.any(dim=2)
             likelihood = ((image + left_over[..., None] * _tensor(rest, device)) * one_hot).sum(dim=2)
             # A pixel that nothing explains has no share to give, at any codes; its term is held at a floor.
-            inverse = torch.where(labelled & (likelihood > _TINY), 1 / likelihood, 0)
-            logs = likelihood[labelled].clamp_min(_TINY).double().log().sum()
+            inverse = torch.where(labelled & (likelihood > TINY), 1 / likelihood, 0)
+            logs = likelihood[labelled].clamp_min(TINY).double().log().sum()
             residual = one_hot * inverse[..., None]
             spare = (residual * left_over[..., None]).double().sum(dim=(0, 1))
         return gradient(image, carried, residual), spare, logs

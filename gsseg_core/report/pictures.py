@@ -17,7 +17,7 @@ from gsseg_core.export.pictures import outline, overlay
 from gsseg_core.export.view_pictures import background_image
 from gsseg_core.files.input_files import open_image
 from gsseg_core.learn.mask_reliability import ViewCheck
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.report.findings import Evidence
 from gsseg_core.scene.gaussian_scene import GaussianScene
 

@@ -12,9 +12,9 @@ from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.live.session import LiveSession
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_OPACITY, WIDTH
-from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED

@@ -9,7 +9,7 @@ import numpy as np
 
 from gsseg_core.data.view import View
 from gsseg_core.learn.learner import Progress, silent
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 

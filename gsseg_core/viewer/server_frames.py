@@ -11,7 +11,8 @@ import numpy as np
 import viser
 
 from gsseg_core.errors import GssegError
-from gsseg_core.raster.view_operator import ViewOperator, make_operator
+from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.viewer.picture import Picture

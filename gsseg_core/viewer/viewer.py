@@ -18,7 +18,7 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.export.view_pictures import background_image
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.viewer.access import Listener, listen

@@ -18,7 +18,7 @@ from std_msgs.msg import Header
 
 from gsseg_core.errors import GssegError
 from gsseg_core.export.pictures import overlay, palette
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.color_images import color_from_image

@@ -18,7 +18,7 @@ from gsseg_core.data.class_names import flaw_of_class_name
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.objects.object_table import PER_VIEW
-from gsseg_core.raster.devices import DEVICES, checked_device
+from gsseg_core.raster.backends import devices, rasteriser_of
 from gsseg_core.refine.settings import MAX_K, RefineSettings
 from gsseg_ros.frames import Similarity, pose_from_parameters
 
@@ -105,7 +105,7 @@ DECLARATIONS = (
     Declaration(
         "beta", RefineSettings.beta, "probability below which KNN clustering decides [0..1]", 0.0, 1.0, at_once=True
     ),
-    Declaration("device", "cpu", f"where views are rendered: {DEVICES}"),
+    Declaration("device", "cpu", f"where views are rendered: {devices()}"),
     Declaration("autostart", True, "configure and activate at start; false: wait for a lifecycle manager"),
     Declaration("queue_size", 30, "masks waiting to be fused; of more, the oldest are dropped [count]", 1, 1000),
     Declaration("scene_to_map.scale", 1.0, "metres of the map per unit of the scene [m]", 1e-9, 1e9),
@@ -158,7 +158,7 @@ class Settings:
             if getattr(self, name) not in allowed:
                 raise SettingsError(f"parameter {name} is '{getattr(self, name)}'; expected {', '.join(allowed)}")
         try:
-            checked_device(self.device)
+            rasteriser_of(self.device)
         except SettingsError as error:
             raise SettingsError(f"parameter {error}") from error
         if self.ids == PER_VIEW and self.class_names:

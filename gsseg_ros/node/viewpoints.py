@@ -14,7 +14,7 @@ from std_msgs.msg import Header
 from gsseg_core.errors import IntrinsicsError, PoseError
 from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.export.view_pictures import background_image
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_ros.conversions import (
     camera_from_messages,

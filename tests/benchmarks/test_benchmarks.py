@@ -25,9 +25,9 @@ from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, ring
 from workloads import SIZES, RoomSize, make_room, split
 
 from gsseg_core.learn.gradient_learner import GradientLearner, GradientSettings
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.tiling import assign
-from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 SCENE, TRUTH = balls_on_a_table()

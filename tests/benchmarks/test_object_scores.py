@@ -9,7 +9,7 @@ from small_scenes import HEIGHT, WIDTH, build, look_at, ring, true_labels
 
 from gsseg_core.errors import MaskSizeError
 from gsseg_core.objects.silhouettes import surface
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 
 
 def test_a_silhouette_counts_what_sticks_out_and_not_what_is_hidden() -> None:

@@ -20,7 +20,7 @@ from gsseg_core.data.label_images import read_mask, write_mask
 from gsseg_core.data.view import View
 from gsseg_core.errors import UnknownLabelError
 from gsseg_core.learn.registry import make_learner
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
 from gsseg_core.viewer.model import Labelling, ViewModel, completed

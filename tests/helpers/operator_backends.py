@@ -9,8 +9,9 @@ import plain_gsplat
 from naive_rasteriser import NaiveView, naive_gsplat_view, naive_view
 
 from gsseg_core.errors import SettingsError
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.gsplat_backend import GsplatOperator, load_gsplat
-from gsseg_core.raster.view_operator import ViewOperator, make_operator
+from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 

@@ -12,7 +12,7 @@ from gsseg_core.data.view import View
 from gsseg_core.export.pictures import palette
 from gsseg_core.learn.learner import Learner
 from gsseg_core.metrics import Evaluation
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.spherical_harmonics import C0

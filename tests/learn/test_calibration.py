@@ -30,7 +30,7 @@ from gsseg_core.learn.temperature import (
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.session import LiveSession
 from gsseg_core.pipeline import segment
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 

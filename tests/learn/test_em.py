@@ -31,7 +31,7 @@ from gsseg_core.learn.em.em_kernels import GAIN_UNIT, collect, improve, promised
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings, codes_without
 from gsseg_core.learn.em.rejected_regions import SMALLEST
 from gsseg_core.learn.vote_learner import VoteLearner
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 SCENE, TRUTH = balls_on_a_table()

@@ -10,7 +10,7 @@ from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, taught
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn.gradient_learner import GradientLearner, GradientSettings, cross_entropy
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 
 SCENE, TRUTH = balls_on_a_table()
 VIEWS = clean_views(3)

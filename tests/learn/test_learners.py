@@ -14,7 +14,7 @@ from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.gradient_learner import GradientLearner
 from gsseg_core.learn.learner import VOTE_UNIT, Learner
 from gsseg_core.learn.vote_learner import VoteLearner
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.segmentation import UNOBSERVED, Segmentation
 

@@ -14,7 +14,7 @@ from gsseg_core.data.view import View
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.em.leave_one_out import counted_by_others
 from gsseg_core.learn.learner import UNITS
-from gsseg_core.raster.view_operator import Observation
+from gsseg_core.raster.observation import Observation
 
 SCENE, _ = balls_on_a_table()
 POSSIBLE = np.ones(NUM_CLASSES, bool)

@@ -16,7 +16,7 @@ from gsseg_core.errors import SettingsError
 from gsseg_core.learn.em.boundary_alignment import _along_outlines, _reach_across, scene_edges, settle_outlines
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.em.rejected_regions import connected_pixels
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 SCENE, _ = balls_on_a_table()

@@ -33,7 +33,7 @@ from gsseg_core.learn.mask_reliability import check_views
 from gsseg_core.learn.registry import LEARNERS, make_learner
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.session import LiveSession
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 
 SCENE, TRUTH = balls_on_a_table()
 

@@ -33,7 +33,7 @@ from gsseg_core.live.per_view_session import PerViewSession
 from gsseg_core.objects.association import AssociationSettings, associate
 from gsseg_core.objects.lifted_segments import Lifted
 from gsseg_core.objects.object_table import ObjectTable, find_objects
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 SCENE, TRUTH = balls_on_a_table()

@@ -34,7 +34,7 @@ from gsseg_core.export.class_plys import export_classes
 from gsseg_core.objects.removal import without_objects
 from gsseg_core.objects.silhouette_carving import Silhouette, carve, carved, shares
 from gsseg_core.objects.silhouettes import BEHIND, depths, surface
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene

@@ -27,8 +27,8 @@ from gsseg_core.errors import SettingsError
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.gradient_learner import GradientLearner, GradientSettings
 from gsseg_core.learn.vote_learner import VoteLearner
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.gsplat_backend import GsplatOperator, _tensors_of, chunks, load_gsplat
-from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -195,7 +195,7 @@ def refused(device):
 
 @pytest.mark.parametrize("device", ["cuda:", "cuda:x", "cuda:-1", "cudas", "CUDA", "cuda:0 ", ""])
 def test_a_device_that_is_misspelt_is_refused(device):
-    assert refused(device).endswith("expected 'cpu', 'cuda' or 'cuda:' and the number of a GPU")
+    assert refused(device).endswith("expected cpu, cuda (the first GPU) or cuda:1 and so on")
 
 
 @pytest.mark.parametrize("device", ["cuda", "cuda:3"])
@@ -221,7 +221,7 @@ def test_without_torch_the_error_names_the_extra(monkeypatch):
     monkeypatch.delitem(sys.modules, "gsseg_core.raster.gsplat_backend")
     monkeypatch.setitem(sys.modules, "torch", None)
     assert refused("cuda").endswith(
-        "PyTorch is missing; expected a CUDA build of it and gsplat: pip install 'gsseg[gsplat]'"
+        "'torch' is missing; expected a CUDA build of PyTorch, and gsplat: pip install 'gsseg[gsplat]'"
     )
 
 
@@ -242,6 +242,8 @@ def test_gsplat_without_compiled_kernels_is_refused(monkeypatch):
 @pytest.mark.usefixtures("one_gpu")
 def test_kernels_that_do_not_compile_are_one_clear_error(monkeypatch):
     def fail(name):
+        if name.startswith("gsseg_core"):
+            return sys.modules[name]
         raise RuntimeError("Error building extension 'gsplat_cuda': [1/3] nvcc\nmany\nlines")
 
     monkeypatch.setattr(importlib, "import_module", fail)

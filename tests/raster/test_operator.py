@@ -12,8 +12,8 @@ from operator_backends import CPU
 from operator_cases import dense, make_camera, make_scene, one_gaussian, random_mask, random_view
 
 from gsseg_core.errors import MaskSizeError, SceneValueError, SettingsError
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu import blending as blend
-from gsseg_core.raster.view_operator import make_operator
 from gsseg_core.scene.camera import Camera
 
 SIZES = [(37, 21), (16, 16), (33, 50), (70, 5), (1, 1), (1, 40)]

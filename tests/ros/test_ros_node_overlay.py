@@ -19,7 +19,7 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.live.session import LiveSession
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene

@@ -62,7 +62,7 @@ def test_every_parameter_is_typed_described_and_ranged(robot: Robot) -> None:
         ("queue_size", 1001, "out of range"),
         ("autostart", "yes", "type"),
         ("pose_source", "gps", "parameter pose_source is 'gps'; expected topic, odometry, tf"),
-        ("device", "tpu", "parameter device is 'tpu'; expected 'cpu', 'cuda' or 'cuda:' and the number of a GPU"),
+        ("device", "tpu", "parameter device is 'tpu'; expected cpu, cuda (the first GPU) or cuda:1 and so on"),
         ("device", "cuda:x", "parameter device is 'cuda:x'"),
         ("ids", "mine", "parameter ids is 'mine'; expected given, per-view"),
         ("ids", "per-view", "parameter class_names gives 4 names, but with ids 'per-view' the node finds the objects"),

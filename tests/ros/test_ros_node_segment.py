@@ -14,7 +14,7 @@ from small_scenes import NAMES, clean_views
 
 from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.export.view_pictures import background_image
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
 

@@ -14,7 +14,7 @@ from small_scenes import NAMES, balls_on_a_table, clean_views
 
 pytest.importorskip("viser")
 
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.viewer.model import Labelling, ViewModel
 from gsseg_core.viewer.picture import Picture

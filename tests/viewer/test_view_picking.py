@@ -9,7 +9,7 @@ from small_scenes import NAMES, balls_on_a_table, clean_views, ring, true_labels
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError
-from gsseg_core.raster.view_operator import make_operator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import REMOVED, UNOBSERVED
 from gsseg_core.viewer.corrections import Corrections, box, disc, region, share_seen

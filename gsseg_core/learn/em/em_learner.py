@@ -66,7 +66,9 @@ from gsseg_core.learn.em.em_kernels import collect, improve, improve_without, mi
 from gsseg_core.learn.em.leave_one_out import counted_by_others
 from gsseg_core.learn.em.rejected_regions import by_region, in_doubt, take_back
 from gsseg_core.learn.learner import MEMORY_BUDGET, VOTE_UNIT, Learner, Progress, silent
-from gsseg_core.raster.view_operator import Observation, ViewOperator, make_operator
+from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.observation import Observation
+from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import neighbours_of
 

@@ -9,7 +9,7 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence, resolve_row
 from gsseg_core.learn.em.em_kernels import BLOCKS, take_row
 from gsseg_core.learn.learner import UNITS
-from gsseg_core.raster.view_operator import Observation
+from gsseg_core.raster.observation import Observation
 
 
 def counted_by_others(

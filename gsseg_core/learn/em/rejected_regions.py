@@ -19,7 +19,7 @@ from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.learn.em.em_kernels import take_votes
 from gsseg_core.learn.em.leave_one_out import counted_by_others
 from gsseg_core.learn.learner import UNITS
-from gsseg_core.raster.view_operator import Observation
+from gsseg_core.raster.observation import Observation
 
 SMALLEST = 64
 """Regions of fewer px are not told apart: all of one label are judged as one."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
+from gsseg_core.raster.constants import TINY
 from gsseg_core.raster.cpu.blending import AHEAD, open_rays, stride_of, tile_of_turn
 from gsseg_core.raster.cpu.splat import WIDTH, aim, blend_block
 from gsseg_core.raster.cpu.tiling import TILE
@@ -28,7 +29,7 @@ from gsseg_core.simd import (
     sum_row,
 )
 
-_TINY = np.float32(1e-30)
+_TINY = np.float32(TINY)
 
 CHUNKS = 16
 """Parts of the Gaussians that are gone through beside each other. Each counts from 0; `settle` makes that one count."""
@@ -127,28 +128,6 @@ def settle(
     for i in nb.prange(numbers.shape[0]):
         if numbers[i] >= 0:
             numbers[i] = (numbers[i] & _NUMBER) + before[numbers[i] >> _CHUNK]
-
-
-@nb.njit(parallel=True, nogil=True, cache=True)
-def add_votes(
-    total: np.ndarray,  # (N, K) int64, added to
-    ids: np.ndarray,  # (M,) int32, distinct
-    start: np.ndarray,  # (M + 1,)
-    labels: np.ndarray,  # (P,) int32: label of each sighting
-    said_start: np.ndarray,  # (L + 1,) what a pixel of each label votes, as `CSRRows`
-    said_classes: np.ndarray,
-    said: np.ndarray,  # float64
-    votes: np.ndarray,  # (P,) float32
-    units: float,  # per vote; a power of 2
-    sign: int,
-) -> None:
-    """Add a view's votes, or take them away, in whole units."""
-    for m in nb.prange(ids.shape[0]):
-        prefetch(total, ids[min(m + AHEAD, ids.shape[0] - 1)])
-        row = total[ids[m]]
-        for s in range(start[m], start[m + 1]):
-            for j in range(said_start[labels[s]], said_start[labels[s] + 1]):
-                row[said_classes[j]] += sign * np.int64(np.rint(np.float64(votes[s]) * said[j] * units))
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)

@@ -22,8 +22,6 @@ from gsseg_core.raster.cpu.splat import OPEN, WIDTH, blend_block
 from gsseg_core.raster.cpu.tiling import TILE
 from gsseg_core.simd import FAST, add_scaled, dot, first_bit, load_row, prefetch, store_row
 
-_TINY = np.float32(1e-30)
-
 FEW = 4
 """Channels up to which `render_few` is the faster one: colours, depths."""
 

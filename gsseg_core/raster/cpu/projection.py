@@ -18,20 +18,12 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
+from gsseg_core.raster.constants import DILATION, NEAR
 from gsseg_core.raster.cpu.depth_sort import sort_by_depth
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.simd import prefetch
-
-NEAR = 0.01
-"""Centres nearer than this to the camera plane are not drawn, in scene units."""
-
-DILATION = 0.3
-"""Added to both variances on the image, in px^2 (the low-pass filter of 3DGS trainers)."""
-
-ALPHA_MIN = 1.0 / 255.0
-"""Opacities below this count as zero."""
 
 FRUSTUM_MARGIN = 0.3
 """The linearisation point is kept within the image widened by this fraction of half its width, as trainers do."""

@@ -13,6 +13,7 @@ from typing import Any
 from llvmlite import ir
 from numba.core import cgutils, types
 
+from gsseg_core.raster.constants import ALPHA_MAX, T_MIN
 from gsseg_core.simd import BITS, F32, I64, LANES, ROW, Builder, constant, intrinsic, row_type
 
 SIDE = 4
@@ -21,12 +22,8 @@ SIDE = 4
 OPEN = (1 << LANES) - 1
 """Of the bits of `blend_block`, those of the rays that are still open."""
 
-ALPHA_MAX = 0.99
 LOG_ALPHA_MIN = -math.log2(255.0)
 """log2 of the least alpha that counts."""
-
-T_MIN = 1e-4
-"""A ray ends when its transmittance falls below this."""
 
 # Columns of the table of projected Gaussians.
 U, V, SHEAR, WIDTH, HEIGHT, LOG_OPACITY, Y_REACH, X_TURN = range(8)

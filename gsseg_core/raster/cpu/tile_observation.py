@@ -9,7 +9,7 @@ from gsseg_core.errors import SceneValueError
 from gsseg_core.raster.cpu import label_pairs as sightings
 from gsseg_core.raster.cpu.lifted_mask import LiftedMask
 from gsseg_core.raster.cpu.tiling import Tiles
-from gsseg_core.raster.view_operator import Observation, Shares
+from gsseg_core.raster.observation import Observation, Shares
 from gsseg_core.scene.camera import Camera
 
 

@@ -15,7 +15,8 @@ from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.splat import LOG_OPACITY
 from gsseg_core.raster.cpu.tile_observation import TileObservation
 from gsseg_core.raster.cpu.tiling import TILE, assign
-from gsseg_core.raster.view_operator import Blended, Observation, ViewOperator, Weights
+from gsseg_core.raster.observation import Observation
+from gsseg_core.raster.view_operator import Blended, ViewOperator, Weights
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -106,3 +107,9 @@ class TileOperator(ViewOperator):
         lifted = LiftedMask(self.camera, self._table, self._tiles, labels)
         lifted.vote(self.ids, self._tiles, evidence or LabelEvidence(lifted.classes), total, units, sign)
         return lifted.sees
+
+
+def view_operator(scene: GaussianScene, camera: Camera, device: str) -> TileOperator:
+    """Make the operator of a view on the CPU, the only device of this name."""
+    del device
+    return TileOperator(scene, camera)

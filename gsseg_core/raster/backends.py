@@ -1,0 +1,93 @@
+"""The rasterisers by device: who adds one, adds its file and a line to the table here."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from typing import TYPE_CHECKING, NamedTuple
+
+from gsseg_core.errors import SettingsError
+
+if TYPE_CHECKING:
+    from gsseg_core.raster.view_operator import ViewOperator
+    from gsseg_core.scene.camera import Camera
+    from gsseg_core.scene.gaussian_scene import GaussianScene
+
+
+class Rasteriser(NamedTuple):
+    """What renders the views on one kind of device.
+
+    Attributes
+    ----------
+    devices : str
+        Regular expression of the devices' names.
+    described : str
+        The same for readers, as in "device is 'x'; expected ...".
+    module : str
+        Where its function `view_operator(scene, camera, device)` is; loaded when a view is first rendered there.
+    needs : str
+        What to install where the module does not find a package.
+    """
+
+    devices: str
+    described: str
+    module: str
+    needs: str
+
+
+RASTERISERS = [
+    Rasteriser("cpu", "cpu", "gsseg_core.raster.cpu.tile_operator", "pip install gsseg"),
+    Rasteriser(
+        "cuda(:[0-9]+)?", "cuda (the first GPU) or cuda:1 and so on", "gsseg_core.raster.gsplat_backend",
+        "a CUDA build of PyTorch, and gsplat: pip install 'gsseg[gsplat]'",
+    ),
+]  # fmt: skip
+
+
+def devices() -> str:
+    """Describe what may be written as a device, for help texts and errors."""
+    return ", ".join(rasteriser.described for rasteriser in RASTERISERS)
+
+
+def rasteriser_of(device: str) -> Rasteriser:
+    """Find the rasteriser of a device by its name; whether there is such a device shows when it is used.
+
+    Raises
+    ------
+    SettingsError
+        None takes this name.
+    """
+    for rasteriser in RASTERISERS:
+        if re.fullmatch(rasteriser.devices, device):
+            return rasteriser
+    raise SettingsError(f"device is {device!r}; expected {devices()}")
+
+
+def make_operator(scene: GaussianScene, camera: Camera, device: str = "cpu") -> ViewOperator:
+    """Make the operator of a view on a device.
+
+    Parameters
+    ----------
+    scene : GaussianScene
+        What is seen.
+    camera : Camera
+        Where from.
+    device : str
+        'cpu'; 'cuda', the first GPU; or 'cuda:1' and so on, another one. See docs/gpu.md.
+
+    Raises
+    ------
+    SettingsError
+        There is no such device, or what it needs is not installed.
+    """
+    rasteriser = rasteriser_of(device)
+    try:
+        module = importlib.import_module(rasteriser.module)
+    except ModuleNotFoundError as missing:
+        if not missing.name or missing.name.startswith("gsseg_core"):
+            raise
+        raise SettingsError(
+            f"device is {device!r}, and the package {missing.name!r} is missing; expected {rasteriser.needs}"
+        ) from missing
+    operator: ViewOperator = module.view_operator(scene, camera, device)
+    return operator

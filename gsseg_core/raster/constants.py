@@ -1,0 +1,21 @@
+"""The rules of blending that all rasterisers share, as docs/conventions.md has them."""
+
+from __future__ import annotations
+
+NEAR = 0.01
+"""Centres nearer than this to the camera plane are not drawn, in scene units."""
+
+DILATION = 0.3
+"""Added to both variances on the image, in px^2 (the low-pass filter of 3DGS trainers)."""
+
+ALPHA_MIN = 1.0 / 255.0
+"""Alphas and opacities below this count as zero."""
+
+ALPHA_MAX = 0.99
+"""Largest alpha."""
+
+T_MIN = 1e-4
+"""A ray ends when its transmittance falls below this."""
+
+TINY = 1e-30
+"""Floor of a pixel's likelihood."""
