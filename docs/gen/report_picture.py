@@ -16,7 +16,7 @@ from gsseg_core.demo.run import run_demo
 ROOT = Path(__file__).parents[2]
 WIDTH, HEIGHT = 1240, 1330
 
-sys.path.insert(0, str(ROOT / "tests"))
+sys.path.insert(0, str(ROOT / "tests/helpers"))
 from browser import opened_page, screenshot, started_chromium  # noqa: E402
 
 
