@@ -35,7 +35,7 @@ def camera_hint(folder: Path) -> str:
     if folder.is_file():
         return f"; it is a file: type --data {_quoted(folder.parent)}"
     if not folder.is_dir():
-        near = [path for path in _parent_of_missing(folder) if _has_cameras(path)]
+        near = [path for path in _subfolders(folder.parent) if _has_cameras(path)]
         return f"; {near[0]} has cameras: type --data {_quoted(near[0])}" if near else ""
     is_dataset = any((folder / name).is_dir() for name in ("labels", "images"))
     near = [path for path in [*_folders(folder), folder.parent] if _has_cameras(path)]
@@ -100,12 +100,6 @@ def _has_cameras(folder: Path) -> bool:
     with suppress(GssegError):
         return any(known.find(folder) for known in CAMERA_FORMATS)
     return False
-
-
-def _parent_of_missing(folder: Path) -> list[Path]:
-    """List folders beside one that is not there."""
-    parent = folder.parent
-    return sorted(path for path in parent.iterdir() if path.is_dir()) if parent.is_dir() else []
 
 
 def _folders(root: Path) -> list[Path]:
