@@ -120,6 +120,11 @@ def test_one_class_only_works_from_end_to_end(place: Path) -> None:
     assert [path.name for path in (place / "out/classes").iterdir()] == ["0_background.ply"]
 
 
+@pytest.mark.parametrize("line", ["view s", "segment s --data d --out o", "render s --data d --out o --segmentation f"])
+def test_every_command_that_renders_takes_the_number_of_a_gpu(line: str) -> None:
+    assert build_parser().parse_args([*line.split(), "--device", "cuda:1"]).device == "cuda:1"
+
+
 def test_what_may_look_like_an_option_is_still_taken_for_what_it_is() -> None:
     options = build_parser().parse_args(["pick", "s", "--data", "d", "--view=--a", "--click", "-3", "5", "--ou", "o"])
     assert options.view == "--a" and options.click == [[-3, 5]] and options.out == "o"
