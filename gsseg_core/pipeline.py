@@ -154,8 +154,8 @@ def segment(
     refine : RefineSettings, optional
         The paper's by default.
     graph : bool
-        Where views are few, let codes spread to Gaussians that few or no pixels saw, before refinement; see
-        `gsseg_core.refine.label_propagation`.
+        Where views are few, let class probabilities spread to Gaussians that few or no pixels saw, before
+        refinement; see `gsseg_core.refine.label_propagation`.
     memory_budget : int
         Bytes of prepared views to keep between the steps of learning; see docs/memory.md.
     scheduler : str, optional
@@ -190,15 +190,15 @@ def segment(
             run.claim(segment_places(inputs.class_names, inputs.pictured))
             fitted = _learn(inputs, settings, client, watch, progress)
             assessment = _assess(fitted, inputs.class_names, watch, progress)
-        codes, evidence = fitted.codes_, fitted.evidence()
+        probabilities, evidence = fitted.codes_, fitted.evidence()
         settings = replace(
             settings,
             graph=settings.graph if is_scarce(evidence) else None,
             learner_settings=getattr(fitted, "settings", None),
         )
         del fitted  # Its votes take as much memory as all that follows.
-        result = _refine(inputs, codes, evidence, assessment.calibration.temperature, settings, watch)
-        del codes
+        result = _refine(inputs, probabilities, evidence, assessment.calibration.temperature, settings, watch)
+        del probabilities
         report = _write(run, inputs, assessment, result, settings, watch).as_dict()
         write_json(run.folder / "report.json", report)
     return report
@@ -274,7 +274,7 @@ def _assess(learner: Learner, class_names: Mapping[int, str], watch: Stopwatch, 
 
 def _refine(
     inputs: Inputs,
-    codes: np.ndarray,  # (N, K) float32
+    probabilities: np.ndarray,  # (N, K) float32
     evidence: np.ndarray,  # (N,) float32
     temperature: float,
     settings: RunSettings,
@@ -283,8 +283,8 @@ def _refine(
     """Make calibrated labels of learnt class probabilities: graph where views are few, KNN, filter or carving."""
     with watch.stage("refine"):
         if settings.graph:
-            codes = spread_if_scarce(inputs.scene, codes, evidence)
-        result = Segmentation.from_codes(inputs.scene, codes, inputs.class_names, settings.refine)
+            probabilities = spread_if_scarce(inputs.scene, probabilities, evidence)
+        result = Segmentation.from_codes(inputs.scene, probabilities, inputs.class_names, settings.refine)
         result = result.calibrated(temperature)
     if settings.refine.carve:
         # Only now: the kernels of the carving take a while to compile, and most runs do without.

@@ -53,7 +53,7 @@ class RunSettings:
         if self.scheduler is not None and self.learner not in DISTRIBUTED:
             raise SettingsError(
                 f"scheduler {self.scheduler}: the learner {self.learner} takes one view after the other, each at the "
-                "codes that the one before it left, so there is nothing to share out; expected one of "
+                "class probabilities that the one before it left, so there is nothing to share out; expected one of "
                 f"{', '.join(DISTRIBUTED)}"
             )
         if self.ids not in IDS:
