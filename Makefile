@@ -2,8 +2,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 # Python, then ROS, then the messages, each behind a stamp of its own: what needs no ROS does not wait for it, and the
-# messages, which take a minute to compile, are compiled again only when they change.
+# messages, which take a minute to compile, are compiled again only when they change. Kernels wait for Python alone, so
+# that they are compiled beside the messages.
 READY := $(VENV)/.ready
+KERNELS_READY := $(VENV)/.ready-kernels
 ROS_READY := $(VENV)/.ready-ros
 MSGS_READY := $(VENV)/.ready-msgs
 COLCON_VENV := .venv-colcon
@@ -26,29 +28,41 @@ run-tests: export OMP_WAIT_POLICY = passive
 # Targets that `make test` makes beside the tests.
 BESIDE ?=
 
-.PHONY: help demo demo-local view test run-tests docs colcon results robustness bench clean
+.PHONY: help demo demo-local view check house test lint kernels run-tests docs colcon results robustness bench clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{ printf "%-16s %s\n", $$1, $$2 }'
 
-demo: $(READY) $(ROS_READY) $(MSGS_READY)  ## segment a small scene with known truth as robots do, through the ROS 2 node
+demo: $(KERNELS_READY) $(ROS_READY) $(MSGS_READY)  ## segment a small scene with known truth through the ROS 2 node
 	$(BIN)/python -m gsseg_ros.demo --out demo_out
 
-demo-local: $(READY)  ## the same scene without ROS, by the command line
+demo-local: $(KERNELS_READY)  ## the same scene without ROS, by the command line
 	$(BIN)/gsseg demo --out demo_out
 
-view: $(READY)  ## segment a small scene and look at it in the browser; Ctrl-C ends it
+view: $(KERNELS_READY)  ## segment a small scene and look at it in the browser; Ctrl-C ends it
 	$(BIN)/gsseg demo --out demo_out
 	$(BIN)/gsseg view demo_out/scene/scene.ply --segmentation demo_out/segmented/segmentation.npz \
 		--data demo_out/scene --open
 
-test: $(READY) $(ROS_READY) $(MSGS_READY)  ## lint, check the types and run the tests
+check: $(READY) $(ROS_READY) $(MSGS_READY)  ## lint, check the types, the order of the rooms and all that starts no process: under a minute
+	@$(MAKE) --no-print-directory lint kernels
+	OMP_WAIT_POLICY=passive $(BIN)/python -m pytest -q -W error --numprocesses=2 --dist=worksteal -m 'not processes'
+
+house: $(KERNELS_READY)  ## print what the house measures, with the bar beside each
+	$(BIN)/python benchmarks/house.py
+
+test: $(READY)  ## lint, check the types and run the tests
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint kernels $(MSGS_READY)
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target --keep-going run-tests $(BESIDE)
+
+lint: | $(ROS_READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
+
+kernels: | $(READY)
 	$(WARM_UP)
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target --keep-going run-tests $(BESIDE)
 
 run-tests:
 	$(BIN)/python -m pytest -W error --durations=20 --numprocesses=$(TEST_WORKERS) --dist=loadfile
@@ -85,13 +99,16 @@ define check-ros
 	{ echo 'compiling the ROS messages needs gcc, g++ and cmake' >&2; exit 1; }
 endef
 
-# setuptools first, so that the build uses the pinned one too. Kernels are compiled here, so that the first picture does
-# not wait for them.
+# setuptools first, so that the build uses the pinned one too.
 $(READY): $(INSTALLED) pyproject.toml constraints.txt
 	$(check-python)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt setuptools
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable '.[dev]'
+	touch $@
+
+# Compiled before the first picture, so that it does not wait for them.
+$(KERNELS_READY): | $(READY)
 	$(WARM_UP)
 	touch $@
 

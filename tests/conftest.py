@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import browser
+import processes
 import pytest
 from hypothesis import HealthCheck, settings
 
@@ -31,6 +33,22 @@ def pytest_configure() -> None:
     """Let processes that tests start hear SIGINT: a test run in the background is deaf to it, and they inherit that."""
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    sys.addaudithook(processes.refuse_events)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that start processes, which `make check` leaves out."""
+    processes.mark(items)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
+    """Hold a test that bears no marker to starting no process."""
+    processes.allow(item.get_closest_marker(processes.MARKER) is not None)
+    try:
+        return (yield)
+    finally:
+        processes.allow(True)
 
 
 @pytest.fixture

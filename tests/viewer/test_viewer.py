@@ -293,27 +293,19 @@ def test_a_browser_gets_images_until_it_has_shown_that_it_draws_fast(
 
 def test_the_command_serves_the_page_until_it_is_interrupted(tmp_path: Path) -> None:
     data = write_dataset(tmp_path / "data")
-    command = [
-        sys.executable,
-        "-m",
-        "gsseg_core.cli.main",
-        "view",
-        str(data / "scene.ply"),
-        "--data",
-        str(data),
-        "--quiet",
-    ]
-    process = subprocess.Popen([*command, "--port", "18085"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    try:
-        assert process.stdout is not None and process.stderr is not None
-        said = process.stdout.readline()
-        assert said.startswith("gsseg: 626 Gaussians at http://localhost:"), process.stderr.read()
-        with urllib.request.urlopen(said.split(" at ")[1].split()[0], timeout=PATIENCE) as page:
-            assert b"<html" in page.read()
-        process.send_signal(signal.SIGINT)
-        assert process.communicate(timeout=PATIENCE) == ("", "") and process.returncode == 0
-    finally:
-        process.kill()
+    command = [sys.executable, "-m", "gsseg_core.cli", "view", str(data / "scene.ply"), "--data", str(data), "--quiet"]
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([*command, "--port", "18085"], **pipes) as process:
+        try:
+            assert process.stdout is not None and process.stderr is not None
+            said = process.stdout.readline()
+            assert said.startswith("gsseg: 626 Gaussians at http://localhost:"), process.stderr.read()
+            with urllib.request.urlopen(said.split(" at ")[1].split()[0], timeout=PATIENCE) as page:
+                assert b"<html" in page.read()
+            process.send_signal(signal.SIGINT)
+            assert process.communicate(timeout=PATIENCE) == ("", "") and process.returncode == 0
+        finally:
+            process.kill()
 
 
 @pytest.mark.parametrize(
