@@ -66,7 +66,7 @@ def test_killed_while_it_learns_the_saved_state_loads_in_a_new_process(
     ros: Ros, parameters: dict[str, Any], root: Path, saved: Segmentation
 ) -> None:
     before = (root / "state.npz").read_bytes()
-    moments: list[tuple[str, str, int]] = [("long", "observe", 0), ("long", "observe", 300), ("", "em", 1)]
+    moments: list[tuple[str, str, int]] = [("long", "observe", 0), ("long", "observe", 30), ("", "em", 1)]
     for i, (dataset, stage, done) in enumerate(moments):
         # A namespace for each, since what was killed takes a while to be forgotten.
         robot = Robot(ros, f"/learns{i}").started(parameters)

@@ -1,0 +1,241 @@
+"""Distributed learning by the command line: the same files, and one clear line for what cannot be."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import nullcontext, suppress
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from dask_workers import SCENE, SETTINGS, VIEWS, address_fixture, assert_same, changed, client_fixture, distributed  # noqa: F401
+from patience import PATIENCE
+from small_scenes import NUM_CLASSES, balls_on_a_table, taught, write_dataset
+
+from gsseg_core.cli.main import main
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.errors import MaskFormatError, SchedulerError
+from gsseg_core.learn.distributed import dask_cluster as scheduler
+from gsseg_core.learn.distributed.dask_learners import DistributedEM, DistributedVotes
+from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.scene.gaussian_scene import GaussianScene
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    return write_dataset(tmp_path / "data")
+
+
+def segment(data: Path, out: str, *more: str) -> list[str]:
+    return ["segment", f"{data}/scene.ply", "--data", str(data), "--out", f"{data.parent}/{out}", "--quiet", *more]
+
+
+@pytest.mark.parametrize("learner", ["em", "votes"])
+def test_the_command_gives_the_same_files_with_a_scheduler(address: str, data: Path, learner: str) -> None:
+    assert main(segment(data, "here", "--learner", learner)) == 0
+    assert main(segment(data, "there", "--learner", learner, "--scheduler", address)) == 0
+    here, there = data.parent / "here", data.parent / "there"
+    with np.load(here / "segmentation.npz") as one, np.load(there / "segmentation.npz") as other:
+        for name in set(one.files) - {"header"}:  # It names the run.
+            np.testing.assert_array_equal(one[name], other[name])
+    reports = [json.loads((out / "report.json").read_text()) for out in (here, there)]
+    assert reports[1]["settings"]["scheduler"] == address
+    reports[0]["views"].pop("reliability", None)  # The asking process has no view prepared that it could check.
+    for key in ("objective", "views", "gaussians", "classes"):
+        assert reports[0][key] == reports[1][key]
+
+
+@pytest.mark.parametrize("elsewhere", ["scene", "masks", "both"])
+def test_files_that_a_worker_has_not_or_has_different_are_sent(client: Any, data: Path, elsewhere: str) -> None:
+    scene, views = GaussianScene.load(data / "scene.ply"), Dataset(data).views("train")
+    here = taught(EMLearner(scene, NUM_CLASSES, SETTINGS), views)
+    if elsewhere != "masks":
+        balls_on_a_table(seed=1)[0].save(data / "scene.ply")
+    one = list(client.nthreads())[:1] if elsewhere != "scene" else []
+    with (
+        changed(client, one, "gsseg_core.learn.distributed.dask_worker", "digest_of", lambda path: "another")
+        if one
+        else nullcontext()
+    ):
+        there = DistributedEM(client, scene, NUM_CLASSES, SETTINGS)
+        there.observe_all(views)
+        assert_same(there, here)
+
+
+def test_a_broken_mask_is_one_clear_error_and_changes_nothing(
+    client: Any, address: str, data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (data / "labels/view1.png").write_bytes(b"\x89PNG")
+    assert main(segment(data, "out", "--scheduler", address)) == 2
+    stderr = capsys.readouterr().err
+    assert stderr.startswith("gsseg: error: ") and "view1.png" in stderr and stderr.count("\n") == 1
+    assert not (data.parent / "out").exists()
+    there = DistributedVotes(client, GaussianScene.load(data / "scene.ply"), NUM_CLASSES)
+    with pytest.raises(MaskFormatError, match=r"view1\.png"):
+        there.observe_all(Dataset(data).views("train"))
+    assert not there.views and not there._votes.any()
+
+
+@pytest.mark.parametrize(("version", "says"), [(None, "no gsseg"), ("0.0.1", "gsseg 0.0.1")])
+def test_a_worker_without_this_gsseg_is_refused_by_name(
+    client: Any, address: str, data: Path, version: str | None, says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def version_there(name: str) -> str:
+        import importlib.metadata
+
+        if version is None:
+            raise importlib.metadata.PackageNotFoundError(name)
+        return version
+
+    worker = list(client.nthreads())[1]
+    with changed(client, [worker], "importlib.metadata", "version", version_there):
+        assert main(segment(data, "out", "--scheduler", address)) == 2
+    stderr = capsys.readouterr().err
+    assert f"worker {worker} has {says}; expected gsseg" in stderr and stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [(["--scheduler", "tcp://127.0.0.1:9"], "does not answer within 0.5 s"),
+     (["--scheduler", "nonsense"], "scheduler is 'nonsense'; expected an address"),
+     (["--scheduler", "ucx://host:1"], "expected an address such as tcp://host:8786"),
+     (["--scheduler", "tcp://127.0.0.1:9", "--learner", "gradient"], "gradient takes one view after the other")],
+)  # fmt: skip
+def test_what_cannot_be_distributed_is_one_clear_line(
+    data: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    options: list[str],
+    says: str,
+) -> None:
+    monkeypatch.setattr(scheduler, "PATIENCE", 0.5)
+    assert main(segment(data, "out", *options)) == 2
+    stderr = capsys.readouterr().err
+    assert stderr.startswith("gsseg: error: ") and says in stderr and stderr.count("\n") == 1
+    assert not (data.parent / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("answer", "says"),
+    [(None, "does not answer within "), (b"HTTP/1.1 400 Bad Request\r\n\r\n" * 9, "what answers is no scheduler")],
+)
+def test_a_port_where_no_scheduler_answers_is_one_clear_line_in_time(
+    data: Path,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    answer: bytes | None,
+    says: str,
+) -> None:
+    monkeypatch.setattr(scheduler, "PATIENCE", PATIENCE if answer else 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve() -> None:
+            with suppress(OSError), server.accept()[0] as connection:
+                if answer:
+                    connection.sendall(answer)
+                connection.recv(1 << 20)
+                connection.recv(1 << 20)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+        assert main(segment(data, "out", "--scheduler", address)) == 2
+        thread.join(PATIENCE)
+    stderr = capfd.readouterr().err
+    assert stderr.startswith(f"gsseg: error: scheduler {address}: {says}") and stderr.count("\n") == 1
+    assert not thread.is_alive() and not (data.parent / "out").exists()
+
+
+def test_an_address_of_a_worker_is_said_to_be_none_of_a_scheduler(client: Any) -> None:
+    worker = next(iter(client.nthreads()))
+    with pytest.raises(SchedulerError, match="is a worker; expected the address that"), scheduler.connected(worker):
+        pass
+
+
+def test_ctrl_c_while_workers_learn_ends_with_130_and_not_a_word(address: str, data: Path) -> None:
+    arguments = [option for option in segment(data, "out", "--scheduler", address) if option != "--quiet"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "gsseg_core.cli", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stderr is not None
+        stderr = b""
+        while b"observe:" not in stderr and process.poll() is None:
+            stderr += os.read(process.stderr.fileno(), 4096)
+        process.send_signal(signal.SIGINT)
+        out, rest = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, out) == (130, b""), stderr + rest
+    assert not re.search(rb"Traceback|Exception|Error|distributed", stderr + rest), stderr + rest
+
+
+def test_without_dask_the_error_says_what_to_install(
+    data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    assert main(segment(data, "out", "--scheduler", "tcp://127.0.0.1:9")) == 2
+    assert "pip install 'gsseg[distributed]'" in capsys.readouterr().err
+
+
+def test_the_documented_commands_make_a_cluster_and_its_loss_is_one_clear_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Workers are waited for a second, the scheduler for as long as a busy machine needs.
+    fast = SimpleNamespace(monotonic=lambda: PATIENCE * time.monotonic(), sleep=time.sleep)
+    monkeypatch.setattr(scheduler, "time", fast)
+    monkeypatch.setattr(scheduler, "PATIENCE", PATIENCE)
+    run, quiet = [sys.executable, "-m", "dask"], {"stderr": subprocess.DEVNULL, "stdout": subprocess.DEVNULL}
+    found = tmp_path / "scheduler.json"
+    options = [
+        "--host",
+        "127.0.0.1",
+        "--port",
+        "0",
+        "--dashboard-address",
+        "127.0.0.1:0",
+        "--scheduler-file",
+        str(found),
+    ]
+    with subprocess.Popen([*run, "scheduler", *options], **quiet) as first:
+        try:
+            address = written(found)
+            with pytest.raises(SchedulerError, match="has no workers"), scheduler.connected(address):
+                pass
+            with subprocess.Popen([*run, "worker", address, "--no-dashboard", "--nthreads", "1"], **quiet) as worker:
+                with distributed.Client(address, set_as_default=False) as client:
+                    client.wait_for_workers(1, timeout=PATIENCE)
+                with scheduler.connected(address) as client:
+                    there = DistributedEM(client, SCENE, NUM_CLASSES, SETTINGS)
+                    there.observe_all(VIEWS)
+                    assert_same(there, taught(EMLearner(SCENE, NUM_CLASSES, SETTINGS), VIEWS))
+                    worker.terminate()
+                    with pytest.raises(SchedulerError, match="has no workers"):
+                        there.fit()
+                    first.kill()
+                    with pytest.raises(SchedulerError, match="does not answer any more"):
+                        there.fit()
+        finally:
+            first.kill()
+
+
+def written(path: Path) -> str:
+    """The address in a scheduler's file, as soon as it is there."""
+    end = time.monotonic() + PATIENCE
+    while time.monotonic() < end:
+        if path.is_file() and path.stat().st_size:
+            return str(json.loads(path.read_text())["address"])
+        time.sleep(0.1)
+    raise AssertionError(f"{path}: no scheduler in {PATIENCE:g} s")
+
+
+def test_dask_is_not_imported_where_nothing_is_distributed() -> None:
+    program = "import sys, gsseg_core.cli.main, gsseg_core.pipeline; sys.exit('distributed' in sys.modules)"
+    subprocess.run([sys.executable, "-c", program], check=True)
