@@ -43,8 +43,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
-    """Hold a test that bears no marker to starting no process."""
-    processes.allow(item.get_closest_marker(processes.MARKER) is not None)
+    """Hold the tests that are left where those that start processes are left out to starting none."""
+    processes.allow(item.config.option.markexpr != f"not {processes.MARKER}")
     try:
         return (yield)
     finally:
