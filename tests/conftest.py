@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
+import io
 import os
 import signal
 import sys
@@ -57,6 +60,22 @@ def real_data() -> Path:
     if not DATA.is_dir():
         pytest.skip(f"{_NO_DATA} under {DATA}")
     return DATA
+
+
+@pytest.fixture(scope="session")
+def demo_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `gsseg demo` wrote, and in said.txt what it printed: made once for all workers, to be read only."""
+    from gsseg_core.cli.main import main
+
+    own = tmp_path_factory.getbasetemp()
+    top = own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
+    out = top / "demo_run"
+    with (top / "demo_run.lock").open("w") as lock, contextlib.redirect_stdout(io.StringIO()) as said:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (out / "said.txt").exists():
+            assert main(["demo", "--out", str(out), "--quiet"]) == 0
+            (out / "said.txt").write_text(said.getvalue())
+    return out
 
 
 @pytest.fixture(scope="session", params=["cpu", "plain", "cuda"])

@@ -154,13 +154,11 @@ def test_the_package_and_the_pipeline_load_neither_pytorch_nor_templates() -> No
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
-def test_the_demo_segments_its_scene_well(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["demo", "--out", f"{tmp_path}/demo", "--quiet"]) == 0
-    out = capsys.readouterr().out
-    found = re.search(r"mIoU ([0-9.]+) %", out)
+def test_the_demo_segments_its_scene_well(demo_run: Path) -> None:
+    found = re.search(r"mIoU ([0-9.]+) %", (demo_run / "said.txt").read_text())
     assert found is not None and float(found[1]) > 80
-    assert (tmp_path / "demo/segmented/report.json").is_file()
-    assert (tmp_path / "demo/segmented/pictures/contact_sheet.png").is_file()
+    assert (demo_run / "segmented/report.json").is_file()
+    assert (demo_run / "segmented/pictures/contact_sheet.png").is_file()
 
 
 def test_a_real_apartment_is_segmented_from_20_views(real_data: Path, tmp_path: Path) -> None:

@@ -23,7 +23,6 @@ from doc_blocks import FENCE, FIRST, PAGES, REPOSITORY, Block, blocks_of, needs_
 from doc_commands import Started, check, core_libraries, kind_of, run_commands, words_of
 
 from gsseg_core.cli.arguments import COMMANDS, command_module
-from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset
 from gsseg_ros.child_nodes import NODES
 
@@ -37,33 +36,25 @@ MASKS = "docs/masks.md"
 _COMMAND = re.compile(r"^(?: {4}|\t)(gsseg|python3?|pip|make|ros2|dask|segment_node|replay_node|colcon) ", re.MULTILINE)
 
 
-@pytest.fixture(scope="session")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What `gsseg demo` writes, made once."""
-    out = tmp_path_factory.mktemp("docs") / "demo_out"
-    assert main(["demo", "--out", str(out), "--quiet"]) == 0
-    return out
-
-
 @pytest.fixture
-def desk(tmp_path: Path, demo: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def desk(tmp_path: Path, demo_run: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with what the reader of a page has, and its programs on PATH."""
     (tmp_path / "bin").mkdir()
     for name, module in PROGRAMS.items():
         program = tmp_path / "bin" / name
         program.write_text(f'#!/bin/sh\nexec {sys.executable} {f"-m {module}" if module else ""} "$@"\n')
         program.chmod(0o755)
-    shutil.copytree(demo / "scene", tmp_path / "demo_out/scene")
-    split = json.loads((demo / "scene/split.json").read_text())  # Fewer views, for the sake of time.
+    shutil.copytree(demo_run / "scene", tmp_path / "demo_out/scene")
+    split = json.loads((demo_run / "scene/split.json").read_text())  # Fewer views, for the sake of time.
     split = {"train": split["train"][::6], "test": split["test"][::3]}
     (tmp_path / "demo_out/scene/split.json").write_text(json.dumps(split))
     data = tmp_path / "DATASET"
     shutil.copytree(tmp_path / "demo_out/scene", data, ignore=shutil.ignore_patterns("labels_true", "truth.npz"))
-    for mask in (demo / "scene/labels_true").iterdir():  # The views to be scored on have true masks.
+    for mask in (demo_run / "scene/labels_true").iterdir():  # The views to be scored on have true masks.
         if not (data / "labels" / mask.name).exists():
             shutil.copy(mask, data / "labels")
-    shutil.copy(demo / "scene/scene.ply", tmp_path)
-    (tmp_path / "demo_out/segmented").symlink_to(demo / "segmented")
+    shutil.copy(demo_run / "scene/scene.ply", tmp_path)
+    (tmp_path / "demo_out/segmented").symlink_to(demo_run / "segmented")
     for name in ("benchmarks", "examples"):
         (tmp_path / name).symlink_to(REPOSITORY / name)
     monkeypatch.chdir(tmp_path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -18,7 +19,6 @@ from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import read_mask
 from gsseg_core.data.view import View
-from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 REPOSITORY = Path(__file__).parents[2]
@@ -56,9 +56,9 @@ def test_the_notebook_runs_from_its_first_cell_to_its_last_and_stores_no_output(
     assert len(objects) == 10 and len(GaussianScene.load(objects[1])) > 500
 
 
-def test_masks_of_a_segmenter_that_knows_no_objects_are_segmented_per_view(tmp_path: Path) -> None:
+def test_masks_of_a_segmenter_that_knows_no_objects_are_segmented_per_view(tmp_path: Path, demo_run: Path) -> None:
     pytest.importorskip("skimage", reason="scikit-image is not installed")
-    data = build_demo(tmp_path / "data").root
+    data = Path(shutil.copytree(demo_run / "scene", tmp_path / "data"))
     split = json.loads((data / "split.json").read_text())
     (data / "split.json").write_text(json.dumps({**split, "train": split["train"][::6]}))
     ran = run_example("masks_from_photos.py", data, "--scene", data / "scene.ply", "--out", "auto")

