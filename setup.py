@@ -95,7 +95,7 @@ setup(
             "replay_node = gsseg_ros.replay.replay_node:main",
             "segment_node = gsseg_ros.node.segment_node:main",
         ],
-        # Where `gsseg view` gets codes from that change while it runs; see gsseg_core/viewer/live_source.py.
+        # Sources of class probabilities that change while `gsseg view` runs; see gsseg_core/viewer/live_source.py.
         "gsseg.live_sources": ["ros = gsseg_ros.client.view_source:RosSource"],
     },
 )

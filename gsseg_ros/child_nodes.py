@@ -1,4 +1,4 @@
-"""Nodes as child processes, in a ROS domain where nobody else is; they never outlive whoever started them."""
+"""Runs nodes as child processes in a ROS domain of their own, and ends them with whoever started them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NODES = {"segment_node": "gsseg_ros.node.segment_node", "replay_node": "gsseg_ro
 
 
 class ChildError(GssegError):
-    """A child process has ended that should not have."""
+    """A node that runs as a child process has ended too early."""
 
 
 class ChildNode:

@@ -1,4 +1,4 @@
-"""Conversion between ROS messages and the values of `gsseg_core`; that of objects is in `object_messages`.
+"""Converts between ROS messages and the values of `gsseg_core`; `object_messages` does so for objects.
 
 Numbers of a message are set as `array.array`, which rclpy takes over as a whole; anything else it checks and copies
 element by element, which takes seconds for a large cloud.
@@ -58,7 +58,7 @@ _CLOUD_POINT = np.dtype([(name, "<" + kind) for name, _, kind in _CLOUD_FIELDS])
 
 
 class CloudArrays(NamedTuple):
-    """What a cloud of this node holds."""
+    """Points of a cloud with colour, label and confidence."""
 
     points: npt.NDArray[np.float32]  # (M, 3) metres
     rgb: npt.NDArray[np.uint8]  # (M, 3)
@@ -78,7 +78,7 @@ def stamp_message(ns: int) -> Time:
 
 
 def labels_from_image(message: Image, topic: str) -> npt.NDArray[np.int32]:
-    """Read the labels (H, W) of a mask message, `UNKNOWN` (-1) where it says nothing.
+    """Read the labels (H, W) of a mask message, `UNKNOWN` (-1) where a pixel has none.
 
     Encodings are mono8 and 8UC1 (255 is unknown), mono16 and 16UC1 (65535) and 32SC1 (-1), of either byte order, with
     rows of any `step`.
@@ -335,7 +335,7 @@ def arrays_from_cloud(message: PointCloud2, topic: str = "cloud") -> CloudArrays
 
 
 def topic_tokens(class_names: Mapping[int, str]) -> dict[int, str]:
-    """Make a valid part of a topic's name of each class name: unique, ASCII letters, digits and single underscores.
+    """Turn class names into unique parts of topic names: ASCII letters, digits and single underscores.
 
     Where classes would get the same token, that of the lowest id keeps it and the others get `_<id>` appended.
     """

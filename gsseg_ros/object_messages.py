@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 from builtin_interfaces.msg import Duration
@@ -37,9 +39,16 @@ def object_message(
         confidence=float(confidence.mean(dtype=np.float64)),
         box_pose=pose_from_matrix(rigid(box.axes, box.center)),
         box_size=Vector3(**_xyz(box.size)),
-        center=Point(**_xyz(box.mean)),
+        center=point_message(box.mean),
         covariance=box.covariance.ravel(),
     )
+
+
+def point_message(
+    values: npt.NDArray[np.floating[Any]],  # (3,)
+) -> Point:
+    """Turn an array (3,) into a point."""
+    return Point(**_xyz(values))
 
 
 def box_from_object(message: Object) -> OrientedBox:
@@ -90,6 +99,6 @@ def _reach_up(thing: Object) -> float:
 
 
 def _xyz(
-    values: npt.NDArray[np.float64],  # (3,)
+    values: npt.NDArray[np.floating[Any]],  # (3,)
 ) -> dict[str, float]:
     return dict(zip("xyz", values.tolist(), strict=True))

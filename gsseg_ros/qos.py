@@ -22,7 +22,7 @@ def sensor_data() -> QoSProfile:
 
 
 def latched() -> QoSProfile:
-    """Make a profile for what those who come late get too."""
+    """Make a profile for latched topics, whose last message late subscribers get, too."""
     return QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 

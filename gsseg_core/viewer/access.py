@@ -36,7 +36,7 @@ HeaderValues = Callable[[str], Sequence[str]]
 
 
 class Listener:
-    """A socket that listens, and what a request must have to be answered. Use it in a `with`, or close it.
+    """Listens on a socket, and checks requests. Use it in a `with`, or close it.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ class Listener:
         return None
 
     def headers(self, path: str, values: HeaderValues) -> dict[str, str]:
-        """Give what goes with every page that is sent: what it may load and connect to, and who may show it.
+        """Make the headers of every page that is sent: what it may load and connect to, and who may show it.
 
         That is its own server alone, since viser's page connects to any that its address names, as
         `?websocket=...`, and does what that says.

@@ -65,7 +65,7 @@ class ClientRenderer:
 
     @property
     def bytes_sent(self) -> int:
-        """Of Gaussians, before compression."""
+        """Bytes of Gaussians sent, before compression."""
         return self._nodes.bytes_sent if self._nodes else 0
 
     @property
@@ -74,7 +74,7 @@ class ClientRenderer:
         return self._nodes is not None
 
     def show(self, picture: Picture) -> None:
-        """Have this seen from now on."""
+        """Show a picture from now on."""
         with self._lock:
             self._picture = picture
             if self._nodes:
@@ -144,7 +144,7 @@ class ClientRenderers:
 
     @property
     def bytes_sent(self) -> int:
-        """Of Gaussians, before compression, to those that look now."""
+        """Bytes of Gaussians sent to the browsers of now, before compression."""
         return sum(renderer.bytes_sent for renderer in self._all())
 
     @property
@@ -153,7 +153,7 @@ class ClientRenderers:
         return sum(renderer.draws for renderer in self._all())
 
     def show(self, picture: Picture) -> None:
-        """Have this seen from now on."""
+        """Show a picture from now on."""
         with self._lock:
             self._picture = picture
             for renderer in self._renderers.values():

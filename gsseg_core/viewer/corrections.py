@@ -143,7 +143,7 @@ class Corrections:
         return True
 
     def apply(self, before: Labelling, names: Mapping[int, str] | None = None) -> Labelling:
-        """Correct what was learnt before.
+        """Combine a labelling with the corrections.
 
         Parameters
         ----------

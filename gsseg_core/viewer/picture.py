@@ -36,7 +36,7 @@ class Picture:
 
     @cached_property
     def nodes(self) -> dict[Key, Node]:
-        """The pieces that a browser draws."""
+        """Nodes that a browser draws, by label and band."""
         opacities = np.rint(self.scene.opacities * 255).astype(np.uint8)
         return paint(self.parts, self.shown, self.colors, opacities)
 
@@ -44,7 +44,7 @@ class Picture:
         self,
         operator: ViewOperator,  # of the scene
     ) -> np.ndarray:
-        """Draw it as a view sees it, before black: (H, W, 3) uint8."""
+        """Render the picture before a black background: (H, W, 3) uint8."""
         image = operator.without(~self.shown).render(self._rgb)
         drawn: np.ndarray = (image * 255 + 0.5).clip(0, 255).astype(np.uint8)
         return drawn

@@ -56,7 +56,7 @@ class Frames:
         self._thread.start()
 
     def show(self, picture: Picture) -> None:
-        """Have this seen from now on."""
+        """Show a picture from now on."""
         self._picture = picture
         self._change()
 
@@ -90,7 +90,7 @@ class Frames:
         self._client.flush()
 
     def _operator(self, scene: GaussianScene, rows: int) -> ViewOperator:
-        """Take the view of so many rows; while the camera rests, the one that is there."""
+        """Make the view operator for so many rows; while the camera rests, reuse the last one."""
         camera = self._camera_of(self._client, rows)
         known = self._known.get(rows)
         if known is None or not _alike(known.camera, camera):

@@ -70,7 +70,7 @@ class SplatNodes:
         self.bytes_sent = 0
 
     def show(self, wanted: dict[Key, Node]) -> None:
-        """Make the picture look like this; what is there already is not sent again."""
+        """Show these nodes; what the browser has already is not sent again."""
         todo = changes(self._sent, wanted)
         with self._client.atomic():
             for key in todo.drop:

@@ -1,4 +1,4 @@
-"""Programs that ask the node: requests block, arrays come back."""
+"""Client of the segmentation node: requests block, and return arrays."""
 
 from gsseg_ros.client.results import (
     Exported,

@@ -1,4 +1,4 @@
-"""Requests to the node, from being sent to being answered: what is not there is named, what failed is raised."""
+"""Sends requests to the node and waits for their answers; errors say what is missing or what failed."""
 
 from __future__ import annotations
 
@@ -57,13 +57,13 @@ class Calls:
             client.remove_pending_request(answer)
 
     def find(self, ready: Callable[[], bool], what: str, timeout: float) -> None:
-        """Wait until something of the node is there; raises `NodeUnavailableError`."""
+        """Wait until a service or action of the node is there; raises `NodeUnavailableError`."""
         timeout = min(timeout, self.find_timeout)
         if not self.spinner.wait_for(ready, timeout):
             raise self.absent(what, timeout)
 
     def absent(self, what: str, timeout: float) -> NodeUnavailableError:
-        """Make the error that says what was not there and what to check."""
+        """Make the error for a service or topic that is missing; it says what to check."""
         node = self.spinner.node
         others = sorted(
             f"{namespace.rstrip('/')}/{name}"
@@ -77,7 +77,7 @@ class Calls:
         )
 
     def settle(self, settled: Callable[[], object], ready: Callable[[], bool], what: str, deadline: float) -> None:
-        """Wait for something that a request brings about, for as long as the node is there.
+        """Wait for the effect of a request, for as long as the node is there.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""What `SegmentationClient` takes and returns: arrays and plain values in place of messages."""
+"""Arguments and results of `SegmentationClient`: arrays and plain values in place of messages."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gsseg_core.scene.camera import Camera
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """Where to look from.
+    """A camera in the map, from which the node renders.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class SegmentedObject:
 
 
 class Timed:
-    """Something that a run of the node reported on."""
+    """A result with the report of the run that it comes from."""
 
     report: SegmentationReport
 
@@ -111,7 +111,7 @@ class Timed:
 
 @dataclass(frozen=True, eq=False)
 class SegmentResult(Timed):
-    """Every object of the scene, the background left out, as it was asked for.
+    """Segmentation of the scene: all objects that were asked for, without the background.
 
     Attributes
     ----------
@@ -145,14 +145,14 @@ class SegmentResult(Timed):
         """Objects by the name of their class: those that have points."""
         objects = {}
         for summary in self.report.classes:
-            mine = self.labels == summary.class_id
-            if mine.any():
+            members = self.labels == summary.class_id
+            if members.any():
                 objects[summary.name] = SegmentedObject(
                     summary.class_id,
                     summary.name,
-                    self.points[mine],
-                    self.confidence[mine],
-                    self.rgb[mine][0],
+                    self.points[members],
+                    self.confidence[members],
+                    self.rgb[members][0],
                     self.boxes[summary.class_id],
                 )
         return objects
@@ -160,12 +160,12 @@ class SegmentResult(Timed):
 
 @dataclass(frozen=True, eq=False)
 class LearnResult(Timed):
-    """What learning came to.
+    """Outcome of learning.
 
     Attributes
     ----------
     report : gsseg_msgs.msg.SegmentationReport
-        Views used and rejected, seconds, and the classes of the learnt codes before refinement.
+        Views used and rejected, seconds, and the classes as learnt, before refinement.
     num_steps : int
         Steps that were done; 0 for a learner that has none.
     converged : bool
@@ -182,7 +182,7 @@ class LearnResult(Timed):
 
 @dataclass(frozen=True, eq=False)
 class RenderedView:
-    """What a viewpoint sees.
+    """Labels, confidences and overlay rendered from a viewpoint.
 
     Attributes
     ----------
@@ -214,7 +214,7 @@ class LoadedScene:
 
 @dataclass(frozen=True)
 class SavedState:
-    """A state that the node has saved: file, size in bytes, and the number of views that its codes come from."""
+    """A state that the node has saved: file, size in bytes, and the number of views that it comes from."""
 
     path: Path
     num_bytes: int
@@ -223,7 +223,7 @@ class SavedState:
 
 @dataclass(frozen=True)
 class LoadedState:
-    """A state that the node has loaded: file, class names by id, and the number of views that its codes come from."""
+    """A state that the node has loaded: file, class names by id, and the number of views that it comes from."""
 
     path: Path
     class_names: dict[int, str]

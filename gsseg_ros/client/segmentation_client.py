@@ -1,4 +1,4 @@
-"""Drive the segmentation node from any Python program or notebook: requests block, arrays come back.
+"""Drives the segmentation node from any Python program or notebook: requests block, and return arrays.
 
 with SegmentationClient() as client:
     client.wait_until_active()
@@ -143,7 +143,7 @@ class SegmentationClient:
         )
 
     def wait_for_views(self, count: int, timeout: float = 60.0, on_views: Callable[[int], object] | None = None) -> int:
-        """Wait until the node has fused so many views; it says once a second how many it has.
+        """Wait until the node has fused a number of views; it reports that number once a second.
 
         Parameters
         ----------
@@ -197,7 +197,7 @@ class SegmentationClient:
         *,
         timeout: float = 3600.0,
     ) -> LearnResult:
-        """Learn the best codes. Ctrl-C, an error in `on_feedback`, or running out of time cancels it.
+        """Learn class probabilities. Ctrl-C, an error in `on_feedback`, or running out of time cancels it.
 
         Parameters
         ----------
@@ -318,18 +318,18 @@ class SegmentationClient:
         )
 
     def load_scene(self, path: str | os.PathLike[str] = "", *, timeout: float = 120.0) -> LoadedScene:
-        """Load another scene, and forget views and codes; by default the node's `scene_path` again."""
+        """Load another scene, and forget all views and what was learnt; by default the node's `scene_path` again."""
         answer = self._call(LoadScene, LoadScene.Request(path=os.fspath(path)), timeout)
         box = array_from_point(answer.box_min), array_from_point(answer.box_max)
         return LoadedScene(Path(answer.path), answer.scene_hash, answer.num_gaussians, box)
 
     def save_state(self, path: str | os.PathLike[str] = "", *, timeout: float = 60.0) -> SavedState:
-        """Save votes, views and codes; by default in gsseg_state.npz in `data_root`."""
+        """Save votes, views and class probabilities; by default in gsseg_state.npz in `data_root`."""
         answer = self._call(SaveState, SaveState.Request(path=os.fspath(path)), timeout)
         return SavedState(Path(answer.path), answer.num_bytes, answer.num_views)
 
     def load_state(self, path: str | os.PathLike[str] = "", *, timeout: float = 60.0) -> LoadedState:
-        """Load what was saved, in place of what the node knows."""
+        """Load a saved state in place of the present one."""
         answer = self._call(LoadState, LoadState.Request(path=os.fspath(path)), timeout)
         return LoadedState(Path(answer.path), dict(enumerate(answer.class_names)), answer.num_views)
 
@@ -356,7 +356,7 @@ class SegmentationClient:
         return Exported(folder, [folder / name for name in answer.files], answer.report)
 
     def reset(self, *, timeout: float = 30.0) -> int:
-        """Forget views and codes, and clear the clouds; return how many views were forgotten."""
+        """Forget all views and what was learnt, and clear the clouds; return how many views were forgotten."""
         return int(self._call(Reset, Reset.Request(), timeout).num_views_dropped)
 
     def _call(self, kind: Any, request: Any, timeout: float) -> Any:

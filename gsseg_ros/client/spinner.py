@@ -1,4 +1,4 @@
-"""A node with a thread of its own that spins it, for programs that wait for answers instead of living in callbacks."""
+"""Spins a node in a thread of its own, for programs that wait for answers instead of living in callbacks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TURN_SECONDS = 0.1
 
 
 class Spinner:
-    """Spins a node in a thread, and wakes whoever waits whenever something may have changed.
+    """Spins a node in a thread, and wakes the threads that wait after each turn.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ class Spinner:
         atexit.register(self.close)
 
     def wait_for(self, condition: Callable[[], Any], timeout: float) -> bool:
-        """Wait until the condition holds, looked at in the caller's thread; return whether it does.
+        """Wait until a condition holds, which is checked in the caller's thread; return whether it does.
 
         Raises
         ------
@@ -93,7 +93,7 @@ class Spinner:
         return outcome.result(0)
 
     def wake(self) -> None:
-        """Have all who wait look at what they wait for."""
+        """Wake all threads that wait, so that they check their conditions."""
         with self._turned:
             self._turned.notify_all()
 

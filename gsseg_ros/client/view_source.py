@@ -1,4 +1,4 @@
-"""Codes of a running segmentation node for the viewer: the source "ros" of `gsseg view --ros`."""
+"""Class probabilities of a running segmentation node for the viewer: the source "ros" of `gsseg view --ros`."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ ANSWER_SECONDS = 30.0
 
 _PARAMETERS = ("scene_to_map.scale", "scene_to_map.translation", "scene_to_map.rotation")
 _CHANGING = ("views fused", "codes", "last job")
-"""Values of the node's diagnostics that say that its codes have changed."""
+"""Values of the node's diagnostics that change with its class probabilities."""
 
 
 class RosSource:
-    """Asks a node to segment whenever its diagnostics say that views have come in or codes were learnt.
+    """Asks a node to segment whenever its diagnostics report new views or a new result of learning.
 
     A request has the node publish its clouds, for all who listen. They hold the class of a Gaussian and its confidence,
     and no other probabilities.
@@ -82,7 +82,7 @@ class RosSource:
             raise
 
     def wait(self, timeout: float) -> LiveUpdate | None:
-        """Wait until the node knows more than it did, and ask it what.
+        """Wait until the node has new class probabilities, and fetch them.
 
         Raises
         ------
@@ -169,9 +169,9 @@ class RosSource:
 
 
 class _Places:
-    """Finds Gaussians by where they are in the map, bit for bit: a cloud does not say which they are.
+    """Finds the Gaussians of a cloud, which has no indices, by their position in the map, bit for bit.
 
-    Of two in the very same place, both go by what is said of the first.
+    Of two in the very same place, the first is found.
     """
 
     def __init__(self, points: np.ndarray) -> None:  # (N, 3) float32

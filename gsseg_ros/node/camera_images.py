@@ -1,4 +1,4 @@
-"""Pictures of the camera, for the overlay: heard only while somebody looks at that, for they are large."""
+"""Subscribes to the camera's pictures, which are large, only while the overlay has subscribers."""
 
 from __future__ import annotations
 

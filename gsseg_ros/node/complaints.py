@@ -1,4 +1,4 @@
-"""Warnings in the log, of one kind at most once in five seconds."""
+"""Writes warnings to the log, those of one kind at most once in five seconds."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class _Said:
 
 
 class Complaints:
-    """Warns, and says of how many of a kind it did not.
+    """Writes warnings to the log at a limited rate, and how many of a kind were left out.
 
     Its methods may be called from any thread. A kind that is not in `KINDS` counts as `OTHER`, so that there are never
     more of them, whatever a message says.
@@ -61,7 +61,7 @@ class Complaints:
                 said.last = message
 
     def due(self, kind: str) -> bool:
-        """Whether something may be said again that goes on: what is not said then need not be counted."""
+        """Whether a kind may be warned of now; a lasting condition asks this first, since it need not be counted."""
         with self._lock:
             return self._is_due(self._of(kind))
 

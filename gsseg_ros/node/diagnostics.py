@@ -1,4 +1,4 @@
-"""How the node is: counts, ages and a verdict for `/diagnostics`, and for the log why nothing arrives or is fused."""
+"""Reports the state of the node: counts, ages and a verdict on `/diagnostics`, and warnings in the log."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from collections import Counter
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from gsseg_core.live.results import SCENE_CHANGED
+from gsseg_core.text import counted
 from gsseg_ros.node.complaints import CLOCK, MISSING, PERIOD, TIME_JUMP, Complaints
 from gsseg_ros.node.inputs import Inputs
 from gsseg_ros.node.workspace import Workspace
 
 WINDOW_SECONDS = 10.0
-"""For which masks the verdict counts how many were refused, of a clock that never stands still."""
+"""The verdict counts the refused masks of so many last seconds, by a clock that never stands still."""
 
 WARN_SHARE, ERROR_COUNT = 0.1, 3
 """The verdict is WARN from this share of refused masks on, and ERROR if all were, and at least so many."""
@@ -30,7 +31,7 @@ _HINTS = {
 
 
 def rejections(inputs: Inputs) -> dict[str, int]:
-    """Masks that did not become views, by reason, from arrival to fusion."""
+    """Count the masks that did not become views, by reason, from arrival to fusion."""
     counts = Counter(inputs.pairing.dropped) + Counter(inputs.rejected)
     if inputs.worker.dropped:
         counts["queue_full"] += inputs.worker.dropped
@@ -38,21 +39,21 @@ def rejections(inputs: Inputs) -> dict[str, int]:
 
 
 def missing_inputs(inputs: Inputs) -> dict[str, str]:
-    """Say of each input from which nothing came for five seconds what to check; by what it is, such as "mask"."""
+    """Explain what to check for each input that was silent for five seconds; by its role, such as "mask"."""
     now, complaints = time.monotonic(), {}
     for topic, (count, last) in inputs.arrivals.items():
         silence, role = now - last, inputs.roles[topic]
         if silence < PERIOD:
             continue
         publishers = inputs.publishers_of(topic)
-        many = f"{publishers} publisher{'s' * (publishers > 1)}"
+        found = counted(publishers, "publisher")
         if publishers and not count:
             hint = (
-                f"it has {many}: do their QoS and type match (this side is {inputs.policies[topic]}; "
+                f"it has {found}: do their QoS and type match (this side is {inputs.policies[topic]}; "
                 f"ros2 topic info -v {topic}), and do they publish?"
             )
         elif publishers:
-            hint = f"{count} came before, and it still has {many}"
+            hint = f"{count} came before, and it still has {found}"
         else:
             hint = f"nobody publishes it: {_HINTS[role]}"
         complaints[role] = f"no data on {topic} for {silence:.0f} s; {hint}"
@@ -60,7 +61,7 @@ def missing_inputs(inputs: Inputs) -> dict[str, str]:
 
 
 def why_dropped(inputs: Inputs, reason: str) -> str:
-    """Say why masks are dropped before they are fused, and what to check; empty for other reasons."""
+    """Explain why masks are dropped before they are fused, and what to check; empty for other reasons."""
     return {
         "no_pose": f"no pose with their stamp came within a second{_pose_problem(inputs)}; expected mask and pose to "
         "carry the stamp of the same image, from the same clock (use_sim_time?)",
@@ -77,7 +78,7 @@ def why_dropped(inputs: Inputs, reason: str) -> str:
 
 
 def complain(complaints: Complaints, inputs: Inputs | None, clock_problem: str) -> None:
-    """Say in the log what is missing and what was lost; call it once a second."""
+    """Warn in the log of missing inputs and lost masks; call it once a second."""
     if clock_problem and complaints.due(CLOCK):
         complaints.add(CLOCK, clock_problem)
     if inputs is not None:
@@ -102,7 +103,7 @@ def _complain_of_losses(complaints: Complaints, inputs: Inputs) -> None:
     for reason, count in rejections(inputs).items():
         why, more = why_dropped(inputs, reason), count - logged[reason]
         if why and more and complaints.due(reason):
-            complaints.add(reason, f"{more} mask{'s were' if more > 1 else ' was'} dropped because {why}")
+            complaints.add(reason, f"{counted(more, 'mask was', 'masks were')} dropped because {why}")
             logged[reason] = count
 
 
@@ -123,7 +124,7 @@ def _frame_problem(inputs: Inputs) -> str:
 def diagnostic_array(
     name: str, workspace: Workspace, inputs: Inputs | None, stamp: object, clock_problem: str = ""
 ) -> DiagnosticArray:
-    """Put all that an operator wants to know into one message.
+    """Make the message for `/diagnostics`.
 
     Its level is OK while masks are fused; WARN if something is amiss that may cost views: not active, no scene, no
     clock, silent inputs, refused poses, a tenth or more of the masks of the last ten seconds refused; ERROR if all of

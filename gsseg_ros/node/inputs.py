@@ -1,4 +1,4 @@
-"""What the node listens to: masks, camera_infos and poses, paired by stamp and camera, fused in their own thread."""
+"""Subscribes to masks, camera_infos and poses, pairs them by stamp and camera, and fuses them in a thread."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ EXPIRE_PERIOD = 0.1  # s
 
 
 class Inputs:
-    """Subscriptions, from activation to deactivation. Callbacks only put messages aside; the worker does the work.
+    """Subscribes from activation to deactivation. Callbacks only put messages aside; a worker fuses them.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ class Inputs:
         self._built.close()
 
     def publishers_of(self, topic: str) -> int:
-        """How many publish on an input."""
+        """Count the publishers of an input."""
         return int(self._node.count_publishers(topic))
 
     def _listen(self, kind: Any, topic: str, callback: Callable[[str, Any], None]) -> Any:
@@ -212,7 +212,7 @@ class Inputs:
         self._told = dropped
 
     def _forget_waiting(self) -> None:
-        """Drop the masks of before; those on their way to the session are known there by their era."""
+        """Drop the masks that wait; the session knows those on their way to it by their era."""
         self._count_rejected(SCENE_CHANGED, self.pairing.clear() + self.worker.clear())
 
     def _count_rejected(self, reason: str, count: int = 1) -> None:

@@ -1,4 +1,4 @@
-"""Work that takes long: the thread that fuses views, and the one slot for jobs that change all that is known."""
+"""Runs long work: a thread that fuses views, a slot for jobs that exclude each other, turns for requests."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 
 class Job:
-    """A piece of work that can be asked to stop."""
+    """A job that can be asked to stop."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -80,7 +80,7 @@ class JobSlot:
 
 
 class Requests:
-    """Counts the requests at work, so that a transition can wait for their end."""
+    """Counts the requests at work, so that a lifecycle transition can wait for their end."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -110,7 +110,7 @@ class Turns:
     Parameters
     ----------
     at_work, waiting : int
-        How many of each; one thread is held by each of them.
+        Number of each; one thread is held by each of them.
     """
 
     def __init__(self, at_work: int, waiting: int) -> None:
@@ -170,7 +170,7 @@ class Worker(Generic[T]):
 
     @property
     def waiting(self) -> int:
-        """How many items wait."""
+        """Number of items that wait."""
         return len(self._items)
 
     def clear(self) -> int:

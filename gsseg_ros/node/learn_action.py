@@ -1,4 +1,4 @@
-"""The action `~/learn`: codes from the views received or from a dataset folder, with feedback and cancel."""
+"""The action `~/learn`: learns from the views received or from a dataset folder, with feedback and cancel."""
 
 from __future__ import annotations
 
@@ -17,18 +17,15 @@ from gsseg_core.data.dataset import Dataset
 from gsseg_core.learn.registry import LEARNERS
 from gsseg_core.live.results import Outcome
 from gsseg_core.live.session import LiveSession
-from gsseg_core.refine.settings import RefineSettings
 from gsseg_ros.errors import CanceledError, InvalidRequestError, NotActiveError, error_code
 from gsseg_ros.node.jobs import Job
 from gsseg_ros.node.outputs import Outputs
-from gsseg_ros.node.reports import Selection, finish, report_message
+from gsseg_ros.node.reports import RAW, Selection, finish, report_message
 from gsseg_ros.node.services import explain
 from gsseg_ros.node.workspace import Run, Workspace
 
 FEEDBACK_PERIOD = 0.1
 """Seconds between two messages of feedback, at least; a new stage is always told."""
-
-RAW = RefineSettings(cluster=False, filter=False)
 
 
 class LearnAction:
@@ -36,7 +33,7 @@ class LearnAction:
 
     A goal is rejected while the node is not active.
 
-    When it is done, the objects of the learnt codes are published, before refinement as in its report.
+    When it is done, the learnt objects are published, before refinement as in its report.
     """
 
     def __init__(self, node: LifecycleNode, workspace: Workspace, outputs: Callable[[], Outputs]) -> None:

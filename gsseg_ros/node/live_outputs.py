@@ -1,8 +1,8 @@
-"""What the node shows by itself while views come in: pictures on ~/overlay, and the objects so far on ~/objects.
+"""Publishes pictures on ~/overlay and the objects so far on ~/objects while views come in.
 
 All of it is made in a thread of its own, only while somebody listens, and only of what is newest. Masks that wait to be
-fused go first, but for a second at most: they may come faster than they are fused. It goes by the codes as they are at
-that moment, without refinement.
+fused go first, but for a second at most: they may come faster than they are fused. It shows the class
+probabilities of that moment, without refinement.
 """
 
 from __future__ import annotations
@@ -19,20 +19,17 @@ from std_msgs.msg import Header
 from gsseg_core.errors import GssegError
 from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.color_images import color_from_image
 from gsseg_ros.conversions import camera_from_messages, rgb_image
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.pairing import Paired
-from gsseg_ros.node.reports import Selection
+from gsseg_ros.node.reports import RAW, Selection
 from gsseg_ros.node.size_limits import require_size
 from gsseg_ros.node.workspace import Workspace
 
-RAW = RefineSettings(cluster=False, filter=False)
-
 CODES_PERIOD, OBJECTS_PERIOD = 1.0, 2.0
-"""Seconds for which codes are gone by before they are looked up again, and between two messages of objects."""
+"""Seconds for which a segmentation is reused before it is made again, and between two messages of objects."""
 
 IMAGE_SILENCE = 2.0
 """Seconds without a usable camera image until the classes are drawn without one."""
@@ -44,7 +41,7 @@ _PAUSE = 0.05  # s, between two looks at whether masks still wait
 
 
 class LiveOutputs:
-    """Draws and boxes in a thread of its own, from activation to deactivation. Its methods return at once.
+    """Draws overlays and boxes objects in a thread, from activation to deactivation. Its methods return at once.
 
     Parameters
     ----------
@@ -75,7 +72,7 @@ class LiveOutputs:
         self._objects_due = False
         self._news: int | None = None  # `objects_count` when the newest view came whose objects nobody has been told
         self._stopping = False
-        self._codes: tuple[tuple[object, int], float, Segmentation] | None = None
+        self._segmentation: tuple[tuple[object, int], float, Segmentation] | None = None
         self._last_image = self._last_objects = -np.inf
         self._thread = threading.Thread(target=self._run, name="live outputs", daemon=True)
         self._thread.start()
@@ -94,7 +91,7 @@ class LiveOutputs:
     def tick(self) -> None:
         """See whether objects are due; call it some ten times a second.
 
-        What a run has published since the newest view came stays: it is refined, and of codes that were learnt.
+        What a run has published since the newest view came stays: it is refined, or learnt.
         """
         if (
             self._news == self._outputs.objects_count
@@ -183,15 +180,15 @@ class LiveOutputs:
         self._last_objects = time.monotonic()
 
     def _current(self) -> Segmentation:
-        """Codes as they are now, or were a second ago."""
+        """Segmentation without refinement, as it is now or was a second ago."""
         session = self._workspace.session
         key = (session.era, session.version)
-        if self._codes is not None:
-            kept, since, result = self._codes
+        if self._segmentation is not None:
+            kept, since, result = self._segmentation
             if kept == key or (kept[0] is key[0] and time.monotonic() - since < CODES_PERIOD):
                 return result
         learnt = session.learnt
         result = Segmentation.unfiltered(session.scene, session.codes(), session.class_names, RAW)
         result = result.calibrated(1.0 if learnt is None else learnt.temperature)
-        self._codes = (key, time.monotonic(), result)
+        self._segmentation = (key, time.monotonic(), result)
         return result

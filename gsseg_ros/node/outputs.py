@@ -1,4 +1,4 @@
-"""Everything that the node publishes, but for diagnostics."""
+"""Publishes clouds, objects, reports and overlays, each only if it is of the newest run."""
 
 from __future__ import annotations
 

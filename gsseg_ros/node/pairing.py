@@ -30,7 +30,7 @@ _UNCLEAR_NS = 10 * SECOND
 
 
 class PoseSource(Protocol):
-    """Where poses of the camera in the map come from."""
+    """Source of the poses of the camera in the map."""
 
     @property
     def knows_frames(self) -> bool:
@@ -47,7 +47,7 @@ class PoseSource(Protocol):
 
 
 class Paired(NamedTuple):
-    """A mask, and what belongs to it."""
+    """A mask with the camera_info and the pose that belong to it."""
 
     name: str  # Unique: the pairing's prefix, the epoch, the stamp, and at one stamp the number of the camera.
     stamp: int
@@ -59,7 +59,7 @@ class Paired(NamedTuple):
 
 @dataclass(frozen=True)
 class PairingSettings:
-    """How long masks wait.
+    """Limits on how long and how many masks wait.
 
     Attributes
     ----------
@@ -143,7 +143,7 @@ class Pairing:
     poses : PoseSource
         `ExactPoses`, `InterpolatedPoses` or `gsseg_ros.node.tf_poses.TfPoses`.
     settings : PairingSettings
-        How long masks wait.
+        Limits on the masks that wait.
     prefix : str
         What the names of all pairs begin with: epochs and stamps of another pairing may be the same.
 
@@ -234,7 +234,7 @@ class Pairing:
 
     @property
     def waiting(self) -> int:
-        """How many masks wait, for what belongs to them or until it is clear to which time they belong."""
+        """Number of masks that wait for a pose or camera_info, or that `Timeline` holds back."""
         with self._lock:
             return len(self._waiting) + self._timeline.held_masks
 
@@ -260,7 +260,7 @@ class Pairing:
             self._deliver(epoch, self._timeline.take_in(message))
 
     def _deliver(self, epoch: int, messages: list[Message]) -> None:
-        """Work on what is now known to be of this time; `epoch` is that of before the last message."""
+        """Pair messages that `Timeline` has released; `epoch` is that of before the last message."""
         if self._timeline.epoch > epoch:
             for waiting in sorted(self._waiting):
                 self._pair(waiting, last_chance=True, epoch=epoch)

@@ -1,4 +1,4 @@
-"""What the node says of a segmentation: the report, one cloud per class, and the objects with their boxes."""
+"""Turns a segmentation into messages: the report, one cloud per class, and the objects with their boxes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from geometry_msgs.msg import Point
 from gsseg_msgs.msg import ClassSummary, Object, ObjectArray, SegmentationReport, StageTiming
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import ColorRGBA, Header
@@ -22,12 +21,15 @@ from gsseg_core.segmentation import Segmentation
 from gsseg_ros.conversions import cloud
 from gsseg_ros.frames import Similarity
 from gsseg_ros.node.workspace import Run
-from gsseg_ros.object_messages import object_message
+from gsseg_ros.object_messages import object_message, point_message
+
+RAW = RefineSettings(cluster=False, filter=False)
+"""Settings without any refinement."""
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """A segmentation as it was asked for.
+    """Those classes and Gaussians of a segmentation that a request asked for.
 
     Attributes
     ----------
@@ -119,8 +121,8 @@ class Selection:
             points, confidence = self._points[index], self._confidence[index]
             summary.mean_confidence = float(confidence.mean(dtype=np.float64))
             summary.min_confidence = float(confidence.min())
-            summary.centroid = _point(points.mean(axis=0, dtype=np.float64))
-            summary.box_min, summary.box_max = _point(points.min(axis=0)), _point(points.max(axis=0))
+            summary.centroid = point_message(points.mean(axis=0, dtype=np.float64))
+            summary.box_min, summary.box_max = point_message(points.min(axis=0)), point_message(points.max(axis=0))
         return summary
 
 
@@ -161,7 +163,7 @@ def report_message(
 
 
 def empty_report(run: Run, session: LiveSession | None, map_frame: str) -> SegmentationReport:
-    """Report that nothing of what was published before a run holds any more."""
+    """Report an empty segmentation, after a run that has made all earlier ones invalid."""
     report = SegmentationReport(
         header=Header(stamp=run.stamp, frame_id=map_frame), revision=run.revision, job=run.job,
         total_seconds=run.total_seconds,
@@ -182,8 +184,3 @@ def finish(report: SegmentationReport, run: Run) -> SegmentationReport:
 def stage_timings(run: Run) -> list[StageTiming]:
     """Seconds of every stage, in the order in which they ran."""
     return [StageTiming(name=name, seconds=seconds) for name, seconds in run.watch.seconds.items()]
-
-
-def _point(values: Sequence[float]) -> Point:
-    x, y, z = (float(value) for value in values)
-    return Point(x=x, y=y, z=z)

@@ -1,4 +1,4 @@
-"""The node's services: each request becomes calls of the core, each error an error code and one line."""
+"""Answers the node's services: each request becomes calls of the core, each error an error code and one line."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
-from geometry_msgs.msg import Point
 from gsseg_msgs.srv import Export, LoadScene, LoadState, RenderView, Reset, SaveState, Segment
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.lifecycle import LifecycleNode
@@ -31,12 +30,13 @@ from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.reports import Selection, empty_report, finish, report_message, stage_timings
 from gsseg_ros.node.viewpoints import Lookup, draw, viewpoint
 from gsseg_ros.node.workspace import Run, Workspace, checked_confidence, chosen_classes
+from gsseg_ros.object_messages import point_message
 from gsseg_ros.qos import requests
 
 STATE_FILE, EXPORT_FOLDER = "gsseg_state.npz", "gsseg_export"
 
 AT_WORK, WAITING = 2, 4
-"""Requests that take long: how many work at a time, and how many more wait; each holds a thread of the executor."""
+"""Most long requests that work at a time, and that wait besides; each holds a thread of the executor."""
 
 Handler = TypeVar("Handler", bound=Callable[..., Any])
 
@@ -99,7 +99,7 @@ def refinement(request: Any, workspace: Workspace) -> RefineSettings:
 
 
 class Services:
-    """Answers requests.
+    """Creates the services and answers their requests.
 
     Parameters
     ----------
@@ -207,13 +207,13 @@ class Services:
         corners = workspace.settings.scene_to_map.points_to_map(session.scene.means)
         response.path, response.scene_hash = str(session.scene.path), session.scene.digest
         response.num_gaussians = len(session.scene)
-        response.box_min, response.box_max = (_point(corner) for corner in (corners.min(axis=0), corners.max(axis=0)))
+        response.box_min, response.box_max = (point_message(side(axis=0)) for side in (corners.min, corners.max))
         response.seconds = time.perf_counter() - started
 
     @answered
     @in_turn
     def save_state(self, request: SaveState.Request, response: SaveState.Response) -> None:
-        """Save votes, views and codes."""
+        """Save votes, views and class probabilities."""
         path, session = self.workspace.path(request.path, STATE_FILE), self.workspace.session
         with self.workspace.run("save_state"), pinned_folder(path.parent, self.workspace.root) as folder:
             response.num_views = session.save(folder / path.name)
@@ -221,7 +221,7 @@ class Services:
 
     @answered
     def load_state(self, request: LoadState.Request, response: LoadState.Response) -> None:
-        """Load what was saved, in place of what is known."""
+        """Load a saved state in place of the present one."""
         session, path = self.workspace.session, self.workspace.existing(request.path, STATE_FILE)
         with self.workspace.slot.take("load_state"), self.workspace.run("load_state") as run:
             response.num_views = self.workspace.load_state(path, self.workspace.root)
@@ -263,7 +263,7 @@ class Services:
 
     @answered
     def reset(self, request: Reset.Request, response: Reset.Response) -> None:
-        """Forget codes and views, and clear the clouds."""
+        """Forget all views and what was learnt, and clear the clouds."""
         workspace = self.workspace
         with workspace.slot.take("reset"), workspace.run("reset") as run:
             response.num_views_dropped = workspace.reset()
@@ -280,7 +280,7 @@ class Services:
         return Selection(session, result, chosen, threshold, self.workspace.settings.scene_to_map), refine
 
     def _clear(self, run: Run) -> None:
-        """Take back what was published of what is known no more."""
+        """Replace all that is latched by empty messages."""
         workspace = self.workspace
         workspace.number(run)
         session = workspace.session if workspace.has_scene else None
@@ -288,8 +288,3 @@ class Services:
 
     def _header(self, run: Run) -> Header:
         return Header(stamp=run.stamp, frame_id=self.workspace.settings.map_frame)
-
-
-def _point(corner: Any) -> Point:
-    x, y, z = (float(value) for value in corner)
-    return Point(x=x, y=y, z=z)

@@ -1,4 +1,4 @@
-"""Simulated time: whether it comes at all, goes on, or is set back."""
+"""Watches simulated time: whether /clock comes at all, goes on, or is set back."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from builtin_interfaces.msg import Time
 from rclpy.clock import Clock, JumpHandle, JumpThreshold
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
+
+from gsseg_core.text import counted
 
 STANDSTILL_SECONDS = 5.0
 """How long /clock may stand still, of a clock that does not."""
@@ -43,12 +45,11 @@ class SimTime:
         if silence < STANDSTILL_SECONDS or not clock.ros_time_is_active:
             return ""
         publishers = self._node.count_publishers("/clock")
-        many = f"{publishers} publisher{'s' * (publishers > 1)}"
         if stamp == 0:
             found = f"no /clock has come for {silence:.0f} s"
         else:
             found = f"/clock has stood still at {stamp / 1e9:.3f} s for {silence:.0f} s"
-        hint = f"it has {many} (is it paused?)" if publishers else "nobody publishes it"
+        hint = f"it has {counted(publishers, 'publisher')} (is it paused?)" if publishers else "nobody publishes it"
         return (
             f"use_sim_time is true, but {found}, and {hint}; expected a simulator or 'ros2 bag play --clock', or "
             "use_sim_time false"

@@ -1,4 +1,4 @@
-"""How large what peers send and ask for may be."""
+"""Limits the size of the images that peers send and ask for."""
 
 from __future__ import annotations
 

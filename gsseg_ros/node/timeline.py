@@ -1,4 +1,4 @@
-"""Tells time that was set back, by a simulator that starts again or a bag that loops, from messages that are late."""
+"""Detects that time was set back, as when a bag loops, and tells that from messages that are merely late."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MASK = "mask"
 
 
 class Message(NamedTuple):
-    """What came, unread."""
+    """A message of one stream, with its stamp, not yet parsed."""
 
     stream: str  # "mask", "camera_info" or "pose"
     stamp: int  # ns
@@ -24,7 +24,7 @@ class Message(NamedTuple):
 
 
 class Timeline:
-    """Follows the stamps of some streams, and says of every message to which time it belongs.
+    """Follows the stamps of several streams, and tells which messages came before and after time was set back.
 
     A stream goes on when it brings a stamp newer than all before. A message is behind if it is a second or more older
     than the newest of its stream. It is held back until it is clear what it is:
@@ -49,7 +49,7 @@ class Timeline:
     Attributes
     ----------
     epoch : int
-        How often time was set back.
+        How often time was set back so far.
     last_jump : (int, int)
         From where to where that was, the last time, ns.
     lost_masks : int
@@ -73,7 +73,7 @@ class Timeline:
 
     @property
     def held_masks(self) -> int:
-        """How many masks are held back."""
+        """Number of masks that are held back."""
         return sum(message.stream == MASK for message in self._held)
 
     def take_in(self, message: Message) -> list[Message]:
@@ -162,7 +162,7 @@ class Timeline:
         return late
 
     def _start_afresh(self, began: int | None = None) -> list[Message]:
-        """Begin a new time, with what is held."""
+        """Begin a new epoch with the messages that are held."""
         first = self._release()
         began = min(message.stamp for message in first) if began is None else began
         self.epoch += 1

@@ -1,4 +1,4 @@
-"""Pictures of a segmentation from a viewpoint that a request names."""
+"""Renders a segmentation from the viewpoint of a request."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Lookup: TypeAlias = Callable[[str, int], "npt.NDArray[np.float64] | None"]
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """What a viewpoint shows, as messages; `overlay` is empty unless it was asked for."""
+    """Pictures from a viewpoint, as messages; `overlay` is empty unless it was asked for."""
 
     labels: Image
     confidence: Image

@@ -1,4 +1,4 @@
-"""What the node's services share: settings, the live session, the job slot, and the number of the last run."""
+"""Holds what the node's services share: settings, the live session, the job slot, the number of the last run."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from gsseg_ros.node.parameters import Settings
 
 @dataclass
 class Run:
-    """One run, whose outputs all carry its stamp and number.
+    """One piece of work for a request; all its outputs carry its stamp and number.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class Run:
 
 
 class Workspace:
-    """Holds what there is between requests. All its methods may be called from any thread.
+    """Holds settings, session and job slot between requests. All its methods may be called from any thread.
 
     Attributes
     ----------
@@ -120,7 +120,7 @@ class Workspace:
 
     @property
     def era(self) -> object:
-        """Another one as soon as a scene is loaded, reset or given a saved state; a mask belongs to that it came in."""
+        """Token that changes when the scene or what is known of it is replaced; a mask carries that of its arrival."""
         session = self._session
         return self if session is None else session.era
 
@@ -191,7 +191,7 @@ class Workspace:
         return loaded
 
     def reset(self) -> int:
-        """Forget codes and views, if there is a scene; return how many views were forgotten."""
+        """Forget all views and what was learnt, if there is a scene; return how many views were forgotten."""
         forgotten = self._session.reset() if self._session is not None else 0
         self.dropped = Counter()
         self.forget_waiting()
@@ -202,7 +202,7 @@ class Workspace:
         self._replace(None)
 
     def retire(self) -> None:
-        """Let nothing that is still at work have any effect; what is known stays."""
+        """Refuse the results of whatever is still at work; the session stays."""
         if self._session is not None:
             self._session.retire()
 
@@ -218,7 +218,7 @@ class Workspace:
 
     @contextmanager
     def run(self, job: str) -> Iterator[Run]:
-        """Note how a run ends. It gets its number by `number`."""
+        """Begin a run, and note how it ends; `number` gives it its number."""
         run = Run(job, self.era)
         try:
             yield run
@@ -234,7 +234,7 @@ class Workspace:
             run.stamp, run.revision, run.dropped = self._now(), self._revision, Counter(self.dropped)
 
     def holds(self, run: Run) -> bool:
-        """Whether what a run goes by is still what is known, and the node has not been deactivated meanwhile."""
+        """Whether a run is still valid: nothing was replaced, nor the node deactivated, since it began."""
         return run.era is self.era
 
     @property

@@ -1,1 +1,1 @@
-"""A dataset or a bag as the topics of a robot."""
+"""Replays a dataset or a bag as the topics of a robot."""

@@ -157,7 +157,7 @@ class ReplayNode(Node):
 
 
 def make_source(settings: dict[str, Any]) -> Source:
-    """Open what the parameters name."""
+    """Open the folder or bag that the parameters name."""
     data, bag = settings["data"], settings["bag"]
     if bool(data) == bool(bag):
         found = f"data is '{data}' and bag is '{bag}'" if data else "neither 'data' nor 'bag' is set"

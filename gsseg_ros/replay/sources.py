@@ -1,4 +1,4 @@
-"""What can be replayed: a dataset folder or a recorded bag, as a stream of messages with the time they are due.
+"""Reads a dataset folder or a recorded bag as a stream of messages with the times when they are due.
 
 Time is counted in masks: the message of due time 3.5 belongs halfway between the fourth mask and the fifth. So a
 recording can be played at another rate, and what was recorded between two masks still comes between them.
@@ -200,7 +200,7 @@ class BagSource:
 
 
 class _MaskClock:
-    """From times of recording to masks since the start: straight lines between one mask and the next."""
+    """Converts times of recording to masks since the start, linearly between one mask and the next."""
 
     def __init__(self, masks: Iterator[int]) -> None:
         self._masks = masks
