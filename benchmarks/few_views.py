@@ -37,10 +37,11 @@ from gsseg_core.metrics import Evaluation
 from gsseg_core.objects.pick import Pick, pick_clicks, pick_mask
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.view_operator import ViewOperator
-from gsseg_core.refine.label_propagation import GraphSettings, graph_of, propagate
+from gsseg_core.refine.label_propagation import GraphSettings, propagate
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
+from gsseg_core.spatial.neighbour_graph import graph_of
 from gsseg_core.warm_up import warm_up
 
 COUNTS = (1, 2, 4, 8, 16, 32)

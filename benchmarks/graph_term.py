@@ -29,10 +29,11 @@ from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.temperature import ReliabilityDiagram
 from gsseg_core.metrics import Evaluation
-from gsseg_core.refine.label_propagation import GraphSettings, graph_of, is_scarce, propagate
+from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, propagate
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
+from gsseg_core.spatial.neighbour_graph import graph_of
 from gsseg_core.warm_up import warm_up
 
 COUNTS = (4, 8, 16, 32)

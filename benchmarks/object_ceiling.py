@@ -15,12 +15,12 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.data.view import View
-from gsseg_core.objects.silhouettes import BEHIND, depths, surface
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu.blending import in_tile, open_rays
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.splat import WIDTH, aim, blend_block
 from gsseg_core.raster.cpu.tiling import TILE, assign
+from gsseg_core.raster.depth import BEHIND, depths, surface
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.simd import first_bit, store_row
 

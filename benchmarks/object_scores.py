@@ -16,8 +16,8 @@ import numpy as np
 
 from gsseg_core.errors import MaskSizeError
 from gsseg_core.metrics import BOUNDARY_SHARE, boundary_band, iou
-from gsseg_core.objects.silhouettes import BEHIND, COVERED, surface
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.depth import BEHIND, COVERED, surface
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 

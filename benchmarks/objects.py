@@ -28,10 +28,10 @@ from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.export.pictures import contact_sheet, save_png
 from gsseg_core.export.view_pictures import background_image
 from gsseg_core.learn.em.em_learner import EMLearner
-from gsseg_core.objects.silhouette_carving import KEPT, Silhouette, shares
-from gsseg_core.objects.silhouettes import surface
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.depth import surface
 from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.refine.silhouette_carving import KEPT, Silhouette, kept_shares
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
@@ -124,11 +124,11 @@ def refined(
     for view in spread(train, RefineSettings.carve_views):
         operator = make_operator(scene, view.camera)
         silhouettes.append(Silhouette.of(scene, operator, clustered.render(operator).labels))
-    found = shares(scene, clustered.labels, silhouettes)
+    found = kept_shares(scene, clustered.labels, silhouettes)
     parts[CARVED] = scene, np.where(found.kept < KEPT, -2, clustered.labels)
     halves, parents = split(scene, straddlers(found))
     labels = clustered.labels[parents]
-    parts[SPLIT] = halves, np.where(shares(halves, labels, silhouettes).kept < KEPT, -2, labels)
+    parts[SPLIT] = halves, np.where(kept_shares(halves, labels, silhouettes).kept < KEPT, -2, labels)
     return parts, labels
 
 
@@ -201,7 +201,7 @@ which others hid a part, show in full, and so do those just under a neighbour's 
 - **KNN** gives unobserved Gaussians to what is around them.
 - **The paper's filter** removes whatever is farther from its fellows than mu + sigma. Where Gaussians are large and
   sparse this takes away good ones.
-- **Carving** (`gsseg segment --carve`, `gsseg_core.objects.silhouette_carving`) drops the Gaussians that stick out of
+- **Carving** (`gsseg segment --carve`, `gsseg_core.refine.silhouette_carving`) drops the Gaussians that stick out of
   the silhouettes in 24 train views, unless the object would have holes without them. The silhouettes are those of the
   label maps that the segmentation itself renders, so errors of single masks carve nothing away; no retraining. What no
   view reaches stays. It replaces the filter. Where objects touch, it may take a little of the object itself: see the

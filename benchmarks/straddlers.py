@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsseg_core.errors import SceneValueError
-from gsseg_core.objects.silhouette_carving import Shares
+from gsseg_core.refine.silhouette_carving import KeptShares
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.quaternions import rotations
 
@@ -81,7 +81,7 @@ def split(
 
 
 def straddlers(
-    shares: Shares,  # of N Gaussians
+    shares: KeptShares,  # of N Gaussians
     balance: float = 0.3,
     least: float = 2.0,
 ) -> np.ndarray:
@@ -89,8 +89,8 @@ def straddlers(
 
     Parameters
     ----------
-    shares : Shares
-        From `gsseg_core.objects.silhouette_carving.shares`.
+    shares : KeptShares
+        From `gsseg_core.refine.silhouette_carving.kept_shares`.
     balance : float
         How large the weaker of the two reasons must be, as a share of the stronger one, 0 to 1.
     least : float

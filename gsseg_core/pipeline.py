@@ -287,12 +287,9 @@ def _refine(
         result = Segmentation.from_codes(inputs.scene, probabilities, inputs.class_names, settings.refine)
         result = result.calibrated(temperature)
     if settings.refine.carve:
-        # Only now: the kernels of the carving take a while to compile, and most runs do without.
-        from gsseg_core.objects.silhouette_carving import carved
-
         with watch.stage("carve"):
             cameras = [view.camera for view in spread(inputs.train, settings.refine.carve_views)]
-            result = carved(inputs.scene, result, cameras, settings.device)
+            result = result.carved(inputs.scene, cameras, settings.device)
     return result
 
 

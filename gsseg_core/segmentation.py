@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,9 +18,12 @@ from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.npz_files import UnfitError, check_shares, class_names_of, open_npz, temperature_of
 from gsseg_core.files.run_folder import settle
 from gsseg_core.learn.temperature import tempered
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.refine.knn_filter import cluster, statistical_filter
 from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.refine.silhouette_carving import Silhouette, carve
+from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import neighbours_of
 from gsseg_core.text import clipped
@@ -199,6 +202,19 @@ class Segmentation:
         """
         image = self.blend(operator)
         return LabelMap(self.class_ids[image.argmax(axis=2)], tempered(image, self.temperature).max(axis=2))
+
+    def carved(self, scene: GaussianScene, cameras: Iterable[Camera], device: str = "cpu") -> Segmentation:
+        """Take out of each object what sticks out of its silhouettes in some views; these Gaussians become `REMOVED`.
+
+        What the views show are the label maps that the segmentation itself renders, not the masks: they are learnt from
+        all masks together, so that errors of single masks carve nothing away.
+        """
+        silhouettes = []
+        for camera in cameras:
+            operator = make_operator(scene, camera, device)
+            silhouettes.append(Silhouette.of(scene, operator, self.render(operator).labels))
+        out = carve(scene, self.labels, silhouettes)
+        return replace(self, labels=np.where(out, np.int32(REMOVED), self.labels))
 
     def blend(self, operator: ViewOperator) -> np.ndarray:
         """Blend what was learnt into a view, (H, W, K) float32, not calibrated; rows sum to what is known of a pixel.

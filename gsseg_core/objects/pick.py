@@ -34,9 +34,10 @@ from gsseg_core.errors import MaskFormatError, NoUsableViewsError, SettingsError
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.objects.clicks import Pixel, click_labels
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.refine.label_propagation import GraphSettings, graph_of, propagate
+from gsseg_core.refine.label_propagation import GraphSettings, propagate
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.spatial.neighbour_graph import graph_of
 
 FORMAT = "gsseg-pick-1"
 

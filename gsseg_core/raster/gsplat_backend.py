@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import functools
 import importlib
+import math
 import threading
 import warnings
 from collections.abc import Iterator
@@ -177,6 +178,12 @@ class GsplatOperator(ViewOperator):
         """Memory that it holds, in bytes, most of it on the GPU."""
         held = (self._means2d, self._conics, self._opacities, self._offsets, self._entries)
         return self.ids.nbytes + sum(tensor.nbytes for tensor in held)
+
+    def footprints(self) -> np.ndarray:
+        """Sum of the alphas of each of `ids` over an endless image, (M,) float32."""
+        xx, xy, yy = self._conics[0].unbind(dim=1)
+        areas: np.ndarray = (self._opacities[0] * (2 * math.pi) / torch.sqrt(xx * yy - xy * xy)).cpu().numpy()
+        return areas
 
     def rasterise(
         self,

@@ -47,6 +47,23 @@ class Blended(NamedTuple):
     transmittance: np.ndarray
 
 
+class SilhouetteTerms(NamedTuple):
+    """What objects that stand alone in a view would lose and gain by each of their Gaussians, in px.
+
+    With T_k(p) the transmittance of object k alone in pixel p:
+
+    Attributes
+    ----------
+    stay : (M,) float64
+        Sum of alpha T_k / (1 - T_k) over the pixels that show the Gaussian's own object.
+    go : (M,) float64
+        Sum of alpha over the pixels that show another one, where that does not hide the Gaussian.
+    """
+
+    stay: np.ndarray
+    go: np.ndarray
+
+
 class ViewOperator(ABC):
     """The weight matrix W (pixels x Gaussians) of one view of one scene, and its transpose.
 
@@ -214,6 +231,43 @@ class ViewOperator(ABC):
     def transmittance(self) -> np.ndarray:
         """Return what is left of each ray after the last Gaussian, (H, W) float32 in [0, 1]."""
         return self._blend(np.empty((self.num_gaussians, 0), np.float32)).transmittance
+
+    @abstractmethod
+    def footprints(self) -> np.ndarray:
+        """Sum of the alphas of each of `ids` over an endless image, opacity * 2 pi sqrt(|S|): (M,), in px."""
+
+    def silhouette_terms(
+        self,
+        labels: np.ndarray,  # (M,) int32
+        kept: np.ndarray,  # (M,)
+        asked: np.ndarray,  # (M,) bool
+        depths: np.ndarray,  # (M,) float32
+        shown: np.ndarray,  # (H, W) int32
+        hidden_from: np.ndarray,  # (H, W) float32
+    ) -> SilhouetteTerms:
+        """Weigh what speaks for each Gaussian in its object, and what against it, were each object alone in the view.
+
+        Parameters
+        ----------
+        labels : (M,) int32
+            Object of each of `ids`; 0 and below are none.
+        kept : (M,)
+            Share of each Gaussian that its object keeps, by which its alphas are multiplied.
+        asked : (M,) bool
+            Whose terms are wanted; those of all others are 0.
+        depths : (M,) float32
+            Depth of each Gaussian, in scene units.
+        shown : (H, W) int32
+            Object that the view shows in each pixel, negative where unknown.
+        hidden_from : (H, W) float32
+            Depth from which on the pixel hides a Gaussian.
+
+        Raises
+        ------
+        SettingsError
+            The rasteriser cannot tell; the one of the CPU can.
+        """
+        raise SettingsError(f"view '{self.camera.name}': silhouettes are weighed on the device cpu only")
 
     def weights(self, row: int | None = None, column: int | None = None) -> Weights:
         """List W, or only the row of W of one pixel: which Gaussians made it, and how much.

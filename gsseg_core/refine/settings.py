@@ -26,7 +26,7 @@ class RefineSettings:
     cluster, filter : bool
         Whether to take each of the two steps.
     carve : bool
-        Whether to cut objects to their silhouettes (`gsseg_core.objects.silhouette_carving`), in place of the filter;
+        Whether to cut objects to their silhouettes (`gsseg_core.refine.silhouette_carving`), in place of the filter;
         for whoever has views.
     carve_views : int
         From how many views, 1 or more, spread evenly over the train views.

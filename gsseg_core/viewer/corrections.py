@@ -13,8 +13,6 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.live.session import LiveSession
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.raster.cpu.projection import project
-from gsseg_core.raster.cpu.splat import HEIGHT, LOG_OPACITY, WIDTH
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED
@@ -177,19 +175,12 @@ class Corrections:
 
 
 def share_seen(scene: GaussianScene, view: View, device: str = "cpu") -> np.ndarray:
-    """How much of each Gaussian the labelled pixels of a view see, (N,) float32 in [0, 1].
-
-    A Gaussian's alphas sum up to opacity * 2 pi sqrt(|S|) over an endless image, S being its covariance there.
-    """
+    """How much of each Gaussian the labelled pixels of a view see, (N,) float32 in [0, 1]."""
     operator = make_operator(scene, view.camera, device)
     drawn = (view.read_labels() != UNKNOWN)[..., None].astype(np.float32)
     seen = operator.adjoint(drawn)[:, 0]
-    projected = project(scene, view.camera)
-    table = projected.table
-    # |S| = var(x|y) S_yy, and the table has log2(e) / 2 over each of them.
-    area = np.pi / np.log(2.0) / np.sqrt(table[:, WIDTH] * table[:, HEIGHT])
     full = np.zeros(len(scene), np.float32)
-    full[projected.ids] = np.exp2(table[:, LOG_OPACITY]) * area
+    full[operator.ids] = operator.footprints()
     share: np.ndarray = np.divide(seen, full, out=np.zeros_like(seen), where=full > 0)
     share = np.minimum(share, 1.0)
     return share

@@ -8,8 +8,8 @@ from object_scores import ObjectScores, objects_of
 from small_scenes import HEIGHT, WIDTH, build, look_at, ring, true_labels
 
 from gsseg_core.errors import MaskSizeError
-from gsseg_core.objects.silhouettes import surface
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.depth import surface
 
 
 def test_a_silhouette_counts_what_sticks_out_and_not_what_is_hidden() -> None:

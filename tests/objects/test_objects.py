@@ -32,10 +32,10 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import EmptySceneError, MaskSizeError, SceneValueError, SettingsError
 from gsseg_core.export.class_plys import export_classes
 from gsseg_core.objects.removal import without_objects
-from gsseg_core.objects.silhouette_carving import Silhouette, carve, carved, shares
-from gsseg_core.objects.silhouettes import BEHIND, depths, surface
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.depth import BEHIND, depths, surface
 from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.refine.silhouette_carving import Silhouette, carve, kept_shares
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
@@ -72,7 +72,7 @@ def with_fringe() -> tuple[GaussianScene, np.ndarray, np.ndarray]:
 
 
 def slow_shares(scene: GaussianScene, labels: np.ndarray, views: list[Silhouette], steps: int) -> np.ndarray:
-    """Readable twin of `shares`: each Gaussian's alpha is the weight that it has when it is alone."""
+    """Readable twin of `kept_shares`: each Gaussian's alpha is the weight that it has when it is alone."""
     kept = np.ones(len(scene))
     alphas = [
         np.stack([1 - make_operator(scene.subset([i]), view.camera).transmittance() for i in range(len(scene))])
@@ -103,7 +103,7 @@ def test_shares_agree_with_their_slow_twin() -> None:
         shown = true_labels(SCENE, TRUTH, camera)
         shown[:10] = -1
         views.append(Silhouette.of(scene, make_operator(scene, camera), shown))
-    result = shares(scene, labels, views, steps=3)
+    result = kept_shares(scene, labels, views, steps=3)
     np.testing.assert_allclose(result.kept, slow_shares(scene, labels, views, 3), atol=2e-3)
     assert (result.kept < 0.5).any() and (result.kept == 1).any()
 
@@ -173,7 +173,7 @@ def test_a_rigid_motion_carves_the_same() -> None:
 
 def test_a_segmentation_carves_itself_by_what_it_renders() -> None:
     result = Segmentation.from_codes(SCENE, np.eye(NUM_CLASSES, dtype=np.float32)[TRUTH], NAMES, UNREFINED)
-    after = carved(SCENE, result, ring(3))
+    after = result.carved(SCENE, ring(3))
     changed = after.labels != result.labels
     assert (after.labels[changed] == REMOVED).all() and changed.mean() < 0.05
     np.testing.assert_array_equal(after.probabilities, result.probabilities)
@@ -235,7 +235,7 @@ def test_a_split_scene_is_a_valid_ply_and_the_others_are_untouched(tmp_path: Pat
 
 def test_straddlers_have_reasons_for_both() -> None:
     scene, labels, fringe = with_fringe()
-    result = shares(scene, labels, silhouettes())
+    result = kept_shares(scene, labels, silhouettes())
     found = straddlers(result)
     assert found.any() and not found[labels <= 0].any()
     assert (np.minimum(result.stay, result.go)[found] >= 2).all() and found[~fringe].mean() < 0.2

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from gsseg_core.data.view import View
 from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.learn.em.em_learner import EMLearner
-from gsseg_core.refine.label_propagation import Graph, GraphSettings, graph_of, is_scarce, propagate, spread_if_scarce
+from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, propagate, spread_if_scarce
+from gsseg_core.spatial.neighbour_graph import Graph, graph_of
 
 FEW = GraphSettings(k=4, steps=60)
 
@@ -30,35 +31,35 @@ def some_codes(seed: int = 0, count: int = 80, classes: int = 3) -> tuple[np.nda
 
 
 def slow_graph(means: np.ndarray, colors: np.ndarray, k: int) -> np.ndarray:
-    """Shares p_ij as the module's docstring has them, (N, N)."""
+    """Weights p_ij as the module's docstring has them, (N, N)."""
     apart = np.linalg.norm(means[:, None].astype(float) - means, axis=2)
     np.fill_diagonal(apart, np.inf)
     near = np.argsort(apart, axis=1)[:, :k]
     rows = np.arange(len(means))[:, None]
     spacing = apart[rows, near].max(axis=1)
     contrast = np.linalg.norm(colors[:, None] - colors[near], axis=2)
-    weights = np.exp(
+    unnormalised = np.exp(
         -(apart[rows, near] ** 2) / (spacing[:, None] * spacing[near]) - (contrast / np.median(contrast)) ** 2 / 2
     )
-    shares = np.zeros((len(means), len(means)))
-    shares[rows, near] = weights / weights.sum(axis=1, keepdims=True)
-    return shares
+    weights = np.zeros((len(means), len(means)))
+    weights[rows, near] = unnormalised / unnormalised.sum(axis=1, keepdims=True)
+    return weights
 
 
-def slow_propagate(shares: np.ndarray, codes: np.ndarray, evidence: np.ndarray, strength: float) -> np.ndarray:
+def slow_propagate(weights: np.ndarray, codes: np.ndarray, evidence: np.ndarray, strength: float) -> np.ndarray:
     """Solve for the codes at rest; every Gaussian must be within reach of one that is known."""
     weight = np.where(codes.any(axis=1), evidence / strength, 0.0)
-    system = np.diag(weight + 1) - shares
+    system = np.diag(weight + 1) - weights
     return np.linalg.solve(system, weight[:, None] * codes)
 
 
-def test_shares_are_those_of_the_formula() -> None:
+def test_weights_are_those_of_the_formula() -> None:
     means, colors = some_points()
     graph = Graph.build(means, colors, 4)
-    shares = np.zeros((80, 80))
-    of = np.repeat(graph.order, np.diff(graph.start))
-    shares[of, graph.order[graph.places]] = graph.shares
-    np.testing.assert_allclose(shares, slow_graph(means, colors, 4), atol=1e-5)
+    dense = np.zeros((80, 80))
+    of = np.repeat(graph.order, np.diff(graph.indptr))
+    dense[of, graph.order[graph.indices]] = graph.weights
+    np.testing.assert_allclose(dense, slow_graph(means, colors, 4), atol=1e-5)
 
 
 def test_steps_end_where_the_linear_system_is_solved() -> None:
@@ -133,7 +134,7 @@ def test_degenerate_scenes_work(count: int) -> None:
     codes[0, 1] = 1
     spread = propagate(graph, codes, np.full(count, 1e4))
     assert spread[0].tolist() == [0, 1]
-    assert np.diff(graph.start).max() <= 8  # a hundred points in one place do not have a hundred neighbours each
+    assert np.diff(graph.indptr).max() <= 8  # a hundred points in one place do not have a hundred neighbours each
 
 
 def test_the_graph_of_a_scene_is_built_once() -> None:

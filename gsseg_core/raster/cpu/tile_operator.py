@@ -12,11 +12,12 @@ from gsseg_core.raster.cpu import products
 from gsseg_core.raster.cpu.label_pairs import take
 from gsseg_core.raster.cpu.lifted_mask import LiftedMask
 from gsseg_core.raster.cpu.projection import project
-from gsseg_core.raster.cpu.splat import LOG_OPACITY
+from gsseg_core.raster.cpu.silhouette_kernels import silhouette_terms
+from gsseg_core.raster.cpu.splat import HEIGHT, LOG_OPACITY, WIDTH
 from gsseg_core.raster.cpu.tile_observation import TileObservation
 from gsseg_core.raster.cpu.tiling import TILE, assign
 from gsseg_core.raster.observation import Observation
-from gsseg_core.raster.view_operator import Blended, ViewOperator, Weights
+from gsseg_core.raster.view_operator import Blended, SilhouetteTerms, ViewOperator, Weights
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -36,6 +37,31 @@ class TileOperator(ViewOperator):
         self.ids = projected.ids
         self._table = projected.table
         self._tiles = assign(projected, camera.width, camera.height)
+
+    def footprints(self) -> np.ndarray:
+        """Sum of the alphas of each of `ids` over an endless image, (M,)."""
+        # |S| = var(x|y) S_yy, and the table has log2(e) / 2 over each of them.
+        area = np.pi / np.log(2.0) / np.sqrt(self._table[:, WIDTH] * self._table[:, HEIGHT])
+        areas: np.ndarray = np.exp2(self._table[:, LOG_OPACITY]) * area
+        return areas
+
+    def silhouette_terms(
+        self,
+        labels: np.ndarray,
+        kept: np.ndarray,
+        asked: np.ndarray,
+        depths: np.ndarray,
+        shown: np.ndarray,
+        hidden_from: np.ndarray,
+    ) -> SilhouetteTerms:
+        """Weigh what speaks for each Gaussian in its object, and what against it, entry by entry."""
+        tiles = self._tiles
+        stay, go = np.zeros((2, len(tiles.entries)), np.float32)
+        silhouette_terms(
+            tiles.columns, self._table, tiles.start, tiles.entries, labels, int(labels.max(initial=0)) + 1,
+            kept.astype(np.float32), asked, depths, shown, hidden_from, stay, go,
+        )  # fmt: skip
+        return SilhouetteTerms(*(np.bincount(tiles.entries, part, len(self.ids)) for part in (stay, go)))
 
     def _without(self, hidden: np.ndarray) -> TileOperator:
         other = copy.copy(self)

@@ -1,0 +1,161 @@
+"""Cut each object to its silhouettes: drop the Gaussians that stick out of it when it stands alone.
+
+In the scene, what is in front and beside hides a good part of a Gaussian across an edge. Cut out with its object, it
+shows as a fringe, and so does what lay just under another surface. Which those are follows from the views alone. With
+x the share of each Gaussian that its object keeps, object k standing alone covers pixel p by
+
+    A_k(p) = 1 - T_k(p),    T_k(p) = prod over i in k of (1 - x_i alpha_i(p)),
+
+which does not depend on who is in front, so all objects are made in one pass over a view. A_k should be 1 where the
+view shows k, and 0 where it shows something else that does not hide it. Each Gaussian has reasons to stay, and to go,
+
+    stay_i = sum over p that shows k of      alpha_i(p) T_k(p) / (1 - T_k(p))
+    go_i   = sum over p that shows another of alpha_i(p),   unless i lies behind the surface of the scene there,
+
+the two parts of the gradient of log A_k on its own pixels and log T_k on the others, with -log(1 - alpha) taken as
+alpha. x_i <- min(1, x_i stay_i / go_i) is the multiplicative step of expectation maximisation for such sums (Shepp and
+Vardi 1982). Where the object is covered by others anyway, T_k is small and there is little reason to stay; where a
+Gaussian is all there is, it stays although it sticks out. One that never sticks out, or that no view reaches, stays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsseg_core.errors import MaskSizeError
+from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.depth import BEHIND, depths, surface
+from gsseg_core.raster.view_operator import ViewOperator
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
+
+STEPS = 5
+"""Steps of the shares: the labels hardly change after these."""
+
+KEPT = 0.5
+"""Least share with which a Gaussian stays with its object."""
+
+_LEAST = np.float32(0.01)  # of a share, so that a Gaussian may come back
+
+
+@dataclass(frozen=True, eq=False)
+class Silhouette:
+    """What a view shows, to cut objects by.
+
+    Attributes
+    ----------
+    camera : Camera
+        Where from.
+    labels : (H, W) int32
+        Class of each pixel, negative where unknown.
+    depth : (H, W) float32
+        Depth of the scene's surface, scene units; infinite where there is none.
+    """
+
+    camera: Camera
+    labels: np.ndarray
+    depth: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        scene: GaussianScene,
+        operator: ViewOperator,
+        labels: np.ndarray,  # (H, W) int32
+    ) -> Silhouette:
+        """Put a label map and the depth of the scene together.
+
+        Raises
+        ------
+        MaskSizeError
+            The labels are not of the camera's size.
+        """
+        camera = operator.camera
+        if labels.shape != (camera.height, camera.width):
+            raise MaskSizeError(
+                f"view '{camera.name}': labels have shape {labels.shape}; expected ({camera.height}, {camera.width})"
+            )
+        return cls(camera, labels.astype(np.int32), surface(scene, operator).depth)
+
+
+@dataclass(frozen=True, eq=False)
+class KeptShares:
+    """Share of each Gaussian that its object keeps, and the reasons for it.
+
+    Attributes
+    ----------
+    kept : (N,) float64
+        Share of each Gaussian that its object keeps, 0.01 to 1; 1 where it has no object or no view says anything.
+    stay, go : (N,) float64
+        Reasons for either at the last step, in px; both 0 where there is none to go.
+    """
+
+    kept: np.ndarray
+    stay: np.ndarray
+    go: np.ndarray
+
+
+def kept_shares(
+    scene: GaussianScene,
+    labels: np.ndarray,  # (N,) int
+    silhouettes: Iterable[Silhouette],
+    steps: int = STEPS,
+) -> KeptShares:
+    """Find how much of each Gaussian its object should keep.
+
+    Parameters
+    ----------
+    scene : GaussianScene
+        N Gaussians.
+    labels : (N,) int32
+        Class of each; those of class 0 and below belong to no object and are not looked at.
+    silhouettes : iterable of Silhouette
+        Views.
+    steps : int
+        How often to go through them, at least 1.
+
+    Returns
+    -------
+    KeptShares
+    """
+    labels = np.ascontiguousarray(labels, np.int32)
+    views = [(silhouette, *_aimed(scene, silhouette.camera)) for silhouette in silhouettes]
+    kept = np.ones(len(scene))
+    stay, go, asked = np.zeros(len(scene)), np.zeros(len(scene)), labels > 0
+    for _ in range(steps):
+        stay, go = np.zeros(len(scene)), np.zeros(len(scene))
+        for shown, operator, depth in views:
+            ids = operator.ids
+            terms = operator.silhouette_terms(
+                labels[ids], kept[ids], asked[ids], depth, shown.labels, shown.depth * np.float32(BEHIND)
+            )
+            stay[ids] += terms.stay
+            go[ids] += terms.go
+        # Reasons to go do not depend on the shares: who has none is not asked again.
+        asked = go > 0
+        kept = np.where(asked, np.clip(kept * stay / np.maximum(go, 1e-30), _LEAST, 1.0), kept)
+    return KeptShares(kept, np.where(asked, stay, 0), go)
+
+
+def _aimed(scene: GaussianScene, camera: Camera) -> tuple[ViewOperator, np.ndarray]:
+    """Operator of a view on the CPU, which alone tells the terms of a silhouette, and the depths of its `ids`."""
+    operator = make_operator(scene, camera)
+    return operator, depths(scene, camera)[operator.ids]
+
+
+def carve(
+    scene: GaussianScene,
+    labels: np.ndarray,  # (N,) int
+    silhouettes: Iterable[Silhouette],
+    steps: int = STEPS,
+) -> np.ndarray:
+    """Find the Gaussians that stick out of their objects, (N,) bool.
+
+    Parameters are those of `kept_shares`. Results depend neither on the order of the Gaussians nor on the number of
+    threads.
+    """
+    out: np.ndarray = kept_shares(scene, labels, silhouettes, steps).kept < KEPT
+    return out
