@@ -129,7 +129,7 @@ class StoringLearner(EMLearner):
 
     def _prepare(self, view: View, seen: SeenLabels) -> StoredWeights:
         operator = make_operator(self.scene, view.camera)
-        labels, evidence = self._heard(seen, operator)
+        labels, evidence = self._used_labels(seen, operator)
         observation = StoredWeights(operator, labels)
         if evidence is not None:
             observation.evidence = evidence

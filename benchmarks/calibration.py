@@ -26,10 +26,10 @@ from scipy.optimize import minimize_scalar
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View, spread
 from gsseg_core.demo.table_scene import build_demo
-from gsseg_core.learn.calibrate import calibrate, votes_without
+from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import VOTE_UNIT, Learner
-from gsseg_core.learn.mask_reliability import OtherViews
+from gsseg_core.learn.mask_reliability import MaskChecker
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.learn.temperature import (
     HIGHEST,
@@ -128,12 +128,12 @@ def taught(bench: Bench, name: str, views: Sequence[View]) -> Taught:
 
 
 def _held_out(learner: Learner, name: str, views: Sequence[View]) -> Iterator[Sample]:
-    others = OtherViews(learner) if isinstance(learner, EMLearner) else None
+    checker = MaskChecker(learner) if name == EM else None
     for view in views:
-        if others is not None:
-            yield others.sample(view)
+        if checker is not None:
+            yield checker.sample(view)
             continue
-        codes = votes_without(learner, view.name)
+        codes = learner.vote_codes_without(view.name)
         codes = hard_votes(codes, 0.0) if name == HARD else codes
         image, left_over = make_operator(learner.scene, view.camera).blend(codes)
         image[..., 0] += left_over * bool(codes[:, 0].any())

@@ -239,8 +239,8 @@ The scene is one floor of a real scanned apartment (Replica `apartment_0`): 126,
 view, and edges off by up to 3 px. Scores are of the test views against the true masks; no learner saw either.
 [What is measured](#what-is-measured) stands at the end. The settings of `em` were chosen on 15 of the train views, held
 out from learning for that purpose; but `least_agreement`, `majority` and `tolerance` on the test views here and on
-those of the demo scene, with masks drawn wrong in many ways ([robustness.md](robustness.md)); and so were `ROUGH`
-of `gsseg_core/learn/em/em_learner.py`, `SHARPNESS`, `SHORTEST` and `TELLING` of
+those of the demo scene, with masks drawn wrong in many ways ([robustness.md](robustness.md)); and so were
+`REFIT_FACTOR` of `gsseg_core/learn/em/em_learner.py`, `SHARPNESS`, `SHORTEST` and `TELLING` of
 `gsseg_core/learn/em/boundary_alignment.py` and `COVERED` of `gsseg_core/learn/em/rejected_regions.py`.
 """
 

@@ -31,9 +31,8 @@ from gsseg_core.files.earlier_outputs import earlier_render, earlier_segment
 from gsseg_core.files.json_files import write_json
 from gsseg_core.files.run_folder import StagedRun, staged_run
 from gsseg_core.learn.calibrate import Calibration, calibrate
-from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner import MEMORY_BUDGET, NO_MASK, Learner
-from gsseg_core.learn.mask_reliability import OtherViews, ViewCheck, hold_against, reliability_report
+from gsseg_core.learn.mask_reliability import MaskChecker, ViewCheck, compare_mask, reliability_report
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.objects.object_table import PER_VIEW, ObjectTable, find_objects
 from gsseg_core.progress import Progress, Stopwatch, silent
@@ -260,14 +259,14 @@ def _learn(
 
 def _assess(learner: Learner, class_names: Mapping[int, str], watch: Stopwatch, progress: Progress) -> Assessment:
     """Compare each mask with what the other views predict, where the learner can tell, and calibrate."""
-    checks, others, reliability = None, None, {}
-    if type(learner) is EMLearner:
+    checks, checker, reliability = None, None, {}
+    if learner.checks_masks:
         with watch.stage("check views"):
-            others = OtherViews(learner, progress)
-            checks = others.check_all(progress)
+            checker = MaskChecker(learner, progress)
+            checks = checker.check_all(progress)
             reliability = {"reliability": reliability_report(checks, class_names)}
     with watch.stage("calibrate"):
-        calibration = calibrate(learner, others, progress)
+        calibration = calibrate(learner, checker, progress)
     views = {"used": len(learner.views), "rejected": learner.reject_summary(), "names": learner.rejected, **reliability}
     return Assessment(dict(learner.views), checks, calibration, learner.history_, views)
 
@@ -338,7 +337,7 @@ def _picture(
         for drawn in draw_views(inputs.scene, result, inputs.pictured, device=device):
             images.keep(drawn.view, drawn.image)
             if assessment.checks is None and drawn.view.name in views:
-                checks.append(hold_against(views[drawn.view.name], drawn.labels, result.num_classes))
+                checks.append(compare_mask(views[drawn.view.name], drawn.labels, result.num_classes))
             yield drawn
 
     pictures = write_pictures(result, noted(), folder, run.id)

@@ -11,7 +11,6 @@ from numba.core import event
 from gsseg_core import kernel_cache
 from gsseg_core.data.view import View
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
-from gsseg_core.learn.mask_reliability import OtherViews
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
@@ -76,7 +75,7 @@ def _segment_something(device: str) -> None:
     learner = EMLearner(scene, 2, EMSettings(max_steps=2), device=device)
     learner.observe(view)
     result = Segmentation.from_codes(scene, learner.fit().codes_, {0: "left", 1: "right"})
-    OtherViews(learner).blend(view)
+    learner.predict_without(view)
     operator = make_operator(scene, camera, device)
     result.render(operator)
     operator.render(scene.colors(camera.center))

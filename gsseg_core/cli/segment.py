@@ -6,6 +6,7 @@ import argparse
 
 from gsseg_core.cli.shared import add_scene, load_kernels
 from gsseg_core.cli.terminal import tell
+from gsseg_core.learn.registry import DEFAULT, LEARNERS, distributed_learners
 from gsseg_core.progress import progress_bars
 from gsseg_core.refine.settings import RefineSettings
 
@@ -28,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--labels", default="labels", metavar="DIR", help="folder of the masks in DATASET (default: labels)"
     )
     learning = parser.add_argument_group("learning")
-    learning.add_argument("--learner", choices=("em", "gradient", "votes"), default="em", help="default: em")
+    learning.add_argument("--learner", choices=tuple(LEARNERS), default=DEFAULT, help="default: %(default)s")
     learning.add_argument(
         "--views", type=int, metavar="N", help="learn from N train views, spread evenly (default: all)"
     )
@@ -69,7 +70,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="for prepared views; those beyond it are prepared anew in each step (default: %(default)s)",
     )
     learning.add_argument(
-        "--scheduler", metavar="ADDRESS", help="learn on the workers of this Dask scheduler (em and votes)"
+        "--scheduler",
+        metavar="ADDRESS",
+        help=f"learn on the workers of this Dask scheduler ({' and '.join(distributed_learners())})",
     )
 
 

@@ -224,6 +224,12 @@ def _scaled(
     return scaled
 
 
+@nb.njit(nogil=True)
+def vote_units(weight: np.float32, votes: np.float64, units: float) -> np.int64:
+    """Round a (Gaussian, label) pair's votes for a class to whole units: everywhere the same, so sums stay exact."""
+    return np.int64(np.rint(np.float64(weight) * votes * units))
+
+
 @nb.njit(parallel=True, nogil=True, cache=True)
 def is_resolved(
     votes: np.ndarray,  # (N, K) int64

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsseg_core.errors import SettingsError
-from gsseg_core.learn.registry import DISTRIBUTED
+from gsseg_core.learn.registry import check_learner
 from gsseg_core.objects.object_table import IDS
 from gsseg_core.objects.oriented_boxes import object_boxes
 from gsseg_core.refine.label_propagation import GraphSettings
@@ -50,12 +50,7 @@ class RunSettings:
 
     def check(self) -> None:
         """Raise `SettingsError` where they do not go together."""
-        if self.scheduler is not None and self.learner not in DISTRIBUTED:
-            raise SettingsError(
-                f"scheduler {self.scheduler}: the learner {self.learner} takes one view after the other, each at the "
-                "class probabilities that the one before it left, so there is nothing to share out; expected one of "
-                f"{', '.join(DISTRIBUTED)}"
-            )
+        check_learner(self.learner, self.scheduler)
         if self.ids not in IDS:
             raise SettingsError(f"ids is {self.ids!r}; expected one of {', '.join(IDS)}")
 

@@ -80,6 +80,11 @@ class GradientLearner(Learner):
         super().__init__(scene, num_classes, device=device, memory_budget=memory_budget)
         self.settings = settings or GradientSettings()
 
+    @classmethod
+    def default_settings(cls, max_steps: int | None, seed: int) -> tuple[GradientSettings]:
+        """Return settings for the registry; `max_steps` are epochs."""
+        return (GradientSettings(epochs=max_steps or GradientSettings.epochs, seed=seed),)
+
     @property
     def loss(self) -> float:
         """Cross-entropy summed over the classes (K times CES), in nats per labelled pixel; mean of the last epoch."""
@@ -135,11 +140,14 @@ class _CrossEntropy(torch.autograd.Function):
         ctx.shape, ctx.observation = probabilities.shape, observation
         if observation.evidence.mass is None:
             where = observation.ids[observation.rows], observation.classes[observation.labels]
-            said, rest = codes[where], (observation.classes == 0).astype(np.float32)
+            likelihood, rest = codes[where], (observation.classes == 0).astype(np.float32)
         else:
             plausible = observation.evidence.plausibility(codes.shape[1])
-            said, rest = (codes[observation.ids] @ plausible.T)[observation.rows, observation.labels], plausible[:, 0]
-        shares = observation.shares(said, rest)
+            likelihood, rest = (
+                (codes[observation.ids] @ plausible.T)[observation.rows, observation.labels],
+                plausible[:, 0],
+            )
+        shares = observation.shares(likelihood, rest)
         ctx.gradient = -scale * shares.sightings
         return torch.tensor(-scale * shares.log_likelihood, dtype=probabilities.dtype)
 

@@ -1,4 +1,4 @@
-"""What all learners share: views come and go one at a time, votes are kept exactly, and `fit` makes codes of them."""
+"""Learner, the base class of all learners: views are added and taken back one at a time, their votes kept exactly."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from gsseg_core.data.label_evidence import impute_probabilities, is_resolved
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
-from gsseg_core.learn.em.em_kernels import share_votes
+from gsseg_core.learn.em.em_kernels import normalise_votes
 from gsseg_core.learn.learner_state import State
 from gsseg_core.progress import Progress as Progress
 from gsseg_core.progress import silent as silent
@@ -38,7 +38,7 @@ Self = TypeVar("Self", bound="Learner")
 
 
 class Learner(ABC):
-    """Learns which class each Gaussian of a scene belongs to.
+    """Base class of what learns which class each Gaussian of a scene belongs to; `fit` sets what ends with "_".
 
     Parameters
     ----------
@@ -58,19 +58,25 @@ class Learner(ABC):
     rejected : dict of str to str
         Names of views that could not be used, and why.
     codes_ : (N, K) float32
-        After `fit`: class probabilities of each Gaussian; a row of zeros where no labelled pixel saw it, or all that is
-        known is what it is not, see docs/masks.md.
+        After `fit`: class probabilities of each Gaussian, the paper's object codes; a row of zeros where no labelled
+        pixel saw it, or all that is known is what it is not, see docs/masks.md.
     observed_ : (N,) bool
         After `fit`: whether the Gaussian has a code.
     history_ : list of float
         The objective after each step of `fit`, for learners that have one.
     converged_ : bool
         After `fit`: whether another step would have changed little.
+    leaves_out : bool
+        Whether `predict_without` leaves the view's mask out; else the prediction has learnt from it, too.
+    checks_masks : bool
+        Whether a report holds every mask against `predict_without`.
     """
 
     codes_: np.ndarray
     observed_: np.ndarray
     converged_: bool = False
+    leaves_out = False
+    checks_masks = False
 
     def __init__(
         self, scene: GaussianScene, num_classes: int, *, device: str = "cpu", memory_budget: int = MEMORY_BUDGET
@@ -86,6 +92,14 @@ class Learner(ABC):
         self.history_: list[float] = []
         self._votes = np.zeros((len(scene), num_classes), np.int64)
         self._prepared: dict[str, Observation] = {}
+
+    @classmethod
+    def default_settings(cls, max_steps: int | None, seed: int) -> tuple[Any, ...]:
+        """Arguments after `num_classes` for `gsseg_core.learn.registry.make_learner`: settings, where there are any.
+
+        `max_steps` is for learners that take steps, None for their own default; `seed` for those that draw at random.
+        """
+        return ()
 
     def observe(self, view: View) -> bool:
         """Add a view and its votes. A view of a name that is there already replaces it.
@@ -159,6 +173,20 @@ class Learner(ABC):
             There is no view.
         """
 
+    def prepare_predictions(self, progress: Progress = silent) -> None:  # noqa: B027 - most need nothing
+        """Compute once what `predict_without` needs of all views; it does so itself if this was not called."""
+
+    def predict_without(self, view: View) -> np.ndarray:
+        """Blend into a view the probabilities learnt without its mask, as far as `leaves_out`: (H, W, K) float32.
+
+        After `fit`, for one of its views; nothing of the learner changes. Rows sum to less where little is known.
+        """
+        return self._blend_codes(self.codes_, view)
+
+    def rejected_share(self, view: View) -> float:
+        """Share of a view's labelled pixels that `fit` has not used, in [0, 1]."""
+        return 0.0
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Save the views, with their masks and votes, atomically. The scene itself is not in the file.
 
@@ -198,13 +226,22 @@ class Learner(ABC):
     def vote_codes(self) -> np.ndarray:
         """Votes as probabilities, (N, K) float32; a row of zeros where no labelled pixel saw the Gaussian."""
         codes, possible = np.empty(self._votes.shape, np.float32), self._possible()
-        if share_votes(self._votes, possible, codes):
+        if normalise_votes(self._votes, possible, codes):
             impute_probabilities(codes, self._votes, possible)
         return codes
 
+    def vote_codes_without(self, name: str) -> np.ndarray:
+        """Votes of all other views as probabilities, (N, K) float32; a row of zeros where none saw the Gaussian."""
+        observation = self.observation(name)
+        observation.vote(self._votes, UNITS, -1)
+        try:
+            return self.vote_codes()
+        finally:
+            observation.vote(self._votes, UNITS)
+
     def evidence(self) -> np.ndarray:
         """Weight of the labelled pixels that saw each Gaussian, over all views, in px, (N,) float32."""
-        # What rules a class out counts as much as what speaks for one.
+        # Votes against a class are evidence as much as votes for one.
         evidence: np.ndarray = (np.abs(self._votes).sum(axis=1) * VOTE_UNIT).astype(np.float32)
         return evidence
 
@@ -228,7 +265,7 @@ class Learner(ABC):
         if seen is None:
             return why
         operator = make_operator(self.scene, view.camera, self.device)
-        return "" if operator.vote(*self._heard(seen, operator), self._votes, UNITS, sign) else SEES_NOTHING
+        return "" if operator.vote(*self._used_labels(seen, operator), self._votes, UNITS, sign) else SEES_NOTHING
 
     def _open(self, view: View) -> tuple[Observation | None, str]:
         seen, why = self._read(view)
@@ -239,7 +276,7 @@ class Learner(ABC):
 
     def _prepare(self, view: View, seen: SeenLabels) -> Observation:
         operator = make_operator(self.scene, view.camera, self.device)
-        return operator.observe(*self._heard(seen, operator))
+        return operator.observe(*self._used_labels(seen, operator))
 
     def _read(self, view: View) -> tuple[SeenLabels | None, str]:
         if not view.has_mask:
@@ -248,8 +285,8 @@ class Learner(ABC):
         self._check_labels(view, seen)
         return (seen, "") if (seen.labels >= 0).any() else (None, ALL_UNKNOWN)
 
-    def _heard(self, seen: SeenLabels, operator: ViewOperator) -> SeenLabels:
-        """Make of a mask what is learnt from it."""
+    def _used_labels(self, seen: SeenLabels, operator: ViewOperator) -> SeenLabels:
+        """Turn a mask into the labels that are learnt from; here, as they are."""
         return seen
 
     def _check_labels(self, view: View, seen: SeenLabels) -> None:
@@ -286,14 +323,20 @@ class Learner(ABC):
         self.observed_ = is_resolved(self._votes, self._possible())
 
     def _finish(self) -> None:
-        """Leave codes only where something was seen that they can be told by."""
+        """Clear codes without evidence, and impute those of Gaussians with votes only against classes."""
         unsure = np.flatnonzero(~self.observed_)
-        # Votes for a class without a code to go with them are votes that the learner does not believe.
+        # A Gaussian with votes for a class that is not `observed_` was seen in rejected regions only: it stays unknown.
         seen = (self._votes[unsure] < 0).any(axis=1)
         self.codes_[unsure[~seen]] = 0.0
         if seen.any():
             impute_probabilities(self.codes_, self._votes, self._possible(), unsure[seen])
             self.observed_[unsure] = self.codes_[unsure].any(axis=1)
+
+    def _blend_codes(self, codes: np.ndarray, view: View) -> np.ndarray:
+        image, left_over = make_operator(self.scene, view.camera, self.device).blend(codes)
+        if codes[:, 0].any():
+            image[..., 0] += left_over
+        return image
 
     def _possible(self) -> np.ndarray:
         """Mark the ids that are classes, (K,) bool: those that views name; all, where one of them has no names."""

@@ -1,16 +1,13 @@
-"""How far each view's mask can be trusted: what the other views say of it, pixel by pixel.
+"""Mask reliability: the share of each view's labelled pixels whose label the other views predict.
 
-The codes that learnt from a mask agree with its errors, so a mask is held against codes that have not seen it: one
-more step of EM from the codes that were learnt, without the summand of this view (see
-`gsseg_core.learn.em.em_learner`). Rendered from where the view was taken, they predict its labels. A view's reliability
-is the share of its pixels whose label is the one predicted. It is an estimate of the share whose label is right. Of a
-soft mask, a pixel's label is its largest share; in a partial one "none of those looked for" is a label too, and right
-where a class is predicted that was not looked for.
+Probabilities that were fitted to a mask agree with its errors, so a mask is compared with a rendering of what was
+learnt without it (`Learner.predict_without`). The share estimates how many of its labels are right. Of a soft mask, a
+pixel's label is its largest share; in a partial one "none of those looked for" is a label too, and right where a class
+is predicted that was not looked for.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -18,15 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.class_names import class_name
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN, PackedLabels
 from gsseg_core.data.view import View, spread
-from gsseg_core.learn.em.em_learner import EMLearner, codes_without
-from gsseg_core.learn.learner import Progress, silent
+from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.learn.temperature import VIEWS, Sample, sample_pixels
-from gsseg_core.raster.backends import make_operator
 
 CONFUSIONS = 3
 """Most confusions that the report of a view names."""
@@ -34,7 +28,7 @@ CONFUSIONS = 3
 
 @dataclass(frozen=True, eq=False)
 class ViewCheck:
-    """A view's mask beside what the other views predict.
+    """Comparison of a view's mask with what the other views predict.
 
     Attributes
     ----------
@@ -45,14 +39,14 @@ class ViewCheck:
     classes : (L,) int32
         Labels that occur in the mask, ascending; of a partial one, `UNKNOWN` (-1) at last for "none of these".
     counts : (K, L) int64
-        Of the pixels with a label of which the other views say something: how many by class predicted (row) and by
+        Of the pixels with a label of which there is a prediction: how many by class predicted (row) and by
         label (column).
     predicted : PackedLabels, optional
         What the other views predict, (H, W), for pictures.
     evidence : LabelEvidence, optional
         Of a soft or partial mask; `classes` are its vocabulary.
-    unheard : float
-        Share of the pixels with a label from which nothing was learnt, since they lie in regions in doubt; see
+    rejected : float
+        Share of the pixels with a label from which nothing was learnt, since they lie in rejected regions; see
         `gsseg_core.learn.em.rejected_regions`.
     """
 
@@ -62,11 +56,11 @@ class ViewCheck:
     counts: np.ndarray
     predicted: PackedLabels | None = None
     evidence: LabelEvidence | None = None
-    unheard: float = 0.0
+    rejected: float = 0.0
 
     @property
     def checked(self) -> int:
-        """Pixels with a label of which the other views say something."""
+        """Pixels with a label of which there is a prediction."""
         return int(self.counts.sum())
 
     @property
@@ -89,7 +83,7 @@ class ViewCheck:
         return self.predicted.unpack()
 
     def confusions(self, count: int = CONFUSIONS) -> list[tuple[int, int, float]]:
-        """Give what was most often taken for something else: class predicted, label seen, share of checked pixels."""
+        """List what was most often taken for something else: class predicted, label seen, share of checked pixels."""
         wrong = self.counts.copy()
         wrong[self._right] = 0
         largest = np.argsort(-wrong, axis=None, kind="stable")[:count]
@@ -105,72 +99,49 @@ class ViewCheck:
         return (self.evidence or LabelEvidence(self.classes)).correct_words(len(self.counts))
 
 
-class OtherViews:
-    """What all views but one say, for each view of a fitted learner.
+class MaskChecker:
+    """Hold the masks of a fitted learner against what it predicts of them without learning from them.
 
     Parameters
     ----------
-    learner : EMLearner
+    learner : Learner
         After `fit`. It must not learn on while this is in use.
     progress : callable, optional
         Told of every view.
     """
 
-    def __init__(self, learner: EMLearner, progress: Progress = silent) -> None:
+    def __init__(self, learner: Learner, progress: Progress = silent) -> None:
         self.learner = learner
         self._sampled = {view.name for view in spread(list(learner.views.values()), VIEWS)}
         self._samples: dict[str, Sample] = {}
-        self._codes = CSRRows.from_dense(learner.codes_)
-        # Where no other view has seen anything, nothing is to be said.
-        self._prior = np.zeros_like(self._codes.data)
-        self._shows_background = bool((self._codes.indices == 0).any())
-        total = len(learner.views)
-        done = itertools.count()
-        self._gains, _ = learner._gains(
-            self._codes, learner.error_models_, lambda: progress("sum up views", min(next(done), total - 1), total)
-        )
-        progress("sum up views", total, total)
+        learner.prepare_predictions(progress)
 
     def predict(self, view: View) -> np.ndarray:
-        """Predict a view's labels from all the others.
+        """Predict a view's labels without its mask.
 
         Returns
         -------
         (H, W) int32
-            `UNKNOWN` (-1) where they say nothing: most of the ray ends on Gaussians that only this view has seen.
+            `UNKNOWN` (-1) where most of the ray ends on Gaussians that only this view has seen.
         """
-        return _strongest(self.blend(view))
-
-    def blend(self, view: View) -> np.ndarray:
-        """Blend what all the others say into a view, (H, W, K) float32; rows sum to less where they are silent."""
-        learner = self.learner
-        model = learner.error_models_[view.name]
-        observation, codes = learner.observation(view.name), self._codes.data.copy()
-        places = self._codes.positions(observation.ids[observation.order]).data
-        codes[places] = codes_without(observation, model, self._codes, self._gains, self._prior).data
-        operator = make_operator(learner.scene, view.camera, learner.device)
-        image, left_over = operator.blend_rows(self._codes.with_data(codes), learner.num_classes)
-        if self._shows_background:
-            image[..., 0] += left_over
-        return image
+        return _strongest(self.learner.predict_without(view))
 
     def check(self, view: View) -> ViewCheck:
-        """Hold a view's mask against what the others predict."""
-        image = self.blend(view)
+        """Compare a view's mask with its prediction."""
+        image = self.learner.predict_without(view)
         if view.name in self._sampled:
             self._samples[view.name] = sample_pixels(image, view.read_labels())
-        check = hold_against(view, _strongest(image), self.learner.num_classes)
-        evidence, areas = self.learner.error_models_[view.name].evidence, self.learner.observation(view.name).areas
-        return replace(check, unheard=float(areas[~evidence.informative].sum() / areas.sum()))
+        check = compare_mask(view, _strongest(image), self.learner.num_classes)
+        return replace(check, rejected=self.learner.rejected_share(view))
 
     def sample(self, view: View) -> Sample:
-        """Take pixels of a view's mask with what the others predict of them, to fit the temperature to."""
+        """Take pixels of a view's mask with their predicted probabilities, to fit the temperature to."""
         if view.name not in self._samples:
-            self._samples[view.name] = sample_pixels(self.blend(view), view.read_labels())
+            self._samples[view.name] = sample_pixels(self.learner.predict_without(view), view.read_labels())
         return self._samples[view.name]
 
     def check_all(self, progress: Progress = silent) -> list[ViewCheck]:
-        """Do that for all views, in their order."""
+        """Compare all masks with their predictions, in the order of the views."""
         checks, views = [], self.learner.views
         for done, view in enumerate(views.values()):
             progress("check views", done, len(views))
@@ -179,13 +150,13 @@ class OtherViews:
         return checks
 
 
-def check_views(learner: EMLearner, progress: Progress = silent) -> list[ViewCheck]:
-    """Hold each view's mask against what the others predict; see `worst_views` and `reliability_report`.
+def check_views(learner: Learner, progress: Progress = silent) -> list[ViewCheck]:
+    """Compare each view's mask with what the other views predict; see `worst_views` and `reliability_report`.
 
     Parameters
     ----------
-    learner : EMLearner
-        After `fit`.
+    learner : Learner
+        After `fit`; one of which `checks_masks` holds.
     progress : callable, optional
         Told of every view.
 
@@ -194,7 +165,7 @@ def check_views(learner: EMLearner, progress: Progress = silent) -> list[ViewChe
     list of ViewCheck
         In the order of the views.
     """
-    return OtherViews(learner, progress).check_all(progress)
+    return MaskChecker(learner, progress).check_all(progress)
 
 
 def worst_views(checks: Iterable[ViewCheck], count: int | None = None) -> list[ViewCheck]:
@@ -211,12 +182,12 @@ def worst_views(checks: Iterable[ViewCheck], count: int | None = None) -> list[V
 
 
 def reliability_report(checks: Iterable[ViewCheck], class_names: Mapping[int, str]) -> list[dict[str, Any]]:
-    """Say for `report.json` how far each view can be trusted, the worst first.
+    """Reliability of each view for `report.json`, the worst first.
 
     Returns
     -------
     list of dict
-        `name`; `reliability` in [0, 1], None where the other views say nothing; `num_pixels` with a label; `unheard`,
+        `name`; `reliability` in [0, 1], None where there is no prediction; `num_pixels` with a label; `unheard`,
         the share of them from which nothing was learnt;
         `confusions`, largest first: `true`, the class that the others predict, `seen` as, and the `share` of the
         view's checked pixels.
@@ -226,7 +197,7 @@ def reliability_report(checks: Iterable[ViewCheck], class_names: Mapping[int, st
             "name": check.name,
             "reliability": round(check.reliability, 4) if check.checked else None,
             "num_pixels": check.num_pixels,
-            "unheard": round(check.unheard, 4),
+            "unheard": round(check.rejected, 4),
             "confusions": [
                 {"true": _name(class_names, k), "seen": _name(class_names, y), "share": round(share, 4)}
                 for k, y, share in check.confusions()
@@ -243,12 +214,12 @@ def _strongest(
     return labels
 
 
-def hold_against(
+def compare_mask(
     view: View,
     predicted: np.ndarray,  # (H, W) int32
     num_classes: int,
 ) -> ViewCheck:
-    """Hold a view's mask against any prediction of its labels, `UNKNOWN` (-1) where that says nothing."""
+    """Compare a view's mask with any prediction of its labels, `UNKNOWN` (-1) where there is none."""
     seen = view.read_seen()
     labels, evidence = seen.named(), seen.evidence
     # Where a partial mask names no class, it says "none of these", its last word.

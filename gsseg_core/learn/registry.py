@@ -1,22 +1,61 @@
-"""The learners by their names: who adds one, adds it here."""
+"""The table of learners: from it come the command line's choices, the node's, the report's and the errors' lists."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import importlib
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gsseg_core.errors import SettingsError
-from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
-from gsseg_core.learn.learner import MEMORY_BUDGET, Learner
-from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 if TYPE_CHECKING:
     from distributed import Client
 
-LEARNERS = ("em", "votes", "gradient")
+    from gsseg_core.learn.learner import Learner
 
-DISTRIBUTED = ("em", "votes")
-"""Learners that sum over views, and so can do it on many machines."""
+
+class Entry(NamedTuple):
+    """Where the classes of a learner are, as "module:class": they are imported when one is made.
+
+    Attributes
+    ----------
+    learner : str
+        A subclass of `gsseg_core.learn.learner.Learner`.
+    distributed : str
+        The same on the workers of a Dask cluster, which it takes first; "" if it cannot be distributed.
+    """
+
+    learner: str
+    distributed: str = ""
+
+
+LEARNERS = {
+    "em": Entry("gsseg_core.learn.em.em_learner:EMLearner", "gsseg_core.learn.distributed.dask_learners:DistributedEM"),
+    "votes": Entry(
+        "gsseg_core.learn.vote_learner:VoteLearner", "gsseg_core.learn.distributed.dask_learners:DistributedVotes"
+    ),
+    "gradient": Entry("gsseg_core.learn.gradient_learner:GradientLearner"),
+}
+"""Every learner by its name; the first is the default."""
+
+DEFAULT = next(iter(LEARNERS))
+
+
+def distributed_learners() -> list[str]:
+    """Names of the learners that sum over views, and so can do it on many machines."""
+    return [name for name, entry in LEARNERS.items() if entry.distributed]
+
+
+def check_learner(name: str, scheduler: str | None = None) -> None:
+    """Raise `SettingsError` if there is no such learner, or it cannot learn on the workers of this scheduler."""
+    if name not in LEARNERS:
+        raise SettingsError(f"learner is {name!r}; expected one of {', '.join(LEARNERS)}")
+    if scheduler is not None and not LEARNERS[name].distributed:
+        raise SettingsError(
+            f"scheduler {scheduler}: the learner {name} takes one view after the other, each at the class "
+            "probabilities that the one before it left, so there is nothing to share out; expected one of "
+            f"{', '.join(distributed_learners())}"
+        )
 
 
 def make_learner(
@@ -26,9 +65,8 @@ def make_learner(
     *,
     max_steps: int | None = None,
     seed: int = 0,
-    device: str = "cpu",
-    memory_budget: int = MEMORY_BUDGET,
     client: Client | None = None,
+    **where: Any,
 ) -> Learner:
     """Make a learner by its name, with its default settings.
 
@@ -41,37 +79,23 @@ def make_learner(
     num_classes : int
         K, the background included.
     max_steps : int, optional
-        Steps of EM, or epochs of the gradient learner, at most.
+        Steps at most, for learners that take steps.
     seed : int
-        For the gradient learner, which draws views at random.
-    device : str
-        Where views are rendered.
-    memory_budget : int
-        Bytes of prepared views to keep; of each worker, if there are any.
+        For learners that draw at random.
     client : distributed.Client, optional
-        Have the workers of this Dask cluster do it.
+        Have the workers of this Dask cluster do it, if the learner can be distributed.
+    where
+        `device` and `memory_budget`, as of `gsseg_core.learn.learner.Learner`.
 
     Raises
     ------
     SettingsError
-        There is no such learner, or it cannot be distributed.
+        There is no such learner.
     """
-    where: dict[str, Any] = {"device": device, "memory_budget": memory_budget}
-    em = EMSettings(max_steps=max_steps or EMSettings.max_steps)
-    if client is not None and name in DISTRIBUTED:
-        from gsseg_core.learn.distributed.dask_learners import DistributedEM, DistributedVotes
-
-        if name == "em":
-            return DistributedEM(client, scene, num_classes, em, **where)
-        return DistributedVotes(client, scene, num_classes, **where)
-    if name == "em":
-        return EMLearner(scene, num_classes, em, **where)
-    if name == "votes":
-        return VoteLearner(scene, num_classes, **where)
-    if name == "gradient":
-        # PyTorch takes seconds to import, and the other learners do without.
-        from gsseg_core.learn.gradient_learner import GradientLearner, GradientSettings
-
-        settings = GradientSettings(epochs=max_steps or GradientSettings.epochs, seed=seed)
-        return GradientLearner(scene, num_classes, settings, **where)
-    raise SettingsError(f"learner is {name!r}; expected one of {', '.join(LEARNERS)}")
+    check_learner(name)
+    distributed = LEARNERS[name].distributed if client is not None else ""
+    module, kind = (distributed or LEARNERS[name].learner).split(":")
+    make = getattr(importlib.import_module(module), kind)
+    first = (client,) if distributed else ()
+    learner: Learner = make(*first, scene, num_classes, *make.default_settings(max_steps, seed), **where)
+    return learner

@@ -82,7 +82,7 @@ def tempered(
 
 
 class Sample(NamedTuple):
-    """Pixels of one view: what was predicted without it, and what its mask shows.
+    """Pixels of one view: predicted probabilities, and labels of its mask.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ def sample_pixels(
 
 
 def fit_temperature(samples: Sequence[Sample]) -> float:
-    """Find the temperature at which held-out masks are likeliest, each seen through a confusion matrix of its own.
+    """Fit the temperature at which held-out masks are likeliest, each seen through a confusion matrix of its own.
 
     Returns
     -------
@@ -151,17 +151,17 @@ def log_likelihood(sample: Sample, temperature: float) -> float:
     confusion /= confusion.sum(axis=1, keepdims=True)
     for step in range(STEPS):
         by_pixel = ((1 - OUTLIERS) * confusion.T)[column] * probabilities  # (P, C): this class, meant by this label
-        told = np.maximum(by_pixel.sum(axis=1) + OUTLIERS / len(present), _TINY)
+        likelihood = np.maximum(by_pixel.sum(axis=1) + OUTLIERS / len(present), _TINY)
         if step < STEPS - 1:
-            counts = np.add.reduceat(by_pixel / told[:, None], first, axis=0).T
+            counts = np.add.reduceat(by_pixel / likelihood[:, None], first, axis=0).T
             counts[diagonal] += right
             total = counts.sum(axis=1, keepdims=True)
             np.divide(counts, total, out=confusion, where=total > 0)
-    return float(np.log(told).sum())
+    return float(np.log(likelihood).sum())
 
 
 class ReliabilityDiagram:
-    """How often predictions are right, by how sure they are, accumulated over views.
+    """Reliability diagram: how often predictions are right by their confidence, accumulated over views.
 
     Confidences from 0 to 1 fall into `BINS` bins of equal width; 1 falls into the last one.
 
@@ -222,7 +222,7 @@ class ReliabilityDiagram:
 
 
 class RiskCoverage(NamedTuple):
-    """What is lost by answering only where one is sure.
+    """Risk by coverage: the error of answering only where one is sure.
 
     Attributes
     ----------

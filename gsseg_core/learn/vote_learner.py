@@ -1,17 +1,20 @@
-"""Votes: the sum over views of W^T onehot(y)."""
+"""The learner by votes: class probabilities are the normalised sum over views of W^T onehot(y)."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from gsseg_core.data.view import View
 from gsseg_core.learn.learner import Learner, Progress, silent
 
 
 class VoteLearner(Learner):
-    """Codes proportional to the votes. Exact, additive, one pass: what a live robot runs.
+    """Class probabilities proportional to the votes. Exact, additive, one pass: what a live robot runs.
 
     FlashSplat (Shen et al. 2024) takes the largest entry of the same sums.
     """
+
+    leaves_out = True
 
     def fit(self, progress: Progress = silent) -> VoteLearner:
         """Normalise the votes."""
@@ -19,3 +22,7 @@ class VoteLearner(Learner):
         self.codes_, self.converged_ = self.vote_codes(), True
         self.observed_ = np.asarray(self.codes_.any(axis=1))
         return self
+
+    def predict_without(self, view: View) -> np.ndarray:
+        """Blend into a view the votes of all others as probabilities, (H, W, K) float32; exact, by subtraction."""
+        return self._blend_codes(self.vote_codes_without(view.name), view)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
+from gsseg_core.data.label_evidence import vote_units
 from gsseg_core.simd import prefetch
 
 AHEAD = 12
@@ -30,4 +31,4 @@ def add_votes(
         row = total[ids[m]]
         for s in range(start[m], start[m + 1]):
             for j in range(said_start[labels[s]], said_start[labels[s] + 1]):
-                row[said_classes[j]] += sign * np.int64(np.rint(np.float64(votes[s]) * said[j] * units))
+                row[said_classes[j]] += sign * vote_units(votes[s], said[j], units)

@@ -14,10 +14,10 @@ from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, ring, taught, wri
 
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.export.class_plys import export_classes
-from gsseg_core.learn.calibrate import calibrate, votes_without
+from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner import Learner
-from gsseg_core.learn.mask_reliability import OtherViews
+from gsseg_core.learn.mask_reliability import MaskChecker
 from gsseg_core.learn.temperature import (
     PIXELS,
     ReliabilityDiagram,
@@ -177,7 +177,7 @@ def test_votes_without_a_view_are_those_of_a_learner_that_never_saw_it() -> None
     learner = fitted(VoteLearner)
     before = learner._votes.copy()
     others = taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS[1:]).fit()
-    np.testing.assert_array_equal(votes_without(learner, VIEWS[0].name), others.codes_)
+    np.testing.assert_array_equal(learner.vote_codes_without(VIEWS[0].name), others.codes_)
     np.testing.assert_array_equal(learner._votes, before)
 
 
@@ -198,10 +198,10 @@ def test_wrong_masks_make_votes_less_sure_than_they_are_right() -> None:
 def test_checked_views_are_not_rendered_again(monkeypatch: pytest.MonkeyPatch) -> None:
     learner = fitted(EMLearner)
     assert isinstance(learner, EMLearner)
-    others = OtherViews(learner)
-    others.check_all()
-    monkeypatch.setattr(OtherViews, "blend", None)
-    found = calibrate(learner, others)
+    checker = MaskChecker(learner)
+    checker.check_all()
+    monkeypatch.setattr(EMLearner, "predict_without", None)
+    found = calibrate(learner, checker)
     monkeypatch.undo()
     assert found == calibrate(learner)
 

@@ -27,7 +27,7 @@ from threadpoolctl import threadpool_limits
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
-from gsseg_core.learn.em.em_kernels import GAIN_UNIT, collect, improve, promised
+from gsseg_core.learn.em.em_kernels import GRADIENT_UNIT, accumulate, m_step, predicted_gain
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings, codes_without
 from gsseg_core.learn.em.rejected_regions import SMALLEST
 from gsseg_core.learn.vote_learner import VoteLearner
@@ -43,8 +43,8 @@ def slow_em(
     """Readable twin of `EMLearner.fit`, with W as dense matrices in float64: codes, objectives, confusions R."""
     n, K, o = len(scene), NUM_CLASSES, settings.outliers
     seen = []
-    heard = without_doubtful_regions(scene, views, settings) if settings.errors else views
-    for view, before in zip(heard, views, strict=True):
+    used = without_rejected_regions(scene, views, settings) if settings.errors else views
+    for view, before in zip(used, views, strict=True):
         operator, y = make_operator(scene, view.camera), view.read_labels().ravel()
         entries = operator.weights()
         W = np.zeros((y.size, n))
@@ -81,29 +81,29 @@ def slow_em(
         p = ((W @ codes + rest[:, None] * np.eye(K)[0]) @ C * onehot).sum(axis=1)
         return onehot / p[:, None]
 
-    objectives, told = [], prior > 0
+    objectives, counted = [], prior > 0
     for r, steps in enumerate(rounds):
         for step in range(steps):
             shares = [one_over_p(v, q) for v in range(len(seen))]
-            objective = (prior[told] * np.log(q[told])).sum() - sum(np.log(s.max(axis=1)).sum() for s in shares)
+            objective = (prior[counted] * np.log(q[counted])).sum() - sum(np.log(s.max(axis=1)).sum() for s in shares)
             objectives.append(objective / sum(len(onehot) for _, _, onehot, _ in seen))
-            gains = [W.T @ s @ ((1 - o) * R + o / len(c)).T
+            gradient = [W.T @ s @ ((1 - o) * R + o / len(c)).T
                      for (W, _, _, c), s, R in zip(seen, shares, confusions, strict=True)]  # fmt: skip
             if step == steps - 1 and r < len(rounds) - 1:
                 for v, (W, rest, _, classes) in enumerate(seen):
-                    without = scaled(q * (sum(gains) - gains[v]) + prior)
+                    without = scaled(q * (sum(gradient) - gradient[v]) + prior)
                     share = one_over_p(v, without)
                     counts = without.T @ (W.T @ share)
                     counts[0] += rest @ share
                     diagonal = np.eye(K)[:, classes]
                     confusions[v] = scaled((1 - o) * confusions[v] * counts + diagonal * rights[v], confusions[v])
-            q = scaled(q * sum(gains) + prior)
+            q = scaled(q * sum(gradient) + prior)
     q[~votes.any(axis=1)] = 0
     return q, objectives, {view.name: R for view, R in zip(views, confusions, strict=True)}
 
 
-def without_doubtful_regions(scene: GaussianScene, views: list[View], settings: EMSettings) -> list[View]:
-    """Make pixels unknown that lie in regions in doubt, as the equations have it."""
+def without_rejected_regions(scene: GaussianScene, views: list[View], settings: EMSettings) -> list[View]:
+    """Make pixels of rejected regions unknown, as the equations have it."""
     weights, regions, onehots = [], [], []
     for view in views:
         entries, labels = make_operator(scene, view.camera).weights(), view.read_labels()
@@ -114,15 +114,15 @@ def without_doubtful_regions(scene: GaussianScene, views: list[View], settings: 
         onehots.append(onehot)
         regions.append(slow_regions(labels))
     votes = sum(W.T @ onehot for W, onehot in zip(weights, onehots, strict=True))
-    heard = []
+    used = []
     for view, W, onehot, (of_pixel, classes) in zip(views, weights, onehots, regions, strict=True):
         others = scaled(np.maximum(votes - W.T @ onehot, 0))
         inside = (of_pixel.reshape(-1, 1) == np.arange(len(classes))).astype(np.float64)
         counts = others.T @ (W.T @ inside)
-        doubtful = counts[classes, np.arange(len(classes))] < settings.least_agreement * counts.sum(axis=0)
-        hidden = np.append(doubtful, False)[of_pixel]
-        heard.append(View.from_arrays(view.camera, np.where(hidden, -1, view.read_labels())))
-    return heard
+        rejected = counts[classes, np.arange(len(classes))] < settings.least_agreement * counts.sum(axis=0)
+        hidden = np.append(rejected, False)[of_pixel]
+        used.append(View.from_arrays(view.camera, np.where(hidden, -1, view.read_labels())))
+    return used
 
 
 def slow_regions(
@@ -205,22 +205,22 @@ def test_it_stops_by_itself(views: list[View]) -> None:
 def test_no_step_gains_more_than_its_slope_promises() -> None:
     learner = taught(EMLearner(SCENE, NUM_CLASSES), wrong_views(4))
     votes = CSRRows.from_dense(learner._votes)
-    models = learner._first_models(votes, {}, lambda: None)
+    models = learner._initial_error_models(votes, {}, lambda: None)
     codes, prior = votes.with_data(votes.data.astype(np.float32)).normalised(), np.full(len(votes.data), 0.1)
 
     def look() -> tuple[np.ndarray, float]:
-        gains, told = learner._gains(codes, models, lambda: None)
-        return gains, sum(told.values()) + (prior * np.log(codes.data.astype(np.float64))).sum()
+        gradient, counted = learner._e_step(codes, models, lambda: None)
+        return gradient, sum(counted.values()) + (prior * np.log(codes.data.astype(np.float64))).sum()
 
-    gains, objective = look()
+    gradient, objective = look()
     slopes, gained = [], []
     for _ in range(6):
         before = codes.data.astype(np.float64)
-        slopes.append(promised(codes.indptr, codes.data, gains, prior.astype(np.float32)))
-        improve(codes.indptr, codes.data, gains, prior.astype(np.float32))
-        gradient = gains * GAIN_UNIT + prior / before
+        slopes.append(predicted_gain(codes.indptr, codes.data, gradient, prior.astype(np.float32)))
+        m_step(codes.indptr, codes.data, gradient, prior.astype(np.float32))
+        gradient = gradient * GRADIENT_UNIT + prior / before
         np.testing.assert_allclose(slopes[-1], gradient @ (codes.data - before), rtol=1e-3)
-        gains, after = look()
+        gradient, after = look()
         gained.append(after - objective)
         objective = after
     assert (np.array(gained) > 0).all() and (np.array(gained) < slopes).all()
@@ -272,14 +272,14 @@ def test_sums_over_views_do_not_depend_on_order_or_grouping(groups: list[int], o
     learner = taught(EMLearner(SCENE, NUM_CLASSES), [with_clutter(view) for view in wrong_views(6)])
     codes, names = CSRRows.from_dense(learner.vote_codes() + np.float32(0.01)), list(learner.views)
     votes = CSRRows.from_dense(learner._votes)
-    models = learner._first_models(votes, learner._judge(votes, lambda: None)[1], lambda: None)
-    whole, told = learner._gains(codes, deepcopy(models), lambda: None)
+    models = learner._initial_error_models(votes, learner._reject_regions(votes, lambda: None)[1], lambda: None)
+    whole, counted = learner._e_step(codes, deepcopy(models), lambda: None)
     parts = np.zeros_like(whole)
     for group in set(groups):
         chosen = {names[i]: deepcopy(models[names[i]]) for i in order if groups[i] == group}
-        gains, part_told = learner._gains(codes, chosen, lambda: None)
-        parts += gains
-        assert part_told == {name: told[name] for name in chosen}
+        gradient, part_counted = learner._e_step(codes, chosen, lambda: None)
+        parts += gradient
+        assert part_counted == {name: counted[name] for name in chosen}
     np.testing.assert_array_equal(parts, whole)
 
 
@@ -288,15 +288,15 @@ def test_codes_without_a_view_are_a_step_with_the_gains_of_all_the_others() -> N
     codes = CSRRows.from_dense(learner.vote_codes() + np.float32(0.01))
     prior = np.random.default_rng(0).uniform(0, 3, len(codes.data)).astype(np.float32)
     votes = CSRRows.from_dense(learner._votes)
-    models = learner._first_models(votes, learner._judge(votes, lambda: None)[1], lambda: None)
-    gains, _ = learner._gains(codes, models, lambda: None)
+    models = learner._initial_error_models(votes, learner._reject_regions(votes, lambda: None)[1], lambda: None)
+    gradient, _ = learner._e_step(codes, models, lambda: None)
     for name in learner.views:
         observation = learner.observation(name)
-        others, _ = learner._gains(codes, {other: models[other] for other in models if other != name}, lambda: None)
+        others, _ = learner._e_step(codes, {other: models[other] for other in models if other != name}, lambda: None)
         expected = codes.with_data(codes.data.copy())
-        improve(expected.indptr, expected.data, others, prior)
+        m_step(expected.indptr, expected.data, others, prior)
         seen = expected.positions(observation.ids[observation.order])
-        found = codes_without(observation, models[name], codes, gains, prior)
+        found = codes_without(observation, models[name], codes, gradient, prior)
         np.testing.assert_array_equal(found.indptr, seen.indptr)
         np.testing.assert_array_equal(found.indices, seen.indices)
         np.testing.assert_array_equal(found.data, expected.data[seen.data])
@@ -304,13 +304,13 @@ def test_codes_without_a_view_are_a_step_with_the_gains_of_all_the_others() -> N
 
 def test_what_was_all_but_ruled_out_does_not_overflow_the_sums() -> None:
     rows, classes = np.array([0, 2]), np.array([0, 1], np.int32)
-    codes, gains = np.full(2, 0.5, np.float32), np.zeros(2, np.int64)
+    codes, gradient = np.full(2, 0.5, np.float32), np.zeros(2, np.int64)
     one, start, label = np.zeros(1, np.int32), np.array([0, 1]), np.zeros(1, np.int32)
     share, likelihood = np.array([1e30], np.float32), np.array([[1.0, 1e-30]], np.float32)
     for _ in range(255):
-        collect(rows, classes, gains, one, one, start, label, likelihood, share)
-    np.testing.assert_allclose(gains * GAIN_UNIT, [255 * 2.0**27, 255.0], rtol=1e-6)
-    improve(rows, codes, gains, np.zeros_like(codes))
+        accumulate(rows, classes, gradient, one, one, start, label, likelihood, share)
+    np.testing.assert_allclose(gradient * GRADIENT_UNIT, [255 * 2.0**27, 255.0], rtol=1e-6)
+    m_step(rows, codes, gradient, np.zeros_like(codes))
     np.testing.assert_allclose(codes, [1.0, 0.0], atol=1e-6)
 
 

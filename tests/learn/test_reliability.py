@@ -16,7 +16,7 @@ from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.export.view_pictures import draw_worst_views
 from gsseg_core.learn.em.em_learner import EMLearner
-from gsseg_core.learn.mask_reliability import OtherViews, ViewCheck, check_views, reliability_report, worst_views
+from gsseg_core.learn.mask_reliability import MaskChecker, ViewCheck, check_views, reliability_report, worst_views
 
 SCENE, _ = balls_on_a_table()
 CLEAN = clean_views(12)
@@ -86,7 +86,7 @@ def test_a_view_is_held_against_the_others_only() -> None:
     truth = CLEAN[0].read_labels()
     # Nobody else has seen what it shows, so only the empty rays, which belong to the background, say anything.
     assert alone.checked < truth.size and not alone.counts[1:].any()
-    assert (OtherViews(learner).predict(CLEAN[0])[truth > 0] == UNKNOWN).mean() > 0.9
+    assert (MaskChecker(learner).predict(CLEAN[0])[truth > 0] == UNKNOWN).mean() > 0.9
 
 
 def test_unknown_pixels_do_not_count() -> None:

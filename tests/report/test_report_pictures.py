@@ -12,7 +12,7 @@ from small_scenes import balls_on_a_table, look_at
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.export.pictures import palette
-from gsseg_core.learn.mask_reliability import hold_against
+from gsseg_core.learn.mask_reliability import compare_mask
 from gsseg_core.report.findings import Evidence
 from gsseg_core.report.pictures import THUMBNAIL_PX, ViewImages, draw_triple, jpeg_uri, thumbnails
 
@@ -28,7 +28,7 @@ def test_thumbnail_is_cut_from_the_view_that_shows_the_class_whole() -> None:
     whole = view_of("whole", painted((1, slice(10, 26), slice(20, 44))))
     tiny = view_of("tiny", painted((1, slice(10, 12), slice(20, 22))))
     views = {view.name: view for view in (cut_off, whole, tiny)}
-    evidence = Evidence([hold_against(view, view.read_labels(), 3) for view in views.values()], views, True)
+    evidence = Evidence([compare_mask(view, view.read_labels(), 3) for view in views.values()], views, True)
     images = ViewImages(SCENE)
     for view in views.values():
         images.keep(view, np.where(view.read_labels()[..., None] == 1, np.uint8(200), np.uint8(100)).repeat(3, axis=2))
@@ -45,7 +45,7 @@ def test_thumbnail_is_cut_from_the_view_that_shows_the_class_whole() -> None:
 def test_what_only_the_mask_says_is_on_no_thumbnail() -> None:
     view = view_of("a", painted((1, slice(10, 20), slice(10, 20)), (2, slice(30, 40), slice(10, 20))))
     predicted = painted((1, slice(10, 20), slice(10, 20)))
-    evidence = Evidence([hold_against(view, predicted, 3)], {"a": view}, True)
+    evidence = Evidence([compare_mask(view, predicted, 3)], {"a": view}, True)
     assert set(thumbnails(range(3), evidence, ViewImages(SCENE), palette(3))) == {0, 1}
 
 
@@ -56,7 +56,7 @@ def test_differences_are_red_and_only_they() -> None:
     predicted = painted((1, slice(10, 20), slice(15, 25)))
     images = ViewImages(SCENE)
     images.keep(view, np.full((48, 64, 3), 120, np.uint8))
-    triple = draw_triple(hold_against(view, predicted, 2), view, images, palette(2))
+    triple = draw_triple(compare_mask(view, predicted, 2), view, images, palette(2))
     red = triple.difference[..., 0] > triple.difference[..., 1].astype(int) + 80
     np.testing.assert_array_equal(red, (labels != predicted) & (labels != UNKNOWN))
     assert all(picture.shape == (48, 64, 3) and picture.dtype == np.uint8 for picture in triple)

@@ -33,8 +33,8 @@ from gsseg_core.learn.distributed.dask_worker import (
     prepare,
     refit_models,
     start_models,
-    sum_doubted,
-    sum_gains,
+    sum_gradients,
+    sum_rejected,
     sum_votes,
 )
 from gsseg_core.learn.em.confusion_model import ErrorModel
@@ -249,41 +249,43 @@ class DistributedEM(_OnWorkers, EMLearner):
     `memory_budget` is that of each worker. Views are best added together, by `observe_all`.
     """
 
-    def _judge(
+    checks_masks = False  # which would prepare all views here
+
+    def _reject_regions(
         self,
         votes: CSRRows,  # int64
-        tell: Callable[[], None],
+        tick: Callable[[], None],
         names: Iterable[str] | None = None,
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        return self._sum(sum_doubted, self.views, lambda done: tell(), None, votes)
+        return self._sum(sum_rejected, self.views, lambda done: tick(), None, votes)
 
-    def _first_models(
+    def _initial_error_models(
         self,
         votes: CSRRows,  # int64
-        doubts: Mapping[str, np.ndarray],  # (L,) bool
-        tell: Callable[[], None],
+        rejected: Mapping[str, np.ndarray],  # (L,) bool
+        tick: Callable[[], None],
         names: Iterable[str] | None = None,
     ) -> dict[str, ErrorModel]:
-        models = self._sum(start_models, self.views, lambda done: tell(), doubts, votes)[1]
+        models = self._sum(start_models, self.views, lambda done: tick(), rejected, votes)[1]
         return {name: models[name] for name in self.views}
 
-    def _gains(
+    def _e_step(
         self,
         codes: CSRRows,
         models: dict[str, ErrorModel],
-        tell: Callable[[], None],
+        tick: Callable[[], None],
     ) -> tuple[np.ndarray, dict[str, float]]:
-        return self._sum(sum_gains, self.views, lambda done: tell(), models, codes)
+        return self._sum(sum_gradients, self.views, lambda done: tick(), models, codes)
 
-    def _refit(
+    def _refit_error_models(
         self,
         codes: CSRRows,
-        gains: np.ndarray,  # (Z,) int64
+        gradient: np.ndarray,  # (Z,) int64
         prior: np.ndarray,  # (Z,) px
         models: dict[str, ErrorModel],
-        tell: Callable[[], None],
+        tick: Callable[[], None],
     ) -> dict[str, ErrorModel]:
-        models.update(self._sum(refit_models, self.views, lambda done: tell(), models, codes, gains, prior)[1])
+        models.update(self._sum(refit_models, self.views, lambda done: tick(), models, codes, gradient, prior)[1])
         return models
 
 

@@ -1,4 +1,4 @@
-"""What a worker does in a distributed run (`distributed.py`): hold some of the views and sum over them.
+"""Tasks of a Dask worker in a distributed run (`dask_learners.py`): it holds some of the views and sums over them.
 
 A task leaves its inputs as they are, so that it can be run again.
 """
@@ -110,47 +110,47 @@ def sum_votes(shard: Shard, wanted: dict[str, Any]) -> Part:
     return votes, {name: shard.rejected.get(name, "") for name in wanted}
 
 
-def sum_doubted(
+def sum_rejected(
     shard: Shard,
     wanted: dict[str, Any],
     votes: CSRRows,  # int64
 ) -> Part:
-    """Count the votes that are in doubt; beside them, what they have been given to."""
+    """Sum the votes of rejected regions; beside them, which labels of each view these are."""
     with _all_threads():
-        return shard._judge(_as_compiled_for(votes), _go_on, wanted)
+        return shard._reject_regions(_as_compiled_for(votes), _go_on, wanted)
 
 
 def start_models(
     shard: Shard,
-    doubts: dict[str, np.ndarray | None],
+    rejected: dict[str, np.ndarray | None],
     votes: CSRRows,  # int64
 ) -> Part:
-    """Make the first error model of each view."""
+    """Estimate the first error model of each view."""
     with _all_threads():
-        known = {name: doubtful for name, doubtful in doubts.items() if doubtful is not None}
-        return None, shard._first_models(_as_compiled_for(votes), known, _go_on, doubts)
+        known = {name: labels for name, labels in rejected.items() if labels is not None}
+        return None, shard._initial_error_models(_as_compiled_for(votes), known, _go_on, rejected)
 
 
-def sum_gains(
+def sum_gradients(
     shard: Shard,
     models: dict[str, ErrorModel],
     codes: CSRRows,
 ) -> Part:
-    """Sum up gains; beside them, each view's part of J."""
+    """Sum the gradient of the log-likelihood; beside it, each view's log-likelihood."""
     with _all_threads():
-        return shard._gains(_as_compiled_for(codes), models, _go_on)
+        return shard._e_step(_as_compiled_for(codes), models, _go_on)
 
 
 def refit_models(
     shard: Shard,
     models: dict[str, ErrorModel],
     codes: CSRRows,
-    gains: np.ndarray,  # (Z,) int64
+    gradient: np.ndarray,  # (Z,) int64
     prior: np.ndarray,  # (Z,)
 ) -> Part:
-    """Learn the views' error models anew."""
+    """Re-estimate the views' error models."""
     with _all_threads():
-        return None, shard._refit(_as_compiled_for(codes), gains, prior, deepcopy(models), _go_on)
+        return None, shard._refit_error_models(_as_compiled_for(codes), gradient, prior, deepcopy(models), _go_on)
 
 
 def hand_on(value: Any) -> Any:

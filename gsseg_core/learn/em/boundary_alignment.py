@@ -1,25 +1,20 @@
-"""Outlines of a mask, moved to where the scene itself has edges.
+"""Boundary alignment: boundaries of a mask are moved to where the scene itself has edges of colour or depth.
 
-Segmenters draw an object too wide in one view and too narrow in the next. Other views cannot tell where the outline
-really is any better than the mean over all of them, and there are not many; but the trained scene can, for most objects
-end where its colour or its depth does.
-
-Each region A of a mask, connected pixels of one label, is taken to have been drawn s_A px too wide, all around, with
-s_A a whole number from -S to S. Where two regions touch, their outline then lies s_A - s_B px too far inside B. With E
-the strength of the scene's edges, f_AB(b) its mean over the pixels on both sides of the outline of A and B, moved b px
+The model: each region A of a mask, connected pixels of one label, was drawn s_A px too wide all around, s_A a whole
+number from -S to S. Where two regions touch, their boundary then lies s_A - s_B px too far inside B. With E
+the strength of the scene's edges, f_AB(b) its mean over the pixels on both sides of the boundary of A and B, moved b px
 into A, and n_AB how many these are at b = 0, the log of the posterior of all shifts of a view is, but for a constant,
 
     sum_AB SHARPNESS sqrt(n_AB / LENGTH) f_AB(s_A - s_B) + sum_A log p(s_A).
 
-Shifts of regions that touch depend on each other, so the posterior is approached by one factor per region (mean
-field), each in turn made the best one given the others. The prior p is the view's own: it is learnt along with the
-shifts, the same for s and -s. In a mask with true outlines most shifts are found to be 0, p says so, and the rest, too,
-stays where it is unless the edges are clear.
+The posterior is approximated by one factor per region (mean field), each in turn set to its optimum given the others.
+The prior p is the view's own and symmetric, re-estimated in every round: in a mask with true boundaries most shifts are
+found to be 0, so p favours 0, and the rest stays, too, unless the edges are clear.
 
 E is the gradient of the luminance plus the second differences of the inverse depth, each in units of its 95th
 percentile over the view. On a plane, inverse depth is linear in the image, so that only creases and steps are left.
-Depth alone is too soft to tell outlines by: a scene of one colour has no edges. And where edges are no stronger along
-the outlines than elsewhere, as on a wall of posters, they do not tell of outlines, and all stay where they are.
+Depth alone is too blurred to locate boundaries: a scene of one colour has no edges. And where edges are no stronger
+along the boundaries than elsewhere, as on a wall of posters, no boundary is moved. docs/method.md has the reasons.
 """
 
 from __future__ import annotations
@@ -34,22 +29,22 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 
 SHARPNESS = 3.0
-"""How much edges of one unit in the mean say, in nats, where `LENGTH` pixels lie along the outline."""
+"""Log-likelihood of edges of one unit in the mean, in nats, where `LENGTH` pixels lie along the boundary."""
 
 LENGTH = 30.0
 """In px, of both sides."""
 
 LONGEST = 400
-"""More pixels than these say no more: that a region is too wide by the same all around holds only roughly."""
+"""More pixels than these weigh no more: that a region is too wide by the same all around holds only roughly."""
 
 SHORTEST = 3
-"""Along fewer px of either side nothing is asked."""
+"""Boundaries of fewer px on either side are not moved."""
 
-NO_ROOM = -20.0
-"""What speaks against an outline so far inside a region that hardly anything of it would be left, in nats."""
+VANISHED = -20.0
+"""Log-likelihood, in nats, of a boundary so far inside a region that hardly anything of it would be left."""
 
 TELLING = 1.75
-"""Edges within S px of the outlines must be so many times as strong as those of the whole view, or nothing is moved."""
+"""Nothing is moved unless edges within S px of the boundaries are this many times as strong as in the whole view."""
 
 BAND = 64
 """Rows of the image that are gone through at once."""
@@ -67,37 +62,37 @@ def scene_edges(
     operator: ViewOperator,
     scene: GaussianScene,
 ) -> np.ndarray:
-    """Draw how strong the edges of colour and depth are in a view, (H, W) float32, at least 0; see above for units."""
+    """Strength of the edges of colour and depth of a view, (H, W) float32, at least 0; see above for units."""
     camera, light = operator.camera, _LIGHT.of(scene, lambda: scene.colors().mean(axis=1))
     if light.min() == light.max():
         return np.zeros((camera.height, camera.width), np.float32)
-    looks = np.empty((len(scene), 2), np.float32)
-    _looks(scene.means, light, camera.world_to_camera[2].astype(np.float32), looks)
-    image, left_over = operator.blend(looks)
+    channels = np.empty((len(scene), 2), np.float32)
+    _luminance_and_inverse_depth(scene.means, light, camera.world_to_camera[2].astype(np.float32), channels)
+    image, left_over = operator.blend(channels)
     light_edges, depth_edges = np.empty(image.shape[:2], np.float32), np.empty(image.shape[:2], np.float32)
     _differences(image, left_over, light_edges, depth_edges)
     edges: np.ndarray = _in_units(light_edges) + _in_units(depth_edges)
     return edges
 
 
-def settle_outlines(
+def align_boundaries(
     labels: np.ndarray,  # (H, W) int32
     edges: np.ndarray,  # (H, W) float32
     farthest: int,
     telling: float = TELLING,
 ) -> np.ndarray:
-    """Move the outlines of a mask to edges.
+    """Align the boundaries of a mask with edges of the scene.
 
     Parameters
     ----------
     labels : (H, W) int32
-        The mask; negative where it says nothing.
+        The mask; negative where unknown.
     edges : (H, W) float32
-        How strong they are, as of `scene_edges`.
+        Their strength, from `scene_edges`.
     farthest : int
-        S, in px: regions are drawn too wide or too narrow by so much at most.
+        S, in px: regions are drawn too wide or too narrow by this much at most.
     telling : float
-        How many times as strong as in the whole view edges must be within S px of the outlines.
+        How many times as strong as in the whole view edges must be within S px of the boundaries.
 
     Returns
     -------
@@ -105,22 +100,22 @@ def settle_outlines(
         A new mask.
     """
     region, first, area = connected_pixels(labels)
-    other, ring = _reach_across(region, 2 * farthest)
-    pairs, pair, lengths, strengths = _along_outlines(region, other, ring, edges, len(area), 2 * farthest)
-    near = slice(farthest, 3 * farthest)  # an outline may lie so far from its edge
+    other, ring = _nearest_regions(region, 2 * farthest)
+    pairs, pair, lengths, strengths = _boundary_strengths(region, other, ring, edges, len(area), 2 * farthest)
+    near = slice(farthest, 3 * farthest)  # a boundary may lie this far from its edge
     if strengths[:, near].sum() < telling * edges.mean() * lengths[:, near].sum():
         return labels.copy()
-    asked = lengths[:, 2 * farthest - 1 : 2 * farthest + 1].min(axis=1) >= SHORTEST
-    shifts = _shifts(pairs[asked], _told(lengths[asked], strengths[asked]), len(area), farthest)
+    moving = lengths[:, 2 * farthest - 1 : 2 * farthest + 1].min(axis=1) >= SHORTEST
+    shifts = _shifts(pairs[moving], _edge_log_likelihood(lengths[moving], strengths[moving]), len(area), farthest)
     most = 2 * farthest - 1
-    moved = np.where(asked, np.clip(shifts[pairs[:, 0]] - shifts[pairs[:, 1]], -most, most), 0)
-    settled: np.ndarray = labels.copy()
-    _move(region, other, ring, pair, pairs, moved, labels.ravel()[first], settled)
-    return settled
+    moved = np.where(moving, np.clip(shifts[pairs[:, 0]] - shifts[pairs[:, 1]], -most, most), 0)
+    aligned: np.ndarray = labels.copy()
+    _move(region, other, ring, pair, pairs, moved, labels.ravel()[first], aligned)
+    return aligned
 
 
 def _in_units(edges: np.ndarray) -> np.ndarray:
-    some = edges[::2, ::2].ravel()  # every fourth pixel tells it as well
+    some = edges[::2, ::2].ravel()  # every fourth pixel will do
     rank = 95 * (some.size - 1) // 100
     unit = np.partition(some, rank)[rank]
     return np.minimum(edges / unit, np.float32(STRONGEST)) if unit > 0 else np.zeros_like(edges)
@@ -128,74 +123,74 @@ def _in_units(edges: np.ndarray) -> np.ndarray:
 
 def _shifts(
     touching: np.ndarray,  # (P, 2) regions
-    told: np.ndarray,  # (P, 4 S - 1)
-    many: int,
+    log_likelihood: np.ndarray,  # (P, 4 S - 1)
+    count: int,
     farthest: int,
 ) -> np.ndarray:
     """Find by how much each region was drawn too wide, (R,) int64, in px."""
     prior = np.full(2 * farthest + 1, 0.25 / farthest)
     prior[farthest] = 0.5
-    belief, touches = np.tile(prior, (many, 1)), np.zeros(many, bool)
+    posterior, touches = np.tile(prior, (count, 1)), np.zeros(count, bool)
     touches[touching] = True
-    begin = starts(np.bincount(touching.ravel(), minlength=many))
+    begin = starts(np.bincount(touching.ravel(), minlength=count))
     # Pair i ends in its two regions, as 2 i and as 2 i + 1; these are the ends, region by region.
     ends = np.argsort(touching.ravel(), kind="stable")
     for _ in range(ROUNDS):
-        _believe(touching, told, begin, ends, np.log(prior), belief)
-        counts = belief[touches].sum(axis=0)
+        _mean_field_round(touching, log_likelihood, begin, ends, np.log(prior), posterior)
+        counts = posterior[touches].sum(axis=0)
         prior = (counts + counts[::-1]) / 2 + 1
         prior /= prior.sum()
-    found: np.ndarray = np.where(touches, belief.argmax(axis=1) - farthest, 0)
+    found: np.ndarray = np.where(touches, posterior.argmax(axis=1) - farthest, 0)
     return found
 
 
-def _told(
+def _edge_log_likelihood(
     lengths: np.ndarray,  # (P, 4 S) pixels in each ring, from the farthest inside the second to that inside the first
     strengths: np.ndarray,  # (P, 4 S) sum of their edges
 ) -> np.ndarray:
-    """Tell what edges say of outlines moved by -(2 S - 1) to 2 S - 1 px, (P, 4 S - 1), in nats."""
+    """Log-likelihood of boundaries moved by -(2 S - 1) to 2 S - 1 px, (P, 4 S - 1), in nats."""
     there = np.minimum(lengths[:, 1:], lengths[:, :-1]) >= SHORTEST
     mean = (strengths[:, 1:] + strengths[:, :-1]) / np.maximum(lengths[:, 1:] + lengths[:, :-1], 1)
     middle = lengths.shape[1] // 2
     length = np.minimum(lengths[:, middle - 1] + lengths[:, middle], LONGEST)
-    told = SHARPNESS * np.sqrt(length / LENGTH)[:, None] * mean
-    return np.where(there, told, NO_ROOM)
+    log_likelihood = SHARPNESS * np.sqrt(length / LENGTH)[:, None] * mean
+    return np.where(there, log_likelihood, VANISHED)
 
 
 @nb.njit(nogil=True, cache=True)
-def _believe(
+def _mean_field_round(
     pairs: np.ndarray,  # (P, 2) regions
-    told: np.ndarray,  # (P, 4 S - 1)
+    log_likelihood: np.ndarray,  # (P, 4 S - 1)
     begin: np.ndarray,  # (R + 1,) where the ends of each region begin
     ends: np.ndarray,  # (2 P,)
     log_prior: np.ndarray,  # (2 S + 1,)
-    belief: np.ndarray,  # (R, 2 S + 1) changed in place: probability of each shift
+    posterior: np.ndarray,  # (R, 2 S + 1) changed in place: probability of each shift
 ) -> None:
-    """Tell each region's shifts from those of the regions that it touches, one after the other."""
-    many, middle = log_prior.shape[0], told.shape[1] // 2
-    for region in range(belief.shape[0]):
+    """Update the posterior of each region in turn, given those of the regions that it touches."""
+    num_shifts, middle = log_prior.shape[0], log_likelihood.shape[1] // 2
+    for region in range(posterior.shape[0]):
         field = log_prior.copy()
         for end in ends[begin[region] : begin[region + 1]]:
             pair, sign = end // 2, 1 - 2 * (end % 2)
-            other = belief[pairs[pair, (end + 1) % 2]]
-            for i in range(many):
-                for j in range(many):
-                    field[i] += other[j] * told[pair, min(max(sign * (i - j), -middle), middle) + middle]
+            other = posterior[pairs[pair, (end + 1) % 2]]
+            for i in range(num_shifts):
+                for j in range(num_shifts):
+                    field[i] += other[j] * log_likelihood[pair, min(max(sign * (i - j), -middle), middle) + middle]
         field = np.exp(field - field.max())
-        belief[region] = field / field.sum()
+        posterior[region] = field / field.sum()
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _looks(
+def _luminance_and_inverse_depth(
     means: np.ndarray,  # (N, 3) float32
     light: np.ndarray,  # (N,)
     ahead: np.ndarray,  # (4,) third row of world to camera
-    looks: np.ndarray,  # (N, 2) out: luminance, inverse depth
+    channels: np.ndarray,  # (N, 2) out: luminance, inverse depth
 ) -> None:
     for i in nb.prange(means.shape[0]):
         depth = means[i, 0] * ahead[0] + means[i, 1] * ahead[1] + means[i, 2] * ahead[2] + ahead[3]
-        looks[i, 0] = light[i]
-        looks[i, 1] = 1 / max(depth, np.float32(1e-6))  # what is behind the camera is not drawn
+        channels[i, 0] = light[i]
+        channels[i, 1] = 1 / max(depth, np.float32(1e-6))  # what is behind the camera is not drawn
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
@@ -225,11 +220,11 @@ def _differences(
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _reach_across(
+def _nearest_regions(
     region: np.ndarray,  # (H, W) int32
     farthest: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find what is near, band by band: pixels at outlines tell those around them where they are.
+    """Find for each pixel the nearest other region, by spreading from boundary pixels, band by band.
 
     Returns
     -------
@@ -251,7 +246,7 @@ def _reach_across(
                 if borders[y, x]:
                     while end < width and borders[y, end] and region[y, end] == region[y, x]:
                         end += 1
-                    _tell_around(region, y, x, end, farthest, first, last, other, away)
+                    _spread_region(region, y, x, end, farthest, first, last, other, away)
                 x = end
         for y in range(first, last):
             for x in range(width):
@@ -262,7 +257,7 @@ def _reach_across(
 
 @nb.njit
 def _borders(region: np.ndarray) -> np.ndarray:
-    """Tell which pixels touch another region, over sides or corners, (H, W) bool."""
+    """Find pixels that touch another region, over sides or corners, (H, W) bool."""
     height, width = region.shape
     borders = np.zeros((height, width), np.bool_)
     for y in range(height):
@@ -279,7 +274,7 @@ def _borders(region: np.ndarray) -> np.ndarray:
 
 
 @nb.njit
-def _tell_around(
+def _spread_region(
     region: np.ndarray,  # (H, W)
     y: int,
     begin: int,
@@ -290,8 +285,8 @@ def _tell_around(
     other: np.ndarray,  # (H, W) changed in place
     away: np.ndarray,  # (last - first, W) changed in place: squared distance to it
 ) -> None:
-    """Tell the pixels of other regions around a stretch of a row that it is near, in the rows from first to last."""
-    mine = region[y, begin]
+    """Offer a stretch of a row as the nearest region to the pixels around it, in the rows from first to last."""
+    own = region[y, begin]
     for v in range(max(y - farthest, first), min(y + farthest + 1, last)):
         across = int(np.sqrt(farthest**2 - (v - y) ** 2))
         left, right = max(begin - across, 0), min(end + across, region.shape[1])
@@ -300,21 +295,21 @@ def _tell_around(
         for j in range(right - left):
             beside = max(begin - left - j, left + j - end + 1, 0)
             squared = np.int32((v - y) ** 2 + beside * beside)
-            nearer = (squared < squares[j]) & (there[j] != mine) & (there[j] >= 0)
+            nearer = (squared < squares[j]) & (there[j] != own) & (there[j] >= 0)
             squares[j] = squared if nearer else squares[j]
-            nearest[j] = mine if nearer else nearest[j]
+            nearest[j] = own if nearer else nearest[j]
 
 
 @nb.njit(nogil=True, cache=True)
-def _along_outlines(
+def _boundary_strengths(
     region: np.ndarray,  # (H, W)
     other: np.ndarray,  # (H, W)
     ring: np.ndarray,  # (H, W)
     edges: np.ndarray,  # (H, W)
-    many: int,  # regions
+    count: int,  # regions
     farthest: int,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Give pairs of regions that touch numbers, and sum up edges by pair and ring.
+    """Enumerate pairs of regions that touch, and sum up edges by pair and ring.
 
     Returns
     -------
@@ -326,10 +321,10 @@ def _along_outlines(
         Pixels, and sum of their edges, from the farthest ring inside the second region to that inside the first.
     """
     of_pixel, of_other, rings, strength = region.ravel(), other.ravel(), ring.ravel(), edges.ravel()
-    begin, order = _by_lower(of_pixel, of_other, many)
-    pair, met = np.full(of_pixel.shape[0], -1, np.int32), np.full(many, -1, np.int64)
+    begin, order = _sort_by_lower_region(of_pixel, of_other, count)
+    pair, met = np.full(of_pixel.shape[0], -1, np.int32), np.full(count, -1, np.int64)
     pairs, n = np.empty((order.shape[0], 2), np.int64), 0
-    for low in range(many):
+    for low in range(count):
         first = n
         for p in order[begin[low] : begin[low + 1]]:
             high = max(of_pixel[p], of_other[p])
@@ -346,13 +341,13 @@ def _along_outlines(
 
 
 @nb.njit
-def _by_lower(
+def _sort_by_lower_region(
     of_pixel: np.ndarray,  # (H W,) region
     of_other: np.ndarray,  # (H W,) the one near by, -1 for none
-    many: int,  # regions
+    count: int,  # regions
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sort the pixels near another region by the lower number of the two: where each begins, and the pixels."""
-    begin = np.zeros(many + 1, np.int64)
+    begin = np.zeros(count + 1, np.int64)
     for p in range(of_pixel.shape[0]):
         if of_other[p] >= 0:
             begin[min(of_pixel[p], of_other[p]) + 1] += 1

@@ -1,4 +1,4 @@
-"""What a view's segmenter calls each class: the error model of `gsseg_core.learn.em.em_learner`, of one view."""
+"""Error model of one view: a confusion matrix in the manner of Dawid & Skene, with a prior and outliers."""
 
 from __future__ import annotations
 
@@ -11,35 +11,35 @@ from gsseg_core.data.label_evidence import LabelEvidence
 
 @dataclass
 class ErrorModel:
-    """What one view's segmenter calls each class.
+    """Probability of each label of one view's mask given the true class.
 
     Attributes
     ----------
     evidence : LabelEvidence
-        Of the L labels that occur in the view's mask; they are made of W words.
+        Of the L labels that occur in the view's mask, in a vocabulary of W words.
     confusion : (K, W) float32
-        R_v: rows are true classes, columns the words seen; rows sum to 1.
-    right : (T,) float64
-        a_v of the classes that have a right word, in px.
+        Confusion matrix R_v: rows are true classes, columns the words seen; rows sum to 1.
+    pseudo_counts : (T,) float64
+        a_v, px added to the count of the correct word of each class that has one.
     outliers : float
         Share of pixels labelled by chance.
     num_pixels : int
-        Pixels with a label that says something.
+        Pixels with a label that is informative.
     """
 
     evidence: LabelEvidence
     confusion: np.ndarray
-    right: np.ndarray
+    pseudo_counts: np.ndarray
     outliers: float
     num_pixels: int
 
     @classmethod
-    def trusting(cls, evidence: LabelEvidence, num_classes: int, outliers: float, num_pixels: int) -> ErrorModel:
-        """Believe that every label is right."""
+    def without_errors(cls, evidence: LabelEvidence, num_classes: int, outliers: float, num_pixels: int) -> ErrorModel:
+        """Make the model of a segmenter whose labels are all correct."""
         confusion = np.zeros((num_classes, len(evidence.vocabulary)), np.float32)
-        right = evidence.correct_words(num_classes)
-        confusion[right] = 1.0
-        return cls(evidence, confusion, np.zeros(len(right[0])), outliers, num_pixels)
+        correct = evidence.correct_words(num_classes)
+        confusion[correct] = 1.0
+        return cls(evidence, confusion, np.zeros(len(correct[0])), outliers, num_pixels)
 
     @classmethod
     def from_counts(
@@ -50,19 +50,19 @@ class ErrorModel:
         outliers: float,
         num_pixels: int,
     ) -> ErrorModel:
-        """Start from what the codes so far say of the mask."""
+        """Estimate a model from counts of predicted classes under each label."""
         if evidence.word_plausibility is not None:
             shares = evidence.word_plausibility[evidence.informative]
             counts = counts[:, evidence.informative] @ (shares / shares.sum(axis=1, keepdims=True))
-        right = prior * counts[evidence.correct_words(len(counts))[0]].sum(axis=1)
+        pseudo_counts = prior * counts[evidence.correct_words(len(counts))[0]].sum(axis=1)
         uniform = np.full(counts.shape, 1.0 / len(evidence.vocabulary), np.float32)
-        model = cls(evidence, uniform, right, outliers, num_pixels)
-        model.maximise(counts)
+        model = cls(evidence, uniform, pseudo_counts, outliers, num_pixels)
+        model.m_step(counts)
         return model
 
     @property
     def classes(self) -> np.ndarray:
-        """The words seen, (W,) int32: classes, and then `UNKNOWN` (-1) for "none of these", if it occurs."""
+        """Words of the confusion matrix's columns, (W,) int32; `UNKNOWN` (-1), the last, is "none of these"."""
         return self.evidence.vocabulary
 
     @property
@@ -73,31 +73,31 @@ class ErrorModel:
         return words if plausible is None else np.asarray(words @ plausible.T)
 
     @property
-    def told(self) -> tuple[np.ndarray, np.ndarray]:
-        """The same by label, (L, K) float32; and then with zeros where a label says nothing: its pixels teach nothing.
+    def by_label(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return C_v by label, (L, K) float32, and the same with zeros for labels that are not informative.
 
-        All classes are as plausible there, so they would not change where the steps end, only how soon they do.
+        All classes are as likely under such a label: its pixels would not change where EM ends, only how soon.
         """
         likelihood = np.ascontiguousarray(self.likelihood.T)
         return likelihood, np.where(self.evidence.informative[:, None], likelihood, np.float32(0))
 
-    def expected(
+    def expected_counts(
         self,
-        counts: np.ndarray,  # (K, L) sum of the shares of each class under each label
+        counts: np.ndarray,  # (K, L) px of each class under each label, divided by the label's likelihood
     ) -> np.ndarray:
-        """Count the pixels (K, W) in which each class was there and each word was meant."""
+        """Return the expected number of pixels (K, W) with each true class and each word seen."""
         if self.evidence.word_plausibility is not None:
             counts = counts[:, self.evidence.informative] @ self.evidence.word_plausibility[self.evidence.informative]
         expected: np.ndarray = counts * (1 - self.outliers) * self.confusion
         return expected
 
-    def maximise(
+    def m_step(
         self,
         counts: np.ndarray,  # (K, W) expected px
     ) -> None:
-        """Set R_v to its best for expected counts; classes that the view does not show keep their row."""
+        """Set the confusion matrix to its maximiser for expected counts; rows without any count stay."""
         counts = counts.astype(np.float64)
-        counts[self.evidence.correct_words(len(counts))] += self.right
+        counts[self.evidence.correct_words(len(counts))] += self.pseudo_counts
         total = counts.sum(axis=1, keepdims=True)
         shown = total[:, 0] > 0
         self.confusion[shown] = counts[shown] / total[shown]

@@ -1,55 +1,26 @@
-"""Expectation maximisation with an error model of every view.
+"""Expectation maximisation (EM) of class probabilities, with a confusion matrix for each view: the default learner.
 
-The likelihood of what was seen. A pixel p of view v carries the label y_p. Its ray belongs to class k with the
-probability O_v[p, k] = (W_v q)[p, k] + T_end[p] [k = 0], and the segmenter calls class k in this view y with the
-probability (Dawid & Skene 1979, who had examiners in place of views)
+This is the model of Dawid & Skene (1979) with views as annotators and Gaussians as items, except that an annotation, a
+pixel's label, depends on all Gaussians along a ray. docs/method.md, "Learners", has the model, the objective J and its
+reasons; here is what the names below stand for, with q (N, K) the class probabilities and C_v[k, y] the probability of
+label y in view v given class k:
 
-    C_v[k, y] = (1 - outliers) R_v[k, y] + outliers / L_v,     p_v(y | p) = sum_k O_v[p, k] C_v[k, y].
+- `_e_step` sums over the views gradient[i, k] = dlogL / dq_i[k] = sum_v sum_y C_v[k, y] B_v[i, y], with B_v[i, y] the
+  sum of w_v[p, i] / p_v(y | p) over the pixels p of label y. q * gradient are the expected counts, in px.
+- `m_step` sets q_i to normalise(q_i gradient_i + prior_i), the exact maximiser of the usual lower bound, so J never
+  falls. prior_i is `prior_weight` times the mean of the votes' probabilities over the nearest Gaussians.
+- `predicted_gain` is the slope of J along the step. J is concave, so no step gains more; fitting ends with the first
+  step that cannot gain `tolerance`.
+- `_refit_error_models` re-estimates each view's confusion matrix from probabilities that leave this view out, since
+  probabilities that were fitted to a mask agree with its errors.
 
-A view in which a chair was missed or taken for a table has that in R_v, and so its pixels are no evidence against the
-chair.
-
-Outlines. What a segmenter draws too wide in one view and too narrow in the next is moved to where the scene has edges
-before anything is learnt from it; see `gsseg_core.learn.em.boundary_alignment`.
-
-Regions in doubt. An error model says what a view calls each class, wherever in the image. What is wrong in one place,
-say a blob of clutter, it does not explain. So regions of a mask that the votes of all other views speak against are
-left out of all that follows; see `gsseg_core.learn.em.rejected_regions`.
-
-The objective. With the error models fixed, the log of the posterior of the codes, in nats:
-
-    J(q) = sum_v sum_p log p_v(y_p | p) + prior_weight sum_i sum_k m_i[k] log q_i[k].
-
-m_i is the mean of the votes' codes over the nearest Gaussians: objects are continuous in space. The step, with
-B_v[i, y] = sum over the pixels p seen as y of w_v[p, i] / p_v(y | p), is the exact maximiser of the usual lower bound
-of J at the old values, so J never falls:
-
-    q_i[k]     <- normalise( q_i[k] sum_v sum_y C_v[k, y] B_v[i, y] + prior_weight m_i[k] )
-
-Only B_v needs the rasteriser, and its cost does not depend on the number of classes. J is concave, so a step gains at
-most what its slope along the step promises. That is known before the step is taken, and where it is next to nothing,
-the step is the last: no pass over the views is spent on learning how little it brought.
-
-The error models. Codes that have learnt from a mask agree with its errors, the more so the longer they learn, and find
-nothing wrong with it. So a view's model is learnt from codes that have not seen this view: q^-v is the step above
-without the summand of v, and with B_v taken at q^-v
-
-    R_v[k, y]  <- normalise( (1 - outliers) R_v[k, y] sum_i q^-v_i[k] B_v[i, y] + a_v[k] [y = k] )
-
-with the left-over transmittance as one more Gaussian of class 0. a_v[k] counts pseudo-pixels in which the segmenter was
-right, a share of those that class k fills in view v by the votes of the others. At first q^-v are these votes' codes,
-raised to a power: where a third of the views is wrong, each in its own way, the majority still is right, and to count
-the minorities along with it would smear every large class over the rows of the small ones. Once the codes have all but
-converged the models are learnt anew in this way, and then the codes once more.
-
-Soft and partial masks. There the segmenter's words y are classes, and "none of those that I looked for", which is right
-for all others. A pixel's label m is a mixture of words with shares s_m[y] (see `gsseg_core.data.label_evidence`):
-wherever C_v[k, y] stands for a pixel, it is sum_y s_m[y] C_v[k, y] there, and the expected counts of R_v are split in
-proportion to the summands.
+Before the first step, the boundaries of each mask are aligned with edges of the scene (`boundary_alignment`), and
+regions that the votes of all other views contradict are rejected (`rejected_regions`).
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -59,12 +30,20 @@ import numpy as np
 from gsseg_core.csr_rows import CSRRows, starts
 from gsseg_core.data.label_evidence import resolved_votes
 from gsseg_core.data.soft_masks import SeenLabels
+from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
-from gsseg_core.learn.em.boundary_alignment import scene_edges, settle_outlines
+from gsseg_core.learn.em.boundary_alignment import align_boundaries, scene_edges
 from gsseg_core.learn.em.confusion_model import ErrorModel
-from gsseg_core.learn.em.em_kernels import collect, improve, improve_without, mix, promised, tally
-from gsseg_core.learn.em.leave_one_out import counted_by_others
-from gsseg_core.learn.em.rejected_regions import by_region, in_doubt, take_back
+from gsseg_core.learn.em.em_kernels import (
+    accumulate,
+    confusion_counts,
+    m_step,
+    m_step_without_view,
+    pair_likelihood,
+    predicted_gain,
+)
+from gsseg_core.learn.em.leave_one_out import leave_one_out_counts
+from gsseg_core.learn.em.rejected_regions import find_rejected, split_regions, subtract_labels
 from gsseg_core.learn.learner import MEMORY_BUDGET, VOTE_UNIT, Learner, Progress, silent
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.observation import Observation
@@ -72,8 +51,8 @@ from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import neighbours_of
 
-ROUGH = 8
-"""Codes that error models are learnt anew from may be so many times less settled than those that are handed out."""
+REFIT_FACTOR = 8
+"""Error models are re-estimated once a step gains less than this many times the tolerance."""
 
 
 @dataclass(frozen=True)
@@ -83,23 +62,23 @@ class EMSettings:
     Attributes
     ----------
     max_steps : int
-        Steps at most.
+        Steps at most; scikit-learn's `max_iter`.
     tolerance : float
-        Stop with a step that gains less than this, in nats per labelled pixel; `ROUGH` times this before a refit.
+        Stop with a step that gains less than this, in nats per labelled pixel; scikit-learn's `tol`.
     errors : bool
-        Learn what the segmenter got wrong in each view; without, every mask is taken at its word.
+        Learn a confusion matrix for each view; without, every mask is taken to be right.
     refits : int
-        How often error models are learnt anew once the codes have all but converged, and the codes then once more.
+        How often error models are re-estimated once the probabilities have all but converged.
     edge_px : int
-        Outlines of a mask may lie so many px too far in or out, and are moved to edges of the scene; see
-        `gsseg_core.learn.em.boundary_alignment`. 0 leaves them where they are, and so do soft and partial masks.
+        Boundaries of a plain mask may be this many px too far in or out, and are moved to edges of the scene; see
+        `gsseg_core.learn.em.boundary_alignment`. 0 switches this off.
     least_agreement : float
-        A region of a mask is not heard if a smaller share of it is of its label by the votes of the other views; see
-        `gsseg_core.learn.em.rejected_regions`. 0 hears all.
+        A region of a mask is rejected if less than this share of it has its label by the votes of the other views; see
+        `gsseg_core.learn.em.rejected_regions`. 0 switches this off.
     majority : float
-        The first error models are counted from the votes' codes to this power: above 1, majorities stand out.
+        The first error models are counted from the votes' probabilities to this power: above 1, majorities stand out.
     error_prior : float
-        Pseudo-pixels in which a class was labelled right, as a share of the pixels that it fills in the view.
+        Pseudo-count of correctly labelled pixels of a class, as a share of the pixels that it fills in the view.
     outliers : float
         Share of pixels that carry any label of the view by chance, in (0, 1).
     prior_weight : float
@@ -136,23 +115,31 @@ class EMSettings:
             )
 
     @property
-    def judges(self) -> bool:
-        """Whether regions of masks may be in doubt."""
+    def rejects_regions(self) -> bool:
+        """Whether regions of masks are tested, and may be rejected."""
         return self.errors and self.least_agreement > 0
 
 
 class EMLearner(Learner):
-    """The default: the paper's loss with an error model, maximised by multiplicative steps that need no rate.
+    """Class probabilities of most posterior density, by EM with a confusion matrix for each view.
 
     Attributes
     ----------
     error_models_ : dict of str to ErrorModel
-        After `fit`: what each view's segmenter got wrong.
+        After `fit`: confusion matrix of each view, what crowd-kit's `DawidSkene` calls `errors_`.
     history_ : list of float
-        After `fit`: J per labelled pixel, in nats, of what went into each step; within a round it never falls.
+        After `fit`: J per labelled pixel before each step, in nats; it never falls until error models are re-estimated.
     rounds_ : list of int
         After `fit`: steps with each set of error models.
+    n_iter_ : int
+        After `fit`: steps in all.
+    lower_bound_ : float
+        After `fit`: the last entry of `history_`.
+    converged_ : bool
+        After `fit`: whether the last step gained less than the tolerance.
     """
+
+    leaves_out = checks_masks = True
 
     def __init__(
         self,
@@ -166,45 +153,63 @@ class EMLearner(Learner):
         super().__init__(scene, num_classes, device=device, memory_budget=memory_budget)
         self.settings = settings or EMSettings()
         self.error_models_: dict[str, ErrorModel] = {}
+        self._leave_one_out: tuple[CSRRows, np.ndarray] | None = None  # probabilities, and gradient of all views there
+
+    @classmethod
+    def default_settings(cls, max_steps: int | None, seed: int) -> tuple[EMSettings]:
+        """Return settings for the registry."""
+        return (EMSettings(max_steps=max_steps or EMSettings.max_steps),)
+
+    @property
+    def n_iter_(self) -> int:
+        """Steps of `fit`."""
+        return len(self.history_)
+
+    @property
+    def lower_bound_(self) -> float:
+        """J per labelled pixel, in nats, as of the last step."""
+        return self.history_[-1] if self.history_ else float("nan")
 
     @property
     def loss(self) -> float:
         """-J per labelled pixel, in nats."""
-        return -self.history_[-1] if self.history_ else float("nan")
+        return -self.lower_bound_
 
     def fit(self, progress: Progress = silent) -> EMLearner:
-        """Step until a step can gain no more than the tolerance."""
+        """Alternate E and M steps until a step can gain no more than the tolerance."""
         settings = self.settings
         self._begin()
-        votes, tell = CSRRows.from_dense(self._votes), partial(progress, "em", 0, settings.max_steps)
-        doubts: dict[str, np.ndarray] = {}
-        if settings.judges:
-            doubted, doubts = self._judge(votes, tell)
-            votes = votes.with_data(votes.data - doubted).nonzero()
-        stands = resolved_votes(votes, self._possible())
-        self.observed_ = np.diff(stands.indptr) > 0
-        counted, prior = stands.united(self._smooth(stands))
-        # Votes are the first step; with the prior counted in, the objective is finite from the start. What is zero now
-        # is zero after every step, so the codes keep these places.
-        codes = counted.with_data(counted.data.astype(np.float32) * np.float32(VOTE_UNIT) + prior.data).normalised()
+        self._leave_one_out = None
+        votes, tick = CSRRows.from_dense(self._votes), partial(progress, "em", 0, settings.max_steps)
+        rejected: dict[str, np.ndarray] = {}
+        if settings.rejects_regions:
+            rejected_votes, rejected = self._reject_regions(votes, tick)
+            votes = votes.with_data(votes.data - rejected_votes).nonzero()
+        resolved = resolved_votes(votes, self._possible())
+        self.observed_ = np.diff(resolved.indptr) > 0
+        resolved, prior = resolved.united(self._spatial_prior(resolved))
+        # The votes are the first step; with the prior added, J is finite from the start. What is zero now is zero after
+        # every step, so the pattern of the probabilities stays.
+        codes = resolved.with_data(resolved.data.astype(np.float32) * np.float32(VOTE_UNIT) + prior.data).normalised()
         history: list[float] = []
         self.history_ = history
-        models = self._first_models(votes, doubts, tell)
+        models = self._initial_error_models(votes, rejected, tick)
         pixels = sum(model.num_pixels for model in models.values())
         self.rounds_ = rounds = [0]
         while len(history) < settings.max_steps:
-            tell = partial(progress, "em", len(history), settings.max_steps)
-            gains, told = self._gains(codes, models, tell)
-            history.append((_log_prior(codes.data, prior.data) + sum(told[name] for name in self.views)) / pixels)
+            tick = partial(progress, "em", len(history), settings.max_steps)
+            gradient, log_likelihoods = self._e_step(codes, models, tick)
+            log_likelihood = sum(log_likelihoods[name] for name in self.views)
+            history.append((_log_prior(codes.data, prior.data) + log_likelihood) / pixels)
             rounds[-1] += 1
-            last = len(rounds) > settings.refits or not settings.errors
-            enough = settings.tolerance * (1 if last else ROUGH) * pixels
-            settled = promised(codes.indptr, codes.data, gains, prior.data) < enough
-            if settled and not last:
-                self._refit(codes, gains, prior.data, models, tell)
+            last_round = len(rounds) > settings.refits or not settings.errors
+            tolerance = settings.tolerance * (1 if last_round else REFIT_FACTOR) * pixels
+            small = predicted_gain(codes.indptr, codes.data, gradient, prior.data) < tolerance
+            if small and not last_round:
+                self._refit_error_models(codes, gradient, prior.data, models, tick)
                 rounds.append(0)
-            improve(codes.indptr, codes.data, gains, prior.data)
-            self.converged_ = settled and last
+            m_step(codes.indptr, codes.data, gradient, prior.data)
+            self.converged_ = small and last_round
             if self.converged_:
                 break
         progress("em", settings.max_steps, settings.max_steps)
@@ -212,149 +217,179 @@ class EMLearner(Learner):
         self._finish()
         return self
 
-    def _heard(self, seen: SeenLabels, operator: ViewOperator) -> SeenLabels:
-        """Move outlines to edges, if the mask has any; tell regions apart, if they may be in doubt."""
+    def prepare_predictions(self, progress: Progress = silent) -> None:
+        """Run the E-step at the fitted probabilities, from which `predict_without` takes one view's part away."""
+        if self._leave_one_out is None:
+            codes, total, done = CSRRows.from_dense(self.codes_), len(self.views), itertools.count()
+            gradient, _ = self._e_step(
+                codes, self.error_models_, lambda: progress("sum up views", min(next(done), total - 1), total)
+            )
+            self._leave_one_out = codes, gradient
+            progress("sum up views", total, total)
+
+    def predict_without(self, view: View) -> np.ndarray:
+        """Blend into a view the probabilities after one more step without its mask, (H, W, K) float32.
+
+        The spatial prior is left out, too, so rows sum to less where no other view has seen anything.
+        """
+        self.prepare_predictions()
+        assert self._leave_one_out is not None
+        codes, gradient = self._leave_one_out
+        observation, data = self.observation(view.name), codes.data.copy()
+        stepped = codes_without(observation, self.error_models_[view.name], codes, gradient, np.zeros_like(codes.data))
+        data[codes.positions(observation.ids[observation.order]).data] = stepped.data
+        operator = make_operator(self.scene, view.camera, self.device)
+        image, left_over = operator.blend_rows(codes.with_data(data), self.num_classes)
+        if (codes.indices == 0).any():
+            image[..., 0] += left_over
+        return image
+
+    def rejected_share(self, view: View) -> float:
+        """Share of a view's labelled pixels that lie in rejected regions."""
+        evidence, areas = self.error_models_[view.name].evidence, self.observation(view.name).areas
+        return float(areas[~evidence.informative].sum() / areas.sum())
+
+    def _used_labels(self, seen: SeenLabels, operator: ViewOperator) -> SeenLabels:
+        """Align boundaries of a plain mask with edges, and give each region a label if regions may be rejected."""
         settings = self.settings
         if settings.errors and settings.edge_px and seen.evidence is None:
-            # Where outlines go is decided, not computed to a precision: all devices have to see the very same edges.
+            # Where boundaries go is a decision, not a quantity: all devices have to see the very same edges.
             drawing = operator if self.device == "cpu" else make_operator(self.scene, operator.camera)
-            seen = SeenLabels(settle_outlines(seen.labels, scene_edges(drawing, self.scene), settings.edge_px))
-        return by_region(seen) if settings.judges else seen
+            seen = SeenLabels(align_boundaries(seen.labels, scene_edges(drawing, self.scene), settings.edge_px))
+        return split_regions(seen) if settings.rejects_regions else seen
 
-    def _judge(
+    def _reject_regions(
         self,
         votes: CSRRows,  # int64
-        tell: Callable[[], None],
+        tick: Callable[[], None],
         names: Iterable[str] | None = None,
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Find the labels of each view, or of some, that the other views speak against.
+        """Find the labels of each view, or of some, that the other views contradict.
 
         Returns
         -------
-        doubted : (Z,) int64
+        rejected_votes : (Z,) int64
             Their part of each entry of the votes.
-        doubts : dict of str to (L,) bool
+        rejected : dict of str to (L,) bool
             Which they are; views without any are left out.
         """
-        left, doubts = np.zeros_like(votes.data), {}
+        remaining, rejected = np.zeros_like(votes.data), {}
         for name, observation in self._observations(names):
-            tell()
-            doubtful = in_doubt(votes, observation, self._possible(), self.settings.least_agreement)
-            if doubtful.any():
-                doubts[name] = doubtful
-                take_back(doubtful, votes, observation, left)
-        return -left, doubts
+            tick()
+            labels = find_rejected(votes, observation, self._possible(), self.settings.least_agreement)
+            if labels.any():
+                rejected[name] = labels
+                subtract_labels(labels, votes, observation, remaining)
+        return -remaining, rejected
 
-    def _first_models(
+    def _initial_error_models(
         self,
         votes: CSRRows,  # int64
-        doubts: Mapping[str, np.ndarray],  # (L,) bool
-        tell: Callable[[], None],
+        rejected: Mapping[str, np.ndarray],  # (L,) bool
+        tick: Callable[[], None],
         names: Iterable[str] | None = None,
     ) -> dict[str, ErrorModel]:
-        """Start an error model for each view, or for some, from what the votes of the others make of its mask."""
+        """Estimate an error model for each view, or for some, from the votes of all other views."""
         models = {}
         for name, observation in self._observations(names):
-            tell()
-            models[name] = self._first_model(votes, observation, doubts.get(name))
+            tick()
+            models[name] = self._initial_error_model(votes, observation, rejected.get(name))
         return models
 
-    def _first_model(self, votes: CSRRows, observation: Observation, doubtful: np.ndarray | None) -> ErrorModel:
+    def _initial_error_model(self, votes: CSRRows, observation: Observation, rejected: np.ndarray | None) -> ErrorModel:
         settings, evidence = self.settings, observation.evidence
         if not settings.errors:
-            return ErrorModel.trusting(evidence, self.num_classes, settings.outliers, observation.num_pixels)
-        if doubtful is not None:
-            evidence = evidence.without(doubtful)
+            return ErrorModel.without_errors(evidence, self.num_classes, settings.outliers, observation.num_pixels)
+        if rejected is not None:
+            evidence = evidence.without(rejected)
         pixels = int(observation.areas[evidence.informative].sum())
-        counts = counted_by_others(votes, observation, self._possible(), evidence, settings.majority)
+        counts = leave_one_out_counts(votes, observation, self._possible(), evidence, settings.majority)
         return ErrorModel.from_counts(evidence, counts, settings.error_prior, settings.outliers, pixels)
 
-    def _gains(
+    def _e_step(
         self,
         codes: CSRRows,
         models: dict[str, ErrorModel],
-        tell: Callable[[], None],
+        tick: Callable[[], None],
     ) -> tuple[np.ndarray, dict[str, float]]:
-        """Sum over the views of these models what they say of the codes.
+        """Sum over the views of these models the gradient of the log-likelihood.
 
         Returns
         -------
-        gains : (Z,) int64
-            sum_v sum_y C_v[k, y] B_v[i, y], in units of `GAIN_UNIT`, for each entry of the codes.
-        told : dict of str to float
-            The part of J that is each view's own, at the codes and models that came in.
+        gradient : (Z,) int64
+            With respect to each entry of the codes, in units of `GRADIENT_UNIT`.
+        log_likelihoods : dict of str to float
+            Of each view's labels, in nats.
         """
-        gains, told = np.zeros(len(codes.data), np.int64), {}
+        gradient, log_likelihoods = np.zeros(len(codes.data), np.int64), {}
         for name, observation in self._observations(models):
-            tell()  # after each view, so that whoever listens can stop the work at once
-            likelihood, taught = models[name].told
-            seen = observation.order, observation.ids, observation.start, observation.labels
-            shares = observation.shares(mix(*codes, *seen, likelihood), likelihood[:, 0])
-            told[name] = shares.log_likelihood
-            collect(codes.indptr, codes.indices, gains, *seen, taught, shares.sightings)
-        return gains, told
+            tick()  # after each view, so that whoever listens can stop the work at once
+            (likelihood, used), pairs = models[name].by_label, _pairs(observation)
+            shares = observation.shares(pair_likelihood(*codes, *pairs, likelihood), likelihood[:, 0])
+            log_likelihoods[name] = shares.log_likelihood
+            accumulate(codes.indptr, codes.indices, gradient, *pairs, used, shares.sightings)
+        return gradient, log_likelihoods
 
-    def _refit(
+    def _refit_error_models(
         self,
         codes: CSRRows,
-        gains: np.ndarray,  # (Z,) int64, of a step at these codes and models
+        gradient: np.ndarray,  # (Z,) int64, of all views at these codes and models
         prior: np.ndarray,  # (Z,) px
         models: dict[str, ErrorModel],
-        tell: Callable[[], None],
+        tick: Callable[[], None],
     ) -> dict[str, ErrorModel]:
-        """Learn each view's error model anew, from the codes that the step would give without this view."""
+        """Re-estimate each view's error model, in place, from the step without this view."""
         for name, observation in self._observations(models):
-            tell()
+            tick()
             model, order = models[name], observation.order
-            without = codes_without(observation, model, codes, gains, prior)
-            likelihood, _ = model.told
-            said = mix(*without, order, _inverse(order), observation.start, observation.labels, likelihood)
-            shares = observation.shares(said, likelihood[:, 0])
-            seen = order, observation.start, observation.labels
-            counts = tally(*without, *seen, shares.sightings, self.num_classes, len(observation.classes))
+            without = codes_without(observation, model, codes, gradient, prior)
+            # Rows of `without` are in the order of the scene, so a Gaussian's row is its place in that order.
+            place = np.empty(len(order), np.int32)
+            place[order] = np.arange(len(order), dtype=np.int32)
+            pairs = observation.start, observation.labels
+            likelihood, _ = model.by_label
+            shares = observation.shares(pair_likelihood(*without, order, place, *pairs, likelihood), likelihood[:, 0])
+            counts = confusion_counts(
+                *without, order, *pairs, shares.sightings, self.num_classes, len(observation.classes)
+            )
             counts[0] += shares.rest
-            model.maximise(model.expected(counts))
+            model.m_step(model.expected_counts(counts))
         return models
 
-    def _smooth(self, votes: CSRRows) -> CSRRows:
-        """Weigh the mean code of those of the nearest Gaussians that were observed; rows without where none was."""
+    def _spatial_prior(self, votes: CSRRows) -> CSRRows:
+        """Mean probabilities of the nearest observed Gaussians times the prior weight; empty rows where none was."""
         neighbours = neighbours_of(self.scene, self.settings.prior_k)
         if neighbours is None or self.settings.prior_weight == 0:
             return CSRRows(np.zeros_like(votes.indptr), np.empty(0, np.uint32), np.empty(0, np.float32))
         codes = votes.with_data(votes.data.astype(np.float32) * np.float32(VOTE_UNIT)).normalised()
-        smooth = neighbours.mean_codes(codes, self.observed_, self.num_classes).normalised()
-        return smooth.with_data(np.float32(self.settings.prior_weight) * smooth.data)
+        mean = neighbours.mean_codes(codes, self.observed_, self.num_classes).normalised()
+        return mean.with_data(np.float32(self.settings.prior_weight) * mean.data)
 
 
 def codes_without(
     observation: Observation,
     model: ErrorModel,
     codes: CSRRows,
-    gains: np.ndarray,  # (Z,) int64, of a step at these codes and models
+    gradient: np.ndarray,  # (Z,) int64, of all views at these codes and models
     prior: np.ndarray,  # (Z,) float32, px
 ) -> CSRRows:
-    """Take a step of EM that leaves a view's own summand out: codes of the M Gaussians that it sees, by `order`."""
-    likelihood, taught = model.told
-    seen = observation.order, observation.ids, observation.start, observation.labels
-    shares = observation.shares(mix(*codes, *seen, likelihood), likelihood[:, 0])
-    start = starts(np.diff(codes.indptr)[observation.ids[observation.order]])
-    without = CSRRows(start, np.empty(start[-1], np.uint32), np.empty(start[-1], np.float32))
-    improve_without(*codes, gains, prior, *seen, taught, shares.sightings, *without)
+    """Take an M-step without one view: probabilities of the M Gaussians that it sees, in the order of the scene."""
+    (likelihood, used), pairs = model.by_label, _pairs(observation)
+    shares = observation.shares(pair_likelihood(*codes, *pairs, likelihood), likelihood[:, 0])
+    indptr = starts(np.diff(codes.indptr)[observation.ids[observation.order]])
+    without = CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], np.float32))
+    m_step_without_view(*codes, gradient, prior, *pairs, used, shares.sightings, *without)
     return without
 
 
-def _inverse(
-    order: np.ndarray,  # (M,) a permutation
-) -> np.ndarray:
-    """Tell where in the order each one comes, (M,) int32."""
-    place = np.empty(len(order), np.int32)
-    place[order] = np.arange(len(order), dtype=np.int32)
-    return place
+def _pairs(observation: Observation) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the (Gaussian, label) pairs of a view as the kernels take them."""
+    return observation.order, observation.ids, observation.start, observation.labels
 
 
 def _log_prior(
     codes: np.ndarray,  # (Z,)
     prior: np.ndarray,  # (Z,) px
 ) -> float:
-    told = prior > 0
-    return float((prior[told] * np.log(codes[told])).sum(dtype=np.float64))
+    counted = prior > 0
+    return float((prior[counted] * np.log(codes[counted])).sum(dtype=np.float64))

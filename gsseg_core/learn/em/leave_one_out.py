@@ -1,4 +1,4 @@
-"""What lies under each label of a view by the votes of all other views, counted without this one's own say."""
+"""Leave-one-out class counts: the pixels of each class under each label of a view, by the votes of all other views."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence, resolve_row
-from gsseg_core.learn.em.em_kernels import BLOCKS, take_row
+from gsseg_core.learn.em.em_kernels import BLOCKS, subtract_row
 from gsseg_core.learn.learner import UNITS
 from gsseg_core.raster.observation import Observation
 
 
-def counted_by_others(
+def leave_one_out_counts(
     votes: CSRRows,  # int64, of all views
     observation: Observation,
     possible: np.ndarray,  # (K,) bool: ids that are classes
@@ -20,7 +20,7 @@ def counted_by_others(
     power: float = 1.0,
     most: float = np.inf,
 ) -> np.ndarray:
-    """Count the pixels (K, L) of each class under each label of a view, by the votes of all the others.
+    """Count the pixels (K, L) of each class under each label of a view by the votes of all other views.
 
     Parameters
     ----------
@@ -31,11 +31,11 @@ def counted_by_others(
     possible : (K,) bool
         Ids that are classes.
     evidence : LabelEvidence
-        What the view has voted with.
+        Of the view, which it has voted with.
     power : float
-        Codes are raised to it, and scaled to sum 1 again, before they are counted: above 1, majorities stand out.
+        Probabilities are raised to it and normalised before they are counted: above 1, majorities stand out.
     most : float
-        A Gaussian counts at most so many times the pixels that the others saw of it.
+        A Gaussian counts at most this many times the pixels that the other views saw of it.
     """
     return _count(
         *votes, observation.order, observation.ids, observation.start, observation.labels, observation.votes(),
@@ -58,7 +58,7 @@ def _raised(x: np.float32, power: float) -> np.float32:
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def _count(
-    rows: np.ndarray,  # (N + 1,) votes of all views, as `CSRRows`
+    indptr: np.ndarray,  # (N + 1,) votes of all views, as `CSRRows` with the next two
     classes: np.ndarray,  # (Z,)
     votes: np.ndarray,  # (Z,) int64
     order: np.ndarray,  # (M,) in which to go through the Gaussians
@@ -66,50 +66,51 @@ def _count(
     start: np.ndarray,  # (M + 1,)
     labels: np.ndarray,  # (P,)
     own: np.ndarray,  # (P,) float32, px
-    said_start: np.ndarray,  # (L + 1,) what a pixel of each label votes, as `CSRRows`
-    said_classes: np.ndarray,
-    said: np.ndarray,  # float64
+    vote_indptr: np.ndarray,  # (L + 1,) votes of a pixel of each label, as `CSRRows` with the next two
+    vote_classes: np.ndarray,
+    vote: np.ndarray,  # float64
     possible: np.ndarray,  # ids that are classes, ascending
     power: float,
     most: float,
     num_classes: int,
     num_labels: int,
 ) -> np.ndarray:
-    """Count as `counted_by_others`, all of it row by row, so that no array of the others' votes is ever made."""
+    """Count as `leave_one_out_counts` does, row by row, so that the votes of the other views are never stored."""
     parts = np.zeros((BLOCKS, num_classes, num_labels))
     for block in nb.prange(BLOCKS):
         part = parts[block]
-        which, others = np.empty(num_classes + 1, np.uint32), np.empty(num_classes + 1, np.int64)
-        kept_which, kept_others = np.empty_like(which), np.empty_like(others)
+        which, remaining = np.empty(num_classes + 1, np.uint32), np.empty(num_classes + 1, np.int64)
+        kept_which, kept_votes = np.empty_like(which), np.empty_like(remaining)
         codes = np.empty(num_classes + 1, np.float32)
         for i in range(order.shape[0] * block // BLOCKS, order.shape[0] * (block + 1) // BLOCKS):
             m = order[i]
-            first, many = rows[ids[m]], rows[ids[m] + 1] - rows[ids[m]]
-            for z in range(many):
-                which[z], others[z] = classes[first + z], votes[first + z]
-            mine = slice(start[m], start[m + 1])
-            take_row(which[:many], others[:many], labels[mine], said_start, said_classes, said, own[mine], UNITS)
+            first, count = indptr[ids[m]], indptr[ids[m] + 1] - indptr[ids[m]]
+            for z in range(count):
+                which[z], remaining[z] = classes[first + z], votes[first + z]
+            pairs = slice(start[m], start[m + 1])
+            row = which[:count], remaining[:count]
+            subtract_row(row[0], row[1], labels[pairs], vote_indptr, vote_classes, vote, own[pairs], UNITS)
             least = np.int64(0)
-            for z in range(many):
-                least = min(least, others[z])
+            for z in range(count):
+                least = min(least, remaining[z])
             if least < 0:
-                many = resolve_row(which[:many], others[:many], possible, kept_which, kept_others)
-                which[:many], others[:many] = kept_which[:many], kept_others[:many]
+                count = resolve_row(which[:count], remaining[:count], possible, kept_which, kept_votes)
+                which[:count], remaining[:count] = kept_which[:count], kept_votes[:count]
             total, largest = np.int64(0), np.int64(0)
-            for z in range(many):
-                total += others[z]
-                largest = max(largest, others[z])
+            for z in range(count):
+                total += remaining[z]
+                largest = max(largest, remaining[z])
             if total == 0:
                 continue
             raised, seen = np.float32(0), np.float64(0)
-            for z in range(many):  # As shares of the largest, of which some power is never lost to rounding.
-                codes[z] = _raised(np.float32(others[z]) / np.float32(largest), power)
+            for z in range(count):  # As shares of the largest, of which some power is never lost to rounding.
+                codes[z] = _raised(np.float32(remaining[z]) / np.float32(largest), power)
                 raised += codes[z]
             for s in range(start[m], start[m + 1]):
                 seen += own[s]
             share = np.float32(min(1.0, most * total / max(seen * UNITS, 1.0))) / raised
             for s in range(start[m], start[m + 1]):
-                for z in range(many):
+                for z in range(count):
                     part[which[z], labels[s]] += own[s] * share * codes[z]
     counts: np.ndarray = parts.sum(axis=0)
     return counts

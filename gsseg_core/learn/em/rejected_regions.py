@@ -1,10 +1,9 @@
-"""Regions of a mask, and which of them the other views speak against.
+"""Rejected regions: connected pixels of one label that the votes of all other views contradict.
 
-Most errors of a segmenter sit in one place: a blob of clutter, one object under the id of another, a frame in which
-everything is wrong. An error model of the whole view, which says how often each class is called what, does not explain
-them. A *region* is a set of connected pixels of one label. It is held against the votes of all other views: where they
-saw enough of it, and next to nothing of that is of its label to them, it is in doubt, and what it says is not heard at
-all. That costs little if it was right, since others say the same, and much is won if it was wrong.
+Most errors of a segmenter sit in one place: a blob of clutter, an object under another's id, a whole bad frame. The
+confusion matrix of a view, the same all over it, does not model them. So each *region* of a mask, connected pixels of
+one label, is tested against the votes of all other views. Where they saw enough of it, and next to nothing of that has
+its label, its pixels count as unknown. docs/method.md has the reasons.
 """
 
 from __future__ import annotations
@@ -16,23 +15,23 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import SeenLabels
-from gsseg_core.learn.em.em_kernels import take_votes
-from gsseg_core.learn.em.leave_one_out import counted_by_others
+from gsseg_core.learn.em.em_kernels import subtract_votes
+from gsseg_core.learn.em.leave_one_out import leave_one_out_counts
 from gsseg_core.learn.learner import UNITS
 from gsseg_core.raster.observation import Observation
 
 SMALLEST = 64
-"""Regions of fewer px are not told apart: all of one label are judged as one."""
+"""Regions of fewer px are not split: all of one label are tested as one."""
 
 COVERED = 0.25
-"""Share of a region, by weight, that the other views must have seen as well as this one for it to be in doubt."""
+"""Share of a region, by weight, that the other views must have seen as well as this one for it to be rejected."""
 
 MOST = 500
-"""Regions of a mask that are told apart at most, the largest; what is left of each label is judged as one."""
+"""Regions of a mask that are split at most, the largest; what is left of each label is tested as one."""
 
 
-def by_region(seen: SeenLabels) -> SeenLabels:
-    """Give every region of a mask a label of its own, which means the class that it had; a soft mask stays as it is."""
+def split_regions(seen: SeenLabels) -> SeenLabels:
+    """Split a plain mask into regions, each a label of its own with evidence for the same class as before."""
     if seen.evidence is not None or not (seen.labels >= 0).any():
         return seen
     connected, first, area = connected_pixels(seen.labels)
@@ -52,62 +51,63 @@ def by_region(seen: SeenLabels) -> SeenLabels:
 def connected_pixels(
     labels: np.ndarray,  # (H, W) int32
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Give sets of pixels of one label that are connected over sides numbers, in the order of their first pixels.
+    """Label the 4-connected components of pixels of one label, in the order of their first pixels.
 
     Returns
     -------
     connected : (H, W) int32
         `UNKNOWN` (-1) where the label is negative.
     first : (R,) int64
-        The first pixel of each set, counted row by row.
+        First pixel of each component, counted row by row.
     area : (R,) int64
-        Pixels of each set.
+        Pixels of each component.
     """
     connected = np.empty(labels.shape, np.int32)
     first, area = _connect(np.ascontiguousarray(labels), connected)
     return connected, first, area
 
 
-def in_doubt(
+def find_rejected(
     votes: CSRRows,  # int64, of all views
     observation: Observation,
     possible: np.ndarray,  # (K,) bool: ids that are classes
     least: float,
 ) -> np.ndarray:
-    """Tell which labels of a view the others speak against, (L,) bool; none where a label may mean several classes.
+    """Find the labels of a view that the votes of all other views contradict, (L,) bool; none of uncertain evidence.
 
-    A Gaussian that this view saw better than all others together, says as much for a class as they saw of it, and no
-    more: what shows through a gap somewhere else is no witness. Where they saw too little of a region, it is heard.
+    A Gaussian that this view saw better than all others together counts by what they saw of it, no more: what shows
+    through a gap in another view is little evidence. A region of which they saw too little is kept.
 
     Parameters
     ----------
     votes, observation, possible
-        As in `counted_by_others`.
+        As for `leave_one_out_counts`.
     least : float
-        Share of what lies under a label, by weight, that has to be of its class by the votes of the others.
+        Least share of what lies under a label, by weight, that is of its class by the votes of the others.
     """
     evidence = observation.evidence
     if not evidence.is_certain:
         return np.zeros(len(observation.classes), bool)
-    counts = counted_by_others(votes, observation, possible, evidence, most=1)
+    counts = leave_one_out_counts(votes, observation, possible, evidence, most=1)
     label = np.arange(len(evidence.informative))
     covered = counts.sum(axis=0)
     enough = covered >= COVERED * np.bincount(observation.labels, weights=observation.votes(), minlength=len(label))
-    doubtful: np.ndarray = enough & (counts[evidence.named(), label] < least * covered)
-    return doubtful
+    rejected: np.ndarray = enough & (counts[evidence.named(), label] < least * covered)
+    return rejected
 
 
-def take_back(
-    doubtful: np.ndarray,  # (L,) bool
+def subtract_labels(
+    chosen: np.ndarray,  # (L,) bool
     votes: CSRRows,  # int64, of all views
     observation: Observation,
     total: np.ndarray,  # (Z,) int64, changed in place
 ) -> None:
-    """Take what a view has voted with some of its labels away from a total of the same rows as the votes."""
-    order, said = observation.order, observation.evidence.without(~doubtful).votes
+    """Subtract a view's votes with some of its labels from a total of the same pattern as the votes."""
+    order, label_votes = observation.order, observation.evidence.without(~chosen).votes
     ids = observation.ids[order]
-    seen = order, observation.start, observation.labels
-    take_votes(votes.indptr[ids], votes.indptr[ids + 1], votes.indices, total, *seen, *said, observation.votes(), UNITS)
+    rows = votes.indptr[ids], votes.indptr[ids + 1], votes.indices
+    pairs = order, observation.start, observation.labels
+    subtract_votes(*rows, total, *pairs, *label_votes, observation.votes(), UNITS)
 
 
 @nb.njit(nogil=True, cache=True)
@@ -125,7 +125,7 @@ def _connect(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Write the numbers, return first pixels and areas. Runs of equal pixels are joined to those of the row above."""
     height, width = labels.shape
-    parent = np.empty(height * width, np.int32)  # of runs; there are at most as many as pixels
+    parent = np.empty(height * width, np.int32)  # of runs; there are at most as count as pixels
     begin = np.empty(height * width, np.int32)
     runs = 0
     for y in range(height):
@@ -142,19 +142,19 @@ def _connect(
             if y > 0 and labels[y, x] == labels[y - 1, x] and not (joined and labels[y - 1, x - 1] == labels[y, x]):
                 one, two = _root(parent, run), _root(parent, connected[y - 1, x])
                 parent[max(one, two)] = min(one, two)
-    many = 0
+    count = 0
     number, first = np.empty(runs, np.int32), np.empty(runs, np.int64)
     for run in range(runs):
         root = _root(parent, run)
         if root == run:
-            number[run], first[many] = many, begin[run]
-            many += 1
+            number[run], first[count] = count, begin[run]
+            count += 1
         else:
             number[run] = number[root]
-    area = np.zeros(many, np.int64)
+    area = np.zeros(count, np.int64)
     for y in range(height):
         for x in range(width):
             if connected[y, x] >= 0:
                 connected[y, x] = number[connected[y, x]]
                 area[connected[y, x]] += 1
-    return first[:many].copy(), area
+    return first[:count].copy(), area

@@ -10,7 +10,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import starts
-from gsseg_core.data.label_evidence import LabelEvidence
+from gsseg_core.data.label_evidence import LabelEvidence, vote_units
 from gsseg_core.raster.cpu.blending import AHEAD
 from gsseg_core.raster.cpu.lifting import Labels, cut_labels, lift
 from gsseg_core.raster.cpu.tiling import Tiles
@@ -184,5 +184,5 @@ def _vote(
             for s in range(n):
                 row = total[who[s]]
                 for z in range(said_start[labels[s]], said_start[labels[s] + 1]):
-                    row[said_classes[z]] += sign * np.int64(np.rint(np.float64(votes[s]) * said[z] * units))
+                    row[said_classes[z]] += sign * vote_units(votes[s], said[z], units)
             n = 0

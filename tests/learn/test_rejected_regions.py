@@ -16,7 +16,7 @@ from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
-from gsseg_core.learn.em.rejected_regions import MOST, SMALLEST, by_region, connected_pixels, in_doubt
+from gsseg_core.learn.em.rejected_regions import MOST, SMALLEST, connected_pixels, find_rejected, split_regions
 from gsseg_core.learn.vote_learner import VoteLearner
 
 SCENE, _ = balls_on_a_table()
@@ -44,7 +44,7 @@ def test_connected_pixels_are_those_of_scipy(labels: np.ndarray) -> None:
 @settings(deadline=None, max_examples=30)
 @given(arrays.arrays(np.int32, st.just((40, 30)), elements=st.integers(-1, 2), fill=st.integers(0, 2)))
 def test_regions_mean_what_the_labels_were_and_only_large_ones_stand_alone(labels: np.ndarray) -> None:
-    seen = by_region(SeenLabels(labels))
+    seen = split_regions(SeenLabels(labels))
     np.testing.assert_array_equal(seen.named(), np.maximum(labels, UNKNOWN))
     if seen.evidence is None:
         assert (labels < 0).all()
@@ -63,27 +63,27 @@ def test_of_very_many_regions_the_largest_stand_alone() -> None:
     y, x = np.indices((30 * 8, 40 * 8)) // 8
     labels = ((y + x) % 2).astype(np.int32)
     labels[:8, :24] = 2
-    seen = by_region(SeenLabels(labels))
+    seen = split_regions(SeenLabels(labels))
     assert seen.evidence is not None and len(seen.evidence.informative) == MOST + 2
     assert (seen.labels == seen.labels[0, 0]).sum() == 8 * 24
 
 
-def test_what_one_view_alone_claims_against_all_others_is_not_heard() -> None:
+def test_what_one_view_alone_claims_against_all_others_is_rejected() -> None:
     views = clean_views(8)
     clean = taught(EMLearner(SCENE, NUM_CLASSES), views).fit()
     assert all(model.evidence.informative.all() for model in clean.error_models_.values())
     cluttered = [with_clutter(view, 1 + i % 3) for i, view in enumerate(views)]
-    heard, unheard = (
+    naive, learner = (
         taught(EMLearner(SCENE, NUM_CLASSES, EMSettings(least_agreement=least)), cluttered).fit()
         for least in (0.0, EMSettings.least_agreement)
     )
     for view in cluttered:
-        evidence = unheard.error_models_[view.name].evidence
-        labels = by_region(view.read_seen()).labels
+        evidence = learner.error_models_[view.name].evidence
+        labels = split_regions(view.read_seen()).labels
         assert not evidence.informative[labels[-1, 0]]
         assert (~evidence.informative).sum() == 1
-    assert mean_iou(unheard) > mean_iou(heard)
-    assert mean_iou(unheard) > mean_iou(clean) - 0.01
+    assert mean_iou(learner) > mean_iou(naive)
+    assert mean_iou(learner) > mean_iou(clean) - 0.01
 
 
 def test_gaussians_of_which_only_doubtful_regions_speak_have_no_code() -> None:
@@ -100,26 +100,26 @@ def test_gaussians_of_which_only_doubtful_regions_speak_have_no_code() -> None:
     assert (learner.observed_ <= voted).all()
 
 
-@pytest.mark.parametrize(("seen", "doubted"), [(1.0, True), (0.5, True), (0.2, False), (0.001, False)])
-def test_a_region_is_in_doubt_only_where_the_others_saw_enough_of_it(seen: float, doubted: bool) -> None:
+@pytest.mark.parametrize(("seen", "expected"), [(1.0, True), (0.5, True), (0.2, False), (0.001, False)])
+def test_a_region_is_rejected_only_where_the_others_saw_enough_of_it(seen: float, expected: bool) -> None:
     view = clean_views(1)[0]
     learner = EMLearner(SCENE, NUM_CLASSES + 1)
     learner.observe(view)
     votes = learner._votes.copy()
     votes[:, NUM_CLASSES] = seen * votes.sum(axis=1)  # all is one more class to the others
     observation, possible = learner._prepared[view.name], np.ones(NUM_CLASSES + 1, bool)
-    doubtful = in_doubt(CSRRows.from_dense(votes), observation, possible, EMSettings().least_agreement)
-    assert len(doubtful) >= NUM_CLASSES
-    np.testing.assert_array_equal(doubtful, doubted)
+    rejected = find_rejected(CSRRows.from_dense(votes), observation, possible, EMSettings().least_agreement)
+    assert len(rejected) >= NUM_CLASSES
+    np.testing.assert_array_equal(rejected, expected)
 
 
-def test_a_single_view_is_heard_whatever_it_says() -> None:
+def test_regions_of_a_single_view_are_never_rejected() -> None:
     learner = taught(EMLearner(SCENE, NUM_CLASSES), [with_clutter(clean_views(1)[0])]).fit()
     assert all(model.evidence.informative.all() for model in learner.error_models_.values())
     assert learner.observed_.any()
 
 
-def test_soft_and_partial_masks_are_heard_whatever_they_say() -> None:
+def test_labels_of_soft_and_partial_masks_are_never_rejected() -> None:
     views = clean_views(5)
     odd = with_clutter(views[0]).read_labels()
     chances = np.stack([np.where(odd == k, 0.8, 0.2 / 3) for k in range(NUM_CLASSES)])

@@ -13,7 +13,7 @@ from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, mean_iou
 from gsseg_core.data.view import View
 from gsseg_core.demo.mask_errors import resize
 from gsseg_core.errors import SettingsError
-from gsseg_core.learn.em.boundary_alignment import _along_outlines, _reach_across, scene_edges, settle_outlines
+from gsseg_core.learn.em.boundary_alignment import _boundary_strengths, _nearest_regions, align_boundaries, scene_edges
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.em.rejected_regions import connected_pixels
 from gsseg_core.raster.backends import make_operator
@@ -55,25 +55,25 @@ def drawn_too_wide(labels: np.ndarray, shifts: dict[int, int]) -> np.ndarray:
 def test_objects_drawn_too_wide_or_too_narrow_get_their_outlines_back(shifts: dict[int, int]) -> None:
     labels = discs()
     wrong = drawn_too_wide(labels, shifts)
-    settled = settle_outlines(wrong, edges_of(labels), FARTHEST)
-    assert (settled != labels).sum() < 0.25 * (wrong != labels).sum()
+    aligned = align_boundaries(wrong, edges_of(labels), FARTHEST)
+    assert (aligned != labels).sum() < 0.25 * (wrong != labels).sum()
 
 
 def test_right_outlines_stay_where_they_are() -> None:
     labels = discs()
-    np.testing.assert_array_equal(settle_outlines(labels, edges_of(labels), FARTHEST), labels)
+    np.testing.assert_array_equal(align_boundaries(labels, edges_of(labels), FARTHEST), labels)
 
 
 def test_without_edges_nothing_moves() -> None:
     labels = discs()
-    np.testing.assert_array_equal(settle_outlines(labels, np.zeros(labels.shape, np.float32), FARTHEST), labels)
+    np.testing.assert_array_equal(align_boundaries(labels, np.zeros(labels.shape, np.float32), FARTHEST), labels)
 
 
-def test_where_edges_are_no_stronger_along_outlines_than_elsewhere_nothing_moves() -> None:
+def test_where_edges_are_no_stronger_along_boundaries_than_elsewhere_nothing_moves() -> None:
     labels = discs()
     posters = ndimage.gaussian_filter(np.random.default_rng(2).random(labels.shape, np.float32), 1)
-    assert (settle_outlines(labels, posters, FARTHEST, telling=0) != labels).any()
-    np.testing.assert_array_equal(settle_outlines(labels, posters, FARTHEST), labels)
+    assert (align_boundaries(labels, posters, FARTHEST, telling=0) != labels).any()
+    np.testing.assert_array_equal(align_boundaries(labels, posters, FARTHEST), labels)
 
 
 @settings(deadline=None, max_examples=60)
@@ -83,13 +83,13 @@ def test_pixels_move_to_regions_near_by_and_the_unknown_stays_unknown(
 ) -> None:
     edges = np.random.default_rng(seed).random(labels.shape, np.float32)
     before = labels.copy()
-    settled = settle_outlines(labels, edges, farthest, telling=0)
+    aligned = align_boundaries(labels, edges, farthest, telling=0)
     np.testing.assert_array_equal(labels, before)
-    np.testing.assert_array_equal(settled < 0, labels < 0)
-    for row, column in np.argwhere(settled != labels):
+    np.testing.assert_array_equal(aligned < 0, labels < 0)
+    for row, column in np.argwhere(aligned != labels):
         y, x = np.indices(labels.shape)
         near = (y - row) ** 2 + (x - column) ** 2 <= (2 * farthest) ** 2
-        assert settled[row, column] in labels[near]
+        assert aligned[row, column] in labels[near]
 
 
 @settings(deadline=None, max_examples=60)
@@ -98,9 +98,9 @@ def test_a_view_turned_around_settles_turned_around(widths: list[int], farthest:
     # Two regions, side by side: where there are more, some pixels are equally near to two, and either may be named.
     labels = (np.arange(20) < np.array(widths)[:, None]).astype(np.int32)
     edges = np.random.default_rng(seed).random(labels.shape, np.float32)
-    settled = settle_outlines(labels, edges, farthest, telling=0)
-    turned = settle_outlines(labels[::-1, ::-1].copy(), edges[::-1, ::-1].copy(), farthest, telling=0)[::-1, ::-1]
-    np.testing.assert_array_equal(settled, turned)
+    aligned = align_boundaries(labels, edges, farthest, telling=0)
+    turned = align_boundaries(labels[::-1, ::-1].copy(), edges[::-1, ::-1].copy(), farthest, telling=0)[::-1, ::-1]
+    np.testing.assert_array_equal(aligned, turned)
 
 
 @settings(deadline=None, max_examples=60)
@@ -110,7 +110,7 @@ def test_a_view_turned_around_settles_turned_around(widths: list[int], farthest:
 )
 def test_the_nearest_region_is_as_far_as_by_looking_at_all_pixels(labels: np.ndarray, farthest: int) -> None:
     region, _, _ = connected_pixels(labels)
-    other, ring = _reach_across(region, farthest)
+    other, ring = _nearest_regions(region, farthest)
     pixels = np.stack(np.indices(labels.shape), axis=-1).reshape(-1, 2)
     away = np.sqrt(((pixels[:, None] - pixels) ** 2).sum(axis=2))
     away[region.ravel()[:, None] == region.ravel()] = np.inf
@@ -127,8 +127,8 @@ def test_edges_are_summed_by_pair_and_ring_as_by_looking_at_all_pixels() -> None
     labels, farthest = discs(), 6
     region, _, area = connected_pixels(labels)
     edges = np.random.default_rng(1).random(labels.shape, np.float32)
-    other, ring = _reach_across(region, farthest)
-    pairs, pair, lengths, strengths = _along_outlines(region, other, ring, edges, len(area), farthest)
+    other, ring = _nearest_regions(region, farthest)
+    pairs, pair, lengths, strengths = _boundary_strengths(region, other, ring, edges, len(area), farthest)
     assert {tuple(sorted(p)) for p in np.stack([region, other], axis=-1)[other >= 0].tolist()} == set(
         map(tuple, pairs.tolist())
     )

@@ -12,7 +12,7 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence, resolved_votes
 from gsseg_core.data.view import View
 from gsseg_core.learn.em.em_learner import EMLearner
-from gsseg_core.learn.em.leave_one_out import counted_by_others
+from gsseg_core.learn.em.leave_one_out import leave_one_out_counts
 from gsseg_core.learn.learner import UNITS
 from gsseg_core.raster.observation import Observation
 
@@ -34,7 +34,7 @@ def slow_count(
     power: float,
     most: float,
 ) -> np.ndarray:
-    """Readable twin of `counted_by_others`, Gaussian by Gaussian."""
+    """Readable twin of `leave_one_out_counts`, Gaussian by Gaussian."""
     counts = np.zeros((NUM_CLASSES, len(observation.classes)))
     own, voted = observation.votes().astype(np.float64), evidence.votes.dense(NUM_CLASSES)
     for m, i in enumerate(observation.ids):
@@ -59,7 +59,7 @@ def test_counts_by_the_others_are_those_of_a_slow_twin(seed: int, power: float, 
     shape = learner._votes.shape
     votes = learner._votes + rng.integers(0, int(UNITS), shape) * (rng.random(shape) < 0.2)
     evidence = observation.evidence.without(rng.random(len(observation.classes)) < 0.3)
-    found = counted_by_others(CSRRows.from_dense(votes), observation, POSSIBLE, evidence, power, most)
+    found = leave_one_out_counts(CSRRows.from_dense(votes), observation, POSSIBLE, evidence, power, most)
     np.testing.assert_allclose(found, slow_count(votes, observation, evidence, power, most), rtol=1e-4, atol=1e-4)
 
 
@@ -72,7 +72,7 @@ def test_votes_against_classes_leave_what_can_be_said_with_them(looked_for: list
         views.append(View.from_arrays(view.camera, found, supervised=looked_for))
     learner, observation = observed(views, views[2].name)
     assert (learner._votes < 0).any()
-    counts = counted_by_others(CSRRows.from_dense(learner._votes), observation, POSSIBLE, observation.evidence, 4.0)
+    counts = leave_one_out_counts(CSRRows.from_dense(learner._votes), observation, POSSIBLE, observation.evidence, 4.0)
     expected = slow_count(learner._votes, observation, observation.evidence, 4.0, np.inf)
     np.testing.assert_allclose(counts, expected, rtol=1e-4, atol=1e-4)
     assert counts.any()
@@ -81,6 +81,6 @@ def test_votes_against_classes_leave_what_can_be_said_with_them(looked_for: list
 def test_a_view_alone_has_nobody_beside_it() -> None:
     view = clean_views(1)[0]
     learner, observation = observed([view], view.name)
-    assert not counted_by_others(
+    assert not leave_one_out_counts(
         CSRRows.from_dense(learner._votes), observation, POSSIBLE, observation.evidence, 4.0
     ).any()
