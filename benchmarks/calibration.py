@@ -20,6 +20,7 @@ from calibration_text import HEADER, ROADS, SCORES
 from jobs import hard_votes
 from machine import DATA, REPOSITORY
 from plots import Axis, draw_panels
+from reliability_diagrams import ReliabilityDiagram, risk_coverage
 from results import machine, markdown
 from scipy.optimize import minimize_scalar
 
@@ -36,10 +37,8 @@ from gsseg_core.learn.temperature import (
     LOWEST,
     OUTLIERS,
     VIEWS,
-    ReliabilityDiagram,
     Sample,
     fit_temperature,
-    risk_coverage,
     sample_pixels,
     tempered,
 )

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from few_views import Bench, split
 from machine import DATA, REPOSITORY
+from reliability_diagrams import ReliabilityDiagram
 from results import markdown
 from wrong_masks import WrongMasks, corrupt
 
@@ -27,7 +28,6 @@ from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.em.em_learner import EMLearner
-from gsseg_core.learn.temperature import ReliabilityDiagram
 from gsseg_core.metrics import Evaluation
 from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, propagate
 from gsseg_core.refine.settings import RefineSettings

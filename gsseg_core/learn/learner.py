@@ -174,7 +174,7 @@ class Learner(ABC):
         """
 
     def prepare_predictions(self, progress: Progress = silent) -> None:  # noqa: B027 - most need nothing
-        """Compute once what `predict_without` needs of all views; it does so itself if this was not called."""
+        """Compute what `predict_without` needs of all views; it does so itself, without progress, if it has to."""
 
     def predict_without(self, view: View) -> np.ndarray:
         """Blend into a view the probabilities learnt without its mask, as far as `leaves_out`: (H, W, K) float32.

@@ -18,7 +18,7 @@ from gsseg_core.learn.registry import LEARNERS, Entry, check_learner, distribute
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.pipeline import segment
 
-SCENE = balls_on_a_table()
+SCENE, _ = balls_on_a_table()
 
 
 class ToyLearner(VoteLearner):

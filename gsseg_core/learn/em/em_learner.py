@@ -219,20 +219,20 @@ class EMLearner(Learner):
 
     def prepare_predictions(self, progress: Progress = silent) -> None:
         """Run the E-step at the fitted probabilities, from which `predict_without` takes one view's part away."""
-        if self._leave_one_out is None:
-            codes, total, done = CSRRows.from_dense(self.codes_), len(self.views), itertools.count()
-            gradient, _ = self._e_step(
-                codes, self.error_models_, lambda: progress("sum up views", min(next(done), total - 1), total)
-            )
-            self._leave_one_out = codes, gradient
-            progress("sum up views", total, total)
+        codes, total, done = CSRRows.from_dense(self.codes_), len(self.views), itertools.count()
+        gradient, _ = self._e_step(
+            codes, self.error_models_, lambda: progress("sum up views", min(next(done), total - 1), total)
+        )
+        self._leave_one_out = codes, gradient
+        progress("sum up views", total, total)
 
     def predict_without(self, view: View) -> np.ndarray:
         """Blend into a view the probabilities after one more step without its mask, (H, W, K) float32.
 
         The spatial prior is left out, too, so rows sum to less where no other view has seen anything.
         """
-        self.prepare_predictions()
+        if self._leave_one_out is None:
+            self.prepare_predictions()
         assert self._leave_one_out is not None
         codes, gradient = self._leave_one_out
         observation, data = self.observation(view.name), codes.data.copy()
