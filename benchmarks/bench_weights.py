@@ -27,13 +27,13 @@ from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View, spread
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.raster.cpu import label_pairs as sightings
+from gsseg_core.raster.cpu import label_pairs
 from gsseg_core.raster.cpu.blending import open_rays
 from gsseg_core.raster.cpu.lifted_mask import LiftedMask
 from gsseg_core.raster.cpu.splat import WIDTH, aim, blend_block
 from gsseg_core.raster.cpu.tile_observation import TileObservation
 from gsseg_core.raster.cpu.tiling import TILE
-from gsseg_core.raster.observation import Shares
+from gsseg_core.raster.observation import VoteShares
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.simd import FAST, LANES, add_scaled, add_scaled_where, first_bit, intrinsic, load_row, store_row
@@ -108,20 +108,20 @@ class StoredWeights(TileObservation):
         """What a step needs: not the Gaussians, but the weights."""
         return super().nbytes - self._table.nbytes + self._kept.nbytes + self._left_over.nbytes
 
-    def shares(self, said: np.ndarray, rest: np.ndarray) -> Shares:
+    def shares(self, said: np.ndarray, rest: np.ndarray) -> VoteShares:
         """Share out as ever, with stored weights."""
         said, rest = np.ascontiguousarray(said, np.float32), np.ascontiguousarray(rest, np.float32)
         mask = self._labels
         logs, left_over = np.zeros(len(self._records)), np.zeros(len(mask.present))
-        sums, parts = np.empty(self._slot_start[-1], np.float32), np.empty((sightings.PARTS, len(said)), np.float32)
+        sums, parts = np.empty(self._slot_start[-1], np.float32), np.empty((label_pairs.PARTS, len(said)), np.float32)
         share_stored(
             self._start, self._blocks, self._first, self._kept, self._left_over, mask.start, mask.present,
-            mask.span_start, mask.slots, mask.lanes, self._slot_start, self._sighting, said, rest, logs, left_over,
+            mask.span_start, mask.slots, mask.lanes, self._slot_start, self._pair, said, rest, logs, left_over,
             sums,
         )  # fmt: skip
-        sightings.add_up(self._slot_start, self._sighting, sums, parts)
+        label_pairs.add_up(self._slot_start, self._pair, sums, parts)
         total = np.bincount(mask.present, weights=left_over, minlength=len(rest))
-        return Shares(parts.sum(axis=0), total, float(logs.sum()))
+        return VoteShares(parts.sum(axis=0), total, float(logs.sum()))
 
 
 class StoringLearner(EMLearner):
@@ -182,7 +182,7 @@ def share_stored(  # type: ignore[no-untyped-def]
     start, blocks, first, kept, final, label_start, present, span_start, slots, lanes, slot_start, sighting, said, rest,
     logs, left_over, sums,
 ) -> None:  # fmt: skip
-    """Do what `sightings.share` does."""
+    """Do what `label_pairs.share` does."""
     for tile in nb.prange(start.shape[0] - 1):
         labels = present[label_start[tile] : label_start[tile + 1]]
         many = labels.shape[0]
@@ -211,9 +211,9 @@ def share_stored(  # type: ignore[no-untyped-def]
                         total = add_scaled_where(total, weight, said[s] * np.float32(1 / STEPS), np.int64(lanes[span]))
                 store_row(value, b, total)
         spare = left_over[label_start[tile] : label_start[tile + 1]]
-        logs[tile] = sightings._invert(spans, slots, lanes, rest[labels], final[tile], value, spare)
+        logs[tile] = label_pairs._invert(spans, slots, lanes, rest[labels], final[tile], value, spare)
         mine = sums[slot_start[tile] : slot_start[tile + 1]]
-        sightings._sum_shares(blocks[start[tile] : start[tile + 1]], many, spans, slots, lanes, value, weights, mine)
+        label_pairs._sum_shares(blocks[start[tile] : start[tile + 1]], many, spans, slots, lanes, value, weights, mine)
         mine *= np.float32(1 / STEPS)
 
 

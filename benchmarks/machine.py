@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from gsseg_core.raster.observation import Observation, Shares
+    from gsseg_core.raster.observation import Observation, VoteShares
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("GSSEG_DATA") or REPOSITORY.parent / "shared" / "data")
@@ -49,7 +49,7 @@ def asked_anew(
     observation: Observation,
     said: np.ndarray,  # (P,)
     rest: np.ndarray,  # (L,)
-) -> Callable[[], Shares]:
+) -> Callable[[], VoteShares]:
     """Ask for shares, each time a little differently: an observation remembers what it was asked last."""
     times = itertools.count(1)
     return lambda: observation.shares(said * np.float32(1 + 1e-3 * next(times)), rest)

@@ -148,7 +148,7 @@ class _CrossEntropy(torch.autograd.Function):
                 plausible[:, 0],
             )
         shares = observation.shares(likelihood, rest)
-        ctx.gradient = -scale * shares.sightings
+        ctx.gradient = -scale * shares.pairs
         return torch.tensor(-scale * shares.log_likelihood, dtype=probabilities.dtype)
 
     @staticmethod

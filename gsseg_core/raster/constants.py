@@ -1,4 +1,4 @@
-"""The rules of blending that all rasterisers share, as docs/conventions.md has them."""
+"""What all rasterisers share: the rules of blending, as docs/conventions.md has them, and how work is cut up."""
 
 from __future__ import annotations
 
@@ -19,3 +19,9 @@ T_MIN = 1e-4
 
 TINY = 1e-30
 """Floor of a pixel's likelihood."""
+
+CHANNELS = 32
+"""Channels that one pass of an adjoint sums at once: bounds its memory, and fits the shared memory of every GPU."""
+
+CHUNKS = 16
+"""Parts into which Gaussians are cut, to be worked on beside each other; fixed, so that threads change nothing."""

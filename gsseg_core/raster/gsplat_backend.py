@@ -23,17 +23,14 @@ import torch
 
 from gsseg_core.csr_rows import starts
 from gsseg_core.errors import SceneValueError, SettingsError
-from gsseg_core.raster.constants import ALPHA_MAX, ALPHA_MIN, DILATION, NEAR, T_MIN, TINY
-from gsseg_core.raster.observation import Observation, Shares
+from gsseg_core.raster.constants import ALPHA_MAX, ALPHA_MIN, CHANNELS, DILATION, NEAR, T_MIN, TINY
+from gsseg_core.raster.observation import Observation, VoteShares
 from gsseg_core.raster.view_operator import Blended, ViewOperator, Weights
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 TILE = 16
 """Side of the tiles that gsplat is asked for, in px."""
-
-CHUNK = 32
-"""Channels that go through gsplat at once. Its backward pass keeps them in shared memory, and 32 fit on every GPU."""
 
 
 @functools.cache
@@ -187,7 +184,7 @@ class GsplatOperator(ViewOperator):
 
     def rasterise(
         self,
-        codes: torch.Tensor,  # (M, C), C from 1 to CHUNK
+        codes: torch.Tensor,  # (M, C), C from 1 to CHANNELS
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Blend codes of the visible Gaussians: image (H, W, C), differentiable, and transmittance left over (H, W)."""
         height, width = self.camera.height, self.camera.width
@@ -224,7 +221,7 @@ class GsplatOperator(ViewOperator):
 
     def carry_back(
         self,
-        residual: torch.Tensor,  # (H, W, C), C from 1 to CHUNK
+        residual: torch.Tensor,  # (H, W, C), C from 1 to CHANNELS
     ) -> torch.Tensor:
         """Carry values of pixels back to the visible Gaussians, (M, C)."""
         codes = torch.zeros((len(self.ids), residual.shape[2]), device=self.device)
@@ -310,7 +307,7 @@ class GsplatObservation(Observation):
         return self._operator.nbytes + self._labels.nbytes + sum(array.nbytes for array in held)
 
     def votes(self) -> np.ndarray:
-        """Weights summed by sighting, (P,) float32."""
+        """Weights summed by pair, (P,) float32."""
         return self._votes
 
     def _lift(self) -> np.ndarray:
@@ -324,8 +321,8 @@ class GsplatObservation(Observation):
         self,
         said: np.ndarray,  # (P,)
         rest: np.ndarray,  # (L,)
-    ) -> Shares:
-        """Share one vote per labelled pixel among the sightings that made it."""
+    ) -> VoteShares:
+        """Share one vote per labelled pixel among the pairs that made it."""
         said, rest = np.asarray(said), np.asarray(rest)
         if said.shape != self.labels.shape or rest.shape != self.classes.shape:
             raise SceneValueError(
@@ -342,7 +339,7 @@ class GsplatObservation(Observation):
             out[:, k] = gaussians.cpu().numpy()
             total[k] = spare.cpu().numpy()
             log_likelihood += float(logs)
-        return Shares(out[rows, self.labels], total, log_likelihood)
+        return VoteShares(out[rows, self.labels], total, log_likelihood)
 
     def _share(
         self,
@@ -383,6 +380,6 @@ def gradient(
 
 
 def chunks(channels: int) -> Iterator[slice]:
-    """Cut channels into slices of at most `CHUNK`."""
-    for k in range(0, channels, CHUNK):
-        yield slice(k, min(k + CHUNK, channels))
+    """Cut channels into slices of at most `CHANNELS`."""
+    for k in range(0, channels, CHANNELS):
+        yield slice(k, min(k + CHANNELS, channels))

@@ -12,20 +12,20 @@ from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.raster.votes import add_votes
 
 
-class Shares(NamedTuple):
-    """What the labelled pixels of a view say of the Gaussians that made them.
+class VoteShares(NamedTuple):
+    """One vote per labelled pixel, shared among the (Gaussian, label) pairs that made it.
 
     Attributes
     ----------
-    sightings : (P,) float32
-        For each, the sum over the pixels of its label of w[p, i] / likelihood[p].
+    pairs : (P,) float32
+        For each pair, the sum over the pixels of its label of w[p, i] / likelihood[p].
     rest : (L,) float64
         The same for what the rays had left over, T_end[p] / likelihood[p].
     log_likelihood : float
         Sum over the labelled pixels of log likelihood[p], natural.
     """
 
-    sightings: np.ndarray
+    pairs: np.ndarray
     rest: np.ndarray
     log_likelihood: float
 
@@ -33,19 +33,19 @@ class Shares(NamedTuple):
 class Observation(ABC):
     """A view with its mask: W cut down, in each pixel, to the label that was seen there.
 
-    A *sighting* is a Gaussian with one of the labels under which this view sees it, that is with a weight above zero in
-    some pixel of that label. Most Gaussians are seen under one label only, so there are about as many sightings as
+    A *pair* is a Gaussian with one of the labels under which this view sees it, that is with a weight above zero in
+    some pixel of that label. Most Gaussians are seen under one label only, so there are about as many pairs as
     Gaussians that are seen, however many labels the mask has. Votes, the paper's loss and its gradient, and every step
-    of EM need one number per sighting.
+    of EM need one number per pair.
 
     Attributes
     ----------
     ids : (M,) int32
         Gaussians that some labelled pixel sees, as indices in the scene.
     start : (M + 1,) int64
-        Sightings of ids[m] are start[m] to start[m + 1].
+        Pairs of ids[m] are start[m] to start[m + 1].
     labels : (P,) int32
-        Label of each sighting, as its position in `classes`.
+        Label of each pair, as its position in `classes`.
     classes : (L,) int32
         Labels that occur in the mask, ascending.
     areas : (L,) int64
@@ -84,21 +84,21 @@ class Observation(ABC):
 
     @property
     def rows(self) -> np.ndarray:
-        """Which of `ids` each sighting is of, (P,) int64."""
+        """Which of `ids` each pair is of, (P,) int64."""
         return np.repeat(np.arange(len(self.ids)), np.diff(self.start))
 
     def dense(
         self,
         values: np.ndarray,  # (P,)
     ) -> np.ndarray:
-        """Write one number per sighting out by Gaussian and label, (M, L); zero where there is no sighting."""
+        """Write one number per pair out by Gaussian and label, (M, L); zero where there is no pair."""
         out = np.zeros((len(self.ids), len(self.classes)), values.dtype)
         out[self.rows, self.labels] = values
         return out
 
     @abstractmethod
     def votes(self) -> np.ndarray:
-        """Sum of weights of each sighting, the entries of W^T onehot(y) that are not zero: (P,) float32, in px."""
+        """Sum of weights of each pair, the entries of W^T onehot(y) that are not zero: (P,) float32, in px."""
 
     def vote(
         self,
@@ -114,11 +114,11 @@ class Observation(ABC):
         self,
         said: np.ndarray,  # (P,)
         rest: np.ndarray,  # (L,)
-    ) -> Shares:
+    ) -> VoteShares:
         """Share one vote per labelled pixel among the Gaussians that made it.
 
-        With likelihood[p] = (W said)[p, y_p] + T_end[p] rest[y_p], the share of a sighting is the sum over the pixels
-        of its label of w[p, i] / likelihood[p]. It is the gradient of the log likelihood with respect to what was said.
+        With likelihood[p] = (W said)[p, y_p] + T_end[p] rest[y_p], the share of a pair is the sum over the pixels of
+        its label of w[p, i] / likelihood[p]. It is the gradient of the log likelihood with respect to what was said.
 
         Parameters
         ----------

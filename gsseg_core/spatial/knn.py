@@ -9,7 +9,15 @@ import numpy as np
 
 from gsseg_core.simd import count_at_most
 from gsseg_core.spatial.kd_tree import LEAF, gap_to_point, leaf_of, leaf_range
-from gsseg_core.spatial.leaf_candidates import DEPTH, FAR, Surroundings, end_of_group, look_around, measure, room_for
+from gsseg_core.spatial.leaf_candidates import (
+    DEPTH,
+    FAR,
+    LeafCandidates,
+    end_of_group,
+    find_leaves,
+    measure,
+    scratch_for,
+)
 
 DIGITS = 24
 """Distances are summed in steps of 2^-DIGITS of the k-th one, or finer: the precision of a float32."""
@@ -36,7 +44,7 @@ def nearest(
     radii, distances = np.empty(m, np.float32), np.empty(m, np.float64)
     bits = radii.view(np.int32)
     for chunk in nb.prange((m + CHUNK - 1) // CHUNK):
-        gaps, close, around = np.empty(DEPTH, np.float32), np.empty(3 * k + 2 * LEAF, np.float32), room_for(128)
+        gaps, close, candidates = np.empty(DEPTH, np.float32), np.empty(3 * k + 2 * LEAF, np.float32), scratch_for(128)
         box, bounds = np.empty(6, np.float32), np.empty((2, LEAF), np.float32)
         close_bits, bound_bits = close.view(np.int32), bounds.view(np.int32)
         before, first = -1, chunk * CHUNK
@@ -46,16 +54,16 @@ def nearest(
             own, bound = places[middle], FAR
             if before >= 0:
                 bound = _farthest(points, places[before], own, radii[before])
-            found = _search(points, boxes, own, k, bound, close, around.nodes, gaps)
+            found = _search(points, boxes, own, k, bound, close, candidates.nodes, gaps)
             bits[middle] = _smallest(close_bits, _fill_up(close, found), k, np.int32(0), _largest(close_bits, found))
             reach = _bound(points, places, first, last, middle, radii[middle], bounds)
-            around, found = look_around(boxes, box, reach, NO_SKIP, 0, around)
-            near = around.near.reshape(-1)
+            candidates, found = find_leaves(boxes, box, reach, NO_SKIP, 0, candidates)
+            near = candidates.near.reshape(-1)
             near_bits = near.view(np.int32)
             for q in range(first, last):
                 own, bound = places[q], bounds[1, q - first]
-                rows = measure(blocks, points[0, own], points[1, own], points[2, own], bound, found, around)
-                _leave_out(own, leaf_of(own, leaves, n), leaves, n, rows, around)
+                rows = measure(blocks, points[0, own], points[1, own], points[2, own], bound, found, candidates)
+                _leave_out(own, leaf_of(own, leaves, n), leaves, n, rows, candidates)
                 bits[q] = _smallest(near_bits, rows, k, bound_bits[0, q - first], bound_bits[1, q - first])
                 distances[q] = _mean_root(near, LEAF * rows, k, radii[q])
             before, first = middle, last
@@ -63,11 +71,11 @@ def nearest(
 
 
 @nb.njit
-def _leave_out(own: int, leaf: int, leaves: int, n: int, rows: int, around: Surroundings) -> None:
+def _leave_out(own: int, leaf: int, leaves: int, n: int, rows: int, candidates: LeafCandidates) -> None:
     """Take a point out of what was measured from it."""
     for h in range(rows):
-        if around.leaves[around.reached[h]] == leaf:
-            around.near[h, own - leaf_range(leaf, leaves, n)[0]] = FAR
+        if candidates.leaves[candidates.reached[h]] == leaf:
+            candidates.near[h, own - leaf_range(leaf, leaves, n)[0]] = FAR
 
 
 @nb.njit
@@ -90,16 +98,16 @@ def middle_of(points: np.ndarray, places: np.ndarray, first: int, last: int, box
 
 
 @nb.njit(inline="always")
-def _apart(points: np.ndarray, i: int, j: int) -> np.float32:
+def _distance(points: np.ndarray, i: int, j: int) -> np.float32:
     dx, dy, dz = points[0, i] - points[0, j], points[1, i] - points[1, j], points[2, i] - points[2, j]
-    apart: np.float32 = np.sqrt(dx * dx + dy * dy + dz * dz)
-    return apart
+    distance: np.float32 = np.sqrt(dx * dx + dy * dy + dz * dz)
+    return distance
 
 
 @nb.njit(inline="always")
 def _farthest(points: np.ndarray, known: int, own: int, radius: float) -> np.float32:
     """Bound above the squared radius of one point by that of another."""
-    reach = _apart(points, known, own) + np.sqrt(radius)
+    reach = _distance(points, known, own) + np.sqrt(radius)
     return max(reach * reach * SLACK, TINY)
 
 
@@ -110,7 +118,7 @@ def _bound(
     """Bound the squared radii of a group, below and above, by that of one of its points; returns the largest."""
     reach, root = np.float32(0), np.sqrt(radius)
     for q in range(first, last):
-        at_least = max(root - _apart(points, places[middle], places[q]), np.float32(0))
+        at_least = max(root - _distance(points, places[middle], places[q]), np.float32(0))
         bounds[0, q - first] = at_least * at_least / SLACK
         bounds[1, q - first] = _farthest(points, places[middle], places[q], radius)
         reach = max(reach, bounds[1, q - first])
@@ -224,7 +232,7 @@ def _smallest(
 
 @nb.njit
 def _fill_up(
-    near: np.ndarray,  # with room for a row more
+    near: np.ndarray,  # long enough for a row more
     found: int,
 ) -> int:
     """End the last row of sixteen with distances that nothing has; returns the number of rows."""

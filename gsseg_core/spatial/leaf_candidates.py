@@ -1,4 +1,4 @@
-"""What lies around the points of a leaf: the leaves near it, each of which a point looks at in one vector.
+"""Leaf candidates: the leaves near the points of a leaf, whose points each of these looks at in one vector.
 
 The points of a leaf have almost the same neighbours. So the tree is descended once for all of them, and each then looks
 only at the boxes of the leaves that were found, and at the points of those that it reaches.
@@ -18,8 +18,8 @@ DEPTH = 64  # nodes that can wait at once; a descent leaves at most one behind a
 FAR = np.float32(np.inf)
 
 
-class Surroundings(NamedTuple):
-    """Scratch of one thread, for at most n leaves.
+class LeafCandidates(NamedTuple):
+    """Leaves near the points of one leaf, and distances to their points: scratch of one thread, for at most n leaves.
 
     Attributes
     ----------
@@ -46,9 +46,9 @@ class Surroundings(NamedTuple):
 
 
 @nb.njit
-def room_for(count: int) -> Surroundings:
-    """Make room for so many leaves."""
-    return Surroundings(
+def scratch_for(count: int) -> LeafCandidates:
+    """Allocate the scratch of one thread for so many leaves."""
+    return LeafCandidates(
         np.empty(DEPTH, np.int64),
         np.empty(count, np.int64),
         np.empty((6, count), np.float32),
@@ -69,21 +69,21 @@ def end_of_group(places: np.ndarray, first: int, limit: int, leaves: int, n: int
 
 
 @nb.njit
-def look_around(
+def find_leaves(
     boxes: np.ndarray,  # (2 L, 6)
     box: np.ndarray,  # (6,)
     reach: float,  # squared
     skip: np.ndarray,  # (2 L,) int32, or (0,): nodes to leave out are
     skipped: int,  # those with this number there
-    around: Surroundings,
-) -> tuple[Surroundings, int]:
-    """Find the leaves at most so far from a box; returns `around`, or a larger one in its place, and their number."""
-    found = _descend(boxes, box, reach, skip, skipped, around.nodes, around.leaves)
-    if found > around.leaves.shape[0]:
-        around = room_for(2 * found)
-        _descend(boxes, box, reach, skip, skipped, around.nodes, around.leaves)
-    _copy_corners(boxes, around.leaves[:found], around.corners)
-    return around, found
+    candidates: LeafCandidates,
+) -> tuple[LeafCandidates, int]:
+    """Find the leaves at most so far from a box; returns them, in larger scratch if need be, and their number."""
+    found = _descend(boxes, box, reach, skip, skipped, candidates.nodes, candidates.leaves)
+    if found > candidates.leaves.shape[0]:
+        candidates = scratch_for(2 * found)
+        _descend(boxes, box, reach, skip, skipped, candidates.nodes, candidates.leaves)
+    _copy_corners(boxes, candidates.leaves[:found], candidates.corners)
+    return candidates, found
 
 
 @nb.njit
@@ -96,7 +96,7 @@ def _descend(
     nodes: np.ndarray,
     near: np.ndarray,
 ) -> int:
-    """Find the leaves, and note as many as there is room for; returns how many there are."""
+    """Find the leaves, and note as many as fit; returns how many there are."""
     leaves, found, waiting = boxes.shape[0] // 2, 0, 1
     nodes[0] = 1
     while waiting:
@@ -129,10 +129,10 @@ def measure(
     z: float,
     reach: float,  # squared
     found: int,
-    around: Surroundings,
+    candidates: LeafCandidates,
 ) -> int:
-    """Measure how far the points of the leaves within reach are, into `around.near`; returns the number of leaves."""
-    corners, gaps, reached = around.corners, around.gaps, around.reached
+    """Measure how far the points of the leaves within reach are, into `candidates.near`; returns how many leaves."""
+    corners, gaps, reached = candidates.corners, candidates.gaps, candidates.reached
     for c in range(found):
         dx = max(max(corners[0, c] - x, x - corners[3, c]), np.float32(0))
         dy = max(max(corners[1, c] - y, y - corners[4, c]), np.float32(0))
@@ -143,5 +143,5 @@ def measure(
         reached[hits] = c
         hits += gaps[c] <= reach
     for h in range(hits):
-        store_row(around.near, h, squared_distances(blocks, 3 * around.leaves[reached[h]], x, y, z))
+        store_row(candidates.near, h, squared_distances(blocks, 3 * candidates.leaves[reached[h]], x, y, z))
     return hits

@@ -1,7 +1,7 @@
 """Distances from points to their k nearest others, found once and only where asked for, and means over those.
 
-What is kept is not who the neighbours are but how far the k-th one is: with it, all of them are found again by one look
-around, and a million points take 16 MB instead of 200. Background that is sure of itself is never asked for, and it is
+What is kept is not who the neighbours are but how far the k-th one is: with it, all of them are found again in one
+search, and a million points take 16 MB instead of 200. Background that is sure of itself is never asked for, and it is
 more than half of most scenes.
 
 Results are bit-identical whatever the order of the points and the number of threads: points tied for the last place
@@ -23,12 +23,12 @@ from gsseg_core.scene.scene_cache import PerScene
 from gsseg_core.simd import at_most, first_bit, load_row
 from gsseg_core.spatial.kd_tree import LEAF, Tree, enclose, leaf_range, scaled, tree_of
 from gsseg_core.spatial.knn import CHUNK, NO_SKIP, middle_of, nearest
-from gsseg_core.spatial.leaf_candidates import Surroundings, end_of_group, look_around, measure, room_for
+from gsseg_core.spatial.leaf_candidates import LeafCandidates, end_of_group, find_leaves, measure, scratch_for
 
 CODE_UNIT = 2.0**-24
 """Codes are summed in steps of this, which is the precision of a float32 near 1."""
 
-BLOCK = 1 << 16  # points whose mean codes are written out at once
+ROWS_AT_ONCE = 1 << 16  # points whose mean codes are written out at once
 MIXED = np.int32(-(2**31))  # stands for the label of a node whose points have several
 NOBODY = MIXED + 1  # the label of no point
 
@@ -98,13 +98,13 @@ class Neighbours:
         read = np.repeat(counted, np.diff(codes.indptr))
         units = np.rint(codes.data * np.float32(1 / CODE_UNIT), where=read, out=np.zeros_like(codes.data))
         units = units.astype(np.int32)
-        mine = np.ones(len(order), bool) if wanted is None else wanted[order]
-        asked = np.flatnonzero(mine)
-        self.look_for(mine)
+        selected = np.ones(len(order), bool) if wanted is None else wanted[order]
+        asked = np.flatnonzero(selected)
+        self.look_for(selected)
         # A block at a time is written out in full, so that of all the codes only what is not zero is ever in memory.
         parts = []
-        for first in range(0, max(len(asked), 1), BLOCK):
-            places = asked[first : first + BLOCK].astype(np.int32)
+        for first in range(0, max(len(asked), 1), ROWS_AT_ONCE):
+            places = asked[first : first + ROWS_AT_ONCE].astype(np.int32)
             out = np.zeros((len(places), num_classes), np.float32)
             average(
                 tree.points, tree.boxes, tree.blocks, order, codes.indptr, codes.indices, units, counted, places,
@@ -179,25 +179,25 @@ def average(
     for chunk in nb.prange((m + CHUNK - 1) // CHUNK):
         sums = np.empty((2, num_classes), np.int64)  # inside the radius, and on it
         counts = np.empty((2, 2), np.int64)  # the same, and of these the ones that count
-        box, around = np.empty(6, np.float32), room_for(128)
+        box, candidates = np.empty(6, np.float32), scratch_for(128)
         first = chunk * CHUNK
         while first < min((chunk + 1) * CHUNK, m):
             last = end_of_group(places, first, min((chunk + 1) * CHUNK, m), leaves, n)
             middle_of(points, places, first, last, box)
-            around, found = look_around(boxes, box, _widest(radii, places, first, last), NO_SKIP, 0, around)
+            candidates, found = find_leaves(boxes, box, _widest(radii, places, first, last), NO_SKIP, 0, candidates)
             for q in range(first, last):
                 own = places[q]
                 radius = radii[own]
-                reached = measure(blocks, points[0, own], points[1, own], points[2, own], radius, found, around)
+                reached = measure(blocks, points[0, own], points[1, own], points[2, own], radius, found, candidates)
                 sums[:], counts[:] = 0, 0
                 for h in range(reached):
-                    start = leaf_range(around.leaves[around.reached[h]], leaves, n)[0]
-                    within = at_most(load_row(around.near, h), radius)
+                    start = leaf_range(candidates.leaves[candidates.reached[h]], leaves, n)[0]
+                    within = at_most(load_row(candidates.near, h), radius)
                     while within:
                         lane = first_bit(within)
                         within &= within - 1
                         if start + lane != own:
-                            row, tied = order[start + lane], np.int64(around.near[h, lane] == radius)
+                            row, tied = order[start + lane], np.int64(candidates.near[h, lane] == radius)
                             counts[tied, 0] += 1
                             if counted[row]:
                                 counts[tied, 1] += 1
@@ -232,7 +232,7 @@ def pure_distances(
     leaves, n = boxes.shape[0] // 2, points.shape[1]
     out, of_node = np.full(n, np.nan), _labels_of_nodes(labels, leaves)
     for chunk in nb.prange((leaves + LEAF - 1) // LEAF):
-        box, around = np.empty(6, np.float32), room_for(128)
+        box, candidates = np.empty(6, np.float32), scratch_for(128)
         for leaf in range(chunk * LEAF, min((chunk + 1) * LEAF, leaves)):
             first, last = leaf_range(leaf, leaves, n)
             widest, label = np.float32(-1), of_node[leaves + leaf]
@@ -243,22 +243,22 @@ def pure_distances(
             enclose(points, first, last, box)
             # A node of the leaf's own label has nothing to say; a leaf of several labels has none.
             skipped = label if label != MIXED else NOBODY
-            around, found = look_around(boxes, box, widest, of_node, skipped, around)
+            candidates, found = find_leaves(boxes, box, widest, of_node, skipped, candidates)
             for q in range(first, last):
                 if labels[q] <= 0:
                     continue
-                reached = measure(blocks, points[0, q], points[1, q], points[2, q], radii[q], found, around)
-                if _pure(labels, labels[q], radii[q], reached, leaves, around):
+                reached = measure(blocks, points[0, q], points[1, q], points[2, q], radii[q], found, candidates)
+                if _pure(labels, labels[q], radii[q], reached, leaves, candidates):
                     out[q] = distances[q]
     return out
 
 
 @nb.njit
-def _pure(labels: np.ndarray, label: int, radius: float, reached: int, leaves: int, around: Surroundings) -> bool:
+def _pure(labels: np.ndarray, label: int, radius: float, reached: int, leaves: int, candidates: LeafCandidates) -> bool:
     """Whether all points measured and within the radius have a label."""
     for h in range(reached):
-        first, last = leaf_range(around.leaves[around.reached[h]], leaves, labels.shape[0])
-        within = at_most(load_row(around.near, h), radius)
+        first, last = leaf_range(candidates.leaves[candidates.reached[h]], leaves, labels.shape[0])
+        within = at_most(load_row(candidates.near, h), radius)
         for i in range(last - first):
             if (within >> i) & 1 and labels[first + i] != label:
                 return False

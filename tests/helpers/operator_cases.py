@@ -80,8 +80,8 @@ def dense(operator):
     return full
 
 
-def spread(operator, observation, per_sighting, num_labels=60001):
-    """Numbers of sightings as rows of the scene and columns by label, to compare different masks."""
+def spread(operator, observation, per_pair, num_labels=60001):
+    """Numbers of pairs as rows of the scene and columns by label, to compare different masks."""
     full = np.zeros((operator.num_gaussians, num_labels), np.float32)
-    full[observation.ids[observation.rows], observation.classes[observation.labels]] = per_sighting
+    full[observation.ids[observation.rows], observation.classes[observation.labels]] = per_pair
     return full

@@ -100,7 +100,7 @@ def test_a_view_without_some_gaussians_is_the_view_of_a_scene_where_they_are_inv
         operator.without(np.zeros(3, bool))
 
 
-def assert_sightings_are_what_labelled_pixels_see(seen, mask, weights, ids):
+def assert_pairs_are_what_labelled_pixels_see(seen, mask, weights, ids):
     sees = np.zeros((weights.shape[1], len(seen.classes)), bool)
     for j, label in enumerate(seen.classes):
         sees[:, j] = (weights[mask.ravel() == label] > 0).any(axis=0)
@@ -121,7 +121,7 @@ def test_votes_and_shares_agree_with_the_naive_rasteriser(backend, seed, n, widt
     assert seen.num_pixels == (mask >= 0).sum()
     np.testing.assert_array_equal(seen.areas, [(mask == label).sum() for label in seen.classes])
     assert seen.nbytes > 0
-    assert_sightings_are_what_labelled_pixels_see(seen, mask, dense(operator), operator.ids)
+    assert_pairs_are_what_labelled_pixels_see(seen, mask, dense(operator), operator.ids)
 
     rng = np.random.default_rng(seed)
     codes = rng.uniform(0.1, 1, (len(seen.ids), len(seen.classes)))
@@ -129,8 +129,8 @@ def test_votes_and_shares_agree_with_the_naive_rasteriser(backend, seed, n, widt
     share = seen.shares(codes[seen.rows, seen.labels], rest)
     likelihood = naive.weights[:, seen.ids] @ codes + np.outer(naive.transmittance, rest)
     near, log_likelihood = 30 * backend.sum, 0.0
-    assert seen.votes().dtype == share.sightings.dtype == np.float32
-    votes, shares = seen.dense(seen.votes()), seen.dense(share.sightings)
+    assert seen.votes().dtype == share.pairs.dtype == np.float32
+    votes, shares = seen.dense(seen.votes()), seen.dense(share.pairs)
     for j, label in enumerate(seen.classes):
         pixels = np.flatnonzero(mask == label)
         counted = naive.weights[pixels][:, seen.ids].sum(axis=0)
@@ -210,7 +210,7 @@ def test_label_ids_may_be_large_and_every_pixel_may_have_its_own(backend):
     np.testing.assert_array_equal(seen.classes, mask.ravel()[pixel_of])
     weights = dense(operator)[:, seen.ids][pixel_of].T
     np.testing.assert_allclose(seen.dense(seen.votes()), weights, rtol=backend.sum, atol=backend.weight)
-    share = seen.dense(seen.shares(np.full(len(seen.labels), 0.25), np.full(37 * 21, 0.25)).sightings)
+    share = seen.dense(seen.shares(np.full(len(seen.labels), 0.25), np.full(37 * 21, 0.25)).pairs)
     np.testing.assert_allclose(share, 4 * weights, rtol=5 * backend.sum, atol=4 * backend.weight)
 
 
@@ -221,7 +221,7 @@ def test_a_mask_with_all_pixels_unknown_gives_no_evidence(backend):
     assert len(seen.classes) == 0
     assert seen.ids.shape == seen.votes().shape == (0,)
     share = seen.shares(np.empty(0), np.empty(0))
-    assert share.sightings.shape == (0,)
+    assert share.pairs.shape == (0,)
     assert share.rest.shape == (0,)
     assert share.log_likelihood == 0
 
@@ -232,11 +232,11 @@ def test_shares_asked_again_are_the_same_and_those_of_other_codes_are_others(bac
     seen = backend.make(scene, camera).observe(labels)
     said, rest = np.full(len(seen.labels), 0.5, np.float32), np.full(len(seen.classes), 0.5, np.float32)
     once = seen.shares(said, rest)
-    np.testing.assert_array_equal(seen.shares(said, rest).sightings, once.sightings)
+    np.testing.assert_array_equal(seen.shares(said, rest).pairs, once.pairs)
     said[: len(said) // 2] = 0.25
     other = seen.shares(said, rest)
     expected = backend.make(scene, camera).observe(labels).shares(said, rest)
-    np.testing.assert_array_equal(other.sightings, expected.sightings)
+    np.testing.assert_array_equal(other.pairs, expected.pairs)
     assert other.log_likelihood == expected.log_likelihood != once.log_likelihood
 
 
@@ -244,7 +244,7 @@ def test_a_pixel_that_nothing_explains_gives_no_share_and_a_finite_likelihood(ba
     scene, camera = random_view(9)
     seen = backend.make(scene, camera).observe(random_mask(9))
     share = seen.shares(np.zeros(len(seen.labels)), np.zeros(len(seen.classes)))
-    assert not share.sightings.any()
+    assert not share.pairs.any()
     assert not share.rest.any()
     assert np.isfinite(share.log_likelihood)
 

@@ -81,7 +81,7 @@ def everything(operator, codes, residual, mask):
         "weights": operator.weights().weights,
         "gaussians": operator.weights().gaussians,
         "votes": spread(operator, seen, seen.votes(), 9),
-        "shares": spread(operator, seen, share.sightings, 9),
+        "shares": spread(operator, seen, share.pairs, 9),
         "rest": share.rest,
         "log likelihood": share.log_likelihood,
     }
@@ -225,7 +225,7 @@ def test_every_labelled_pixel_shares_out_one_vote(backend, view):
     rng = np.random.default_rng(view["seed"])
     said, rest = rng.uniform(0.01, 1, len(seen.labels)), rng.uniform(0.01, 1, len(seen.classes))
     share = seen.shares(said, rest)
-    assert (said * share.sightings).sum() + rest @ share.rest == pytest.approx(seen.num_pixels, rel=5 * backend.sum)
+    assert (said * share.pairs).sum() + rest @ share.rest == pytest.approx(seen.num_pixels, rel=5 * backend.sum)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -243,9 +243,9 @@ def test_shares_are_the_gradient_of_the_log_likelihood(backend, seed):
 
     for _ in range(5):
         along_said, along_rest = rng.uniform(0, 1, said.shape), rng.uniform(0, 1, rest.shape)
-        expected = (share.sightings * along_said).sum() + share.rest @ along_rest
+        expected = (share.pairs * along_said).sum() + share.rest @ along_rest
         assert slope(along_said, along_rest) == pytest.approx(expected, rel=1e-3 + backend.sum)
-    for i in [share.sightings.argmax(), len(said) // 2]:
+    for i in [share.pairs.argmax(), len(said) // 2]:
         one = np.zeros_like(said)
         one[i] = 1
-        assert slope(one, np.zeros_like(rest)) == pytest.approx(share.sightings[i], rel=5e-3, abs=5e-3)
+        assert slope(one, np.zeros_like(rest)) == pytest.approx(share.pairs[i], rel=5e-3, abs=5e-3)

@@ -327,7 +327,7 @@ class EMLearner(Learner):
             (likelihood, used), pairs = models[name].by_label, _pairs(observation)
             shares = observation.shares(pair_likelihood(*codes, *pairs, likelihood), likelihood[:, 0])
             log_likelihoods[name] = shares.log_likelihood
-            accumulate(codes.indptr, codes.indices, gradient, *pairs, used, shares.sightings)
+            accumulate(codes.indptr, codes.indices, gradient, *pairs, used, shares.pairs)
         return gradient, log_likelihoods
 
     def _refit_error_models(
@@ -349,9 +349,7 @@ class EMLearner(Learner):
             pairs = observation.start, observation.labels
             likelihood, _ = model.by_label
             shares = observation.shares(pair_likelihood(*without, order, place, *pairs, likelihood), likelihood[:, 0])
-            counts = confusion_counts(
-                *without, order, *pairs, shares.sightings, self.num_classes, len(observation.classes)
-            )
+            counts = confusion_counts(*without, order, *pairs, shares.pairs, self.num_classes, len(observation.classes))
             counts[0] += shares.rest
             model.m_step(model.expected_counts(counts))
         return models
@@ -378,7 +376,7 @@ def codes_without(
     shares = observation.shares(pair_likelihood(*codes, *pairs, likelihood), likelihood[:, 0])
     indptr = starts(np.diff(codes.indptr)[observation.ids[observation.order]])
     without = CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], np.float32))
-    m_step_without_view(*codes, gradient, prior, *pairs, used, shares.sightings, *without)
+    m_step_without_view(*codes, gradient, prior, *pairs, used, shares.pairs, *without)
     return without
 
 

@@ -118,12 +118,12 @@ def blend_tile(
     lines = np.empty((2, 2, TILE), np.float32)
     n, ahead = 0, aim_next(table, entries, first - 1, last, left, top, lines)
     for e in range(first, last):
-        reached, mine, wide = ahead & live, lines[e % 2], table[entries[e], WIDTH]
+        reached, own, wide = ahead & live, lines[e % 2], table[entries[e], WIDTH]
         ahead = aim_next(table, entries, e, last, left, top, lines)
         while reached:
             b = first_bit(reached)
             reached &= reached - 1
-            weight, bits = blend_block(transmittance, b, mine, wide)
+            weight, bits = blend_block(transmittance, b, own, wide)
             store_row(weights, n, weight)
             blocks[n] = b
             n += bits > OPEN

@@ -8,7 +8,7 @@ import numpy as np
 DIGIT_BITS = 11
 """Three digits make up a key; counts of one fit the fastest cache."""
 
-CHUNKS = 4
+PARTS = 4
 """Parts that are counted and moved beside each other; fixed, so that threads change nothing."""
 
 
@@ -21,12 +21,12 @@ def sort_by_depth(
     """
     keys, order = depth.view(np.uint32), np.arange(len(depth), dtype=np.int32)
     for shift in range(0, 32, DIGIT_BITS):
-        counts = np.zeros((CHUNKS, 1 << DIGIT_BITS), np.int64)
+        counts = np.zeros((PARTS, 1 << DIGIT_BITS), np.int64)
         _count_digits(keys, shift, counts)
         if (counts.sum(axis=0) == len(keys)).any():
             continue  # All keys have the same digit.
         # Digit by digit, and chunk by chunk within a digit.
-        place = (np.cumsum(counts.T) - counts.T.ravel()).reshape(-1, CHUNKS).T.copy()
+        place = (np.cumsum(counts.T) - counts.T.ravel()).reshape(-1, PARTS).T.copy()
         moved_keys, moved_order = np.empty_like(keys), np.empty_like(order)
         _move(keys, order, shift, place, moved_keys, moved_order)
         keys, order = moved_keys, moved_order
@@ -35,9 +35,9 @@ def sort_by_depth(
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def _count_digits(keys: np.ndarray, shift: int, counts: np.ndarray) -> None:
-    many, mask = keys.shape[0], np.uint32((1 << DIGIT_BITS) - 1)
-    for chunk in nb.prange(CHUNKS):
-        for i in range(chunk * many // CHUNKS, (chunk + 1) * many // CHUNKS):
+    count, mask = keys.shape[0], np.uint32((1 << DIGIT_BITS) - 1)
+    for chunk in nb.prange(PARTS):
+        for i in range(chunk * count // PARTS, (chunk + 1) * count // PARTS):
             counts[chunk, (keys[i] >> np.uint32(shift)) & mask] += 1
 
 
@@ -46,13 +46,13 @@ def _move(
     keys: np.ndarray,  # (M,) uint32
     order: np.ndarray,  # (M,) int32
     shift: int,
-    place: np.ndarray,  # (CHUNKS, 2^DIGIT_BITS) where the next key of each digit goes
+    place: np.ndarray,  # (PARTS, 2^DIGIT_BITS) where the next key of each digit goes
     moved_keys: np.ndarray,
     moved_order: np.ndarray,
 ) -> None:
-    many, mask = keys.shape[0], np.uint32((1 << DIGIT_BITS) - 1)
-    for chunk in nb.prange(CHUNKS):
-        for i in range(chunk * many // CHUNKS, (chunk + 1) * many // CHUNKS):
+    count, mask = keys.shape[0], np.uint32((1 << DIGIT_BITS) - 1)
+    for chunk in nb.prange(PARTS):
+        for i in range(chunk * count // PARTS, (chunk + 1) * count // PARTS):
             digit = (keys[i] >> np.uint32(shift)) & mask
             n = place[chunk, digit]
             place[chunk, digit] = n + 1

@@ -1,7 +1,7 @@
 """What is left of a view once its mask has been lifted: only what a labelled pixel really sees.
 
-A *sighting* is a Gaussian with one of the labels under which a view sees it. There are few: most Gaussians lie inside
-one label. Everything that learning asks of a view is one number per sighting, and `share` makes these numbers, from the
+A *pair* is a Gaussian with one of the labels under which a view sees it. There are few: most Gaussians lie inside
+one label. Everything that learning asks of a view is one number per pair, and `share` makes these numbers, from the
 entries and blocks that `lift` found to have a weight. It projects nothing, sorts nothing, and meets no Gaussian that
 something else hides.
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from gsseg_core.raster.constants import TINY
+from gsseg_core.raster.constants import CHUNKS, TINY
 from gsseg_core.raster.cpu.blending import AHEAD, open_rays, stride_of, tile_of_turn
 from gsseg_core.raster.cpu.splat import WIDTH, aim, blend_block
 from gsseg_core.raster.cpu.tiling import TILE
@@ -31,9 +31,7 @@ from gsseg_core.simd import (
 
 _TINY = np.float32(TINY)
 
-CHUNKS = 16
-"""Parts of the Gaussians that are gone through beside each other. Each counts from 0; `settle` makes that one count."""
-
+# Each chunk of Gaussians counts from 0, and `settle` makes one count of these.
 _CHUNK = 27  # the bits above these say which chunk a number belongs to
 _NUMBER = (1 << _CHUNK) - 1
 
@@ -60,31 +58,31 @@ def keep_entries(
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def number_sightings(
+def number_pairs(
     gaussian_start: np.ndarray,  # (M + 1,)
     gaussian_entries: np.ndarray,  # (E,)
     kept: np.ndarray,  # (E, 2)
     tiles: np.ndarray,  # (T, 6) int64: first of all entries, of all slots, of the entries kept, of their slots, of the
-    # labels, and how many labels; together, since each look at another tile waits for memory
+    # labels, and how count labels; together, since each look at another tile waits for memory
     sums: np.ndarray,  # (slots,) sum of weights by entry and label
     present: np.ndarray,
     num_labels: int,
-    room: np.ndarray,  # (CHUNKS + 1,) where each chunk's sightings begin; there is more room than needed
-    found: np.ndarray,  # (CHUNKS, 2) int64 out: Gaussians and sightings of each chunk
+    capacity: np.ndarray,  # (CHUNKS + 1,) where each chunk's pairs begin; there is more than needed
+    found: np.ndarray,  # (CHUNKS, 2) int64 out: Gaussians and pairs of each chunk
     gaussians: np.ndarray,  # (M,) int32 out: those that are seen; each chunk's from where it begins
-    counts: np.ndarray,  # (M,) int32 out: how many labels each of them has; the same
-    labels: np.ndarray,  # (room[-1],) int32 out
-    votes: np.ndarray,  # (room[-1],) float32 out
+    counts: np.ndarray,  # (M,) int32 out: how count labels each of them has; the same
+    labels: np.ndarray,  # (capacity[-1],) int32 out
+    votes: np.ndarray,  # (capacity[-1],) float32 out
     entries: np.ndarray,  # (E',) int32 out: Gaussian of each kept entry
-    sighting: np.ndarray,  # (kept_slot_start[-1],) int32 out: of each kept entry and label of its tile, -1 where none
+    pair: np.ndarray,  # (kept_slot_start[-1],) int32 out: of each kept entry and label of its tile, -1 where none
 ) -> None:
     """Give a number to every Gaussian that is seen, and to each of its labels, and tell the entries."""
-    many, last = gaussians.shape[0], gaussian_entries.shape[0] - 1
+    count, last = gaussians.shape[0], gaussian_entries.shape[0] - 1
     for chunk in nb.prange(CHUNKS):
         seen, number = np.full(num_labels, -1, np.int64), np.zeros(num_labels, np.int64)
-        first, n = chunk * many // CHUNKS, room[chunk]
+        first, n = chunk * count // CHUNKS, capacity[chunk]
         place, tag = first, chunk << _CHUNK
-        for g in range(first, (chunk + 1) * many // CHUNKS):
+        for g in range(first, (chunk + 1) * count // CHUNKS):
             begin, is_seen = n, False
             for i in range(gaussian_start[g], gaussian_start[g + 1]):
                 prefetch(kept, gaussian_entries[min(i + 2 * AHEAD, last)])
@@ -104,7 +102,7 @@ def number_sightings(
                 for j in range(slots):
                     weight = sums[base + j]
                     if not weight > 0:
-                        sighting[position + j] = -1
+                        pair[position + j] = -1
                         continue
                     label = present[facts[4] + j]
                     if seen[label] != g:
@@ -112,17 +110,17 @@ def number_sightings(
                         labels[n], votes[n] = label, 0.0
                         n += 1
                     votes[number[label]] += weight
-                    sighting[position + j] = tag | (number[label] - room[chunk])
+                    pair[position + j] = tag | (number[label] - capacity[chunk])
             if is_seen:
                 gaussians[place], counts[place] = g, n - begin
                 place += 1
-        found[chunk, 0], found[chunk, 1] = place - first, n - room[chunk]
+        found[chunk, 0], found[chunk, 1] = place - first, n - capacity[chunk]
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def settle(
     numbers: np.ndarray,  # int32, changed in place
-    before: np.ndarray,  # (CHUNKS,) how many there are in the chunks before
+    before: np.ndarray,  # (CHUNKS,) how label_count there are in the chunks before
 ) -> None:
     """Make one count of numbers that begin anew in every chunk."""
     for i in nb.prange(numbers.shape[0]):
@@ -159,14 +157,14 @@ def share(
     slots: np.ndarray,  # (S,)
     lanes: np.ndarray,  # (S,)
     slot_start: np.ndarray,  # (T + 1,)
-    sighting: np.ndarray,  # (slot_start[-1],)
-    said: np.ndarray,  # (P,) float32: what each sighting says of its label
+    pair: np.ndarray,  # (slot_start[-1],)
+    said: np.ndarray,  # (P,) float32: what each pair says of its label
     rest: np.ndarray,  # (L,) float32: what the transmittance left over says of each label
     logs: np.ndarray,  # (T,) float64 out: sum of log likelihood, (W said)[p] + T_end rest
     left_over: np.ndarray,  # like present, float64 out: sum of T_end / likelihood by label
     sums: np.ndarray,  # (slot_start[-1],) float32 out: per entry and label, sum of w / likelihood
 ) -> None:
-    """Share one vote per labelled pixel among the sightings that made it."""
+    """Share one vote per labelled pixel among the pairs that made it."""
     rows = (start.shape[0] - 1) // columns
     stride = stride_of(rows)
     for turn in nb.prange(rows * columns):
@@ -175,20 +173,20 @@ def share(
         logs[tile] = 0.0
         if labels.shape[0] == 0:
             continue
-        mine = slice(start[tile], start[tile + 1])
+        own = slice(start[tile], start[tile + 1])
         spans = span_start[tile * TILE : tile * TILE + TILE + 1]
-        here = sighting[slot_start[tile] : slot_start[tile + 1]]
+        here = pair[slot_start[tile] : slot_start[tile + 1]]
         rays, value = np.empty((TILE, TILE), np.float32), np.zeros((TILE, TILE), np.float32)
         weights = np.empty((records[tile], TILE), np.float32)
         left, top, _ = open_rays(tile, columns, width, height, rays)
         _blend_said(
-            left, top, table, entries[mine], blocks[mine], labels.shape[0], spans, slots, lanes, here, said, rays,
+            left, top, table, entries[own], blocks[own], labels.shape[0], spans, slots, lanes, here, said, rays,
             value, weights,
         )  # fmt: skip
         spare = left_over[label_start[tile] : label_start[tile + 1]]
         logs[tile] = _invert(spans, slots, lanes, rest[labels], rays, value, spare)
         _sum_shares(
-            blocks[mine], labels.shape[0], spans, slots, lanes, value, weights,
+            blocks[own], labels.shape[0], spans, slots, lanes, value, weights,
             sums[slot_start[tile] : slot_start[tile + 1]],
         )  # fmt: skip
 
@@ -200,11 +198,11 @@ def _blend_said(
     table: np.ndarray,  # (M, 8)
     entries: np.ndarray,  # (E_t,) of this tile
     blocks: np.ndarray,  # (E_t,)
-    many: int,
+    label_count: int,
     spans: np.ndarray,  # (17,)
     slots: np.ndarray,
     lanes: np.ndarray,
-    sighting: np.ndarray,  # (E_t * many,)
+    pair: np.ndarray,  # (E_t * label_count,)
     said: np.ndarray,  # (P,)
     rays: np.ndarray,  # (16, 16) in and out
     value: np.ndarray,  # (16, 16) in: zeros; out: W said
@@ -216,7 +214,7 @@ def _blend_said(
         prefetch(table, entries[min(e + AHEAD, entries.shape[0] - 1)])
         g = entries[e]
         aim(table, g, left, top, lines)
-        only = said[sighting[e * many]] if many == 1 else np.float32(0.0)
+        only = said[pair[e * label_count]] if label_count == 1 else np.float32(0.0)
         todo = np.int64(blocks[e])
         while todo:
             b = first_bit(todo)
@@ -225,12 +223,12 @@ def _blend_said(
             store_row(weights, n, weight)
             n += 1
             total = load_row(value, b)
-            if many == 1:
+            if label_count == 1:
                 total = add_scaled(total, weight, only)
             else:
                 for span in range(spans[b], spans[b + 1]):
-                    # Where there is no sighting, the weights are zero.
-                    s = max(sighting[e * many + slots[span]], 0)
+                    # Where there is no pair, the weights are zero.
+                    s = max(pair[e * label_count + slots[span]], 0)
                     total = add_scaled_where(total, weight, said[s], np.int64(lanes[span]))
             store_row(value, b, total)
 
@@ -273,50 +271,50 @@ def _invert(
 @nb.njit(fastmath=FAST)
 def _sum_shares(
     blocks: np.ndarray,  # (E_t,)
-    many: int,
+    label_count: int,
     spans: np.ndarray,  # (17,)
     slots: np.ndarray,
     lanes: np.ndarray,
     inverse: np.ndarray,  # (16, 16) 1 / likelihood
     weights: np.ndarray,  # (R, 16)
-    sums: np.ndarray,  # (E_t * many,) out
+    sums: np.ndarray,  # (E_t * label_count,) out
 ) -> None:
     sums[:] = 0.0
     n = 0
     for e in range(blocks.shape[0]):
-        # Sixteen pixels apart, as long as the label stays the same: most blocks have one label, most entries too.
-        current, apart = np.int64(-1), nothing()
+        # Lane by lane, as long as the label stays the same: most blocks have one label, and most entries too.
+        current, lanewise = np.int64(-1), nothing()
         todo = np.int64(blocks[e])
         while todo:
             b = first_bit(todo)
             todo &= todo - 1
             weight = load_row(weights, n)
             n += 1
-            if many == 1:
-                current, apart = np.int64(0), add_product(apart, weight, load_row(inverse, b))
+            if label_count == 1:
+                current, lanewise = np.int64(0), add_product(lanewise, weight, load_row(inverse, b))
                 continue
             for span in range(spans[b], spans[b + 1]):
                 if slots[span] != current:
                     if current >= 0:
-                        sums[e * many + current] += sum_row(apart)
-                    current, apart = np.int64(slots[span]), nothing()
-                apart = add_product_where(apart, weight, load_row(inverse, b), np.int64(lanes[span]))
+                        sums[e * label_count + current] += sum_row(lanewise)
+                    current, lanewise = np.int64(slots[span]), nothing()
+                lanewise = add_product_where(lanewise, weight, load_row(inverse, b), np.int64(lanes[span]))
         if current >= 0:
-            sums[e * many + current] += sum_row(apart)
+            sums[e * label_count + current] += sum_row(lanewise)
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def add_up(
     slot_start: np.ndarray,  # (T + 1,)
-    sighting: np.ndarray,  # (slot_start[-1],)
+    pair: np.ndarray,  # (slot_start[-1],)
     sums: np.ndarray,  # (slot_start[-1],)
     parts: np.ndarray,  # (PARTS, P) float32 out: of each part of the image
 ) -> None:
-    """Add up what `share` summed for each sighting, in tile order."""
+    """Add up what `share` summed for each pair, in tile order."""
     tiles = slot_start.shape[0] - 1
     for part in nb.prange(PARTS):
         total = parts[part]
         total[:] = 0.0
         for i in range(slot_start[part * tiles // PARTS], slot_start[(part + 1) * tiles // PARTS]):
-            if sighting[i] >= 0:
-                total[sighting[i]] += sums[i]
+            if pair[i] >= 0:
+                total[pair[i]] += sums[i]

@@ -11,14 +11,12 @@ import numpy as np
 
 from gsseg_core.csr_rows import starts
 from gsseg_core.data.label_evidence import LabelEvidence, vote_units
+from gsseg_core.raster.constants import CHUNKS
 from gsseg_core.raster.cpu.blending import AHEAD
 from gsseg_core.raster.cpu.lifting import Labels, cut_labels, lift
 from gsseg_core.raster.cpu.tiling import Tiles
 from gsseg_core.scene.camera import Camera
 from gsseg_core.simd import prefetch
-
-CHUNKS = 16
-"""Parts of the Gaussians that are gone through beside each other."""
 
 WAITING = 64
 """Votes that are put together before they are counted: where they go has come into the cache by then."""
@@ -81,12 +79,12 @@ class LiftedMask:
         units: float,
         sign: int,
     ) -> None:
-        """Add the votes to those of other views, bit for bit as `sightings.add_votes` does with sightings."""
+        """Add the votes to those of other views, bit for bit as `raster.votes.add_votes` does with pairs."""
         if not len(self.classes):
             return
         said, mask = np.empty((len(self.reached), 2), np.float32), self.labels
-        many = np.diff(mask.start)
-        facts = np.stack([many, self.slot_start[:-1] - tiles.start[:-1] * many, mask.start[:-1]], axis=1)
+        count = np.diff(mask.start)
+        facts = np.stack([count, self.slot_start[:-1] - tiles.start[:-1] * count, mask.start[:-1]], axis=1)
         _put_beside(tiles.start, facts, self.sums, mask.present, said)
         _vote(
             ids, tiles.gaussian_start, tiles.gaussian_entries, said, facts, self.sums, mask.present, len(self.classes),
@@ -107,17 +105,17 @@ def _put_beside(
     Where it says several labels, there is -1 less the tile instead of one, in whose sums they are found.
     """
     for tile in nb.prange(start.shape[0] - 1):
-        many, base, labels = tiles[tile, 0], tiles[tile, 1], tiles[tile, 2]
-        if many == 1:
+        count, base, labels = tiles[tile, 0], tiles[tile, 1], tiles[tile, 2]
+        if count == 1:
             only = np.float32(present[labels])
             for e in range(start[tile], start[tile + 1]):
                 said[e, 0], said[e, 1] = only, sums[e + base]
             continue
         for e in range(start[tile], start[tile + 1]):
             label, weight, found = np.float32(0), np.float32(0), 0
-            for j in range(many):
-                if sums[e * many + base + j] > 0:
-                    label, weight = np.float32(present[labels + j]), sums[e * many + base + j]
+            for j in range(count):
+                if sums[e * count + base + j] > 0:
+                    label, weight = np.float32(present[labels + j]), sums[e * count + base + j]
                     found += 1
             said[e, 0], said[e, 1] = label if found < 2 else np.float32(-1 - tile), weight
 
@@ -128,7 +126,7 @@ def _vote(
     gaussian_start: np.ndarray,  # (M + 1,)
     gaussian_entries: np.ndarray,  # (E,)
     said_by: np.ndarray,  # (E, 2) from `_put_beside`
-    tiles: np.ndarray,  # (T, 3) int64: how many labels; sums of entry e begin at e times these plus this; first label
+    tiles: np.ndarray,  # (T, 3) int64: how count labels; sums of entry e begin at e times these plus this; first label
     sums: np.ndarray,
     present: np.ndarray,
     num_labels: int,
@@ -139,10 +137,10 @@ def _vote(
     sign: int,
     total: np.ndarray,  # (N, K) int64, added to
 ) -> None:
-    many, last = ids.shape[0], gaussian_entries.shape[0] - 1
+    count, last = ids.shape[0], gaussian_entries.shape[0] - 1
     flat, classes = total.reshape(-1), total.shape[1]
     for chunk in nb.prange(CHUNKS):
-        first, end = chunk * many // CHUNKS, (chunk + 1) * many // CHUNKS
+        first, end = chunk * count // CHUNKS, (chunk + 1) * count // CHUNKS
         seen, place = np.full(num_labels, -1, np.int64), np.zeros(num_labels, np.int64)
         who, labels = np.empty(WAITING + num_labels, np.int32), np.empty(WAITING + num_labels, np.int32)
         votes, n = np.empty(WAITING + num_labels, np.float32), 0

@@ -118,14 +118,14 @@ def lift(
     stride = stride_of(rows)
     for turn in nb.prange(rows * columns):
         tile = tile_of_turn(turn, columns, rows, stride)
-        many = label_start[tile + 1] - label_start[tile]
+        label_count = label_start[tile + 1] - label_start[tile]
         first, last = start[tile], start[tile + 1]
         reached[first:last] = 0
         with_block = blocks = positive = 0
-        if many:
-            mine = sums[slot_start[tile] : slot_start[tile + 1]]
-            mine[:] = 0.0
-            if many == 1:  # The compiler makes a shorter loop of this.
+        if label_count:
+            own = sums[slot_start[tile] : slot_start[tile + 1]]
+            own[:] = 0.0
+            if label_count == 1:  # The compiler makes a shorter loop of this.
                 _lift_tile(
                     tile,
                     columns,
@@ -139,19 +139,19 @@ def lift(
                     slots,
                     lanes,
                     reached,
-                    mine,
+                    own,
                     1,
                 )
             else:
                 _lift_tile(
-                    tile, columns, width, height, table, entries, first, last, span_start, slots, lanes, reached, mine,
-                    many,
+                    tile, columns, width, height, table, entries, first, last, span_start, slots, lanes, reached, own,
+                    label_count,
                 )  # fmt: skip
             for e in range(first, last):
                 with_block += reached[e] > 0
                 blocks += count_bits(np.int64(reached[e]))
-            for i in range(mine.shape[0]):
-                positive += mine[i] > 0
+            for i in range(own.shape[0]):
+                positive += own[i] > 0
         counts[tile, 0], counts[tile, 1], counts[tile, 2] = with_block, blocks, positive
 
 
@@ -169,8 +169,8 @@ def _lift_tile(
     slots: np.ndarray,
     lanes: np.ndarray,
     reached: np.ndarray,
-    sums: np.ndarray,  # (E_t * many,)
-    many: int,
+    sums: np.ndarray,  # (E_t * label_count,)
+    label_count: int,
 ) -> None:
     rays, lines = np.empty((TILE, TILE), np.float32), np.empty((2, 2, TILE), np.float32)
     left, top, live = open_rays(tile, columns, width, height, rays)
@@ -182,29 +182,29 @@ def _lift_tile(
             live &= ~(1 << b)
     ahead = aim_next(table, entries, first - 1, last, left, top, lines)
     for e in range(first, last):
-        blocks, mine, wide = ahead & live, lines[e % 2], table[entries[e], WIDTH]
+        blocks, own, wide = ahead & live, lines[e % 2], table[entries[e], WIDTH]
         ahead = aim_next(table, entries, e, last, left, top, lines)
         hit = np.int64(0)
-        # Sixteen pixels apart, as long as the label stays the same: most blocks have one label, most entries too.
-        current, apart = np.int64(-1), nothing()
+        # Lane by lane, as long as the label stays the same: most blocks have one label, and most entries too.
+        current, lanewise = np.int64(-1), nothing()
         while blocks:
             b = first_bit(blocks)
             blocks &= blocks - 1
-            weight, bits = blend_block(rays, b, mine, wide)
+            weight, bits = blend_block(rays, b, own, wide)
             if not bits & OPEN:
                 live &= ~(1 << b)
             hit |= np.int64(bits >> LANES & labelled[b] > 0) << b
-            if many == 1:
-                current, apart = np.int64(0), add_where(apart, weight, labelled[b])
+            if label_count == 1:
+                current, lanewise = np.int64(0), add_where(lanewise, weight, labelled[b])
                 continue
             for span in range(span_start[tile * TILE + b], span_start[tile * TILE + b + 1]):
                 if slots[span] != current:
                     if current >= 0:
-                        sums[(e - first) * many + current] += sum_row(apart)
-                    current, apart = np.int64(slots[span]), nothing()
-                apart = add_where(apart, weight, np.int64(lanes[span]))
+                        sums[(e - first) * label_count + current] += sum_row(lanewise)
+                    current, lanewise = np.int64(slots[span]), nothing()
+                lanewise = add_where(lanewise, weight, np.int64(lanes[span]))
         if current >= 0:
-            sums[(e - first) * many + current] += sum_row(apart)
+            sums[(e - first) * label_count + current] += sum_row(lanewise)
         reached[e] = hit
         if not live:
             return

@@ -25,9 +25,6 @@ from gsseg_core.simd import FAST, add_scaled, dot, first_bit, load_row, prefetch
 FEW = 4
 """Channels up to which `render_few` is the faster one: colours, depths."""
 
-CHUNK = 32
-"""Channels that one pass of the general adjoint sums at once; bounds its memory at entries x 32 float32."""
-
 
 @nb.njit(inline="always")
 def _scratch(entries: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -118,12 +115,12 @@ def render_few(
         for e in range(first, last):
             g = entries[e]
             prefetch(codes, entries[min(e + AHEAD, last - 1)])
-            reached, mine, wide = ahead & live, lines[e % 2], table[g, WIDTH]
+            reached, own, wide = ahead & live, lines[e % 2], table[g, WIDTH]
             ahead = aim_next(table, entries, e, last, left, top, lines)
             while reached:
                 b = first_bit(reached)
                 reached &= reached - 1
-                weight, bits = blend_block(rays, b, mine, wide)
+                weight, bits = blend_block(rays, b, own, wide)
                 for k in range(b * channels, (b + 1) * channels):
                     store_row(values, k, add_scaled(load_row(values, k), weight, codes[g, k - b * channels]))
                 if not bits & OPEN:
@@ -139,7 +136,7 @@ def adjoint_entries(
     table: np.ndarray,  # (M, 8)
     start: np.ndarray,  # (T + 1,)
     entries: np.ndarray,  # (E,)
-    residual: np.ndarray,  # (H, W, C) float32, C <= CHUNK
+    residual: np.ndarray,  # (H, W, C) float32, C <= CHANNELS
     sums: np.ndarray,  # (E, C) float32 out
 ) -> None:
     """Sum weight times residual over the pixels of each entry: the part of W^T r that one tile adds to a Gaussian."""

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
-from gsseg_core.raster.constants import DILATION, NEAR
+from gsseg_core.raster.constants import CHUNKS, DILATION, NEAR
 from gsseg_core.raster.cpu.depth_sort import sort_by_depth
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
 from gsseg_core.scene.camera import Camera
@@ -38,10 +38,10 @@ LARGEST_REACH = np.sqrt(2.0 * np.log(255.0))
 
 ROOT = np.sqrt(DILATION)
 
-BLOCK = 128
+BATCH = 128
 """Gaussians that are looked at together before those among them that may be visible are projected."""
 
-# Where numbers of the Gaussians of a block lie: so many times BLOCK.
+# Where numbers of the Gaussians of a batch lie: so many times BATCH.
 MEAN, QUAT, SCALES, OPACITY, OUT, DEPTH = 0, 3, 7, 10, 11, 19
 NUMBERS = 20
 
@@ -50,9 +50,6 @@ AHEAD = 32
 
 SHORT = 32
 """Gaussians at one depth, at most, that are sorted by insertion."""
-
-CHUNKS = 16
-"""Parts of the scene that are projected beside each other."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +76,7 @@ def project(scene: GaussianScene, camera: Camera) -> Projected:
     Gaussians at exactly the same depth are ordered by their projected shape, so the order in the scene matters only to
     those that are alike in all of it.
     """
-    table, depth, ids = _room(len(scene))
+    table, depth, ids = _scratch(len(scene))
     found = np.zeros(CHUNKS, np.int64)
     _project(
         scene.means, scene.quats, scene.scales, scene.log_opacities, camera.world_to_camera, camera.K,
@@ -95,12 +92,12 @@ def project(scene: GaussianScene, camera: Camera) -> Projected:
 _KEPT = threading.local()
 
 
-def _room(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _scratch(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Scratch of this thread for so many Gaussians: to touch fresh memory takes longer than to project."""
-    kept: tuple[np.ndarray, np.ndarray, np.ndarray] | None = getattr(_KEPT, "room", None)
+    kept: tuple[np.ndarray, np.ndarray, np.ndarray] | None = getattr(_KEPT, "scratch", None)
     if kept is None or len(kept[0]) != count:
         kept = np.empty((count, 8), np.float32), np.empty(count, np.float32), np.empty(count, np.int32)
-        _KEPT.room = kept
+        _KEPT.scratch = kept
     return kept
 
 
@@ -187,17 +184,17 @@ def _project(
     limits = _limits(K, width, height)
     for chunk in nb.prange(CHUNKS):
         first, last = chunk * means.shape[0] // CHUNKS, (chunk + 1) * means.shape[0] // CHUNKS
-        near, shown, who = np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.int64)
-        lanes = np.empty(NUMBERS * BLOCK, np.float64)
+        near, shown, who = np.empty(BATCH, np.bool_), np.empty(BATCH, np.bool_), np.empty(BATCH, np.int64)
+        lanes = np.empty(NUMBERS * BATCH, np.float64)
         n = first
-        for begin in range(first, last, BLOCK):
-            end = min(begin + BLOCK, last)
+        for begin in range(first, last, BATCH):
+            end = min(begin + BATCH, last)
             _find_near(
                 means[begin:end], scales[begin:end], log_opacities[begin:end], viewmat, K, width, height, limits, near
             )
-            many = _collect(begin, near[: end - begin], means, quats, scales, log_opacities, who, lanes)
-            _project_near(many, lanes, shown, viewmat, K, width, height, limits)
-            n = _keep_shown(many, who, lanes, shown, n, table, depth, ids)
+            count = _collect(begin, near[: end - begin], means, quats, scales, log_opacities, who, lanes)
+            _project_near(count, lanes, shown, viewmat, K, width, height, limits)
+            n = _keep_shown(count, who, lanes, shown, n, table, depth, ids)
         found[chunk] = n - first
 
 
@@ -223,7 +220,7 @@ def _find_near(
     width: float,
     height: float,
     limits: tuple[float, float, float, float],
-    near: np.ndarray,  # (BLOCK,) bool out
+    near: np.ndarray,  # (BATCH,) bool out
 ) -> None:
     """Throw out most of what is off the image before the costly part, by instructions for several Gaussians at once.
 
@@ -256,8 +253,8 @@ def _collect(
     quats: np.ndarray,  # (N, 4)
     scales: np.ndarray,  # (N, 3)
     log_opacities: np.ndarray,  # (N,)
-    who: np.ndarray,  # (BLOCK,) int64 out: which they are
-    lanes: np.ndarray,  # (NUMBERS * BLOCK,) out: what is known of them, number after number
+    who: np.ndarray,  # (BATCH,) int64 out: which they are
+    lanes: np.ndarray,  # (NUMBERS * BATCH,) out: what is known of them, number after number
 ) -> int:
     """Put those that may be visible side by side, for instructions on several of them; returns how many there are."""
     n = 0
@@ -267,19 +264,19 @@ def _collect(
     for j in range(n):
         i = who[j]
         for axis in range(3):
-            lanes[(MEAN + axis) * BLOCK + j] = means[i, axis]
-            lanes[(SCALES + axis) * BLOCK + j] = scales[i, axis]
+            lanes[(MEAN + axis) * BATCH + j] = means[i, axis]
+            lanes[(SCALES + axis) * BATCH + j] = scales[i, axis]
         for part in range(4):
-            lanes[(QUAT + part) * BLOCK + j] = quats[i, part]
-        lanes[OPACITY * BLOCK + j] = log_opacities[i]
+            lanes[(QUAT + part) * BATCH + j] = quats[i, part]
+        lanes[OPACITY * BATCH + j] = log_opacities[i]
     return n
 
 
 @nb.njit(error_model="numpy")
 def _project_near(
-    many: int,
-    lanes: np.ndarray,  # (NUMBERS * BLOCK,) in: what `_collect` put there; out: what the table holds, and depth
-    shown: np.ndarray,  # (BLOCK,) bool out
+    count: int,
+    lanes: np.ndarray,  # (NUMBERS * BATCH,) in: what `_collect` put there; out: what the table holds, and depth
+    shown: np.ndarray,  # (BATCH,) bool out
     viewmat: np.ndarray,  # (4, 4)
     K: np.ndarray,  # (3, 3)
     width: float,
@@ -289,27 +286,27 @@ def _project_near(
     """Project those that may be visible.
 
     Divisions and roots cost more than all else here, so each is done once. Nothing may be contracted: the last of a
-    block are projected one by one, and must come out as the others do.
+    batch are projected one by one, and must come out as the others do.
     """
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     v00, v01, v02, tx = viewmat[0, 0], viewmat[0, 1], viewmat[0, 2], viewmat[0, 3]
     v10, v11, v12, ty = viewmat[1, 0], viewmat[1, 1], viewmat[1, 2], viewmat[1, 3]
     v20, v21, v22, tz = viewmat[2, 0], viewmat[2, 1], viewmat[2, 2], viewmat[2, 3]
     x_low, x_high, y_low, y_high = limits
-    for j in range(many):
-        mx, my, mz = lanes[MEAN * BLOCK + j], lanes[(MEAN + 1) * BLOCK + j], lanes[(MEAN + 2) * BLOCK + j]
+    for j in range(count):
+        mx, my, mz = lanes[MEAN * BATCH + j], lanes[(MEAN + 1) * BATCH + j], lanes[(MEAN + 2) * BATCH + j]
         z = v20 * mx + v21 * my + v22 * mz + tz
         inverse = 1.0 / z
         x, y = (v00 * mx + v01 * my + v02 * mz + tx) * inverse, (v10 * mx + v11 * my + v12 * mz + ty) * inverse
         u, v = fx * x + cx, fy * y + cy
         xc, yc = min(max(x, x_low), x_high), min(max(y, y_low), y_high)
-        cut = max((lanes[OPACITY * BLOCK + j] - LOG_ALPHA_MIN) * (1.0 / HALF_LOG2E), 0.0)
+        cut = max((lanes[OPACITY * BATCH + j] - LOG_ALPHA_MIN) * (1.0 / HALF_LOG2E), 0.0)
         # Rows of J R_view, with J the Jacobian of the pinhole projection.
         ax, ay, az = fx * inverse * (v00 - xc * v20), fx * inverse * (v01 - xc * v21), fx * inverse * (v02 - xc * v22)
         bx, by, bz = fy * inverse * (v10 - yc * v20), fy * inverse * (v11 - yc * v21), fy * inverse * (v12 - yc * v22)
-        qw, qx = lanes[QUAT * BLOCK + j], lanes[(QUAT + 1) * BLOCK + j]
-        qy, qz = lanes[(QUAT + 2) * BLOCK + j], lanes[(QUAT + 3) * BLOCK + j]
-        s0, s1, s2 = lanes[SCALES * BLOCK + j], lanes[(SCALES + 1) * BLOCK + j], lanes[(SCALES + 2) * BLOCK + j]
+        qw, qx = lanes[QUAT * BATCH + j], lanes[(QUAT + 1) * BATCH + j]
+        qy, qz = lanes[(QUAT + 2) * BATCH + j], lanes[(QUAT + 3) * BATCH + j]
+        s0, s1, s2 = lanes[SCALES * BATCH + j], lanes[(SCALES + 1) * BATCH + j], lanes[(SCALES + 2) * BATCH + j]
         r00, r01, r02 = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy - qw * qz), 2 * (qx * qz + qw * qy)
         r10, r11, r12 = 2 * (qx * qy + qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz - qw * qx)
         r20, r21, r22 = 2 * (qx * qz - qw * qy), 2 * (qy * qz + qw * qx), 1 - 2 * (qx * qx + qy * qy)
@@ -330,33 +327,33 @@ def _project_near(
         across = (u + reach_x >= 0.5) & (u - reach_x <= width - 0.5)
         shown[j] = across & (v + reach_y >= 0.5) & (v - reach_y <= height - 0.5)
         inverse_syy = 1.0 / syy
-        lanes[(OUT + U) * BLOCK + j] = u
-        lanes[(OUT + V) * BLOCK + j] = v
-        lanes[(OUT + SHEAR) * BLOCK + j] = sxy * inverse_syy
+        lanes[(OUT + U) * BATCH + j] = u
+        lanes[(OUT + V) * BATCH + j] = v
+        lanes[(OUT + SHEAR) * BATCH + j] = sxy * inverse_syy
         # var(x|y) = S_xx - S_xy^2 / S_yy is at least the dilation; rounding must not bring it below.
-        lanes[(OUT + WIDTH) * BLOCK + j] = HALF_LOG2E / max(sxx - sxy * sxy * inverse_syy, DILATION)
-        lanes[(OUT + HEIGHT) * BLOCK + j] = HALF_LOG2E * inverse_syy
-        lanes[(OUT + LOG_OPACITY) * BLOCK + j] = lanes[OPACITY * BLOCK + j]
-        lanes[(OUT + Y_REACH) * BLOCK + j] = reach_y
-        lanes[(OUT + X_TURN) * BLOCK + j] = min(max(sxy * (reach_x / sxx), -REACH_MAX), REACH_MAX)
-        lanes[DEPTH * BLOCK + j] = z
+        lanes[(OUT + WIDTH) * BATCH + j] = HALF_LOG2E / max(sxx - sxy * sxy * inverse_syy, DILATION)
+        lanes[(OUT + HEIGHT) * BATCH + j] = HALF_LOG2E * inverse_syy
+        lanes[(OUT + LOG_OPACITY) * BATCH + j] = lanes[OPACITY * BATCH + j]
+        lanes[(OUT + Y_REACH) * BATCH + j] = reach_y
+        lanes[(OUT + X_TURN) * BATCH + j] = min(max(sxy * (reach_x / sxx), -REACH_MAX), REACH_MAX)
+        lanes[DEPTH * BATCH + j] = z
 
 
 @nb.njit
 def _keep_shown(
-    many: int,
-    who: np.ndarray,  # (BLOCK,)
-    lanes: np.ndarray,  # (NUMBERS * BLOCK,)
-    shown: np.ndarray,  # (BLOCK,) bool
+    count: int,
+    who: np.ndarray,  # (BATCH,)
+    lanes: np.ndarray,  # (NUMBERS * BATCH,)
+    shown: np.ndarray,  # (BATCH,) bool
     n: int,
     table: np.ndarray,  # (N, 8) out, from row n on
     depth: np.ndarray,  # (N,) out, the same
     ids: np.ndarray,  # (N,) out, the same
 ) -> int:
     """Write down those that are visible; returns the row after the last one."""
-    for j in range(many):
+    for j in range(count):
         for column in range(8):
-            table[n, column] = lanes[(OUT + column) * BLOCK + j]
-        depth[n], ids[n] = lanes[DEPTH * BLOCK + j], who[j]
+            table[n, column] = lanes[(OUT + column) * BATCH + j]
+        depth[n], ids[n] = lanes[DEPTH * BATCH + j], who[j]
         n += shown[j]
     return n

@@ -8,6 +8,7 @@ import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence
+from gsseg_core.raster.constants import CHANNELS
 from gsseg_core.raster.cpu import products
 from gsseg_core.raster.cpu.label_pairs import take
 from gsseg_core.raster.cpu.lifted_mask import LiftedMask
@@ -94,13 +95,13 @@ class TileOperator(ViewOperator):
     def _adjoint(self, residual: np.ndarray) -> np.ndarray:
         tiles = self._tiles
         out = np.zeros((self.num_gaussians, residual.shape[2]), np.float32)
-        for k in range(0, residual.shape[2], products.CHUNK):
-            part = residual[..., k : k + products.CHUNK].astype(np.float32, order="C")
+        for k in range(0, residual.shape[2], CHANNELS):
+            part = residual[..., k : k + CHANNELS].astype(np.float32, order="C")
             sums = np.empty((len(tiles.entries), part.shape[2]), np.float32)
             rows = np.empty((len(self.ids), part.shape[2]), np.float32)
             products.adjoint_entries(tiles.columns, self._table, tiles.start, tiles.entries, part, sums)
             products.reduce_entries(tiles.gaussian_start, tiles.gaussian_entries, sums, rows)
-            out[self.ids, k : k + products.CHUNK] = rows
+            out[self.ids, k : k + CHANNELS] = rows
         return out
 
     def _weights(self, pixel: tuple[int, int] | None) -> Weights:

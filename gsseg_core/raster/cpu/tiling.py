@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
+from gsseg_core.raster.constants import CHUNKS
 from gsseg_core.raster.cpu.projection import Projected
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
 from gsseg_core.simd import LANES
@@ -19,11 +20,8 @@ TYPICAL = 4
 
 _LEAST = np.float32(LOG_ALPHA_MIN)
 
-BLOCK = 256
+BATCH = 256
 """Gaussians that are looked at together."""
-
-CHUNKS = 16
-"""Parts into which Gaussians are cut, to be sorted beside each other; fixed, so that threads change nothing."""
 
 
 @dataclass(frozen=True)
@@ -55,15 +53,15 @@ class Tiles:
 def assign(projected: Projected, width: int, height: int) -> Tiles:
     """Sort projected Gaussians into the tiles that their ellipse of alpha >= 1/255 touches."""
     columns, rows = -(-width // TILE), -(-height // TILE)
-    many = len(projected.ids)
-    gaussian_start = np.zeros(many + 1, np.int64)
-    place, room = np.zeros((CHUNKS, columns * rows), np.int64), TYPICAL * (many // CHUNKS + 1)
+    count = len(projected.ids)
+    gaussian_start = np.zeros(count + 1, np.int64)
+    place, capacity = np.zeros((CHUNKS, columns * rows), np.int64), TYPICAL * (count // CHUNKS + 1)
     while True:
-        touched = np.empty((CHUNKS, room), np.int32)
+        touched = np.empty((CHUNKS, capacity), np.int32)
         most = _list(projected.table, columns, rows, gaussian_start[1:], place, touched)
-        if most <= room:
+        if most <= capacity:
             break
-        room = most
+        capacity = most
     np.cumsum(gaussian_start, out=gaussian_start)
     start = np.concatenate([[0], np.cumsum(place.sum(axis=0))])
     # From counts to places: chunks follow each other within a tile, so that its entries stay sorted by depth.
@@ -116,33 +114,33 @@ def _tile_after(px: np.float32, limit: np.float32) -> np.int32:
 
 @nb.njit(error_model="numpy")
 def _touch_two_rows(
-    table: np.ndarray,  # (at most BLOCK, 8)
+    table: np.ndarray,  # (at most BATCH, 8)
     columns: int,
     rows: int,
-    beside: np.ndarray,  # (8 * BLOCK,) scratch: the table, column after column
-    found: np.ndarray,  # (6 * BLOCK,) int32 out: first and last row (exclusive); tiles in the first one, and the second
+    beside: np.ndarray,  # (8 * BATCH,) scratch: the table, column after column
+    found: np.ndarray,  # (6 * BATCH,) int32 out: first and last row (exclusive); tiles in the first one, and the second
 ) -> None:
     """Most Gaussians touch one or two rows of tiles: tell those by instructions for several Gaussians at once."""
     across = np.float32(columns)
     for j in range(table.shape[0]):
         for column in range(8):
-            beside[column * BLOCK + j] = table[j, column]
+            beside[column * BATCH + j] = table[j, column]
     for j in range(table.shape[0]):
-        u, v, shear = beside[U * BLOCK + j], beside[V * BLOCK + j], beside[SHEAR * BLOCK + j]
-        reach, turn = beside[Y_REACH * BLOCK + j], beside[X_TURN * BLOCK + j]
-        cut, height = beside[LOG_OPACITY * BLOCK + j] - _LEAST, beside[HEIGHT * BLOCK + j]
-        narrowness = np.float32(1) / beside[WIDTH * BLOCK + j]
+        u, v, shear = beside[U * BATCH + j], beside[V * BATCH + j], beside[SHEAR * BATCH + j]
+        reach, turn = beside[Y_REACH * BATCH + j], beside[X_TURN * BATCH + j]
+        cut, height = beside[LOG_OPACITY * BATCH + j] - _LEAST, beside[HEIGHT * BATCH + j]
+        narrowness = np.float32(1) / beside[WIDTH * BATCH + j]
         low = _tile_of(v - reach - np.float32(0.5), np.float32(rows))
         high = _tile_after(v + reach - np.float32(0.5), np.float32(rows))
         row = np.float32(low)
         one = _touched(u, v, shear, reach, turn, cut, height, narrowness, row, across)
         two = _touched(u, v, shear, reach, turn, cut, height, narrowness, row + np.float32(1), across)
         begin = low * np.int32(columns)
-        found[j], found[BLOCK + j] = low, high
-        found[2 * BLOCK + j] = begin + one[0]
-        found[3 * BLOCK + j] = begin + (one[1] if low < high else np.int32(0))
-        found[4 * BLOCK + j] = begin + np.int32(columns) + two[0]
-        found[5 * BLOCK + j] = begin + np.int32(columns) + (two[1] if low + np.int32(1) < high else np.int32(0))
+        found[j], found[BATCH + j] = low, high
+        found[2 * BATCH + j] = begin + one[0]
+        found[3 * BATCH + j] = begin + (one[1] if low < high else np.int32(0))
+        found[4 * BATCH + j] = begin + np.int32(columns) + two[0]
+        found[5 * BATCH + j] = begin + np.int32(columns) + (two[1] if low + np.int32(1) < high else np.int32(0))
 
 
 @nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
@@ -152,38 +150,38 @@ def _list(
     rows: int,
     per_gaussian: np.ndarray,  # (M,) out: tiles that it touches
     per_tile: np.ndarray,  # (CHUNKS, T) out: Gaussians of each chunk that touch it
-    touched: np.ndarray,  # (CHUNKS, R) int32 out: these tiles, Gaussian after Gaussian, as far as there is room
+    touched: np.ndarray,  # (CHUNKS, R) int32 out: these tiles, Gaussian after Gaussian, as far as they fit
 ) -> int:
-    """List which tiles Gaussians touch; returns the room that the chunk with most of them needs."""
-    many, room = table.shape[0], touched.shape[1]
+    """List which tiles Gaussians touch; returns the capacity that the chunk with most of them needs."""
+    count, capacity = table.shape[0], touched.shape[1]
     needed = np.zeros(CHUNKS, np.int64)
     for chunk in nb.prange(CHUNKS):
-        counts, mine, n = per_tile[chunk], touched[chunk], 0
-        beside, found = np.empty(8 * BLOCK, np.float32), np.empty(6 * BLOCK, np.int32)
-        last = (chunk + 1) * many // CHUNKS
-        for begin in range(chunk * many // CHUNKS, last, BLOCK):
-            end = min(begin + BLOCK, last)
+        counts, own, n = per_tile[chunk], touched[chunk], 0
+        beside, found = np.empty(8 * BATCH, np.float32), np.empty(6 * BATCH, np.int32)
+        last = (chunk + 1) * count // CHUNKS
+        for begin in range(chunk * count // CHUNKS, last, BATCH):
+            end = min(begin + BATCH, last)
             _touch_two_rows(table[begin:end], columns, rows, beside, found)
             for g in range(begin, end):
                 j, before = g - begin, n
-                one, one_end = found[2 * BLOCK + j], found[3 * BLOCK + j]
-                two, two_end = found[4 * BLOCK + j], found[5 * BLOCK + j]
-                low, high = found[j], found[BLOCK + j]
-                if high - low > 2 or one_end - one > 2 or two_end - two > 2 or n + 4 > room:
-                    n = _list_many(table[g], low, high, columns, mine, n)
+                one, one_end = found[2 * BATCH + j], found[3 * BATCH + j]
+                two, two_end = found[4 * BATCH + j], found[5 * BATCH + j]
+                low, high = found[j], found[BATCH + j]
+                if high - low > 2 or one_end - one > 2 or two_end - two > 2 or n + 4 > capacity:
+                    n = _list_many(table[g], low, high, columns, own, n)
                 else:  # without a branch: what is not touched is overwritten
-                    mine[n] = one
+                    own[n] = one
                     n += one < one_end
-                    mine[n] = one + 1
+                    own[n] = one + 1
                     n += one + 1 < one_end
-                    mine[n] = two
+                    own[n] = two
                     n += two < two_end
-                    mine[n] = two + 1
+                    own[n] = two + 1
                     n += two + 1 < two_end
                 per_gaussian[g] = n - before
         counts[:] = 0
-        for i in range(min(n, room)):
-            counts[mine[i]] += 1
+        for i in range(min(n, capacity)):
+            counts[own[i]] += 1
         needed[chunk] = n
     return int(needed.max())
 
@@ -194,7 +192,7 @@ def _list_many(
     low: int,  # row of tiles
     high: int,  # exclusive
     columns: int,
-    touched: np.ndarray,  # (R,) int32 out, from n on, as far as there is room
+    touched: np.ndarray,  # (R,) int32 out, from n on, as far as they fit
     n: int,
 ) -> int:
     """List the tiles of a Gaussian that may touch many; returns where the next one's begin."""
@@ -219,13 +217,13 @@ def _fill(
     entries: np.ndarray,  # (E,) out
     gaussian_entries: np.ndarray,  # (E,) out
 ) -> None:
-    many = gaussian_start.shape[0] - 1
+    count = gaussian_start.shape[0] - 1
     for chunk in nb.prange(CHUNKS):
-        cursor, mine = place[chunk], touched[chunk]
-        begin = gaussian_start[chunk * many // CHUNKS]
-        for g in range(chunk * many // CHUNKS, (chunk + 1) * many // CHUNKS):
+        cursor, own = place[chunk], touched[chunk]
+        begin = gaussian_start[chunk * count // CHUNKS]
+        for g in range(chunk * count // CHUNKS, (chunk + 1) * count // CHUNKS):
             for n in range(gaussian_start[g], gaussian_start[g + 1]):
-                tile = mine[n - begin]
+                tile = own[n - begin]
                 e = cursor[tile]
                 cursor[tile] = e + 1
                 entries[e] = g
