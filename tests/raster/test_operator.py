@@ -156,6 +156,15 @@ def test_one_round_gaussian_has_the_weights_that_the_formula_gives(backend):
         assert weights[row, column] == pytest.approx(0.8 * np.exp(-squared / 2), rel=1e-5 + backend.weight)
 
 
+def test_a_footprint_is_the_sum_of_all_alphas_but_those_below_one_in_255(backend):
+    camera = Camera("view", 40, 40, [[100, 0, 20], [0, 100, 20], [0, 0, 1]], np.eye(4))
+    scene = make_scene([[0, 0, 2.0], [0, 0, -1.0]], [[1, 0, 0, 0]] * 2, [[0.04, 0.06, 1e-6]] * 2, [0.6, 0.6])
+    operator = backend.make(scene, camera)
+    assert operator.ids.tolist() == [0]
+    assert operator.footprints()[0] == pytest.approx(0.6 * 2 * np.pi * np.sqrt((2**2 + 0.3) * (3**2 + 0.3)), rel=1e-4)
+    assert operator.visibility()[0] == pytest.approx(operator.footprints()[0] * (1 - 1 / 255 / 0.6), rel=5e-3)
+
+
 def test_a_ray_ends_at_the_gaussian_that_brings_it_below_the_threshold(backend):
     wide = [[1e3, 1e3, 1e-3]] * 5
     scene = make_scene([[0, 0, z] for z in (1, 2, 3, 4, 5)], [[1, 0, 0, 0]] * 5, wide, [0.98] * 5)
