@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,8 +13,7 @@ import numpy as np
 
 from gsseg_core.csr_rows import largest
 from gsseg_core.data.class_names import class_name
-from gsseg_core.files.atomic import write_atomically
-from gsseg_core.files.npz_files import UnfitError, check_shares, class_names_of, open_npz, temperature_of
+from gsseg_core.files.npz_files import UnfitError, check_shares, class_names_of, open_npz, temperature_of, write_npz
 from gsseg_core.files.run_folder import settle
 from gsseg_core.learn.temperature import tempered
 from gsseg_core.raster.backends import make_operator
@@ -35,7 +33,7 @@ FORMAT = "gsseg-segmentation-1"
 
 
 class LabelMap(NamedTuple):
-    """A view of a segmentation.
+    """Class and confidence of every pixel of a rendered view.
 
     Attributes
     ----------
@@ -51,7 +49,7 @@ class LabelMap(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
-    """What each Gaussian of one scene belongs to.
+    """Label and class probabilities of every Gaussian of one scene.
 
     Attributes
     ----------
@@ -248,18 +246,16 @@ class Segmentation:
         """
         header = {"format": FORMAT, "scene": self.scene_digest, "class_names": self.class_names,
                   "temperature": self.temperature, **({} if run is None else {"run": run})}  # fmt: skip
-        with write_atomically(path, suffix=".npz") as temporary, open(temporary, "wb") as file:
-            np.savez_compressed(
-                file,
-                allow_pickle=False,
-                labels=self.labels,
-                probabilities=self.probabilities,
-                class_ids=self.class_ids,
-                confidence=self.confidence,
-                clustered=self.clustered,
-                learnt=self.learnt,
-                header=np.array(json.dumps(header)),
-            )
+        write_npz(
+            path,
+            header,
+            labels=self.labels,
+            probabilities=self.probabilities,
+            class_ids=self.class_ids,
+            confidence=self.confidence,
+            clustered=self.clustered,
+            learnt=self.learnt,
+        )
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], scene: GaussianScene) -> Segmentation:
@@ -287,10 +283,10 @@ class Segmentation:
             probabilities = file.expect("probabilities", np.float32, (n, k))
             clustered = file.expect("clustered", bool, (n,))
             learnt = file.expect("learnt", np.float32, (int(clustered.sum()), k))
-            strangers = np.setdiff1d(labels, [REMOVED, UNOBSERVED, *names])
-            if strangers.size:
+            unknown_ids = np.setdiff1d(labels, [REMOVED, UNOBSERVED, *names])
+            if unknown_ids.size:
                 raise UnfitError(
-                    f"array labels holds {clipped(strangers[:9].tolist())}; expected ids of its {k} classes, or "
+                    f"array labels holds {clipped(unknown_ids[:9].tolist())}; expected ids of its {k} classes, or "
                     f"{UNOBSERVED} (unobserved) or {REMOVED} (removed)"
                 )
             if "class_ids" in file.names and file.expect("class_ids", np.int32, (k,)).tolist() != list(names):

@@ -72,7 +72,7 @@ def open_input(path: str | os.PathLike[str], within: Path | None = None) -> Buff
 
 
 def _open_below(path: str | os.PathLike[str], within: Path, flags: int) -> int:
-    """Open what a path leads to now, and nothing that takes its place meanwhile."""
+    """Open the file that a path leads to now, and nothing that takes its place meanwhile."""
     found = os.open(path, os.O_PATH | os.O_CLOEXEC)  # opens nothing yet
     try:
         require_below(os.readlink(f"{OPENED}/{found}"), path, within)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Limits:
-    """What no real capture comes near to, and a damaged or malicious file may claim.
+    """Largest sizes that are accepted: no real capture comes near, a damaged or malicious file may claim more.
 
     Attributes
     ----------

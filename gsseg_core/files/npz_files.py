@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import struct
 import tokenize
 import zipfile
@@ -17,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.errors import GssegError, StateFileError, StateMismatchError
+from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.input_files import open_input, reason
 from gsseg_core.files.limits import LIMITS, MAX_LABEL
 from gsseg_core.text import clipped, quoted
@@ -35,11 +37,11 @@ _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.r
 
 
 class UnfitError(ValueError):
-    """What is in a file can be read, but not used; the message says what was found, and what was expected."""
+    """Content of a file that can be read, but not used; the message says what was found, and what was expected."""
 
 
 class Header(NamedTuple):
-    """What an array claims to be."""
+    """Shape, order and type that an array of an npz claims to have."""
 
     shape: tuple[int, ...]
     fortran: bool
@@ -173,6 +175,12 @@ def check_shares(name: str, rows: npt.NDArray[np.float32]) -> None:  # (N, K)
             f"values of array {name} {found} in row {i} ({bad.size:,} of {len(rows):,} rows are unusable); expected "
             "probabilities that sum to 1, or zeros"
         )
+
+
+def write_npz(path: str | os.PathLike[str], header: dict[str, Any], **arrays: npt.ArrayLike) -> None:
+    """Write arrays and a JSON header as one compressed npz, atomically; raises `WriteError`."""
+    with write_atomically(path, suffix=".npz") as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays, header=np.array(json.dumps(header)))
 
 
 _BEGINNING = 1024

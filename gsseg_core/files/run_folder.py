@@ -46,7 +46,7 @@ Earlier = Callable[[Path], Iterable[str]]
 
 
 def nothing_earlier(out: Path) -> Iterable[str]:
-    """Know no files of versions of gsseg that wrote no manifest."""
+    """List no files of versions of gsseg that wrote no manifest."""
     return ()
 
 
@@ -127,10 +127,10 @@ def require_own_folder(out: Path, kind: str, earlier: Earlier) -> None:
     if not out.is_dir():
         return
     there = (path.name for path in out.iterdir() if path.name not in (RUN_FILE, LOCK_FILE))
-    strangers = sorted(name for name in there if not _STAGING.fullmatch(name))
-    if strangers and not _own(out, kind, earlier):
+    foreign = sorted(name for name in there if not _STAGING.fullmatch(name))
+    if foreign and not _own(out, kind, earlier):
         raise PathTakenError(
-            f"{out}: holds {strangers[0][:60]!r}, and no results of gsseg {kind}; expected a folder that is new, "
+            f"{out}: holds {foreign[0][:60]!r}, and no results of gsseg {kind}; expected a folder that is new, "
             "empty, or holds such results"
         )
 

@@ -14,7 +14,7 @@ FORMAT = "gsseg-run-1"
 
 
 class FileRecord(NamedTuple):
-    """A file as it was written.
+    """Size, time and digest of a file as it was written.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class FileRecord(NamedTuple):
 
 @dataclass(frozen=True)
 class RunRecord:
-    """A run: its id, and its files by their paths in the folder."""
+    """Id of a run, and its files by their paths in the folder."""
 
     id: str
     files: dict[str, FileRecord]
@@ -54,7 +54,7 @@ class RunRecord:
 
 @dataclass(frozen=True)
 class Manifest:
-    """What is known of a folder; without a file, nothing.
+    """Runs of a folder of results, and what it takes to finish the newest; empty where there is no manifest.
 
     Attributes
     ----------

@@ -115,7 +115,7 @@ def associate(views: Mapping[str, Lifted], settings: AssociationSettings | None 
 
 
 class _Stack:
-    """Segments of all views, one below the other."""
+    """Segments of all views, stacked as the rows of one sparse matrix."""
 
     def __init__(self, views: list[Lifted]) -> None:
         self.views = views
@@ -185,12 +185,12 @@ def _votes(
 
     Who calls a cluster background says nothing of which object it is.
     """
-    told = np.maximum(seen - hidden, 0)
+    foreground = np.maximum(seen - hidden, 0)
     full = np.minimum(settings.full_sight * seen.max(axis=1, keepdims=True), settings.plenty)
-    counts: np.ndarray = np.minimum(told / np.maximum(full, 1e-9), 1)
-    counts *= told / (told + settings.full_sight_px)
+    counts: np.ndarray = np.minimum(foreground / np.maximum(full, 1e-9), 1)
+    counts *= foreground / (foreground + settings.full_sight_px)
     entries = overlap.tocoo()
-    share = entries.data / np.maximum(told[entries.row, view[entries.col]], 1e-9)
+    share = entries.data / np.maximum(foreground[entries.row, view[entries.col]], 1e-9)
     strong = share > settings.least_share
     row, col, share = entries.row[strong], entries.col[strong], share[strong]
     return sparse.csr_matrix((share * counts[row, view[col]], (row, col)), shape=overlap.shape), counts

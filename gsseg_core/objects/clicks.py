@@ -111,14 +111,14 @@ def click_labels(
             )
     blocks = np.arange(camera.height) // side, np.arange(camera.width) // side
     index = (blocks[0][:, None] * shape[1] + blocks[1]).ravel()  # cell of each pixel
-    many = np.bincount(index)
-    means = np.stack([np.bincount(index, feature) / many for feature in features.reshape(len(index), -1).T], axis=1)
+    count = np.bincount(index)
+    means = np.stack([np.bincount(index, feature) / count for feature in features.reshape(len(index), -1).T], axis=1)
     tree = merge_tree(means.reshape(*shape, -1))
-    mine = np.zeros(shape[0] * shape[1], bool)
+    inside_cells = np.zeros(shape[0] * shape[1], bool)
     for cell in cells[0]:
-        mine |= _members(tree, longest_lived(tree, cell, cells[1]))
-    mine[cells[1]] = False
-    region = mine.reshape(shape)
+        inside_cells |= _members(tree, longest_lived(tree, cell, cells[1]))
+    inside_cells[cells[1]] = False
+    region = inside_cells.reshape(shape)
     # Blended edges are regions of their own for long, so that a region tends to end before its object does.
     labels = np.where(region, 1, np.where(ndimage.binary_dilation(region), UNKNOWN, 0)).astype(np.int32)
     labels.ravel()[cells[1]] = 0
@@ -150,10 +150,10 @@ def merge_tree(
 
 @nb.njit(nogil=True, cache=True)
 def _price(means: np.ndarray, size: np.ndarray, a: int, b: int, border: int) -> float:
-    apart = 0.0
+    distance = 0.0
     for d in range(means.shape[1]):
-        apart += (means[a, d] - means[b, d]) ** 2
-    price: float = size[a] * size[b] / (size[a] + size[b]) * apart / border
+        distance += (means[a, d] - means[b, d]) ** 2
+    price: float = size[a] * size[b] / (size[a] + size[b]) * distance / border
     return price
 
 

@@ -35,16 +35,16 @@ class Lifted:
         segments, ids, weights = observation.labels, observation.ids[observation.rows], observation.votes()
         order = np.lexsort([ids, -weights, segments])
         segments, ids, weights = segments[order], ids[order], weights[order]
-        many = np.bincount(segments, minlength=len(observation.classes))
-        size = np.bincount(segments, weights, len(many))
-        above = np.cumsum(weights, dtype=np.float64) - weights - np.repeat(np.cumsum(size) - size, many)
+        count = np.bincount(segments, minlength=len(observation.classes))
+        size = np.bincount(segments, weights, len(count))
+        above = np.cumsum(weights, dtype=np.float64) - weights - np.repeat(np.cumsum(size) - size, count)
         heavy = (above < kept * size[segments]) & (weights > 0)
         segments, ids, weights = segments[heavy], ids[heavy], weights[heavy]
         # An order that the ids have no part in: by weight, then by the first Gaussian.
-        first = np.full(len(many), np.iinfo(np.int64).max)
+        first = np.full(len(count), np.iinfo(np.int64).max)
         np.minimum.at(first, segments, ids)
         order = np.lexsort([first, -size])[: np.count_nonzero(size)]
-        row = np.zeros(len(many), np.int64)
+        row = np.zeros(len(count), np.int64)
         row[order] = np.arange(len(order))
         gaussians, column = np.unique(ids, return_inverse=True)
         lifted = sparse.csr_matrix((weights, (row[segments], column)), shape=(len(order), len(gaussians)))
@@ -56,14 +56,14 @@ class Lifted:
 
 
 class Profiles:
-    """What views say of the objects so far: the segments of each object added up, a sparse (N, K) matrix, in px."""
+    """Weights of the objects on the Gaussians: the segments of each object added up, a sparse (N, K) matrix, in px."""
 
     def __init__(self, weights: sparse.csr_matrix) -> None:
         self._sum, self._more = weights, list[sparse.coo_matrix]()
 
     @classmethod
     def empty(cls, num_gaussians: int) -> Profiles:
-        """Know nothing yet."""
+        """Start without any segment."""
         return cls(sparse.csr_matrix((num_gaussians, 1)))
 
     def add(

@@ -27,7 +27,7 @@ IDS = ("global", PER_VIEW)
 
 @dataclass(frozen=True)
 class Alignment:
-    """What the ids of one view mean.
+    """Objects that the ids of one view stand for, and ids that fit none.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Alignment:
 
 @dataclass(frozen=True, eq=False)
 class Repair:
-    """What `ObjectTable.solve` has changed.
+    """Views and objects that `ObjectTable.solve` gave another number.
 
     Attributes
     ----------
@@ -138,7 +138,7 @@ class ObjectTable:
         """
         undo = self.checkpoint()
         if not self.add(view):
-            return _turned_away(view)
+            return _without_labels(view)
         lifted = self._lifted[view.name]
         best, seen = self._profiles.explain(lifted.gaussians, lifted.weights)
         new = (lifted.ids > 0) & (seen < self.settings.unseen)
@@ -174,13 +174,13 @@ class ObjectTable:
         self._largest = max(self._largest, number)
 
     def remove(self, name: str) -> None:
-        """Take a view back, and all that it said."""
+        """Take a view back, with all its evidence."""
         del self.views[name], self._lifted[name]
         if self._objects.pop(name, None) is not None:
             self._fill()
 
     def forget(self, name: str) -> None:
-        """Drop a view; what it said still counts for `match`, but `solve` does without."""
+        """Drop a view; its evidence still counts for `match`, but no longer for `solve`."""
         lifted = self._lifted.pop(name)
         self._forgotten.add(lifted.gaussians, lifted.weights, self._objects.pop(name))
         del self.views[name]
@@ -207,18 +207,18 @@ class ObjectTable:
         """Return a view as it came, with the numbers of objects for labels; ids that lie on no Gaussian are unknown.
 
         A view that `add` would not take comes back with nothing but background and unknown pixels, or as it is if it
-        has no mask, so that a learner turns it away for the right reason.
+        has no mask, so that a learner rejects it for the right reason.
         """
         lifted = self._lifted.get(view.name)
         if lifted is None:
-            return _turned_away(view)
+            return _without_labels(view)
         labels = self.views[view.name].read_labels()
         table = np.full(int(labels.max()) + 2, UNKNOWN, np.int32)  # The last one is for unknown pixels.
         table[lifted.ids] = self._objects[view.name]
         return replace(View.from_arrays(view.camera, table[labels]), image_path=view.image_path)
 
     def alignment(self, name: str) -> Alignment:
-        """Tell what the ids of a view mean, and how many of them do not fit."""
+        """Tell which object each id of a view stands for, and how many ids do not fit."""
         lifted, objects = self._lifted[name], self._objects[name]
         shown = objects[objects > 0]
         parts, _ = self._profiles.common(lifted.gaussians, lifted.weights)
@@ -282,7 +282,7 @@ class ObjectTable:
         return {name: table[objects].astype(np.int32) for name, objects in solved.items()}, successors
 
 
-def _turned_away(view: View) -> View:
+def _without_labels(view: View) -> View:
     if not view.has_mask:
         return view
     labels = np.minimum(replace(view, class_names=None).read_labels(), 0)

@@ -30,7 +30,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from gsseg_core.errors import SceneValueError
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.scene.quaternions import rotations
+from gsseg_core.scene.quaternions import covariances
 from gsseg_core.segmentation import Segmentation
 
 Array = npt.NDArray[np.float64]
@@ -57,7 +57,7 @@ _SETTLED = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class OrientedBox:
-    """Where an object lies and what room it takes, in the units of the scene.
+    """Where an object lies and how large it is, in the units of the scene.
 
     Attributes
     ----------
@@ -149,11 +149,11 @@ def oriented_box(
     points, shape, weights = points[kept], shape[kept], weights[kept]
     share = weights / weights.sum()
     mean = share @ points
-    apart = points - mean
-    covariance = (apart * share[:, None]).T @ apart + np.einsum("m,mij->ij", share, shape)
-    axes = _turned(apart, share, np.linalg.eigh(covariance)[1])
+    offsets = points - mean
+    covariance = (offsets * share[:, None]).T @ offsets + np.einsum("m,mij->ij", share, shape)
+    axes = _turned(offsets, share, np.linalg.eigh(covariance)[1])
     reach = np.sqrt(np.maximum(np.einsum("ik,mij,jk->mk", axes, shape, axes, optimize=True), 0))
-    along = apart @ axes
+    along = offsets @ axes
     low, high = _quantile(along - reach, share, TRIM), -_quantile(-along - reach, share, TRIM)
     order = np.argsort(low - high, kind="stable")
     center = mean + axes @ ((low + high) / 2)
@@ -178,8 +178,8 @@ def class_box(
     """
     every = -(-len(index) // SAMPLE)
     index, confidence = index[::every], confidence[::every]
-    turns = rotations(scene.quats[index].astype(np.float64)) * scene.scales[index][:, None, :]
-    return oriented_box(scene.means[index], turns @ turns.transpose(0, 2, 1), scene.opacities[index] * confidence)
+    shapes = covariances(scene.quats[index].astype(np.float64), scene.scales[index])
+    return oriented_box(scene.means[index], shapes, scene.opacities[index] * confidence)
 
 
 def object_boxes(scene: GaussianScene, result: Segmentation) -> dict[int, OrientedBox]:
@@ -220,14 +220,14 @@ def _without_floaters(
 
 
 def _turned(
-    apart: Array,  # (M, 3)
+    offsets: Array,  # (M, 3)
     share: Array,  # (M,)
     axes: Array,  # (3, 3)
 ) -> Array:
     """Find the axes (3, 3) of the smallest box around points, beginning with these and with the sides of their hull."""
-    along = apart @ axes
+    along = offsets @ axes
     low, high = _quantile(along, share, TRIM), -_quantile(-along, share, TRIM)
-    points = apart[((along >= low) & (along <= high)).all(axis=1)]
+    points = offsets[((along >= low) & (along <= high)).all(axis=1)]
     if len(points) < 4:  # In one plane, so that boxes of no volume contain them: nothing to choose by.
         return axes
     starts = [axes]
@@ -261,7 +261,7 @@ def _completed(
 
 
 def _least(
-    room: Array,  # (C,)
+    extent: Array,  # (C,)
     girth: Array,  # (C,)
 ) -> int:
     """Choose the candidate that takes the least area or volume, of those that tie the least girth.
@@ -269,7 +269,7 @@ def _least(
     On all sides of a triangle stand rectangles of one area, on the faces of a tetrahedron often boxes of one volume:
     rounding must not choose.
     """
-    return int(np.where(room <= room.min() * (1 + _TIED), girth, np.inf).argmin())
+    return int(np.where(extent <= extent.min() * (1 + _TIED), girth, np.inf).argmin())
 
 
 def _turned_about(

@@ -20,7 +20,6 @@ Clicks become a mask first (`gsseg_core.objects.clicks`).
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,7 +30,7 @@ import numpy as np
 from gsseg_core.data.label_images import UNKNOWN, read_mask
 from gsseg_core.data.view import View
 from gsseg_core.errors import MaskFormatError, NoUsableViewsError, SettingsError
-from gsseg_core.files.atomic import write_atomically
+from gsseg_core.files.npz_files import write_npz
 from gsseg_core.objects.clicks import Pixel, click_labels
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.label_propagation import GraphSettings, propagate
@@ -87,11 +86,8 @@ class Pick:
         WriteError
             The file cannot be written; an earlier one is unchanged.
         """
-        header = json.dumps({"format": FORMAT, "scene": self.scene_digest, **({} if run is None else {"run": run})})
-        with write_atomically(path, suffix=".npz") as temporary, open(temporary, "wb") as file:
-            np.savez_compressed(
-                file, allow_pickle=False, ids=self.ids, membership=self.membership, header=np.array(header)
-            )
+        header = {"format": FORMAT, "scene": self.scene_digest, **({} if run is None else {"run": run})}
+        write_npz(path, header, ids=self.ids, membership=self.membership)
 
 
 def pick_mask(
@@ -189,12 +185,12 @@ def read_object_mask(path: str | os.PathLike[str], label: int | None = None) -> 
     labels = read_mask(path).labels
     if label is None and not (labels > 0).any():
         labels = np.where(labels == UNKNOWN, 1, labels)
-    mine = labels > 0 if label is None else labels == label
-    if not mine.any():
+    chosen = labels > 0 if label is None else labels == label
+    if not chosen.any():
         there = np.unique(labels[labels != UNKNOWN]).tolist()
         wanted = "a label above 0" if label is None else f"the label {label}"
         raise MaskFormatError(f"{Path(path)}: holds the labels {str(there)[1:-1][:60]}; expected pixels with {wanted}")
-    return np.where(mine, 1, np.where(labels == UNKNOWN, UNKNOWN, 0)).astype(np.int32)
+    return np.where(chosen, 1, np.where(labels == UNKNOWN, UNKNOWN, 0)).astype(np.int32)
 
 
 def _distance(

@@ -1,4 +1,4 @@
-"""The scene without some of its objects."""
+"""Removal of objects from a scene."""
 
 from __future__ import annotations
 

@@ -22,3 +22,13 @@ def rotations(
     ]
     matrices: npt.NDArray[Number] = np.moveaxis(np.array(rows), 2, 0)
     return matrices
+
+
+def covariances(
+    quats: npt.NDArray[Number],  # (M, 4) w, x, y, z, unit
+    scales: npt.NDArray[Any],  # (M, 3)
+) -> npt.NDArray[Number]:
+    """Covariances (M, 3, 3) of Gaussians, R diag(scales^2) R^T, of the higher precision of the two."""
+    half = rotations(quats) * scales[:, None, :]
+    product: npt.NDArray[Number] = half @ half.transpose(0, 2, 1)
+    return product

@@ -8,7 +8,7 @@ import numpy as np
 import viser
 
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.scene.quaternions import rotations
+from gsseg_core.scene.quaternions import covariances
 from gsseg_core.viewer.splat_chunks import BYTES_PER_GAUSSIAN, Key, Node, after, changes
 
 _LARGEST = 200.0
@@ -95,13 +95,3 @@ class SplatNodes:
         else:
             name = f"/splats/{key[0]}/{key[1]}"
             self._handles[key] = self._client.scene.add_gaussian_splats(name, **gaussians, scale=self._splats.unit)
-
-
-def covariances(
-    quats: np.ndarray,  # (N, 4) unit, w x y z
-    scales: np.ndarray,  # (N, 3)
-) -> np.ndarray:
-    """Covariances of Gaussians, R diag(scales^2) R^T: (N, 3, 3) float32."""
-    half = rotations(quats) * scales[:, None, :]
-    product: np.ndarray = half @ half.transpose(0, 2, 1)
-    return product
