@@ -6,12 +6,12 @@ import importlib
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gsseg_core.errors import SettingsError
-from gsseg_core.scene.gaussian_scene import GaussianScene
 
 if TYPE_CHECKING:
     from distributed import Client
 
     from gsseg_core.learn.learner import Learner
+    from gsseg_core.scene.gaussian_scene import GaussianScene
 
 
 class Entry(NamedTuple):
