@@ -38,9 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if interrupts.came():
             return interrupts.EXIT_CODE
         if isinstance(error, MemoryError):
-            terminal.note(
-                f"error: memory is not enough: {error or 'no more is free'}; expected smaller views or scenes"
-            )
+            terminal.note(f"error: memory is not enough ({error}); expected smaller views, or a smaller scene")
             return 2
         if not isinstance(error, GssegError):
             raise
