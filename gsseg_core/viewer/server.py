@@ -11,6 +11,7 @@ import inspect
 import io
 import math
 import threading
+import warnings
 from collections.abc import Callable, Iterator
 from http import HTTPStatus
 from typing import Any
@@ -51,6 +52,8 @@ def start_server(listener: Listener) -> viser.ViserServer:
     SettingsError
         This version of viser does not let itself be guarded.
     """
+    # What is sent to a browser in the moment in which it leaves is nothing that people could mend.
+    warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
     # viser draws a box with its address whatever `verbose` says.
     with _guarding(listener) as guarded, contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host="127.0.0.1", port=listener.port, label="gsseg", verbose=False)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from browser import opened_page
+from patience import PATIENCE
 from small_scenes import balls_on_a_table, clean_views
 
 pytest.importorskip("viser")
@@ -36,8 +37,11 @@ from gsseg_core.viewer.viewer import Viewer
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator
 
-PATIENCE = 30.0
+
 PORT = 18200
+
+# As `gsseg view` has it: a browser may leave while it is being sent something.
+pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection:UserWarning")
 SCENE, TRUTH = balls_on_a_table()
 PLAIN = {0: "background", 1: "red ball", 2: "mug", 3: "book"}
 CAMERA = {
