@@ -44,7 +44,7 @@ view: $(KERNELS_READY)  ## segment a small scene and look at it in the browser; 
 	$(BIN)/gsseg view demo_out/scene/scene.ply --segmentation demo_out/segmented/segmentation.npz \
 		--data demo_out/scene --open
 
-check: $(READY) $(ROS_READY) $(MSGS_READY)  ## lint, check the types, the order of the rooms and all that starts no process: under a minute
+check: $(READY) $(ROS_READY) $(MSGS_READY)  ## lint, check the types, the order of the rooms and all that starts no process: three minutes
 	@$(MAKE) --no-print-directory lint kernels
 	OMP_WAIT_POLICY=passive $(BIN)/python -m pytest -q -W error --numprocesses=2 --dist=worksteal -m 'not processes'
 
