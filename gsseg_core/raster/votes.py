@@ -17,7 +17,7 @@ def add_votes(
     total: np.ndarray,  # (N, K) int64, added to
     ids: np.ndarray,  # (M,) int32, distinct
     start: np.ndarray,  # (M + 1,)
-    labels: np.ndarray,  # (P,) int32: label of each sighting
+    labels: np.ndarray,  # (P,) int32: label of each pair
     said_start: np.ndarray,  # (L + 1,) what a pixel of each label votes, as `CSRRows`
     said_classes: np.ndarray,
     said: np.ndarray,  # float64

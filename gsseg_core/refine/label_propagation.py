@@ -232,7 +232,7 @@ def _step(
 
 @nb.njit(nogil=True, cache=True)
 def _steps_to_reach(indptr: np.ndarray, indices: np.ndarray, known: np.ndarray, steps: int) -> np.ndarray:
-    """Tell after how count steps the code of each place is known, (N,) int32, or NEVER."""
+    """Tell after how many steps the code of each place is known, (N,) int32, or NEVER."""
     n = known.shape[0]
     reached = np.full(n, np.int32(NEVER))
     for i in range(n):

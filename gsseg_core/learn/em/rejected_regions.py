@@ -125,7 +125,7 @@ def _connect(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Write the numbers, return first pixels and areas. Runs of equal pixels are joined to those of the row above."""
     height, width = labels.shape
-    parent = np.empty(height * width, np.int32)  # of runs; there are at most as count as pixels
+    parent = np.empty(height * width, np.int32)  # of runs; there are at most as many as pixels
     begin = np.empty(height * width, np.int32)
     runs = 0
     for y in range(height):

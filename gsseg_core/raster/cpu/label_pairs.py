@@ -63,14 +63,14 @@ def number_pairs(
     gaussian_entries: np.ndarray,  # (E,)
     kept: np.ndarray,  # (E, 2)
     tiles: np.ndarray,  # (T, 6) int64: first of all entries, of all slots, of the entries kept, of their slots, of the
-    # labels, and how count labels; together, since each look at another tile waits for memory
+    # labels, and how many labels; together, since each look at another tile waits for memory
     sums: np.ndarray,  # (slots,) sum of weights by entry and label
     present: np.ndarray,
     num_labels: int,
     capacity: np.ndarray,  # (CHUNKS + 1,) where each chunk's pairs begin; there is more than needed
     found: np.ndarray,  # (CHUNKS, 2) int64 out: Gaussians and pairs of each chunk
     gaussians: np.ndarray,  # (M,) int32 out: those that are seen; each chunk's from where it begins
-    counts: np.ndarray,  # (M,) int32 out: how count labels each of them has; the same
+    counts: np.ndarray,  # (M,) int32 out: how many labels each of them has; the same
     labels: np.ndarray,  # (capacity[-1],) int32 out
     votes: np.ndarray,  # (capacity[-1],) float32 out
     entries: np.ndarray,  # (E',) int32 out: Gaussian of each kept entry
@@ -120,7 +120,7 @@ def number_pairs(
 @nb.njit(parallel=True, nogil=True, cache=True)
 def settle(
     numbers: np.ndarray,  # int32, changed in place
-    before: np.ndarray,  # (CHUNKS,) how label_count there are in the chunks before
+    before: np.ndarray,  # (CHUNKS,) how many there are in the chunks before
 ) -> None:
     """Make one count of numbers that begin anew in every chunk."""
     for i in nb.prange(numbers.shape[0]):

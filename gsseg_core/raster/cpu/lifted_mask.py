@@ -126,7 +126,7 @@ def _vote(
     gaussian_start: np.ndarray,  # (M + 1,)
     gaussian_entries: np.ndarray,  # (E,)
     said_by: np.ndarray,  # (E, 2) from `_put_beside`
-    tiles: np.ndarray,  # (T, 3) int64: how count labels; sums of entry e begin at e times these plus this; first label
+    tiles: np.ndarray,  # (T, 3) int64: how many labels; sums of entry e begin at e times these plus this; first label
     sums: np.ndarray,
     present: np.ndarray,
     num_labels: int,

@@ -41,7 +41,7 @@ class TileObservation(Observation):
         kept, self._blocks = np.empty((len(lifted.reached), 2), np.int32), np.empty(self._start[-1], np.uint16)
         label_pairs.keep_entries(tiles.start, lifted.reached, self._start, kept, self._blocks)
 
-        # A Gaussian has at most as label_count labels as sums, and each entry one sum, but for so label_count in all:
+        # A Gaussian has at most as many labels as sums, and each entry one sum, but for so many in all:
         extra = counts[:, 2].sum() - counts[:, 0].sum()
         chunks = np.arange(CHUNKS + 1) * len(ids) // CHUNKS
         capacity = tiles.gaussian_start[chunks] + extra * np.arange(len(chunks))
