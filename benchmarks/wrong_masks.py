@@ -22,7 +22,6 @@ from gsseg_core.demo.mask_errors import (
     relabel,
     with_label,
 )
-from gsseg_core.errors import SettingsError
 
 
 @dataclass(frozen=True)
@@ -61,15 +60,8 @@ class WrongMasks(MaskErrors):
     bad_frame: float = 0.0
     shift_px: float = 0.0
 
-    def __post_init__(self) -> None:
-        """Validate."""
-        super().__post_init__()
-        for name in ("holes", "exchanged", "bad_frame"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise SettingsError(f"mask errors: found {name} = {getattr(self, name)}; expected a probability")
-        for name in ("hole_px", "blobs", "blob_px", "shift_px"):
-            if not getattr(self, name) >= 0:
-                raise SettingsError(f"mask errors: found {name} = {getattr(self, name)}; expected 0 or more")
+    PROBABILITIES = (*MaskErrors.PROBABILITIES, "holes", "exchanged", "bad_frame")
+    AMOUNTS = (*MaskErrors.AMOUNTS, "hole_px", "blobs", "blob_px", "shift_px")
 
 
 def corrupt(

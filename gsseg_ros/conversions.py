@@ -22,11 +22,11 @@ from std_msgs.msg import Header
 
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import IntrinsicsError, MaskFormatError, PoseError, SceneValueError
+from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.scene.camera import Camera
 from gsseg_ros.frames import Similarity, quaternion_from_rotation, rigid, rotation_from_quaternion
 
 _NS = 1_000_000_000
-_LARGEST_LABEL = 2**16 - 2  # As in files, see `gsseg_core.data.class_names.read_classes`.
 _UNIT_TOLERANCE = 1e-3
 _LONGEST_TOKEN = 64  # The full name of a topic must stay below 256 characters.
 
@@ -95,8 +95,8 @@ def labels_from_image(message: Image, topic: str) -> npt.NDArray[np.int32]:
     labels = _pixels(message, np.dtype(kind), topic).astype(np.int32)
     labels[labels == unknown] = UNKNOWN
     low, high = int(labels.min()), int(labels.max())
-    if low < UNKNOWN or high > _LARGEST_LABEL:
-        raise MaskFormatError(f"{topic}: labels are {low} to {high}; expected {UNKNOWN} (unknown) to {_LARGEST_LABEL}")
+    if low < UNKNOWN or high > MAX_LABEL:
+        raise MaskFormatError(f"{topic}: labels are {low} to {high}; expected {UNKNOWN} (unknown) to {MAX_LABEL}")
     return labels
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from gsseg_core.errors import ClassesFileError, SettingsError
 from gsseg_core.files.json_files import kind_of, read_json
+from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.text import clipped, quoted
 
 BACKGROUND_NAME = "background"
@@ -44,7 +45,7 @@ def read_classes(path: str | os.PathLike[str], within: Path | None = None) -> di
         raise ClassesFileError(f'{path}: holds {kind_of(content)}; expected an object such as {{"1": "chair"}}')
     names = {0: BACKGROUND_NAME}
     for key, name in content.items():
-        if not re.fullmatch(r"0|[1-9][0-9]{0,4}", key) or int(key) >= 2**16 - 1:
+        if not re.fullmatch(r"0|[1-9][0-9]{0,4}", key) or int(key) > MAX_LABEL:
             raise ClassesFileError(f"{path}: id {quoted(key)} is unusable; expected whole numbers from 0 to 65534")
         if not isinstance(name, str):
             raise ClassesFileError(f"{path}: id {key} has the name {quoted(name)}; expected text")

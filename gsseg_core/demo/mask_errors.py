@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 from scipy import ndimage
@@ -46,9 +46,12 @@ class MaskErrors:
     edge_px: int = 3
     missed_label: int | None = 0
 
+    PROBABILITIES: ClassVar[tuple[str, ...]] = ("missed", "swapped")
+    AMOUNTS: ClassVar[tuple[str, ...]] = ("edge_px", "missed_label")
+
     def __post_init__(self) -> None:
         """Validate."""
-        for name in ("missed", "swapped"):
+        for name in self.PROBABILITIES:
             if not 0 <= getattr(self, name) <= 1:
                 raise SettingsError(f"mask errors: found {name} = {getattr(self, name)}; expected a probability")
         if self.missed + self.swapped > 1:
@@ -56,7 +59,7 @@ class MaskErrors:
                 f"mask errors: found missed + swapped = {self.missed + self.swapped}; expected at most 1, "
                 "since an object meets one of the two"
             )
-        for name in ("edge_px", "missed_label"):
+        for name in self.AMOUNTS:
             if not (getattr(self, name) is None or getattr(self, name) >= 0):
                 raise SettingsError(f"mask errors: found {name} = {getattr(self, name)}; expected 0 or more")
 
