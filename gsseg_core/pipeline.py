@@ -9,8 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.hints import mask_hint
 from gsseg_core.data.label_images import write_mask
@@ -196,8 +194,16 @@ def segment(
             learner_settings=getattr(fitted, "settings", None),
         )
         del fitted  # Its votes take as much memory as all that follows.
-        result = _refine(inputs, probabilities, evidence, assessment.calibration.temperature, settings, watch)
-        del probabilities
+        with watch.stage("refine"):
+            if settings.graph:
+                probabilities = spread_if_scarce(inputs.scene, probabilities, evidence)
+            result = Segmentation.from_codes(inputs.scene, probabilities, inputs.class_names, settings.refine)
+            result = result.calibrated(assessment.calibration.temperature)
+            del probabilities
+        if settings.refine.carve:
+            with watch.stage("carve"):
+                cameras = [view.camera for view in spread(inputs.train, settings.refine.carve_views)]
+                result = result.carved(inputs.scene, cameras, device)
         report = _write(run, inputs, assessment, result, settings, watch).as_dict()
         write_json(run.folder / "report.json", report)
     return report
@@ -269,27 +275,6 @@ def _assess(learner: Learner, class_names: Mapping[int, str], watch: Stopwatch, 
         calibration = calibrate(learner, checker, progress)
     views = {"used": len(learner.views), "rejected": learner.reject_summary(), "names": learner.rejected, **reliability}
     return Assessment(dict(learner.views), checks, calibration, learner.history_, views)
-
-
-def _refine(
-    inputs: Inputs,
-    probabilities: np.ndarray,  # (N, K) float32
-    evidence: np.ndarray,  # (N,) float32
-    temperature: float,
-    settings: RunSettings,
-    watch: Stopwatch,
-) -> Segmentation:
-    """Make calibrated labels of learnt class probabilities: graph where views are few, KNN, filter or carving."""
-    with watch.stage("refine"):
-        if settings.graph:
-            probabilities = spread_if_scarce(inputs.scene, probabilities, evidence)
-        result = Segmentation.from_codes(inputs.scene, probabilities, inputs.class_names, settings.refine)
-        result = result.calibrated(temperature)
-    if settings.refine.carve:
-        with watch.stage("carve"):
-            cameras = [view.camera for view in spread(inputs.train, settings.refine.carve_views)]
-            result = result.carved(inputs.scene, cameras, settings.device)
-    return result
 
 
 def _write(
