@@ -23,7 +23,7 @@ TEST_WORKERS ?= 4
 export CMAKE_BUILD_PARALLEL_LEVEL ?= $(shell nproc 2>/dev/null || echo 1)
 
 # Beside each other, threads of kernels that wait for work must leave the cores to the others: twice as fast.
-run-tests: export OMP_WAIT_POLICY = passive
+run-tests check: export OMP_WAIT_POLICY = passive
 
 # Targets that `make test` makes beside the tests.
 BESIDE ?=
@@ -46,7 +46,7 @@ view: $(KERNELS_READY)  ## segment a small scene and look at it in the browser; 
 
 check: $(READY) $(ROS_READY) $(MSGS_READY)  ## lint, check the types, the order of the rooms and all that starts no process: three minutes
 	@$(MAKE) --no-print-directory lint kernels
-	OMP_WAIT_POLICY=passive $(BIN)/python -m pytest -q -W error --numprocesses=2 --dist=worksteal -m 'not processes'
+	$(BIN)/python -m pytest -q -W error --numprocesses=2 --dist=worksteal -m 'not processes'
 
 house: $(KERNELS_READY)  ## print what the house measures, with the bar beside each
 	$(BIN)/python benchmarks/house.py
