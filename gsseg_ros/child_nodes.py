@@ -136,12 +136,16 @@ class ChildNodes:
 def free_domain() -> int:
     """Find a ROS domain in which no process of this machine is, 1 to 100."""
     domains = random.sample(range(1, 101), 100)
-    for domain in domains:
+    return next(filter(is_free, domains), domains[0])
+
+
+def is_free(domain: int) -> bool:
+    """Whether no process of this machine is in a ROS domain."""
+    for process in range(4):  # The first may have left before the others.
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             try:
-                # The port that DDS gives to the first process of a domain for being found.
-                probe.bind(("", 7400 + 250 * domain + 10))
+                # The port that DDS gives to this process of a domain for being found.
+                probe.bind(("", 7400 + 250 * domain + 10 + 2 * process))
             except OSError:
-                continue
-        return domain
-    return domains[0]
+                return False
+    return True

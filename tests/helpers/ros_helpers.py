@@ -31,7 +31,7 @@ from typing import Any
 import pytest
 from patience import PATIENCE
 
-from gsseg_ros.child_nodes import NODES
+from gsseg_ros.child_nodes import NODES, is_free
 
 try:
     # Set before any message class is imported: only then do they check their fields.
@@ -56,9 +56,9 @@ _WORKER, _WORKERS = (
 
 
 def next_domain() -> int:
-    """A ROS domain from 1 to 100 that no other worker of this run has, and that this one does not use again soon."""
+    """A ROS domain from 1 to 100 that no other worker of this run has, nor a demo, and that is not used again soon."""
     share = 100 // _WORKERS
-    return _WORKER * share + next(_counter) % share + 1
+    return next(filter(is_free, (_WORKER * share + count % share + 1 for count in _counter)))
 
 
 def own_domain() -> int:
