@@ -44,7 +44,7 @@ MOST_MEMORY = 2 << 30
 LONGEST_LINE = 1000
 COLUMNS = ("done", "refused")
 _NO_MEMORY = re.compile(r"MemoryError|[Uu]nable to allocate|[Cc]annot allocate memory|bad_alloc")
-_FRAME = re.compile(r'File "[^"]*/(gsseg_\w+/\w+\.py)", line (\d+)')
+_FRAME = re.compile(r'File "[^"]*/(gsseg_\w+/(?:\w+/)*\w+\.py)", line (\d+)')
 
 
 @dataclass
