@@ -242,7 +242,7 @@ def measure_page(model: ViewModel, views: list[View], draw: str, toggles: int) -
 
 def measure_all(watched: Watched, page: Page, viewer: Viewer, draw: str, toggles: int) -> None:
     print(f"\n{'medians':<38}{'widget, ms':>12}{'picture, ms':>12}{'longest':>12}{'bytes':>12}")
-    names = seen(viewer.model, viewer.views[0])
+    names = seen(viewer.state.model, viewer.state.views[0])
     presses = [press(names[i // 2 % len(names)]) for i in range(toggles)]
     drawn = [watched.measure(script) for script in presses]
     row("toggle of a class", drawn)
@@ -255,7 +255,7 @@ def measure_all(watched: Watched, page: Page, viewer: Viewer, draw: str, toggles
     page.get_by_role("button", name="show all").click()
     for what, values in {"at a mark of the slider": (0.9, 0.95, 0.8), "between two marks": (0.93, 0.87)}.items():
         row(f"confidence, {what}", [by_server(watched, viewer, "min_confidence", value) for value in values])
-    viewer.change(lambda model: model.show_all())
+    viewer.state.change(lambda model: model.show_all())
     row("colours of another mode", [by_server(watched, viewer, "mode", mode) for mode in ("true colours", "class")])
     print()
     for what, results in {"": drawn, ", nothing drawn": alone}.items():
@@ -268,7 +268,7 @@ def measure_all(watched: Watched, page: Page, viewer: Viewer, draw: str, toggles
 
 def by_server(watched: Watched, viewer: Viewer, name: str, value: object) -> Result:
     """Change the model while the page is watched."""
-    return watched.measure(act=lambda: viewer.change(lambda model: setattr(model, name, value)))
+    return watched.measure(act=lambda: viewer.state.change(lambda model: setattr(model, name, value)))
 
 
 if __name__ == "__main__":

@@ -8,28 +8,38 @@ Every kind has a stream of random numbers of its own, so switching one off leave
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsseg_core.demo.mask_errors import (
+    EDGE_PX,
+    MISSED,
     STREAMS,
-    MaskErrors,
-    identity,
+    SWAPPED,
     mistake_objects,
     move_edges,
     objects_in,
     relabel,
-    with_label,
 )
+from gsseg_core.errors import SettingsError
 
 
 @dataclass(frozen=True)
-class WrongMasks(MaskErrors):
-    """How wrong masks are, in more ways than those of the demo.
+class WrongMasks:
+    """How wrong masks are. An object is a label above 0 that occurs in the view; the defaults are the demo's.
 
     Attributes
     ----------
+    missed : float
+        Probability that an object of a view is missed: its pixels become `missed_label`.
+    swapped : float
+        Probability that an object of a view carries the label of another object of that view instead of its own.
+    edge_px : int
+        The outline of each object of a view moves in or out by a whole number of px, all from 0 to this one as likely.
+    missed_label : int or None
+        What a segmenter writes where it found nothing: the background, or the label of what surrounds the objects.
+        None: the label that most pixels of the view carry, for scenes without a background.
     holes : float
         Probability that an object of a view has a hole, which becomes `missed_label`.
     hole_px : float
@@ -52,6 +62,10 @@ class WrongMasks(MaskErrors):
         A probability outside [0, 1], `missed` and `swapped` together above 1, or a negative amount.
     """
 
+    missed: float = MISSED
+    swapped: float = SWAPPED
+    edge_px: int = EDGE_PX
+    missed_label: int | None = 0
     holes: float = 0.0
     hole_px: float = 8.0
     blobs: float = 0.0
@@ -60,8 +74,19 @@ class WrongMasks(MaskErrors):
     bad_frame: float = 0.0
     shift_px: float = 0.0
 
-    PROBABILITIES = (*MaskErrors.PROBABILITIES, "holes", "exchanged", "bad_frame")
-    AMOUNTS = (*MaskErrors.AMOUNTS, "hole_px", "blobs", "blob_px", "shift_px")
+    def __post_init__(self) -> None:
+        """Validate."""
+        for name in ("missed", "swapped", "holes", "exchanged", "bad_frame"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise SettingsError(f"mask errors: found {name} = {getattr(self, name)}; expected a probability")
+        if self.missed + self.swapped > 1:
+            raise SettingsError(
+                f"mask errors: found missed + swapped = {self.missed + self.swapped}; expected at most 1, "
+                "since an object meets one of the two"
+            )
+        for name in ("edge_px", "missed_label", "hole_px", "blobs", "blob_px", "shift_px"):
+            if not (getattr(self, name) is None or getattr(self, name) >= 0):
+                raise SettingsError(f"mask errors: found {name} = {getattr(self, name)}; expected 0 or more")
 
 
 def corrupt(
@@ -71,9 +96,11 @@ def corrupt(
 ) -> np.ndarray:
     """Draw one wrong version of a view's label map, (H, W) int32; unknown pixels stay so, and a shift takes them along.
 
-    Of the settings that `gsseg_core.demo.mask_errors.corrupt` takes too it makes what that makes.
+    By default it makes what `gsseg_core.demo.mask_errors.corrupt` makes.
     """
-    settings = with_label(settings or WrongMasks(), labels)
+    settings = settings or WrongMasks()
+    if settings.missed_label is None:
+        settings = replace(settings, missed_label=int(np.bincount(labels[labels >= 0], minlength=1).argmax()))
     wrong = np.array(labels, np.int32)
     streams = rng.spawn(STREAMS)
     # Not from `rng`: what its later calls draw depends on how many streams were spawned from it.
@@ -82,6 +109,15 @@ def corrupt(
         wrong = make_error(wrong, stream, settings)
     wrong[labels < 0] = labels[labels < 0]
     return wrong
+
+
+def _move_edges(labels: np.ndarray, rng: np.random.Generator, settings: WrongMasks) -> np.ndarray:
+    return move_edges(labels, rng, settings.edge_px)
+
+
+def _mistake_objects(labels: np.ndarray, rng: np.random.Generator, settings: WrongMasks) -> np.ndarray:
+    assert settings.missed_label is not None
+    return mistake_objects(labels, rng, settings.missed, settings.swapped, settings.missed_label)
 
 
 def _punch_holes(labels: np.ndarray, rng: np.random.Generator, settings: WrongMasks) -> np.ndarray:
@@ -107,9 +143,8 @@ def _exchange_labels(labels: np.ndarray, rng: np.random.Generator, settings: Wro
     objects = rng.permutation(objects_in(labels))
     first, second = objects[: len(objects) // 2 * 2].reshape(-1, 2).T
     chosen = rng.random(len(first)) < settings.exchanged
-    table = identity(labels)
-    table[first[chosen]], table[second[chosen]] = second[chosen], first[chosen]
-    return relabel(labels, table)
+    first, second = first[chosen], second[chosen]
+    return relabel(labels, np.concatenate([first, second]), np.concatenate([second, first]))
 
 
 def _spoil_frame(labels: np.ndarray, rng: np.random.Generator, settings: WrongMasks) -> np.ndarray:
@@ -117,9 +152,7 @@ def _spoil_frame(labels: np.ndarray, rng: np.random.Generator, settings: WrongMa
     objects = rng.permutation(objects_in(labels))
     if rng.random() >= settings.bad_frame:
         return labels
-    table = identity(labels)
-    table[objects] = np.roll(objects, 1)
-    return relabel(labels, table)
+    return relabel(labels, objects, np.roll(objects, 1))
 
 
 def _shift_map(labels: np.ndarray, rng: np.random.Generator, settings: WrongMasks) -> np.ndarray:
@@ -133,7 +166,7 @@ def _shift_map(labels: np.ndarray, rng: np.random.Generator, settings: WrongMask
 
 
 # The streams of the first kinds are those that they have always had, so a seed still gives the masks that it gave.
-_FIRST_KINDS = (move_edges, _punch_holes, mistake_objects, _add_blobs)
+_FIRST_KINDS = (_move_edges, _punch_holes, _mistake_objects, _add_blobs)
 _LATER_KINDS = (_exchange_labels, _spoil_frame, _shift_map)
 
 

@@ -21,6 +21,7 @@ from gsseg_core.segmentation import Segmentation
 from gsseg_core.viewer.access import listen
 from gsseg_core.viewer.model import Labelling, ViewModel, read_reliability
 from gsseg_core.viewer.viewer import Viewer
+from gsseg_core.viewer.viewpoint import camera_of
 
 ROOT = Path(__file__).parents[2]
 BOWL = 2
@@ -45,7 +46,7 @@ def main(demo: Path = ROOT / "demo_out", out: Path = ROOT / "docs/pictures/viewe
         if warning.count():
             page.locator(".mantine-Notification-closeButton").first.click()
         client = next(iter(viewer.server.get_clients().values()))
-        camera = viewer.camera_of(client, client.camera.image_height)
+        camera = camera_of(client)
         (uv,), _ = camera.project(np.median(scene.means[result.labels == BOWL], axis=0, keepdims=True))
         page.mouse.click(float(uv[0]), float(uv[1]))
         page.get_by_text("views voted for it").wait_for(timeout=120_000)

@@ -1,40 +1,18 @@
 """Solids that rays can be cast at and points drawn from; what the demo scene is made of.
 
-Every solid has a frame of its own. For a ray beside a surface, or along it, divisions give NaN or infinity, which never
-count as a hit; callers silence the warnings.
+Every solid has a frame of its own, in metres. For a ray beside a surface, or along it, divisions give NaN or infinity,
+which never count as a hit; callers silence the warnings.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
 WALL = 0.005
 """Thickness of a cup's wall and base, in metres."""
-
-
-class Solid(Protocol):
-    """A shape in its own frame: rays hit it, points are drawn from its surface."""
-
-    @property
-    def corners(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corner (3,) of its bounding box."""
-
-    @property
-    def area(self) -> float:
-        """Surface in square metres."""
-
-    def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Distances (M,) along rays, in lengths of `directions` (M, 3); infinite for rays that miss."""
-
-    def contains(self, points: np.ndarray) -> np.ndarray:
-        """Which points (M, 3) are in its matter, (M,) bool."""
-
-    def sample(self, u: np.ndarray, inset: float) -> tuple[np.ndarray, np.ndarray]:
-        """Surface points (M, 3), `inset` metres off sharp edges, and unit normals (M, 3), from (M, 3) in [0, 1)."""
 
 
 @dataclass(frozen=True)
@@ -45,27 +23,27 @@ class Ellipsoid:
 
     @cached_property
     def corners(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corner."""
+        """Lowest and highest corner (3,) of the bounding box."""
         return -np.array(self.radii), np.array(self.radii)
 
     @cached_property
     def area(self) -> float:
-        """Surface of the sphere of the mean radius."""
+        """Surface of the sphere of the mean radius, in square metres."""
         return 4 * np.pi * float(np.mean(self.radii)) ** 2
 
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Distances along rays."""
+        """Distances (M,) along rays, in lengths of `directions` (M, 3); infinite for rays that miss."""
         o, d = origins / self.radii, directions / self.radii
         near, far = _roots(dot(d, d), dot(o, d), dot(o, o) - 1)
         return _nearest((near, True), (far, True))
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Which points are inside."""
+        """Which points (M, 3) are in its matter, (M,) bool."""
         inside: np.ndarray = dot(points / self.radii, points / self.radii) <= 1
         return inside
 
     def sample(self, u: np.ndarray, inset: float) -> tuple[np.ndarray, np.ndarray]:
-        """Surface points and normals."""
+        """Surface points (M, 3), `inset` metres off sharp edges, and unit normals (M, 3), from (M, 3) in [0, 1)."""
         z, angle = 2 * u[:, 0] - 1, 2 * np.pi * u[:, 1]
         unit = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
         normals = unit / self.radii
@@ -148,7 +126,7 @@ class Cone:
         side = np.pi * (self.bottom + self.top) * np.hypot(self.height, self.top - self.bottom)
         return np.array([side, np.pi * self.bottom**2, side if self.hollow else np.pi * self.top**2])
 
-    @property
+    @cached_property
     def _slope(self) -> float:
         return (self.top - self.bottom) / self.height
 
@@ -161,10 +139,8 @@ class Cone:
         for t in _roots(dot(d, d) - rise**2, dot(o, d) - rise * radius, dot(o, o) - radius**2):
             z = oz + t * dz
             hits.append((t, (z >= 0) & (z <= self.height)))
-        discs = [(WALL, self.bottom + self._slope * WALL)]
-        if not self.hollow:
-            discs = [(0, self.bottom), (self.height, self.top)]
-        for z, r in discs:
+        lids = [(0, self.bottom), (self.height, self.top)]
+        for z, r in [(WALL, self.bottom + self._slope * WALL)] if self.hollow else lids:
             t = (z - oz) / dz
             p = o + t[..., None] * d
             hits.append((t, dot(p, p) <= r * r))
@@ -198,6 +174,9 @@ class Cone:
         normals[inner] *= -1
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         return np.column_stack([radius[:, None] * around, z]), normals
+
+
+Solid = Ellipsoid | Box | Cone
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

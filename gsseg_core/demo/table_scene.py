@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from gsseg_core.data.label_images import write_mask
-from gsseg_core.demo.mask_errors import MaskErrors, corrupt
+from gsseg_core.demo.mask_errors import corrupt
 from gsseg_core.demo.solids import Box, Cone, Ellipsoid, Solid, dot
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.json_files import write_json
@@ -41,6 +41,9 @@ _OBJECT_SPACING = 0.0038
 _INTERIOR_SHARE = 0.05
 _NUM_FLOATERS = 500
 _LIGHT = np.array([-0.9, -1.1, 2.9])
+
+Color = tuple[float, float, float]
+"""Red, green and blue from 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -72,16 +75,8 @@ class DemoScene:
 def build_demo(folder: str | os.PathLike[str], seed: int = 0) -> DemoScene:
     """Write the demo scene to a folder as a dataset like any other; the same seed gives the same files.
 
-    Parameters
-    ----------
-    folder : path
-        Where to; made if it is not there.
-    seed : int
-        Of the Gaussians' defects and of the errors in the masks. The solids and the cameras are always the same.
-
-    Returns
-    -------
-    DemoScene
+    The seed is that of the Gaussians' defects and of the errors in the masks; the solids and the cameras are always the
+    same.
 
     Raises
     ------
@@ -92,8 +87,7 @@ def build_demo(folder: str | os.PathLike[str], seed: int = 0) -> DemoScene:
     """
     root = Path(folder)
     scene_rng, mask_rng = np.random.default_rng(seed).spawn(2)
-    parts = _furnish()
-    cameras = _make_cameras()
+    parts, cameras = _furnish(), _make_cameras()
     scene, truth = _make_gaussians(parts, np.array([camera.center for camera in cameras]), scene_rng)
     test = [camera.name for camera in cameras[TEST_EVERY // 2 :: TEST_EVERY]]
     train = [camera.name for camera in cameras if camera.name not in test]
@@ -109,8 +103,7 @@ def build_demo(folder: str | os.PathLike[str], seed: int = 0) -> DemoScene:
             labels = _cast_view(parts, camera)
             write_mask(run.folder / "labels_true" / f"{camera.name}.png", labels, bits=8)
             if camera.name in train:
-                wrong = corrupt(labels, mask_rng, MaskErrors())
-                write_mask(run.folder / "labels" / f"{camera.name}.png", wrong, bits=8)
+                write_mask(run.folder / "labels" / f"{camera.name}.png", corrupt(labels, mask_rng), bits=8)
     return DemoScene(root, scene, truth, dict(enumerate(CLASS_NAMES)), train, test)
 
 
@@ -131,7 +124,7 @@ class Part:
 
     label: int
     solid: Solid
-    color: tuple[float, float, float]
+    color: Color
     position: tuple[float, float, float]
     yaw: float = 0.0  # degrees
 
@@ -168,15 +161,8 @@ def _furnish() -> list[Part]:
     """All parts: floor, table, and the eight objects resting on the table or on each other."""
     parts: list[Part] = []
 
-    def add(
-        name: str,
-        solid: Solid,
-        color: tuple[float, float, float],
-        x: float,
-        y: float,
-        z: float = 0.0,  # above the table top
-        yaw: float = 0.0,
-    ) -> None:
+    def add(name: str, solid: Solid, color: Color, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> None:
+        """Add a part whose z is that above the table top."""
         parts.append(Part(CLASS_NAMES.index(name), solid, color, (x, y, TABLE_HEIGHT + z), yaw))
 
     wood, floor = (0.66, 0.46, 0.29), (0.60, 0.60, 0.58)
@@ -302,11 +288,9 @@ def _cover(
     points, normals = part.sample(rng.random((round(4 * part.solid.area / spacing**2), 3)), inset=drawn_back)
 
     # A trainer has no reason to put anything where solids touch, or on a surface that no camera faces.
-    kept = (dot(normals[:, None], viewpoints - points[:, None]) > 0).any(axis=1)
-    for other in parts:
-        if other is not part:
-            kept &= ~other.contains(points + 0.002 * normals)
-    points, normals = points[kept], normals[kept]
+    faced = (dot(normals[:, None], viewpoints - points[:, None]) > 0).any(axis=1)
+    touching = np.any([other.contains(points + 0.002 * normals) for other in parts if other is not part], axis=0)
+    points, normals = points[faced & ~touching], normals[faced & ~touching]
     # Off the surface, so that the two sides of a thin wall do not count as near.
     kept = _thin(points + spacing * normals, 0.8 * spacing)
     points, normals = points[kept], normals[kept]
@@ -327,11 +311,8 @@ def _cover(
     return means, quats, scales, opacities, sh, np.full(n, part.label)
 
 
-def _thin(
-    points: np.ndarray,  # (M, 3)
-    distance: float,
-) -> np.ndarray:
-    """(M,) bool, a choice of points with none nearer to each other than a distance; the earlier of two goes first."""
+def _thin(points: np.ndarray, distance: float) -> np.ndarray:
+    """Choose points (M, 3), (M,) bool, none of which are nearer to each other; the earlier of two goes first."""
     first, second = cKDTree(points).query_pairs(distance, output_type="ndarray").T
     undecided, chosen = np.ones(len(points), bool), np.zeros(len(points), bool)
     while undecided.any():
@@ -367,10 +348,7 @@ def _shade(
     lamp = np.zeros(len(points))
     for offset in rng.normal(0, 0.12, (3, 3)):
         towards = _LIGHT + offset - start
-        blocked = np.zeros(len(points), bool)
-        for other in parts:
-            if other.label:
-                blocked |= other.hit(start, towards) < 1
+        blocked = np.any([other.hit(start, towards) < 1 for other in parts if other.label], axis=0)
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         lamp += np.maximum(dot(towards, normals), 0) * ~blocked / 3
     light = 0.46 + 0.10 * normals[:, 2] + 0.52 * lamp

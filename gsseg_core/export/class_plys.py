@@ -16,11 +16,7 @@ from gsseg_core.scene.ply import write_vertices
 from gsseg_core.segmentation import Segmentation
 
 
-def export_classes(
-    scene: GaussianScene,
-    segmentation: Segmentation,
-    folder: str | os.PathLike[str],
-) -> dict[int, Path]:
+def export_classes(scene: GaussianScene, segmentation: Segmentation, folder: str | os.PathLike[str]) -> dict[int, Path]:
     """Write `<id>_<name>.ply` for every class that has Gaussians; valid 3DGS PLYs with all properties kept.
 
     Two properties are added: `label` (int), the class, and `confidence` (float), that of the segmentation.

@@ -19,6 +19,9 @@ PAPER, INK, FAINT_INK = (255, 255, 255), (32, 34, 38), (128, 131, 138)
 FILL = 0.55
 """How much of a label's colour goes into an overlaid pixel."""
 
+LEGEND_ROWS = 24
+"""Most lines in a column of a legend."""
+
 _LONGEST = 400  # characters of a name that are ever looked at; no picture has room for more
 
 
@@ -58,11 +61,7 @@ def palette(num_classes: int) -> np.ndarray:
     return colors
 
 
-def overlay(
-    image: np.ndarray,  # (H, W, 3)
-    labels: np.ndarray,  # (H, W)
-    colors: np.ndarray,  # (K, 3)
-) -> np.ndarray:
+def overlay(image: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.ndarray:
     """Lay labels over an image: tinted areas, and a thin line in the label's full colour along every class border.
 
     Background (0) and unknown (negative) pixels keep the image, a little greyed.
@@ -91,11 +90,7 @@ def overlay(
     return picture
 
 
-def contact_sheet(
-    images: Sequence[np.ndarray],
-    captions: Sequence[str],
-    columns: int,
-) -> np.ndarray:
+def contact_sheet(images: Sequence[np.ndarray], captions: Sequence[str], columns: int) -> np.ndarray:
     """Lay pictures out in rows, each with its caption below it.
 
     Parameters
@@ -126,13 +121,8 @@ def contact_sheet(
     return np.asarray(sheet)
 
 
-def legend(
-    class_names: Mapping[int, str],
-    colors: np.ndarray,  # (K, 3)
-    counts: np.ndarray,  # (K,)
-    rows: int = 24,
-) -> np.ndarray:
-    """Draw one line a class: its colour, label, name and count, in as many columns as it takes.
+def legend(class_names: Mapping[int, str], colors: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Draw one line a class: its colour, label, name and count, in as many columns of even length as it takes.
 
     Parameters
     ----------
@@ -142,38 +132,33 @@ def legend(
         `palette(K)`.
     counts : array (K,) of int
         What to write behind each name, such as the number of Gaussians.
-    rows : int
-        Most lines in a column; columns are of even length.
 
     Returns
     -------
     ndarray (H, W, 3) uint8
     """
-    margin, line = 16, 26
-    font = ImageFont.load_default(15)
-    names = {k: _shorten(name, font, 260) for k, name in class_names.items()}
-    name_width = max((font.getlength(name) for name in names.values()), default=0)
-    count_width = max((font.getlength(f"{counts[k]:,}") for k in names), default=0)
-    id_width = max((font.getlength(str(k)) for k in names), default=0)
+    margin, line, font = 16, 26, ImageFont.load_default(15)
+    entries = [(str(k), _shorten(name, font, 260), f"{counts[k]:,}") for k, name in class_names.items()]
+    id_width, name_width, count_width = (
+        max((font.getlength(entry[i]) for entry in entries), default=0) for i in range(3)
+    )
     column = round(30 + id_width + 12 + name_width + 24 + count_width)
-    columns = max(1, -(-len(names) // rows))
-    rows = max(1, -(-len(names) // columns))
+    columns = max(1, -(-len(entries) // LEGEND_ROWS))
+    rows = max(1, -(-len(entries) // columns))
     sheet = Image.new("RGB", (columns * (column + 2 * margin), rows * line + 2 * margin), PAPER)
     draw = ImageDraw.Draw(sheet)
-    for i, (k, name) in enumerate(names.items()):
+    for i, (k, (label, name, count)) in enumerate(zip(class_names, entries, strict=True)):
         x, y = margin + i // rows * (column + 2 * margin), margin + i % rows * line
         draw.rounded_rectangle((x, y + 4, x + 18, y + 21), 4, fill=tuple(colors[k].tolist()))
         middle = y + line / 2
-        draw.text((x + 30 + id_width, middle), str(k), FAINT_INK, font, anchor="rm")
+        draw.text((x + 30 + id_width, middle), label, FAINT_INK, font, anchor="rm")
         draw.text((x + 30 + id_width + 12, middle), name, INK, font, anchor="lm")
-        draw.text((x + column, middle), f"{counts[k]:,}", FAINT_INK, font, anchor="rm")
+        draw.text((x + column, middle), count, FAINT_INK, font, anchor="rm")
     return np.asarray(sheet)
 
 
 def save_png(path: str | Path, image: np.ndarray, run: str | None = None) -> None:
-    """Write a picture as PNG; an earlier file stays whole until the new one is complete.
-
-    `run` is the id of the run that it belongs to, for a text in the file.
+    """Write a picture as PNG, atomically; `run` is the id of the run that it belongs to, for a text in the file.
 
     Raises
     ------
@@ -185,10 +170,8 @@ def save_png(path: str | Path, image: np.ndarray, run: str | None = None) -> Non
         Image.fromarray(image).save(temporary, format="PNG", compress_level=4, pnginfo=run_text(run))
 
 
-def outline(
-    labels: np.ndarray,  # (H, W)
-) -> np.ndarray:
-    """Mark the pixels with another label beside, above or below them, (H, W) bool."""
+def outline(labels: np.ndarray) -> np.ndarray:
+    """Mark the pixels of a label map (H, W) with another label beside, above or below them, (H, W) bool."""
     border = np.zeros(labels.shape, bool)
     across, down = labels[:, 1:] != labels[:, :-1], labels[1:] != labels[:-1]
     border[:, 1:] |= across

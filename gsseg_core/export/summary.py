@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from typing import Any
 
@@ -18,6 +18,9 @@ from gsseg_core.refine.label_propagation import GraphSettings
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
+
+PACKAGES = ("gsseg", "numpy", "scipy", "numba")
+"""Those whose versions a report names."""
 
 
 @dataclass(frozen=True)
@@ -82,18 +85,12 @@ class RunReport:
         Id, name, size, mean confidence, file and box of each.
     pictures : sequence of str
         Files.
-    seconds : mapping from stage to float
-        How long each took.
-    versions : mapping from package to str
-        What it ran on.
-    run : str, optional
-        Id of the run.
-    calibration : mapping, optional
-        The temperature, and what it was fitted to.
-    ids : mapping, optional
-        Objects that ids which are a view's own were found to be.
-    page : str, optional
-        File of the report page.
+    seconds, versions : mappings
+        Seconds of each stage, and what it ran on: version of each package.
+    run, page : str, optional
+        Id of the run, and file of the report page.
+    calibration, ids : mappings, optional
+        The temperature and what it was fitted to; objects that ids which are a view's own were found to be.
     """
 
     scene: Mapping[str, Any]
@@ -128,15 +125,14 @@ class RunReport:
             gaussians=gaussian_counts(result),
             classes=_class_table(scene, result, plys),
             pictures=pictures,
-            versions=_versions(),
+            versions={"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
             **others,
         )
 
     def as_dict(self) -> dict[str, Any]:
         """Give the content of `report.json`; what a run does not have is left out."""
-        content = {field.name: getattr(self, field.name) for field in fields(self)}
         seconds = {name: round(value, 3) for name, value in self.seconds.items()}
-        return {name: value for name, value in {**content, "seconds": seconds}.items() if value is not None}
+        return {name: value for name, value in {**vars(self), "seconds": seconds}.items() if value is not None}
 
 
 def gaussian_counts(result: Segmentation) -> dict[str, int]:
@@ -150,10 +146,8 @@ def gaussian_counts(result: Segmentation) -> dict[str, int]:
 
 
 def _class_table(scene: GaussianScene, result: Segmentation, plys: Mapping[int, str]) -> list[dict[str, Any]]:
-    counts, confidence, boxes = result.counts(), result.confidence, object_boxes(scene, result)
-    total = np.bincount(
-        result.labels[result.labels >= 0], weights=confidence[result.labels >= 0], minlength=result.num_classes
-    )
+    counts, boxes, labelled = result.counts(), object_boxes(scene, result), result.labels >= 0
+    total = np.bincount(result.labels[labelled], result.confidence[labelled], result.num_classes)
     return [
         {
             "id": k,
@@ -165,8 +159,3 @@ def _class_table(scene: GaussianScene, result: Segmentation, plys: Mapping[int, 
         }
         for k, name in result.class_names.items()
     ]
-
-
-def _versions() -> dict[str, str]:
-    packages = {name: version(name) for name in ("gsseg", "numpy", "scipy", "numba")}
-    return {"python": platform.python_version(), **packages}

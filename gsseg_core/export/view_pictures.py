@@ -81,15 +81,10 @@ def write_pictures(
 ) -> list[Path]:
     """Write overlays of some views, as `draw_views` gives them, a contact sheet of them, and the legend.
 
-    Parameters
-    ----------
-    run : str, optional
-        Id of the run that they belong to.
-
     Returns
     -------
     list of pathlib.Path
-        `overlay_<stem>.png` ..., `contact_sheet.png`, `legend.png`.
+        `overlay_<stem>.png` ..., `contact_sheet.png`, `legend.png`; with the id of the `run` in them, if there is one.
     """
     folder = Path(folder)
     images, captions, paths = [], [], []
@@ -102,11 +97,7 @@ def write_pictures(
 
 
 def write_overview(
-    segmentation: Segmentation,
-    images: Sequence[np.ndarray],
-    captions: Sequence[str],
-    folder: Path,
-    run: str | None = None,
+    result: Segmentation, images: Sequence[np.ndarray], captions: Sequence[str], folder: Path, run: str | None = None
 ) -> list[Path]:
     """Write `contact_sheet.png` of some pictures, if there are any, and `legend.png`."""
     paths = []
@@ -114,18 +105,13 @@ def write_overview(
         paths.append(folder / "contact_sheet.png")
         save_png(paths[-1], contact_sheet(images, captions, min(4, len(images))), run)
     paths.append(folder / "legend.png")
-    colors = palette(segmentation.num_classes)
-    save_png(paths[-1], legend(segmentation.class_names, colors, segmentation.counts()), run)
+    colors = palette(result.num_classes)
+    save_png(paths[-1], legend(result.class_names, colors, result.counts()), run)
     return paths
 
 
 def draw_worst_views(
-    scene: GaussianScene,
-    views: Mapping[str, View],
-    checks: Sequence[ViewCheck],
-    count: int = 4,
-    *,
-    device: str = "cpu",
+    scene: GaussianScene, views: Mapping[str, View], checks: Sequence[ViewCheck], count: int = 4, *, device: str = "cpu"
 ) -> np.ndarray:
     """Draw the worst views: the mask, what the other views predict, and in red where the two differ.
 

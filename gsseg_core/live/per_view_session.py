@@ -16,7 +16,6 @@ from gsseg_core.learn.learner_state import State
 from gsseg_core.live.results import Outcome, Rejection
 from gsseg_core.live.session import LiveSession
 from gsseg_core.objects.object_table import ObjectTable, Repair, object_name
-from gsseg_core.scene.gaussian_scene import GaussianScene
 
 
 class PerViewSession(LiveSession):
@@ -26,26 +25,11 @@ class PerViewSession(LiveSession):
     kept together, and repairs what turns out to be wrong, as `repair` does; objects keep their numbers, and a number
     that has become part of another one is not given again. While it looks, for a few seconds, other calls wait.
 
-    Parameters
-    ----------
-    scene : GaussianScene
-        N Gaussians.
-    max_views : int
-        The last so many views are kept for `repair` and `learn`; votes are never dropped.
-    device : str
-        Where views are rendered.
-    max_classes : int
-        A view that would make more objects than this, the background counted, is refused.
+    It is made like a `LiveSession`, but takes no `class_names`; a view that would make more objects than `max_classes`,
+    the background counted, is refused.
     """
 
     _LABEL, _REMEDY = "would show the first of object", ""
-
-    _table: ObjectTable
-
-    def __init__(
-        self, scene: GaussianScene, *, max_views: int = 200, device: str = "cpu", max_classes: int = 256
-    ) -> None:
-        super().__init__(scene, max_views=max_views, device=device, max_classes=max_classes)
 
     @property
     def class_names(self) -> dict[int, str]:
@@ -90,7 +74,8 @@ class PerViewSession(LiveSession):
             for name in names:
                 self._live.retract(name)
             if moved and forgotten:
-                self._live.adopt(self._renumbered(self._live.state(), repair.successors))
+                state = self._live.state()
+                self._live.adopt(State(_renumber(state.votes, repair.successors), state.views, state.num_fused))
             for view in views.values():
                 self._live.observe(view)
             # The oldest view still is the first one to go.
@@ -133,16 +118,9 @@ class PerViewSession(LiveSession):
         for name in [name for name in self._table.views if name not in self._live.views]:
             self._table.forget(name)
 
-    @staticmethod
-    def _renumbered(state: State, successors: np.ndarray) -> State:
-        return State(_renumber(state.votes, successors), state.views, state.num_fused)
 
-
-def _renumber(
-    columns: np.ndarray,  # (N, K)
-    successors: np.ndarray,  # (K',) at least as many
-) -> np.ndarray:
-    """Add up columns (N, K) that get the same number."""
+def _renumber(columns: np.ndarray, successors: np.ndarray) -> np.ndarray:
+    """Add up columns (N, K) that get the same number by `successors` (K',)."""
     out = np.zeros((len(columns), max(columns.shape[1], int(successors.max()) + 1)), columns.dtype)
     for k in range(columns.shape[1]):
         out[:, successors[k] if k < len(successors) else k] += columns[:, k]

@@ -4,14 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsseg_core.errors import (
-    GssegError,
-    IntrinsicsError,
-    MaskFormatError,
-    MaskSizeError,
-    PoseError,
-    UnknownLabelError,
-)
+from gsseg_core.errors import GssegError, IntrinsicsError, MaskFormatError, MaskSizeError, PoseError, UnknownLabelError
 from gsseg_core.learn.learner_state import Learnt
 
 SCENE_CHANGED = "scene_changed"

@@ -71,9 +71,8 @@ class LiveSession:
 
     _LABEL, _REMEDY = "mask holds the label", ", or class_names that declare it"
 
-    num_fused: int
     _learnt: Learnt | None
-    _kept: tuple[object, Segmentation] | None
+    _segmented: tuple[object, Segmentation] | None
 
     def __init__(
         self,
@@ -267,10 +266,10 @@ class LiveSession:
         """
         settings, watch = settings or RefineSettings(), watch or Stopwatch()
         with self._lock:
-            key, kept, names = (self._version, settings), self._kept, self.class_names
+            key, known, names = (self._version, settings), self._segmented, self.class_names
             temperature = 1.0 if self._learnt is None else self._learnt.temperature
-            if kept is not None and kept[0] == key:
-                return kept[1]
+            if known is not None and known[0] == key:
+                return known[1]
             with watch.stage("codes"):
                 codes = self.codes()
         with watch.stage("knn"):
@@ -279,7 +278,7 @@ class LiveSession:
             with watch.stage("filter"):
                 result = result.filtered(self.scene, settings)
         result = result.calibrated(temperature)
-        self._kept = (key, result)
+        self._segmented = (key, result)
         return result
 
     def save(self, path: str | os.PathLike[str]) -> int:
@@ -317,10 +316,9 @@ class LiveSession:
         """
         state = State.load(path, self.scene.digest, len(self.scene), within)
         width = max(state.votes.shape[1], 0 if state.learnt is None else state.learnt.codes.shape[1])
-        if self._declared and width > len(self._names):
-            raise StateFileError(f"{path}: holds {width} classes; expected at most {len(self._names)}, as were named")
-        if not self._declared and width > self.max_classes:
-            raise StateFileError(f"{path}: holds {width} classes; expected at most {self.max_classes} (max_classes)")
+        most, why = (len(self._names), ", as were named") if self._declared else (self.max_classes, " (max_classes)")
+        if width > most:
+            raise StateFileError(f"{path}: holds {width} classes; expected at most {most}{why}")
         with self._lock:
             if not self._declared:
                 self._names = {0: BACKGROUND_NAME, **state.class_names}
@@ -356,8 +354,7 @@ class LiveSession:
         num_classes = max(self._names) + 1 if self._declared else 1
         # Views are rendered again by `learn`; to keep them prepared would take far more memory than their masks.
         self._live = VoteLearner(self.scene, num_classes, device=self.device, memory_budget=0)
-        self._learnt, self._kept = None, None
-        self.num_fused = 0
+        self._learnt, self._segmented, self.num_fused = None, None, 0
         self._version += 1
         self.retire()
 

@@ -61,12 +61,7 @@ class MergeTree(NamedTuple):
 
 
 def click_labels(
-    scene: GaussianScene,
-    camera: Camera,
-    inside: Sequence[Pixel],
-    outside: Sequence[Pixel] = (),
-    *,
-    device: str = "cpu",
+    scene: GaussianScene, camera: Camera, inside: Sequence[Pixel], outside: Sequence[Pixel] = (), *, device: str = "cpu"
 ) -> np.ndarray:
     """Make labels for `gsseg_core.objects.pick.pick_mask` of clicks in a view.
 
@@ -93,10 +88,12 @@ def click_labels(
     NoUsableViewsError
         A click inside shows no Gaussian.
     """
-    side = -(-max(camera.width, camera.height) // CELLS)
-    shape = -(-camera.height // side), -(-camera.width // side)
-    cells = [[(row // side) * shape[1] + column // side for row, column in _checked(camera, clicks)]
-             for clicks in (inside, outside)]  # fmt: skip
+    for row, column in (*inside, *outside):
+        if not (0 <= row < camera.height and 0 <= column < camera.width):
+            raise SettingsError(
+                f"view '{camera.name}': pixel is (row {row}, column {column}); expected a row from 0 to "
+                f"{camera.height - 1} and a column from 0 to {camera.width - 1}"
+            )
     if not inside or set(inside) & set(outside):
         raise SettingsError(
             f"clicks: {len(inside)} inside, {len(set(inside) & set(outside))} of them outside too; expected at least "
@@ -109,20 +106,20 @@ def click_labels(
                 f"view '{camera.name}': no Gaussian is seen at row {row}, column {column}; "
                 "expected a click on something"
             )
-    blocks = np.arange(camera.height) // side, np.arange(camera.width) // side
-    index = (blocks[0][:, None] * shape[1] + blocks[1]).ravel()  # cell of each pixel
-    count = np.bincount(index)
-    means = np.stack([np.bincount(index, feature) / count for feature in features.reshape(len(index), -1).T], axis=1)
-    tree = merge_tree(means.reshape(*shape, -1))
-    inside_cells = np.zeros(shape[0] * shape[1], bool)
-    for cell in cells[0]:
-        inside_cells |= _members(tree, longest_lived(tree, cell, cells[1]))
-    inside_cells[cells[1]] = False
-    region = inside_cells.reshape(shape)
+    side = -(-max(camera.width, camera.height) // CELLS)
+    shape = -(-camera.height // side), -(-camera.width // side)
+    cell_of = (np.arange(camera.height) // side)[:, None] * shape[1] + np.arange(camera.width) // side
+    count = np.bincount(cell_of.ravel())
+    means = [np.bincount(cell_of.ravel(), feature.ravel()) / count for feature in np.moveaxis(features, 2, 0)]
+    tree = merge_tree(np.stack(means, axis=1).reshape(*shape, -1))
+    hit, without = ([int(cell_of[row, column]) for row, column in clicks] for clicks in (inside, outside))
+    region = np.any([_members(tree, longest_lived(tree, cell, without)) for cell in hit], axis=0)
+    region[without] = False
+    region = region.reshape(shape)
     # Blended edges are regions of their own for long, so that a region tends to end before its object does.
-    labels = np.where(region, 1, np.where(ndimage.binary_dilation(region), UNKNOWN, 0)).astype(np.int32)
-    labels.ravel()[cells[1]] = 0
-    out: np.ndarray = labels.ravel()[index].reshape(camera.height, camera.width)
+    labels = np.where(region, 1, np.where(ndimage.binary_dilation(region), UNKNOWN, 0)).astype(np.int32).ravel()
+    labels[without] = 0
+    out: np.ndarray = labels[cell_of]
     for value, clicks in ((1, inside), (0, outside)):
         for row, column in clicks:
             out[row, column] = value
@@ -140,10 +137,8 @@ def longest_lived(tree: MergeTree, cell: int, without: Sequence[int] = ()) -> in
     return int(chain[int(np.where(fits, gone / np.maximum(born, 1e-300), 0).argmax())])
 
 
-def merge_tree(
-    features: np.ndarray,  # (h, w, D)
-) -> MergeTree:
-    """Merge the cells of a grid, at the least price first, until one region is left."""
+def merge_tree(features: np.ndarray) -> MergeTree:
+    """Merge the cells of a grid (h, w, D) of features, at the least price first, until one region is left."""
     height, width = features.shape[:2]
     return MergeTree(*_merge(np.ascontiguousarray(features.reshape(height * width, -1), np.float64), height, width))
 
@@ -244,13 +239,3 @@ def _members(tree: MergeTree, region: int) -> np.ndarray:
         part[below] |= part[tree.parent[below]]
     cells: np.ndarray = part[: (len(part) + 1) // 2]
     return cells
-
-
-def _checked(camera: Camera, clicks: Sequence[Pixel]) -> Sequence[Pixel]:
-    for row, column in clicks:
-        if not (0 <= row < camera.height and 0 <= column < camera.width):
-            raise SettingsError(
-                f"view '{camera.name}': pixel is (row {row}, column {column}); expected a row from 0 to "
-                f"{camera.height - 1} and a column from 0 to {camera.width - 1}"
-            )
-    return clicks

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -87,13 +88,8 @@ class OrientedBox:
         corners: Array = self.center + (signs * self.size) @ self.axes.T
         return corners
 
-    def moved(
-        self,
-        rotation: Array,  # (3, 3)
-        translation: Array,  # (3,)
-        scale: float,
-    ) -> OrientedBox:
-        """Return the box after x -> scale * rotation @ x + translation; its axes stay in their order."""
+    def moved(self, rotation: Array, translation: Array, scale: float) -> OrientedBox:
+        """Return the box after x -> scale * rotation (3, 3) @ x + translation (3,); its axes stay in their order."""
         turn = scale * rotation
         return OrientedBox(
             turn @ self.center + translation,
@@ -105,20 +101,10 @@ class OrientedBox:
 
     def as_dict(self) -> dict[str, Any]:
         """Write it in plain lists, as in report.json: `axes` is a list of directions, the longest side's first."""
-        return {
-            "center": _rounded(self.center),
-            "axes": _rounded(self.axes.T),
-            "size": _rounded(self.size),
-            "mean": _rounded(self.mean),
-            "covariance": _rounded(self.covariance),
-        }
+        return {name: _rounded(value) for name, value in {**vars(self), "axes": self.axes.T}.items()}
 
 
-def oriented_box(
-    means: np.ndarray,  # (M, 3)
-    covariances: np.ndarray,  # (M, 3, 3)
-    weights: np.ndarray,  # (M,)
-) -> OrientedBox:
+def oriented_box(means: np.ndarray, covariances: np.ndarray, weights: np.ndarray) -> OrientedBox:
     """Put a box around some Gaussians; the module says how.
 
     Parameters
@@ -160,11 +146,7 @@ def oriented_box(
     return OrientedBox(center, _pointed(axes[:, order]), (high - low)[order], mean, covariance)
 
 
-def class_box(
-    scene: GaussianScene,
-    index: np.ndarray,  # (M,) int
-    confidence: np.ndarray,  # (M,)
-) -> OrientedBox:
+def class_box(scene: GaussianScene, index: np.ndarray, confidence: np.ndarray) -> OrientedBox:
     """Put a box around the Gaussians of one object.
 
     Parameters
@@ -190,21 +172,14 @@ def object_boxes(scene: GaussianScene, result: Segmentation) -> dict[int, Orient
     dict of int to OrientedBox
         By class id, ascending; neither the background nor classes without a Gaussian.
     """
-    order = np.argsort(result.labels, kind="stable")
+    order, confidence = np.argsort(result.labels, kind="stable"), result.confidence
     bounds = np.searchsorted(result.labels[order], np.arange(1, result.num_classes + 1))
-    confidence = result.confidence
-    found = {}
-    for k, (first, last) in enumerate(zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True), start=1):
-        if last > first:
-            found[k] = class_box(scene, order[first:last], confidence[order[first:last]])
-    return found
+    members = {k: order[first:last] for k, (first, last) in enumerate(pairwise(bounds.tolist()), start=1)}
+    return {k: class_box(scene, own, confidence[own]) for k, own in members.items() if len(own)}
 
 
-def _without_floaters(
-    points: Array,  # (M, 3)
-    weights: Array,  # (M,)
-) -> npt.NDArray[np.bool_]:
-    """Tell which points (M,) are no farther than `FAR` times 90 % of the weight from the geometric median."""
+def _without_floaters(points: Array, weights: Array) -> npt.NDArray[np.bool_]:
+    """Tell which points (M, 3) are no farther than `FAR` times 90 % of their weight from the geometric median, (M,)."""
     middle = weights @ points / weights.sum()
     distance = np.linalg.norm(points - middle, axis=1)
     for _ in range(_STEPS):
@@ -249,22 +224,16 @@ def _turned(
     return axes
 
 
-def _completed(
-    normal: Array,  # (3,)
-    axes: Array,  # (3, 3)
-) -> Array:
-    """Complete a direction to a rotation (3, 3), with the one of `axes` that lies most across it."""
+def _completed(normal: Array, axes: Array) -> Array:
+    """Complete a direction (3,) to a rotation (3, 3), with the one of `axes` (3, 3) that lies most across it."""
     other = axes[:, np.abs(normal @ axes).argmin()]
     other = other - normal * (normal @ other)
     other /= np.linalg.norm(other)
     return np.stack([normal, other, np.cross(normal, other)], axis=1)
 
 
-def _least(
-    extent: Array,  # (C,)
-    girth: Array,  # (C,)
-) -> int:
-    """Choose the candidate that takes the least area or volume, of those that tie the least girth.
+def _least(extent: Array, girth: Array) -> int:
+    """Choose the candidate that takes the least area or volume (C,), of those that tie the least girth (C,).
 
     On all sides of a triangle stand rectangles of one area, on the faces of a tetrahedron often boxes of one volume:
     rounding must not choose.
@@ -272,12 +241,8 @@ def _least(
     return int(np.where(extent <= extent.min() * (1 + _TIED), girth, np.inf).argmin())
 
 
-def _turned_about(
-    points: Array,  # (M, 3)
-    axes: Array,  # (3, 3)
-    k: int,
-) -> Array:
-    """Turn axes (3, 3) about the one in column k so that the box around the points is smallest."""
+def _turned_about(points: Array, axes: Array, k: int) -> Array:
+    """Turn axes (3, 3) about the one in column k so that the box around points (M, 3) is smallest."""
     i, j = (k + 1) % 3, (k + 2) % 3
     x, y, gain = _smallest_rectangle(points @ axes[:, [i, j]])
     if gain >= ENOUGH:
@@ -287,10 +252,8 @@ def _turned_about(
     return turned
 
 
-def _smallest_rectangle(
-    points: Array,  # (M, 2)
-) -> tuple[float, float, float]:
-    """Direction (x, y) of a side of the smallest rectangle around points, and its area by that of the upright one."""
+def _smallest_rectangle(points: Array) -> tuple[float, float, float]:
+    """Direction x, y of a side of the smallest rectangle around points (M, 2); its area by that of the upright one."""
     try:
         hull = points[ConvexHull(points).vertices] if len(points) > 2 else points[:0]
     except QhullError:  # All on one line.
@@ -312,12 +275,8 @@ def _smallest_rectangle(
     return (x, y, float(areas[best] / upright)) if x > 0 else (-x, -y, float(areas[best] / upright))
 
 
-def _quantile(
-    values: Array,  # (M, C)
-    share: Array,  # (M,)
-    part: float,
-) -> Array:
-    """Least value (C,) of each column up to which `part` of the weight lies; shares sum to 1."""
+def _quantile(values: Array, share: Array, part: float) -> Array:
+    """Least value (C,) of each column of (M, C) up to which `part` of the weight lies; shares (M,) sum to 1."""
     order = np.argsort(values, axis=0, kind="stable")
     reached = np.cumsum(share[order], axis=0) >= part * (1 - 1e-9)
     rows = np.where(reached.any(axis=0), reached.argmax(axis=0), len(values) - 1)
@@ -326,10 +285,8 @@ def _quantile(
     return found
 
 
-def _pointed(
-    axes: Array,  # (3, 3)
-) -> Array:
-    """Choose one of the two directions of each axis, the same way for all boxes, so that they make a rotation."""
+def _pointed(axes: Array) -> Array:
+    """Choose one of the two directions of each axis (3, 3), the same way for all boxes, so that they are a rotation."""
     first, second = (axis * np.copysign(1.0, axis[np.abs(axis).argmax()]) for axis in axes.T[:2])
     pointed: Array = np.stack([first, second, np.cross(first, second)], axis=1)
     return pointed

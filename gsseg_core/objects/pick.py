@@ -72,14 +72,11 @@ class Pick:
 
         What a ray has left over is not the object.
         """
-        operator = make_operator(scene, camera, device)
-        seen: np.ndarray = operator.render(self.membership[:, None])[..., 0] >= 0.5
+        seen: np.ndarray = make_operator(scene, camera, device).render(self.membership[:, None])[..., 0] >= 0.5
         return seen
 
     def save(self, path: str | os.PathLike[str], run: str | None = None) -> None:
-        """Write `ids`, `membership` and the digest of the scene as one npz, atomically.
-
-        `run` is the id of the run that it belongs to, for the header.
+        """Write `ids`, `membership`, and the scene's digest and the `run` in the header, as one npz, atomically.
 
         Raises
         ------
@@ -90,13 +87,7 @@ class Pick:
         write_npz(path, header, ids=self.ids, membership=self.membership)
 
 
-def pick_mask(
-    scene: GaussianScene,
-    view: View,
-    settings: GraphSettings = GRAPH,
-    *,
-    device: str = "cpu",
-) -> Pick:
+def pick_mask(scene: GaussianScene, view: View, settings: GraphSettings = GRAPH, *, device: str = "cpu") -> Pick:
     """Pick the object that a mask of one view shows.
 
     Parameters
@@ -130,28 +121,16 @@ def pick_mask(
             )
     votes[:, 0] += FAR * _distance(scene.means, votes[:, 1])
     evidence = votes.sum(axis=1)
-    codes = np.divide(votes, evidence[:, None], out=np.zeros_like(votes), where=evidence[:, None] > 0)
-    return Pick(propagate(graph_of(scene, settings.k), codes, evidence, settings)[:, 1].copy(), scene.digest)
+    shares = np.divide(votes, evidence[:, None], out=np.zeros_like(votes), where=evidence[:, None] > 0)
+    return Pick(propagate(graph_of(scene, settings.k), shares, evidence, settings)[:, 1].copy(), scene.digest)
 
 
 def pick_clicks(
-    scene: GaussianScene,
-    camera: Camera,
-    inside: Sequence[Pixel],
-    outside: Sequence[Pixel] = (),
-    *,
-    device: str = "cpu",
+    scene: GaussianScene, camera: Camera, inside: Sequence[Pixel], outside: Sequence[Pixel] = (), *, device: str = "cpu"
 ) -> Pick:
     """Pick the object around one click or several in a view, leaving out what clicks say is not of it.
 
-    Parameters
-    ----------
-    scene : GaussianScene
-        N Gaussians.
-    camera : Camera
-        Where the clicks were made.
-    inside, outside : sequence of (row, column)
-        Pixels of the object, at least one, and others; see `gsseg_core.objects.clicks.click_labels`.
+    Parameters are those of `gsseg_core.objects.clicks.click_labels`.
 
     Raises
     ------
@@ -193,11 +172,8 @@ def read_object_mask(path: str | os.PathLike[str], label: int | None = None) -> 
     return np.where(chosen, 1, np.where(labels == UNKNOWN, UNKNOWN, 0)).astype(np.int32)
 
 
-def _distance(
-    means: np.ndarray,  # (N, 3)
-    votes: np.ndarray,  # (N,) for the object
-) -> np.ndarray:
-    """Squared distance of each Gaussian to the middle of the object, as a multiple of the mean of its own, (N,)."""
+def _distance(means: np.ndarray, votes: np.ndarray) -> np.ndarray:
+    """Squared distance of means (N, 3) to the middle of votes (N,), as a multiple of the mean of the voted, (N,)."""
     weights = votes / votes.sum(dtype=np.float64)
     squared: np.ndarray = ((means - weights @ means) ** 2).sum(axis=1)
     typical = float(weights @ squared)

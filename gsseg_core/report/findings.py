@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 
 from gsseg_core.data.view import View
 from gsseg_core.learn.mask_reliability import ViewCheck, worst_views
+from gsseg_core.metrics import iou
 from gsseg_core.text import counted
 
 SHOWN = 1 / 2000
@@ -71,21 +71,14 @@ class Evidence:
         return [(what, ranked[place]) for place, what in sorted(places.items())]
 
 
-def class_ious(
-    confusion: np.ndarray,  # (K, K)
-) -> np.ndarray:
-    """IoU of each class between prediction and masks, (K,); NaN for a class that is in neither."""
-    right = confusion.diagonal()
-    union = confusion.sum(axis=0) + confusion.sum(axis=1) - right
-    ious: np.ndarray = np.divide(right, union, out=np.full(len(right), np.nan), where=union > 0)
+def class_ious(confusion: np.ndarray) -> np.ndarray:
+    """IoU of each class between prediction and masks, (K,) of (K, K) pixels; NaN for a class that is in neither."""
+    ious: np.ndarray = iou(confusion.diagonal(), confusion.sum(axis=0), confusion.sum(axis=1))
     return ious
 
 
-def largest_confusions(
-    confusion: np.ndarray,  # (K, K)
-    count: int,
-) -> list[tuple[int, int, int]]:
-    """List what was most often taken for something else: class predicted, label of the mask, pixels."""
+def largest_confusions(confusion: np.ndarray, count: int) -> list[tuple[int, int, int]]:
+    """List what was most often taken for something else in (K, K) pixels: class predicted, label of the mask, count."""
     wrong = confusion.copy()
     np.fill_diagonal(wrong, 0)
     largest = np.argsort(-wrong, axis=None, kind="stable")[:count]
@@ -93,27 +86,21 @@ def largest_confusions(
     return [(k, y, int(wrong[k, y])) for k, y in pairs if wrong[k, y]]
 
 
-def most_confused(
-    confusion: np.ndarray,  # (K, K)
-    count: int,
-) -> list[int]:
-    """Choose the classes with the most pixels in which prediction and mask differ, `count` at most, by id."""
+def most_confused(confusion: np.ndarray, count: int) -> list[int]:
+    """Choose by (K, K) pixels the classes in most of which prediction and mask differ, `count` at most, by id."""
     wrong = confusion.sum(axis=0) + confusion.sum(axis=1) - 2 * confusion.diagonal()
     order = [int(k) for k in np.argsort(-wrong, kind="stable")[:count] if confusion[k].any() or confusion[:, k].any()]
     return sorted(order)
 
 
-def warnings_of(
-    report: Mapping[str, Any],
-    ious: np.ndarray | None = None,  # (K,)
-) -> list[str]:
+def warnings_of(report: Mapping[str, Any], ious: np.ndarray | None) -> list[str]:
     """Say in sentences what about a run should make its user look twice, what weighs most first.
 
     Parameters
     ----------
     report : mapping
         What `report.json` holds.
-    ious : (K,) array, optional
+    ious : (K,) array or None
         IoU of each class with the masks, in the order of the report, NaN where there is none.
     """
     views, gaussians = report["views"], report["gaussians"]
@@ -152,12 +139,6 @@ def warnings_of(
             "neighbour that was; they belong to nothing."
         )
     return warnings
-
-
-def mean_reliability(report: Mapping[str, Any]) -> float:
-    """Mean over the views of which anything is known; NaN without any."""
-    known = [v["reliability"] for v in report["views"].get("reliability", []) if v["reliability"] is not None]
-    return sum(known) / len(known) if known else math.nan
 
 
 def _some(names: Sequence[str]) -> str:

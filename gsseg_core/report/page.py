@@ -11,15 +11,12 @@ import hashlib
 import os
 from collections.abc import Callable, Mapping
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from gsseg_core.files.atomic import write_atomically
-from gsseg_core.report import charts, sections
-from gsseg_core.report.findings import mean_reliability, warnings_of
+from gsseg_core.report import sections
+from gsseg_core.report.findings import warnings_of
 from gsseg_core.report.sections import PageInputs
-from gsseg_core.segmentation import Segmentation
 from gsseg_core.text import percent, printable
 
 if TYPE_CHECKING:
@@ -53,7 +50,7 @@ def write_report_page(path: str | os.PathLike[str], run: PageInputs) -> None:
 
 def report_page(run: PageInputs) -> str:
     """Put the page together, as HTML."""
-    report = run.report
+    report, labelled = run.report, run.segmentation.labels >= 0
     contents = [(anchor, title, content(run)) for anchor, (title, content) in SECTIONS.items()]
     style, script = (files("gsseg_core.report").joinpath(f"page.{kind}").read_text("utf-8") for kind in ("css", "js"))
     policy = (
@@ -66,7 +63,7 @@ def report_page(run: PageInputs) -> str:
         .render(
             report={"run": None, **report},
             name=os.path.basename(report["scene"]["path"]),
-            figures=_figures(report, run.segmentation),
+            confidence=float(run.segmentation.confidence[labelled].mean()) if labelled.any() else None,
             warnings=warnings_of(report, run.ious),
             sections=[entry for entry in contents if entry[2] is not None],
             policy=policy,
@@ -90,25 +87,8 @@ def environment() -> Environment:
         keep_trailing_newline=True,
     )
     made.filters.update(percent=percent, thousands="{:,}".format)
-    made.globals["bar"] = charts.bar
     made.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
     return made
-
-
-def _figures(report: Mapping[str, Any], segmentation: Segmentation) -> list[tuple[str, str, str]]:
-    gaussians, total = report["gaussians"], report["scene"]["gaussians"]
-    found = sum(1 for entry in report["classes"] if entry["id"] and entry["gaussians"])
-    views, reliability = report["views"], mean_reliability(report)
-    labelled = segmentation.labels >= 0
-    confidence = float(segmentation.confidence[labelled].mean()) if labelled.any() else None
-    return [
-        ("Objects", f"{found}", f"of {sum(1 for entry in report['classes'] if entry['id'])} classes"),
-        ("Gaussians", f"{total:,}", f"{percent(gaussians['labelled'] / max(total, 1))} labelled"),
-        ("Mean confidence", percent(confidence), "of the labelled ones"),
-        ("Views", f"{views['used']}", f"{sum(views['rejected'].values())} rejected"),
-        ("Mean reliability", percent(None if np.isnan(reliability) else reliability), "of the masks"),
-        ("Time", f"{sum(report['seconds'].values()):.1f} s", f"learner {report['settings']['learner']}"),
-    ]
 
 
 def _hash(content: str) -> str:

@@ -44,26 +44,14 @@ class Triple(NamedTuple):
 
 
 class ViewImages:
-    """What was seen from a view: its photo, else the scene's colours.
-
-    Parameters
-    ----------
-    scene : GaussianScene
-        What is rendered where there is no photo.
-    device : str
-        Where.
-    """
+    """What was seen from a view: its photo, else the colours of the scene, rendered on a device."""
 
     def __init__(self, scene: GaussianScene, device: str = "cpu") -> None:
         self.scene, self.device = scene, device
         self._images: dict[str, np.ndarray] = {}
 
-    def keep(
-        self,
-        view: View,
-        rendered: np.ndarray,  # (H, W, 3) uint8
-    ) -> None:
-        """Keep a rendering that has been made anyway, unless there is a photo."""
+    def keep(self, view: View, rendered: np.ndarray) -> None:
+        """Keep a rendering (H, W, 3) uint8 that has been made anyway, unless there is a photo."""
         if view.image_path is None:
             self._images[view.name] = rendered
 
@@ -73,12 +61,12 @@ class ViewImages:
 
     def of(self, view: View) -> np.ndarray:
         """Give the image, (H, W, 3) uint8 of the camera's size."""
-        if view.name in self._images:
-            return self._images[view.name]
-        photo = _read_photo(view)
-        if photo is not None:
-            return photo
-        return background_image(self.scene, make_operator(self.scene, view.camera, self.device))
+        image = self._images.get(view.name)
+        if image is None:
+            image = _read_photo(view)
+        if image is None:
+            image = background_image(self.scene, make_operator(self.scene, view.camera, self.device))
+        return image
 
 
 def draw_triple(
@@ -124,7 +112,8 @@ def thumbnails(
                 mask, predicted = view.read_labels(), check.prediction()
                 agreed[check.name] = PackedLabels(np.where(mask == predicted, mask, UNKNOWN))
             own = agreed[check.name].unpack() == k
-            score = own.sum() * (CUT if _touches_margin(own) else 1) * (1 if images.at_hand(view) else 0.5)
+            is_cut = own[0].any() or own[-1].any() or own[:, 0].any() or own[:, -1].any()
+            score = own.sum() * (CUT if is_cut else 1) * (1 if images.at_hand(view) else 0.5)
             if best is None or score > best[0]:
                 best = score, view.name
         if best is not None:
@@ -137,28 +126,20 @@ def thumbnails(
     return found
 
 
-def jpeg_uri(
-    image: np.ndarray,  # (H, W, 3) uint8
-    largest: int,
-    quality: int = 85,
-) -> str:
-    """Encode a picture as a data URI, shrunk so that neither side is longer than `largest` px."""
+def jpeg_uri(image: np.ndarray, largest: int) -> str:
+    """Encode a picture (H, W, 3) uint8 as a data URI, shrunk so that neither side is longer than `largest` px."""
     picture = Image.fromarray(image)
     picture.thumbnail((largest, largest), Image.Resampling.BOX)
     buffer = BytesIO()
     # Thin lines in strong colours are what these pictures have to show; JPEG's usual subsampling smears them.
-    picture.save(buffer, "JPEG", quality=quality, subsampling=0)
+    picture.save(buffer, "JPEG", quality=85, subsampling=0)
     return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
 def _candidates(evidence: Evidence, k: int) -> list[ViewCheck]:
     """Find the views with most pixels on which mask and prediction agree that they are of a class."""
-    pixels = []
-    for check in evidence.checks:
-        agreed = int(check.counts[k, check.classes == k].sum())
-        if agreed:
-            pixels.append((agreed, check))
-    return [check for _, check in sorted(pixels, key=lambda pair: -pair[0])[:CANDIDATES]]
+    pixels = [(int(check.counts[k, check.classes == k].sum()), check) for check in evidence.checks]
+    return [check for agreed, check in sorted(pixels, key=lambda pair: -pair[0])[:CANDIDATES] if agreed]
 
 
 def _crop(
@@ -179,26 +160,18 @@ def _crop(
     size = (THUMBNAIL_PX, THUMBNAIL_PX)
     shown = np.asarray(Image.fromarray(image[window]).resize(size, Image.Resampling.BICUBIC))
     inside = np.asarray(Image.fromarray(own[window]).resize(size, Image.Resampling.NEAREST))
-    picture = np.where(
-        inside[..., None], shown, (0.45 * shown + 0.15 * shown.mean(axis=2, keepdims=True)).astype(np.uint8)
-    )
+    dimmed = (0.45 * shown + 0.15 * shown.mean(axis=2, keepdims=True)).astype(np.uint8)
+    picture = np.where(inside[..., None], shown, dimmed)
     # Two pixels wide: the page shows two of them as one.
     picture[outline(inside)] = color
     return picture
 
 
-def _extent(
-    weights: np.ndarray,  # (R,)
-    places: np.ndarray,  # (R,)
-) -> tuple[int, int]:
-    """First and last place, but for the hundredth of the weight at either end."""
+def _extent(weights: np.ndarray, places: np.ndarray) -> tuple[int, int]:
+    """First and last of some places (R,), but for the hundredth of their weights (R,) at either end."""
     share = np.cumsum(weights) / weights.sum()
     first, last = np.searchsorted(share, [0.01, 0.99])
     return int(places[first]), int(places[last]) + 1
-
-
-def _touches_margin(own: np.ndarray) -> bool:
-    return bool(own[0].any() or own[-1].any() or own[:, 0].any() or own[:, -1].any())
 
 
 def _read_photo(view: View) -> np.ndarray | None:

@@ -135,17 +135,16 @@ def up_of(cameras: Iterable[Camera]) -> list[float]:
     return (up / length).tolist() if length > 1e-6 else [0.0, -1.0, 0.0]
 
 
-def _draw(
-    weights: np.ndarray,  # (M,)
-    labels: np.ndarray,  # (M,)
-    most: int,
-) -> np.ndarray:
-    """Draw `most` without replacement, by Efraimidis and Spirakis (2006): the largest of u^(1 / w). Ascending."""
+def _draw(weights: np.ndarray, labels: np.ndarray, most: int) -> np.ndarray:
+    """Draw `most` of M without replacement, by weights (M,), the first few of each label (M,) before all; ascending.
+
+    By Efraimidis and Spirakis (2006): the largest of u^(1 / w).
+    """
     if len(weights) <= most:
         return np.arange(len(weights))
     keys = np.random.default_rng(0).exponential(size=len(weights)) / np.maximum(weights, np.finfo(float).tiny)
     order = np.argsort(keys, kind="stable")
-    # Place of each one among those of its class, the most wanted first: the first few of each class go before all.
+    # Place of each one among those of its class, the most wanted first.
     by_class = order[np.argsort(labels[order], kind="stable")]
     starts = np.flatnonzero(np.diff(labels[by_class], prepend=labels[by_class[0]] - 1))
     place = np.empty(len(weights), np.int64)

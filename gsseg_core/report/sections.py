@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from gsseg_core.export.pictures import palette
-from gsseg_core.report import charts
 from gsseg_core.report.findings import TRUSTED, Evidence, class_ious, largest_confusions, most_confused
 from gsseg_core.report.pictures import PICTURE_PX, THUMBNAIL_PX, ViewImages, draw_triple, jpeg_uri, thumbnails
 from gsseg_core.report.preview import look_from, make_preview, up_of
@@ -41,14 +40,12 @@ class PageInputs:
     ----------
     report : mapping
         What `report.json` holds.
-    scene : GaussianScene
-        What was segmented.
-    segmentation : Segmentation
-        What came out.
+    scene, segmentation
+        What was segmented, and what came out.
     evidence : Evidence
         Masks beside predictions of them.
     images : ViewImages
-        What was seen.
+        What was seen from the views.
     """
 
     report: Mapping[str, Any]
@@ -84,8 +81,7 @@ def preview(run: PageInputs) -> Content:
     shown = make_preview(scene, segmentation)
     # The more classes a view shows, the better it is to begin with.
     ranked = sorted(
-        run.evidence.checks,
-        key=lambda check: (-(check.counts.sum(axis=1) > 0).sum(), -np.nan_to_num(check.reliability)),
+        run.evidence.checks, key=lambda check: (-check.counts.any(axis=1).sum(), -np.nan_to_num(check.reliability))
     )
     cameras = [views[check.name].camera for check in ranked[:LOOKS]]
     poster = draw_triple(ranked[0], views[ranked[0].name], run.images, run.colors).prediction if ranked else None
@@ -121,7 +117,9 @@ def views_shown(run: PageInputs) -> Content | None:
             {
                 "name": check.name,
                 "remark": f"{what}: {percent(check.reliability)} the same",
-                "pictures": list(zip(captions, (jpeg_uri(image, PICTURE_PX) for image in triple), strict=True)),
+                "pictures": [
+                    (caption, jpeg_uri(image, PICTURE_PX)) for caption, image in zip(captions, triple, strict=True)
+                ],
                 "confusions": confusions.get(check.name, []),
             }
         )
@@ -154,29 +152,22 @@ def confusion(run: PageInputs) -> Content | None:
     if counts is None:
         return None
     shown = most_confused(counts, MATRIX_CLASSES)
-    total = np.maximum(counts.sum(axis=1, keepdims=True), 1)
-    shares = (counts / total)[np.ix_(shown, shown)]
+    of_class = counts.sum(axis=1, keepdims=True)
+    shares = (counts / np.maximum(of_class, 1))[np.ix_(shown, shown)]
     shares[shares < 0.002] = 0
-    titles = [
-        [f"{names[k]} called {names[y]}: {percent(float(shares[i, j]))} of its pixels" for j, y in enumerate(shown)]
-        for i, k in enumerate(shown)
-    ]
-    everything = max(int(counts.sum()), 1)
+    total = max(int(counts.sum()), 1)
     return {
-        "matrix": charts.heatmap(shares, [names[k] for k in shown], titles),
-        "most": len(shown) if len(shown) < (counts.sum(axis=1) > 0).sum() else None,
-        "pairs": [
-            (names[k], names[y], pixels, pixels / everything) for k, y, pixels in largest_confusions(counts, PAIRS)
-        ],
+        "names": [names[k] for k in shown],
+        "shares": shares.tolist(),
+        "most": len(shown) if len(shown) < (of_class > 0).sum() else None,
+        "pairs": [(names[k], names[y], pixels, pixels / total) for k, y, pixels in largest_confusions(counts, PAIRS)],
     }
 
 
 def reliability(run: PageInputs) -> Content | None:
     """How far each view's mask can be trusted, the worst first."""
     views = run.reliability
-    titles = [f"{view['name']}: {percent(view['reliability'])}" for view in views]
-    chart = charts.columns([view["reliability"] for view in views], titles, TRUSTED)
-    return {"chart": chart, "worst": views[:WORST], "others": views[WORST:], "trusted": TRUSTED} if views else None
+    return {"worst": views[:WORST], "others": views[WORST:], "trusted": TRUSTED} if views else None
 
 
 def confidence(run: PageInputs) -> Content:
@@ -184,30 +175,26 @@ def confidence(run: PageInputs) -> Content:
     segmentation = run.segmentation
     labelled = segmentation.labels >= 0
     sure, clustered = segmentation.confidence[labelled], segmentation.clustered[labelled]
-    series = [
-        (name, np.histogram(sure[part], BINS, (0, 1))[0])
-        for name, part in (("learnt", ~clustered), ("from their neighbours", clustered))
-    ]
+    counts = [np.histogram(sure[part], BINS, (0, 1))[0] for part in (~clustered, clustered)]
     return {
         "temperature": segmentation.temperature,
-        "chart": charts.histogram(series, 0.0, 1.0),
-        "keys": [name for name, _ in series],
+        "series": ["learnt", "from their neighbours"],
+        "bins": np.transpose(counts).tolist(),
     }
 
 
 def time(run: PageInputs) -> Content:
     """Seconds per stage."""
-    seconds = run.report["seconds"]
-    return {"chart": charts.stacked_bar(list(seconds.items())), "seconds": seconds, "total": sum(seconds.values())}
+    return {"seconds": run.report["seconds"], "total": sum(run.report["seconds"].values())}
 
 
 def settings(run: PageInputs) -> Content:
     """All that one needs to compare two runs, or to repeat one; nested settings as `outer.inner`."""
     report = run.report
-    scene = {"scene digest": report["scene"]["digest"][:16]}
-    found = {f"ids.{name}": report["ids"][name] for name in ("objects", "segments")} if "ids" in report else {}
+    ids = {name: report["ids"][name] for name in ("objects", "segments")} if "ids" in report else {}
+    settings = {"scene digest": report["scene"]["digest"][:16], **report["settings"]}
     return {
-        "settings": list(_flat({**scene, **report["settings"], **found})),
+        "settings": [*_flat(settings), *_flat({"ids": ids})],
         "versions": list(_flat(report["versions"])),
     }
 

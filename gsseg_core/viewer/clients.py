@@ -14,7 +14,7 @@ import viser.transforms as vtf
 
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.viewer.picture import Picture
-from gsseg_core.viewer.server_frames import CameraOf, Frames
+from gsseg_core.viewer.server_frames import Frames
 from gsseg_core.viewer.splats import SplatNodes, Splats
 
 AUTO, BROWSER, SERVER = "auto", "browser", "server"
@@ -30,82 +30,37 @@ _TRIAL, _TRIAL_SIZE = 2500, 0.1
 _FAINT = 2
 """Opacity of the trial, of 255: it is drawn like all others, and hardly seen."""
 
-# A browser may leave while its picture is made. That is no news.
-warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
-
 _PATIENCE = 60.0
 _SMALL = (48, 64)
 
+# A browser may leave while its picture is made. That is no news.
+warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
+
 
 class ClientRenderer:
-    """Renders for one browser: by the splats that it draws itself, or by images that are drawn here.
+    """Renders for one browser, which draws by itself, gets images, or both.
 
-    Parameters
+    Attributes
     ----------
-    client : viser.ClientHandle
-        The browser.
-    splats : Splats
-        What it may draw.
-    camera_of : CameraOf
-        Where it looks from.
-    drawn_by : str
-        One of `DRAWN_BY`.
-    device : str
-        Where images are drawn.
+    nodes : SplatNodes or None
+        What it draws by itself.
+    frames : Frames or None
+        The images that it gets.
     """
 
-    def __init__(
-        self, client: viser.ClientHandle, splats: Splats, camera_of: CameraOf, drawn_by: str, device: str
-    ) -> None:
-        self._client, self._splats = client, splats
-        self._lock = threading.Lock()
-        self._picture: Picture | None = None
-        self._nodes = SplatNodes(client, splats) if drawn_by == BROWSER else None
-        self._frames = Frames(client, camera_of, device) if drawn_by != BROWSER else None
-
-    @property
-    def bytes_sent(self) -> int:
-        """Bytes of Gaussians sent, before compression."""
-        return self._nodes.bytes_sent if self._nodes else 0
-
-    @property
-    def draws(self) -> bool:
-        """Whether the browser draws by itself."""
-        return self._nodes is not None
+    def __init__(self, nodes: SplatNodes | None, frames: Frames | None) -> None:
+        self.nodes, self.frames = nodes, frames
 
     def show(self, picture: Picture) -> None:
         """Show a picture from now on."""
-        with self._lock:
-            self._picture = picture
-            if self._nodes:
-                self._nodes.show(picture.nodes)
-            if self._frames:
-                self._frames.show(picture)
-
-    def send_splats(self) -> None:
-        """Have the browser draw by itself, before the images that it gets."""
-        with self._lock:
-            self._nodes = SplatNodes(self._client, self._splats)
-            if self._picture:
-                self._nodes.show(self._picture.nodes)
-
-    def take_splats_back(self) -> None:
-        """Leave the browser with images alone."""
-        with self._lock:
-            if self._nodes:
-                self._nodes.show({})
-            self._nodes = None
-
-    def stop_images(self) -> None:
-        """Leave the browser with what it draws by itself."""
-        self.close()
-        self._client.scene.set_background_image(None)
-        self._client.flush()
+        if self.nodes:
+            self.nodes.show(picture.nodes)
+        if self.frames:
+            self.frames.show(picture)
 
     def close(self) -> None:
         """Send no more images."""
-        with self._lock:
-            frames, self._frames = self._frames, None
+        frames, self.frames = self.frames, None
         if frames:
             frames.close()
 
@@ -119,59 +74,42 @@ class ClientRenderers:
         To which they connect.
     scene : GaussianScene
         What they look at.
-    camera_of : CameraOf
-        Where one looks from.
     drawn_by : str
         One of `DRAWN_BY`. In `AUTO`, a browser gets images until it has shown that it draws fast.
     device : str
         Where images are drawn.
+
+    Attributes
+    ----------
+    by_client : dict of int to ClientRenderer
+        The browsers of now, by viser's id.
     """
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        scene: GaussianScene,
-        camera_of: CameraOf,
-        drawn_by: str = AUTO,
-        device: str = "cpu",
-    ) -> None:
-        self._splats, self._camera_of, self._drawn_by, self._device = Splats(scene), camera_of, drawn_by, device
+    def __init__(self, server: viser.ViserServer, scene: GaussianScene, drawn_by: str, device: str) -> None:
+        self._splats, self._drawn_by, self._device = Splats(scene), drawn_by, device
         self._lock = threading.Lock()
-        self._renderers: dict[int, ClientRenderer] = {}
         self._picture: Picture | None = None
+        self.by_client: dict[int, ClientRenderer] = {}
         server.on_client_connect(self._join)
         server.on_client_disconnect(self._leave)
-
-    @property
-    def bytes_sent(self) -> int:
-        """Bytes of Gaussians sent to the browsers of now, before compression."""
-        return sum(renderer.bytes_sent for renderer in self._all())
-
-    @property
-    def drawing(self) -> int:
-        """Count the browsers that draw by themselves."""
-        return sum(renderer.draws for renderer in self._all())
 
     def show(self, picture: Picture) -> None:
         """Show a picture from now on."""
         with self._lock:
             self._picture = picture
-            for renderer in self._renderers.values():
+            for renderer in self.by_client.values():
                 renderer.show(picture)
 
     def close(self) -> None:
         """Send nothing more."""
-        for renderer in self._all():
+        for renderer in list(self.by_client.values()):
             renderer.close()
 
-    def _all(self) -> list[ClientRenderer]:
-        with self._lock:
-            return list(self._renderers.values())
-
     def _join(self, client: viser.ClientHandle) -> None:
-        renderer = ClientRenderer(client, self._splats, self._camera_of, self._drawn_by, self._device)
+        nodes = SplatNodes(client, self._splats) if self._drawn_by == BROWSER else None
+        renderer = ClientRenderer(nodes, Frames(client, self._device) if nodes is None else None)
         with self._lock:
-            self._renderers[client.client_id] = renderer
+            self.by_client[client.client_id] = renderer
             if self._picture:
                 renderer.show(self._picture)
         if self._drawn_by == AUTO:
@@ -182,19 +120,29 @@ class ClientRenderers:
 
     def _leave(self, client: viser.ClientHandle) -> None:
         with self._lock:
-            renderer = self._renderers.pop(client.client_id, None)
+            renderer = self.by_client.pop(client.client_id, None)
         if renderer:
             renderer.close()
 
-    @staticmethod
-    def _decide(client: viser.ClientHandle, renderer: ClientRenderer) -> None:
+    def _decide(self, client: viser.ClientHandle, renderer: ClientRenderer) -> None:
+        """Try how fast a browser draws, first a few splats and then all, and have it draw or tell it why not."""
         alone = time_of_picture(client)
         with trial(client):
             slow = time_of_picture(client) - alone > SLOW
         if not slow:
-            renderer.send_splats()
+            with self._lock:
+                renderer.nodes = nodes = SplatNodes(client, self._splats)
+                if self._picture:
+                    nodes.show(self._picture.nodes)
             slow = time_of_picture(client) - alone > SLOW
-            renderer.take_splats_back() if slow else renderer.stop_images()
+            if slow:
+                with self._lock:
+                    nodes.show({})
+                    renderer.nodes = None
+            else:
+                renderer.close()
+                client.scene.set_background_image(None)
+                client.flush()
         if slow:
             client.add_notification(
                 "The server draws",

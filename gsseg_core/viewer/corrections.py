@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy import ndimage
@@ -22,13 +23,7 @@ TRUST = 4.0
 """A correction that sees the whole of a Gaussian weighs as much as so many times all that was learnt before."""
 
 
-def disc(
-    camera: Camera,
-    column: float,
-    row: float,
-    radius: float,
-    label: int,
-) -> View:
+def disc(camera: Camera, column: float, row: float, radius: float, label: int) -> View:
     """Draw a disc: a view that says `label` there, and nothing anywhere else.
 
     Parameters
@@ -43,7 +38,7 @@ def disc(
     Raises
     ------
     SettingsError
-        The middle is not in the picture.
+        The middle is not in the picture, or the label is no class.
     """
     _check_inside(camera, column, row)
     x, y = np.arange(camera.width) + 0.5, np.arange(camera.height)[:, None] + 0.5
@@ -52,12 +47,7 @@ def disc(
     return _view(camera, drawn, label)
 
 
-def box(
-    camera: Camera,
-    corner: tuple[float, float],
-    opposite: tuple[float, float],
-    label: int,
-) -> View:
+def box(camera: Camera, corner: Sequence[float], opposite: Sequence[float], label: int) -> View:
     """Draw a rectangle between two corners, column and row in pixels; see `disc`."""
     (left, right), (top, bottom) = (sorted(pair) for pair in zip(corner, opposite, strict=True))
     x, y = np.arange(camera.width) + 0.5, np.arange(camera.height)[:, None] + 0.5
@@ -118,11 +108,8 @@ class Corrections:
         NoUsableViewsError
             Nothing was drawn on any Gaussian.
         """
-        camera = view.camera
-        name = f"correction_{len(self.views):04d}"
-        own = View.from_arrays(
-            Camera(name, camera.width, camera.height, camera.K, camera.world_to_camera), view.read_labels()
-        )
+        camera = replace(view.camera, name=f"correction_{len(self.views):04d}")
+        own = View.from_arrays(camera, view.read_labels())
         rejection = self._session.fuse(own)
         if rejection is not None:
             raise NoUsableViewsError(f"correction: {rejection.message}; expected something drawn on the scene")
@@ -146,23 +133,18 @@ class Corrections:
         Parameters
         ----------
         before : Labelling
-            Of the same scene.
+            Of the same scene; where no correction has seen a Gaussian, it stays.
         names : mapping from id to name, optional
             Of classes that only the corrections have.
-
-        Returns
-        -------
-        Labelling
-            Where no correction has seen a Gaussian, it is as before.
         """
         if not self.views:
             return before
-        codes = self._session.codes()
-        num_classes = max(codes.shape[1], before.probabilities.shape[1])
-        probabilities = _widened(before.probabilities, num_classes)
+        drawn = self._session.codes()
+        num_classes = max(drawn.shape[1], before.probabilities.shape[1])
+        probabilities, drawn = _widened(before.probabilities, num_classes), _widened(drawn, num_classes)
         weight: np.ndarray = TRUST * np.stack(self._seen).sum(axis=0)
         touched = np.flatnonzero(weight > 0)
-        mixed = probabilities[touched] + weight[touched, None] * _widened(codes[touched], num_classes)
+        mixed = probabilities[touched] + weight[touched, None] * drawn[touched]
         mixed /= mixed.sum(axis=1, keepdims=True)
         probabilities[touched] = mixed
         labels = before.labels.copy()
@@ -181,8 +163,7 @@ def share_seen(scene: GaussianScene, view: View, device: str = "cpu") -> np.ndar
     seen = operator.adjoint(drawn)[:, 0]
     full = np.zeros(len(scene), np.float32)
     full[operator.ids] = operator.footprints()
-    share: np.ndarray = np.divide(seen, full, out=np.zeros_like(seen), where=full > 0)
-    share = np.minimum(share, 1.0)
+    share: np.ndarray = np.minimum(np.divide(seen, full, out=np.zeros_like(seen), where=full > 0), 1)
     return share
 
 
@@ -200,5 +181,5 @@ def _check_inside(camera: Camera, column: float, row: float) -> None:
         )
 
 
-def _widened(codes: np.ndarray, num_classes: int) -> np.ndarray:
-    return np.pad(codes, ((0, 0), (0, num_classes - codes.shape[1])))
+def _widened(probabilities: np.ndarray, num_classes: int) -> np.ndarray:
+    return np.pad(probabilities, ((0, 0), (0, num_classes - probabilities.shape[1])))

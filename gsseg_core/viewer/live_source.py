@@ -6,6 +6,7 @@ with the scene, and returns a `LiveSource`. `gsseg view --ros` looks for the nam
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib.metadata import entry_points
 from typing import NamedTuple, Protocol
 
@@ -17,15 +18,7 @@ GROUP = "gsseg.live_sources"
 
 
 class LiveUpdate(NamedTuple):
-    """Labels and class probabilities of a source at one time.
-
-    Attributes
-    ----------
-    labelling : Labelling
-        Of the scene that the source was made for.
-    num_views : int
-        Views that it comes from.
-    """
+    """Labels and class probabilities of a source at one time, and the number of views that they come from."""
 
     labelling: Labelling
     num_views: int
@@ -35,12 +28,7 @@ class LiveSource(Protocol):
     """Hands out class probabilities as they change."""
 
     def wait(self, timeout: float) -> LiveUpdate | None:
-        """Wait for the next class probabilities, `timeout` seconds at most.
-
-        Returns
-        -------
-        LiveUpdate or None
-            None where nothing has changed.
+        """Wait for the next class probabilities, `timeout` seconds at most; return None where nothing has changed.
 
         Raises
         ------
@@ -62,15 +50,14 @@ def open_source(name: str, scene: GaussianScene) -> LiveSource:
     GssegError
         It cannot be used with this scene.
     """
-    found = entry_points(group=GROUP, name=name)
-    if not found:
+    found = next(iter(entry_points(group=GROUP, name=name)), None)
+    if found is None:
         raise SettingsError(f"live source {name!r}: none is installed; expected an entry point in the group {GROUP}")
     try:
-        make = next(iter(found)).load()
+        make: Callable[[GaussianScene], LiveSource] = found.load()
     except ModuleNotFoundError as missing:
         raise SettingsError(
             f"live source {name!r}: the Python package {missing.name!r} is missing; expected ROS 2 Jazzy, from apt "
             "with its setup.sh sourced, or as wheels: pip install ./msg_defs '.[ros]'"
         ) from missing
-    source: LiveSource = make(scene)
-    return source
+    return make(scene)

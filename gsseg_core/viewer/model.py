@@ -125,15 +125,15 @@ class ViewModel:
 
     @property
     def labels_in_use(self) -> list[int]:
-        """Labels of the list, classes first, in ascending order; those that were removed from it are not there."""
-        counts = self._counts()
-        listed = [k for k in self.labelling.class_names if counts.get(k)] + [k for k in NO_CLASS if counts.get(k)]
-        return [k for k in listed if k not in self.removed]
+        """Labels of the list of classes."""
+        return [row.label for row in self.rows()]
 
     def rows(self) -> list[ClassRow]:
-        """List the classes that have Gaussians, and what is of no class."""
-        counts = self._counts()
-        return [ClassRow(k, self.name(k), self.color(k), counts[k], k not in self.hidden) for k in self.labels_in_use]
+        """List the classes that have Gaussians, then what is of no class, without those that were removed."""
+        counts = np.bincount(self.labelling.labels + len(NO_CLASS), minlength=len(NO_CLASS)).tolist()
+        sizes = {label: count for label, count in enumerate(counts, start=-len(NO_CLASS)) if count}
+        listed = [k for k in (*self.labelling.class_names, *NO_CLASS) if k in sizes and k not in self.removed]
+        return [ClassRow(k, self.name(k), self.color(k), sizes[k], k not in self.hidden) for k in listed]
 
     def name(self, label: int) -> str:
         """Name of a label, also of those that are no class."""
@@ -141,19 +141,11 @@ class ViewModel:
 
     def color(self, label: int) -> tuple[int, int, int]:
         """Colour of a label."""
-        if label < 0:
-            return NOTHING_KNOWN
-        red, green, blue = palette(max(self.labelling.class_names, default=0) + 1)[label].tolist()
+        red, green, blue = self._palette[label].tolist()
         return red, green, blue
 
     def toggle(self, label: int) -> None:
-        """Switch a class off, or on again.
-
-        Raises
-        ------
-        UnknownLabelError
-            It is not in the list.
-        """
+        """Switch a class off, or on again; `UnknownLabelError` where it is not in the list, here and below."""
         self.hidden ^= {self._listed(label)}
 
     def isolate(self, label: int) -> None:
@@ -196,19 +188,19 @@ class ViewModel:
         if self.mode == BY_RELIABILITY:
             nothing = np.full(len(self.scene), np.nan, np.float32)
             return ramp(nothing if self.reliability is None else self.reliability)
-        table = np.array([self.color(k) for k in range(self.labelling.probabilities.shape[1])] + [NOTHING_KNOWN] * 2)
-        by_class: np.ndarray = table.astype(np.uint8)[self.labelling.labels]
+        by_class: np.ndarray = self._palette[self.labelling.labels]
         return by_class
+
+    @property
+    def _palette(self) -> np.ndarray:
+        """Colours by label, (K + 2, 3) uint8: labels -1 and -2, which are no class, are its last two."""
+        colors = palette(max(self.labelling.class_names, default=0) + 1)
+        return np.concatenate([colors, np.array([NOTHING_KNOWN] * len(NO_CLASS), np.uint8)])
 
     @cached_property
     def _true_colors(self) -> np.ndarray:
         colors: np.ndarray = np.rint(self.scene.colors() * 255).astype(np.uint8)
         return colors
-
-    def _counts(self) -> dict[int, int]:
-        labels = self.labelling.labels
-        counts = np.bincount(labels + len(NO_CLASS), minlength=len(NO_CLASS))
-        return {i - len(NO_CLASS): n for i, n in enumerate(counts.tolist()) if n}
 
     def _listed(self, label: int) -> int:
         if label not in self.labels_in_use:
@@ -216,10 +208,8 @@ class ViewModel:
         return label
 
 
-def completed(
-    probabilities: np.ndarray,  # (N, K)
-) -> np.ndarray:
-    """Scale rows up to a sum of 1, (N, K) float32: what is missing is divided among the classes that have 0."""
+def completed(probabilities: np.ndarray) -> np.ndarray:
+    """Fill rows (N, K) up to a sum of 1, float32: what is missing is divided among the classes that have 0."""
     rest = 1 - probabilities.sum(axis=1, dtype=np.float64)
     known = probabilities.max(axis=1) > 0
     missing = (probabilities == 0) & (known & (rest > SHARES_TOLERANCE))[:, None]
@@ -228,10 +218,8 @@ def completed(
     return out
 
 
-def ramp(
-    values: np.ndarray,  # (N,)
-) -> np.ndarray:
-    """Colours (N, 3) uint8 from bad (0, dark red) to good (1, dark blue); grey where the value is NaN."""
+def ramp(values: np.ndarray) -> np.ndarray:
+    """Colours (N, 3) uint8 of values (N,), from bad (0, dark red) to good (1, dark blue); grey where one is NaN."""
     position = np.clip(np.nan_to_num(values), 0, 1) * (len(_RAMP) - 1)
     first = np.minimum(position.astype(np.int64), len(_RAMP) - 2)
     part = (position - first)[:, None]
@@ -241,12 +229,7 @@ def ramp(
 
 
 def read_reliability(report: Path) -> dict[str, float]:
-    """Read from the `report.json` of a run how far each view can be trusted.
-
-    Returns
-    -------
-    dict of str to float
-        By name of the view, in [0, 1], without those of which nothing is known; empty where the run did not find out.
+    """Read from the `report.json` of a run how far each view can be trusted, in [0, 1], by name; empty without one.
 
     Raises
     ------

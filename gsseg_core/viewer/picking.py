@@ -13,20 +13,11 @@ from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
-_FOCAL = 1000.0
 _WINDOW = 3
 
 
 class Picked(NamedTuple):
-    """The Gaussian that a ray hit.
-
-    Attributes
-    ----------
-    gaussian : int
-        The one that contributes most to the ray's colour, as an index in the scene.
-    weight : float
-        How much: alpha times the transmittance in front, in (0, 0.99].
-    """
+    """The Gaussian that a ray hit, as an index, and its weight in the ray's colour: alpha times transmittance."""
 
     gaussian: int
     weight: float
@@ -38,7 +29,7 @@ def pick(
     direction: np.ndarray,  # (3,)
     shown: np.ndarray | None = None,  # (N,) bool
     *,
-    focal: float = _FOCAL,
+    focal: float = 1000.0,
     device: str = "cpu",
 ) -> Picked | None:
     """Follow a ray into the scene, to the Gaussian that makes most of what is seen there.
@@ -80,31 +71,8 @@ def pick(
     return Picked(int(weights.gaussians[best]), float(weights.weights[best]))
 
 
-def scene_camera(
-    name: str,
-    width: int,
-    height: int,
-    vertical_fov: float,
-    camera_to_world: np.ndarray,  # (4, 4)
-) -> Camera:
-    """Make a camera from what a viewer says of its own; the field of view in radians, OpenCV axes."""
-    focal = height / (2 * np.tan(vertical_fov / 2))
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return Camera(name, width, height, K, np.linalg.inv(camera_to_world))
-
-
 class ViewVote(NamedTuple):
-    """Vote of one view for one label of one Gaussian.
-
-    Attributes
-    ----------
-    view : str
-        Name of the view.
-    label : int
-        The label under which it sees the Gaussian.
-    weight : float
-        Sum of the Gaussian's weights over the pixels of that label, in px.
-    """
+    """Vote of the view of a name for a label: the sum of a Gaussian's weights over the pixels of that label, in px."""
 
     view: str
     label: int
@@ -115,15 +83,7 @@ class ViewVotes:
     """Votes of every view for the labels of every Gaussian, not added up over the views.
 
     Takes 12 bytes per (Gaussian, label) pair of a view, and as long to make as a pass of a learner over all views.
-
-    Parameters
-    ----------
-    scene : GaussianScene
-        N Gaussians.
-    views : sequence of View
-        Those without a mask do not vote.
-    progress : callable, optional
-        Told of every view.
+    Views without a mask do not vote.
 
     Raises
     ------
@@ -147,10 +107,6 @@ class ViewVotes:
                 self._votes[view.name] = ids[order], labels[order], observation.votes()[order]
         progress("collect the votes of each view", len(views), len(views))
 
-    def __len__(self) -> int:
-        """Count the views with a mask."""
-        return len(self._votes)
-
     def of(self, gaussian: int) -> list[ViewVote]:
         """List the votes for the labels of one Gaussian, the largest first."""
         found = []
@@ -160,7 +116,7 @@ class ViewVotes:
         return sorted(found, key=lambda vote: -vote.weight)
 
     def mean_reliability(self, reliability: Mapping[str, float]) -> np.ndarray:
-        """Mean reliability of the views that saw each Gaussian, weighed by how much of it each saw.
+        """Average the reliability of the views that saw each Gaussian, weighed by how much of it each saw.
 
         Parameters
         ----------
@@ -170,7 +126,7 @@ class ViewVotes:
         Returns
         -------
         (N,) float32
-            NaN where no such view saw the Gaussian.
+            In [0, 1]; NaN where no such view saw the Gaussian.
         """
         total, weight = np.zeros(self._num_gaussians), np.zeros(self._num_gaussians)
         for name, (ids, _, votes) in self._votes.items():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
 from contextlib import suppress
 
 import numpy as np
@@ -14,8 +13,8 @@ from gsseg_core.errors import GssegError
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.camera import Camera
-from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.viewer.picture import Picture
+from gsseg_core.viewer.viewpoint import camera_of
 
 FINE_ROWS, QUICK_ROWS = 720, 320
 """Most rows of an image once nothing changes any more, and until then."""
@@ -24,9 +23,6 @@ RESTS = 0.2
 """Seconds without a change after which an image is drawn finely."""
 
 _QUALITY = 90
-
-CameraOf = Callable[[viser.ClientHandle, int], Camera]
-"""Makes the camera of what a browser looks at, of at most so many rows."""
 
 
 class Frames:
@@ -39,17 +35,15 @@ class Frames:
     ----------
     client : viser.ClientHandle
         The browser.
-    camera_of : CameraOf
-        Where it looks from.
     device : str
         Where images are drawn.
     """
 
-    def __init__(self, client: viser.ClientHandle, camera_of: CameraOf, device: str = "cpu") -> None:
-        self._client, self._camera_of, self._device = client, camera_of, device
+    def __init__(self, client: viser.ClientHandle, device: str = "cpu") -> None:
+        self._client, self._device = client, device
         self._picture: Picture | None = None
         self._changed = -RESTS
-        self._known: dict[int, ViewOperator] = {}
+        self._operators: dict[int, ViewOperator] = {}
         self._stale, self._closing = threading.Event(), threading.Event()
         client.camera.on_update(lambda camera: self._change())
         self._thread = threading.Thread(target=self._keep_drawing, name="frames", daemon=True)
@@ -83,19 +77,13 @@ class Frames:
                 self._stale.set()
 
     def _send(self, picture: Picture, rows: int) -> None:
-        image = picture.draw(self._operator(picture.scene, rows))
-        if self._closing.is_set():
-            return
-        self._client.scene.set_background_image(image, format="jpeg", jpeg_quality=_QUALITY)
-        self._client.flush()
-
-    def _operator(self, scene: GaussianScene, rows: int) -> ViewOperator:
-        """Make the view operator for so many rows; while the camera rests, reuse the last one."""
-        camera = self._camera_of(self._client, rows)
-        known = self._known.get(rows)
-        if known is None or not _alike(known.camera, camera):
-            known = self._known[rows] = make_operator(scene, camera, self._device)
-        return known
+        camera, operator = camera_of(self._client, rows), self._operators.get(rows)
+        if operator is None or not _alike(operator.camera, camera):  # While the camera rests, the last one will do.
+            operator = self._operators[rows] = make_operator(picture.scene, camera, self._device)
+        image = picture.draw(operator)
+        if not self._closing.is_set():
+            self._client.scene.set_background_image(image, format="jpeg", jpeg_quality=_QUALITY)
+            self._client.flush()
 
 
 def _alike(a: Camera, b: Camera) -> bool:

@@ -9,7 +9,7 @@ import viser
 
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.quaternions import covariances
-from gsseg_core.viewer.splat_chunks import BYTES_PER_GAUSSIAN, Key, Node, after, changes
+from gsseg_core.viewer.picture import Key, Node
 
 _LARGEST = 200.0
 """The largest standard deviation is sent as this many units: its square fits a 16-bit float, and so do small ones."""
@@ -19,17 +19,7 @@ class Splats:
     """Centers and covariances of a scene in the units that browsers get, computed once for all of them.
 
     viser sends covariances as 16-bit floats, which know nothing below 6e-8: a millimetre squared, in metres, is hardly
-    there. So the scene is sent in units of its own, and scaled back by each node.
-
-    Parameters
-    ----------
-    scene : GaussianScene
-        N Gaussians.
-
-    Attributes
-    ----------
-    unit : float
-        In units of the scene.
+    there. So the scene is sent in a `unit` of its own (in units of the scene), and scaled back by each node.
     """
 
     def __init__(self, scene: GaussianScene) -> None:
@@ -48,50 +38,42 @@ class Splats:
 
 
 class SplatNodes:
-    """Sends the nodes of a scene to one browser, and remembers what it has.
-
-    Parameters
-    ----------
-    client : viser.ClientHandle
-        The browser.
-    splats : Splats
-        N Gaussians.
-
-    Attributes
-    ----------
-    bytes_sent : int
-        Of Gaussians, before compression, since the start.
-    """
+    """Sends the nodes of a scene to one browser, and remembers what it has."""
 
     def __init__(self, client: viser.ClientHandle, splats: Splats) -> None:
         self._client, self._splats = client, splats
-        self._handles: dict[Key, viser.GaussianSplatHandle] = {}
-        self._sent: dict[Key, Node] = {}
-        self.bytes_sent = 0
+        self._sent: dict[Key, tuple[viser.GaussianSplatHandle, Node]] = {}
 
     def show(self, wanted: dict[Key, Node]) -> None:
-        """Show these nodes; what the browser has already is not sent again."""
-        todo = changes(self._sent, wanted)
+        """Show these nodes. What the browser has already is not sent again, and what nobody sees not before it is."""
         with self._client.atomic():
-            for key in todo.drop:
-                self._handles.pop(key).remove()
-            for key in todo.put:
-                self._put(key, wanted[key])
-            for key, visible in todo.switch.items():
-                self._handles[key].visible = visible
+            for key in self._sent.keys() - wanted.keys():
+                self._sent.pop(key)[0].remove()
+            for key, node in wanted.items():
+                handle, there = self._sent.get(key, (None, None))
+                if node.visible and (there is None or not _alike(there, node)):
+                    handle = self._send(handle, key, node)
+                elif handle is None or there is None:
+                    continue
+                else:
+                    node = there._replace(visible=node.visible)
+                handle.visible = node.visible
+                self._sent[key] = handle, node
         self._client.flush()
-        self._sent = after(self._sent, wanted, todo)
 
-    def _put(self, key: Key, node: Node) -> None:
+    def _send(self, handle: viser.GaussianSplatHandle | None, key: Key, node: Node) -> viser.GaussianSplatHandle:
         gaussians = {
             "centers": self._splats.centers[node.members],
             "covariances": self._splats.covariances[node.members],
             "rgbs": node.rgba[:, :3],
             "opacities": node.rgba[:, 3:],
         }
-        self.bytes_sent += BYTES_PER_GAUSSIAN * len(node.members)
-        if key in self._handles:
-            self._handles[key].set_gaussians(**gaussians)
-        else:
+        if handle is None:
             name = f"/splats/{key[0]}/{key[1]}"
-            self._handles[key] = self._client.scene.add_gaussian_splats(name, **gaussians, scale=self._splats.unit)
+            return self._client.scene.add_gaussian_splats(name, **gaussians, scale=self._splats.unit)
+        handle.set_gaussians(**gaussians)
+        return handle
+
+
+def _alike(a: Node, b: Node) -> bool:
+    return np.array_equal(a.members, b.members) and np.array_equal(a.rgba, b.rgba)

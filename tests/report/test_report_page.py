@@ -88,6 +88,8 @@ def test_page_is_small_and_tells_what_report_json_tells(out: Path, outline: Outl
         assert f"{entry['gaussians']:,}" in said and f"{100 * entry['mean_confidence']:.1f} %" in said
     for view in report["views"]["reliability"]:
         assert view["name"] in said and f"{100 * view['reliability']:.1f} %" in said
+    known = [view["reliability"] for view in report["views"]["reliability"] if view["reliability"] is not None]
+    assert f"{100 * sum(known) / len(known):.1f} %" in said
     for name, value in [*report["versions"].items(), ("refine.beta", 0.65), ("learner", "em")]:
         assert name in said and str(value) in said
     for stage in ("load", "observe", "learn", "check views", "refine", "export", "pictures"):

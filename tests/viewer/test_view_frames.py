@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,12 +13,13 @@ from small_scenes import NAMES, balls_on_a_table, clean_views
 
 pytest.importorskip("viser")
 
+import viser.transforms as vtf
+
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.scene.camera import Camera
 from gsseg_core.viewer.model import Labelling, ViewModel
-from gsseg_core.viewer.picture import Picture
+from gsseg_core.viewer.picture import Picture, cut
 from gsseg_core.viewer.server_frames import FINE_ROWS, QUICK_ROWS, RESTS, Frames
-from gsseg_core.viewer.splat_chunks import cut
+from gsseg_core.viewer.viewpoint import camera_of
 
 SCENE, TRUTH = balls_on_a_table()
 MODEL = ViewModel(SCENE, Labelling(TRUTH.astype(np.int32), np.eye(4, dtype=np.float32)[TRUTH], dict(NAMES)))
@@ -30,13 +30,13 @@ def picture(shown: np.ndarray) -> Picture:
     return Picture(SCENE, cut(MODEL.labelling.labels, MODEL.confidence), shown, MODEL.colors())
 
 
-def camera_of(_: object, rows: int) -> Camera:
-    scale = rows / CAMERA.height
-    return replace(CAMERA, width=round(CAMERA.width * scale), height=rows, K=CAMERA.K * [[scale], [scale], [1]])
-
-
 class Client:
-    """A browser that keeps the images which it gets, and says where it looks when it is told to."""
+    """A browser that looks from `CAMERA`, and keeps the images that it gets; it moves when it is told to."""
+
+    aspect, image_height = CAMERA.width / CAMERA.height, 1080
+    fov = float(2 * np.arctan(CAMERA.height / 2 / CAMERA.fy))
+    wxyz = vtf.SO3.from_matrix(CAMERA.world_to_camera[:3, :3].T).wxyz
+    position = CAMERA.center
 
     def __init__(self) -> None:
         self.camera, self.scene = self, self
@@ -71,7 +71,7 @@ def test_an_image_has_the_colours_of_what_is_shown_and_nothing_else() -> None:
 
 def test_a_change_is_answered_by_a_quick_image_and_then_by_a_fine_one() -> None:
     client = Client()
-    with closing(Frames(client, camera_of)) as frames:  # type: ignore[arg-type]
+    with closing(Frames(client)) as frames:  # type: ignore[arg-type]
         frames.show(picture(TRUTH >= 0))
         client.wait_for(2)
         client.move(None)
@@ -82,21 +82,28 @@ def test_a_change_is_answered_by_a_quick_image_and_then_by_a_fine_one() -> None:
 
 
 def test_a_window_that_is_too_small_for_a_picture_gets_one_once_it_is_larger() -> None:
-    client, asked = Client(), []
-
-    def small_at_first(browser: object, rows: int) -> Camera:
-        asked.append(rows)
-        return camera_of(browser, rows if len(asked) > 1 else 0)
-
-    with closing(Frames(client, small_at_first)) as frames:  # type: ignore[arg-type]
+    client = Client()
+    client.image_height = 0
+    with closing(Frames(client)) as frames:  # type: ignore[arg-type]
         frames.show(picture(TRUTH >= 0))
+        time.sleep(2 * RESTS)
+        assert not client.images
+        client.image_height = 1080
+        client.move(None)
         client.wait_for(1)
-    assert asked[:2] == [QUICK_ROWS, FINE_ROWS] and len(client.images[0]) == FINE_ROWS
+
+
+def test_a_camera_of_a_viewer_sees_what_the_viewer_sees() -> None:
+    client = Client()
+    client.image_height = CAMERA.height
+    camera = camera_of(client)  # type: ignore[arg-type]
+    assert np.allclose(camera.K, CAMERA.K) and np.allclose(camera.world_to_camera, CAMERA.world_to_camera)
+    assert camera_of(client, 12).height == 12  # type: ignore[arg-type]
 
 
 def test_after_the_end_no_image_comes() -> None:
     client = Client()
-    frames = Frames(client, camera_of)  # type: ignore[arg-type]
+    frames = Frames(client)  # type: ignore[arg-type]
     frames.show(picture(TRUTH >= 0))
     client.wait_for(1)
     frames.close()

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +27,11 @@ from gsseg_core.viewer.model import (
     ramp,
     read_reliability,
 )
-from gsseg_core.viewer.splat_chunks import BANDS, Node, after, changes, cut, paint
+from gsseg_core.viewer.picture import BANDS, Node, Picture, cut
+
+pytest.importorskip("viser")
+
+from gsseg_core.viewer.splats import SplatNodes, Splats
 
 SCENE, TRUTH = balls_on_a_table()
 N, K = len(SCENE), len(NAMES)
@@ -137,14 +144,50 @@ def test_a_cut_has_every_gaussian_in_exactly_one_node_and_no_more_nodes_than_all
     assert np.array_equal(np.sort(np.concatenate(list(parts.values()))), np.arange(len(labels)))
 
 
-def test_what_the_browser_has_is_what_is_wanted_whatever_happens() -> None:
-    """Random walks over all switches: a browser that obeys `changes` shows what is wanted."""
-    rng = np.random.default_rng(1)
-    shown = model()
-    opacities = np.full(N, 200, np.uint8)
+class Browser:
+    """A browser that keeps the splats which it is sent, for `SplatNodes` of `SCENE`."""
+
+    def __init__(self) -> None:
+        self.scene, self.sent = self, 0
+        self.nodes: dict[str, Any] = {}
+        self.show = SplatNodes(self, SPLATS).show  # type: ignore[arg-type]
+
+    def add_gaussian_splats(self, name: str, *, scale: float, **gaussians: np.ndarray) -> Any:
+        node = SimpleNamespace(visible=True, remove=lambda: self.nodes.pop(name))
+
+        def set_gaussians(
+            centers: np.ndarray, covariances: np.ndarray, rgbs: np.ndarray, opacities: np.ndarray
+        ) -> None:
+            self.sent += len(centers)
+            node.members = [PLACES[center.tobytes()] for center in centers]
+            node.rgba = np.concatenate([rgbs, opacities], axis=1)
+
+        node.set_gaussians = set_gaussians
+        set_gaussians(**gaussians)
+        self.nodes[name] = node
+        return node
+
+    def atomic(self) -> AbstractContextManager[None]:
+        return nullcontext()
+
+    def flush(self) -> None:
+        pass
+
+
+SPLATS = Splats(SCENE)
+PLACES = {center.tobytes(): i for i, center in enumerate(SPLATS.centers)}
+OPACITIES = np.rint(255 * SCENE.opacities).astype(np.uint8)
+
+
+def wanted(shown: ViewModel) -> dict[tuple[int, int], Node]:
     parts = cut(shown.labelling.labels, shown.confidence)
-    browser: dict[tuple[int, int], Node] = {}
-    sent: dict[tuple[int, int], Node] = {}
+    return Picture(SCENE, parts, shown.shown(), shown.colors()).nodes
+
+
+def test_what_the_browser_has_is_what_is_wanted_whatever_happens() -> None:
+    """Random walks over all switches: a browser that gets what is sent shows what is wanted."""
+    rng = np.random.default_rng(1)
+    shown, browser = model(), Browser()
     for _ in range(120):
         label = int(rng.choice(shown.labels_in_use or [0]))
         step = int(rng.integers(8))
@@ -161,41 +204,30 @@ def test_what_the_browser_has_is_what_is_wanted_whatever_happens() -> None:
         elif step == 5:
             shown.show_all()
         elif step == 6:
-            relabelled = np.roll(shown.labelling.labels, 3)
-            shown.relabel(shown.labelling._replace(labels=relabelled))
-            parts = cut(relabelled, shown.confidence)
+            shown.relabel(shown.labelling._replace(labels=np.roll(shown.labelling.labels, 3)))
         else:
             shown.toggle(label)
-        wanted = paint(parts, shown.shown(), shown.colors(), opacities)
-        todo = changes(sent, wanted)
-        for key in todo.drop:
-            browser.pop(key)
-        for key in todo.put:
-            browser[key] = wanted[key]
-        for key, visible in todo.switch.items():
-            browser[key] = browser[key]._replace(visible=visible)
-        sent = after(sent, wanted, todo)
+        browser.show(wanted(shown))
         picture = np.zeros((N, 4), np.uint8)
-        for node in browser.values():
+        for node in browser.nodes.values():
             if node.visible:
                 picture[node.members] = node.rgba
-        expected = np.concatenate([shown.colors(), opacities[:, None]], axis=1)
+        expected = np.concatenate([shown.colors(), OPACITIES[:, None]], axis=1)
         assert np.array_equal(picture[shown.shown()], expected[shown.shown()])
         assert not picture[~shown.shown(), 3].any()
-        assert changes(sent, wanted) == ([], {}, [])
+        sent = browser.sent
+        browser.show(wanted(shown))
+        assert browser.sent == sent
 
 
 def test_a_class_and_a_mark_of_the_slider_are_switched_without_sending_a_gaussian() -> None:
-    shown = model()
-    parts = cut(shown.labelling.labels, shown.confidence)
-    opacities = np.full(N, 200, np.uint8)
-
-    def wanted() -> dict[tuple[int, int], Node]:
-        return paint(parts, shown.shown(), shown.colors(), opacities)
-
-    sent = wanted()
+    shown, browser = model(), Browser()
+    browser.show(wanted(shown))
+    assert browser.sent == N and all(node.visible for node in browser.nodes.values())
     shown.toggle(1)
-    assert not changes(sent, wanted()).put and changes(sent, wanted()).switch
+    browser.show(wanted(shown))
+    assert not all(node.visible for node in browser.nodes.values())
     for mark in range(BANDS + 1):
         shown.min_confidence = mark * (1 / BANDS)
-        assert not changes(sent, wanted()).put
+        browser.show(wanted(shown))
+    assert browser.sent == N

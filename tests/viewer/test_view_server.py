@@ -33,6 +33,7 @@ from gsseg_core.viewer.access import listen
 from gsseg_core.viewer.clients import SERVER
 from gsseg_core.viewer.model import Labelling, ViewModel
 from gsseg_core.viewer.viewer import Viewer
+from gsseg_core.viewer.viewpoint import camera_of
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator
@@ -342,7 +343,7 @@ def test_markup_in_names_and_errors_runs_nothing_and_fetches_nothing(chromium: B
             answer = page.locator("strong").get_by_text(names[label], exact=True)
 
             def answered(label: int = label, answer: Locator = answer) -> bool:
-                camera = viewer.camera_of(client, client.camera.image_height)
+                camera = camera_of(client)
                 ((x, y),), _ = camera.project(SCENE.means[label == TRUTH].mean(axis=0, keepdims=True))
                 page.mouse.click(float(x), float(y))
                 page.wait_for_timeout(100)

@@ -28,9 +28,10 @@ from gsseg_core.viewer.model import BY_RELIABILITY, TRUE_COLOURS, Labelling, Vie
 
 pytest.importorskip("viser")
 
-from gsseg_core.viewer import clients
+from gsseg_core.viewer import clients, splats
 from gsseg_core.viewer.clients import AUTO, BROWSER, SERVER
 from gsseg_core.viewer.viewer import Viewer
+from gsseg_core.viewer.viewpoint import camera_of
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -61,12 +62,12 @@ class Shown:
 
     def looks_like(self, label: int) -> bool:
         """Whether the colour of a class is anywhere in the picture."""
-        off = np.abs(self.picture() - self.viewer.model.color(label)).max(axis=2)
+        off = np.abs(self.picture() - self.viewer.state.model.color(label)).max(axis=2)
         return int((off < 12).sum()) > 40
 
     def pixel_of(self, label: int) -> tuple[float, float]:
         """Where the middle of a class is on the page."""
-        camera = self.viewer.camera_of(self.client, self.client.camera.image_height)
+        camera = camera_of(self.client)
         (uv,), _ = camera.project(SCENE.means[label == TRUTH].mean(axis=0, keepdims=True))
         return float(uv[0]), float(uv[1])
 
@@ -97,9 +98,9 @@ def opened(chromium: Browser, request: pytest.FixtureRequest) -> Iterator[Shown]
 @pytest.fixture
 def shown(opened: Shown) -> Shown:
     """The page with everything switched on."""
-    while opened.viewer.undo():
+    while opened.viewer.state.undo():
         pass
-    opened.viewer.change(lambda model: model.show_all())
+    opened.viewer.state.change(lambda model: model.show_all())
     opened.tab("Classes")
     opened.wait(lambda: opened.looks_like(1) and opened.looks_like(2), "all classes")
     return opened
@@ -112,24 +113,27 @@ def test_the_page_loads_and_splats_are_drawn(shown: Shown) -> None:
         assert shown.page.get_by_role("button", name=f"{NAMES[k]} {int((k == TRUTH).sum())}").count() == 1
 
 
-def test_a_class_toggle_changes_the_picture_and_sends_no_gaussian(shown: Shown) -> None:
-    before, sent = shown.picture(), shown.viewer.renderers.bytes_sent
+def test_a_class_toggle_changes_the_picture_and_sends_no_gaussian(
+    shown: Shown, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, sent = shown.picture(), []
+    monkeypatch.setattr(splats.SplatNodes, "_send", lambda *node: sent.append(node))
     shown.press("red ball 60")
     shown.wait(lambda: not shown.looks_like(1), "the red ball to go")
     assert shown.looks_like(2)
     shown.press("red ball 60")
     shown.wait(lambda: shown.looks_like(1), "the red ball to come back")
     shown.wait(lambda: np.abs(shown.picture() - before).max(axis=2).mean() < 2, "the picture as it was")
-    assert shown.viewer.renderers.bytes_sent == sent
+    assert not sent
 
 
 def test_a_class_is_isolated_and_another_is_removed(shown: Shown) -> None:
-    rows = [row.label for row in shown.viewer.model.rows()]
+    rows = [row.label for row in shown.viewer.state.model.rows()]
     shown.press("only this", rows.index(2))
     shown.wait(lambda: shown.looks_like(2) and not shown.looks_like(1), "the mug alone")
     shown.press("remove", rows.index(2))
     shown.wait(lambda: not shown.looks_like(2), "nothing")
-    assert 2 in shown.viewer.model.removed
+    assert 2 in shown.viewer.state.model.removed
     shown.press("show all")
     shown.wait(lambda: shown.looks_like(1) and shown.looks_like(2), "all classes")
 
@@ -139,21 +143,21 @@ def test_a_slider_acts_at_once(shown: Shown) -> None:
     slider.focus()
     slider.press("End")
     shown.wait(lambda: not shown.looks_like(1) and not shown.looks_like(2), "all to be less sure than that")
-    assert shown.viewer.model.min_confidence == 1.0
+    assert shown.viewer.state.model.min_confidence == 1.0
     slider.press("Home")
     shown.wait(lambda: shown.looks_like(1), "the red ball")
 
 
 def test_true_colours_and_reliability_change_the_picture(shown: Shown) -> None:
-    shown.viewer.change(lambda model: model.isolate(0))
+    shown.viewer.state.change(lambda model: model.isolate(0))
     shown.wait(lambda: not shown.looks_like(1), "the table alone")
     before = shown.picture()
-    shown.viewer.set_mode(BY_RELIABILITY)
-    assert shown.viewer.model.reliability is not None
+    shown.viewer.state.set_mode(BY_RELIABILITY)
+    assert shown.viewer.state.model.reliability is not None
     shown.wait(lambda: np.abs(shown.picture() - before).mean() > 3, "other colours")
-    shown.viewer.set_mode(TRUE_COLOURS)
+    shown.viewer.state.set_mode(TRUE_COLOURS)
     shown.wait(lambda: np.abs(shown.picture() - before).mean() < 3, "the table's own, that of its class")
-    shown.viewer.set_mode("class")
+    shown.viewer.state.set_mode("class")
 
 
 def test_a_click_tells_the_class_its_probabilities_and_the_views_that_voted_for_it(shown: Shown) -> None:
@@ -170,12 +174,12 @@ def test_a_click_tells_the_class_its_probabilities_and_the_views_that_voted_for_
 def test_the_camera_jumps_to_a_view_and_its_mask_lies_over_it(shown: Shown) -> None:
     shown.tab("Views")
     shown.press("next")
-    pose = shown.viewer.views[1].camera.world_to_camera
+    pose = shown.viewer.state.views[1].camera.world_to_camera
     # The browser may tell on the way where it is already, and not yet where it looks.
-    shown.wait(lambda: np.allclose(shown.viewer.camera_of(shown.client).world_to_camera, pose, atol=1e-2), "the camera")
-    shown.viewer.change(lambda model: model.isolate(3))
+    shown.wait(lambda: np.allclose(camera_of(shown.client).world_to_camera, pose, atol=1e-2), "the camera")
+    shown.viewer.state.change(lambda model: model.isolate(3))
     x, y = shown.pixel_of(1)
-    tinted = np.array(shown.viewer.model.color(1))
+    tinted = np.array(shown.viewer.state.model.color(1))
 
     def is_tinted() -> bool:
         pixel = screenshot(shown.page)[int(y), int(x)].astype(int)
@@ -187,14 +191,14 @@ def test_the_camera_jumps_to_a_view_and_its_mask_lies_over_it(shown: Shown) -> N
 
 
 def test_an_export_is_a_valid_ply_of_what_is_shown(shown: Shown, tmp_path: Path) -> None:
-    shown.viewer.change(lambda model: model.isolate(2))
+    shown.viewer.state.change(lambda model: model.isolate(2))
     shown.tab("Save")
     with shown.page.expect_download(timeout=PATIENCE * 1000) as download:
         shown.press("what is shown, as PLY")
     download.value.save_as(tmp_path / "some.ply")
     exported = GaussianScene.load(tmp_path / "some.ply")
     assert exported.vertices.tobytes() == SCENE.subset(TRUTH == 2).vertices.tobytes()
-    shown.viewer.change(lambda model: model.toggle(2))
+    shown.viewer.state.change(lambda model: model.toggle(2))
     shown.press("what is shown, as PLY")
     shown.says("none of its 626 Gaussians is in the subset")
 
@@ -208,7 +212,7 @@ def test_a_shift_click_corrects_a_label_and_can_be_taken_back(shown: Shown, tmp_
     shown.page.mouse.click(x, y)
     shown.page.keyboard.up("Shift")
     shown.says("1 correction; the last one changed")
-    now = shown.viewer.model.labelling.labels
+    now = shown.viewer.state.model.labelling.labels
     assert (now[TRUTH == 1] == 2).sum() > 10 and (now[TRUTH != 1] == TRUTH[TRUTH != 1]).mean() > 0.99
     with shown.page.expect_download(timeout=PATIENCE * 1000) as download:
         shown.tab("Save")
@@ -217,7 +221,7 @@ def test_a_shift_click_corrects_a_label_and_can_be_taken_back(shown: Shown, tmp_
     assert np.array_equal(Segmentation.load(tmp_path / "s.npz", SCENE).labels, now)
     shown.tab("Correct")
     shown.press("take the last one back")
-    shown.wait(lambda: np.array_equal(shown.viewer.model.labelling.labels, TRUTH), "the old labels")
+    shown.wait(lambda: np.array_equal(shown.viewer.state.model.labelling.labels, TRUTH), "the old labels")
 
 
 def test_a_shift_drag_corrects_what_is_in_the_box(shown: Shown) -> None:
@@ -229,8 +233,8 @@ def test_a_shift_drag_corrects_what_is_in_the_box(shown: Shown) -> None:
     shown.page.mouse.move(x + 15, y + 15, steps=3)
     shown.page.mouse.up()
     shown.page.keyboard.up("Shift")
-    shown.wait(lambda: len(shown.viewer.corrections) == 1, "the correction")
-    assert (shown.viewer.corrections.views[0].read_labels() >= 0).sum() > 300
+    shown.wait(lambda: len(shown.viewer.state.corrections) == 1, "the correction")
+    assert (shown.viewer.state.corrections.views[0].read_labels() >= 0).sum() > 300
 
 
 def test_codes_of_a_live_source_refresh_the_picture(chromium: Browser) -> None:
@@ -257,7 +261,7 @@ def test_codes_of_a_live_source_refresh_the_picture(chromium: Browser) -> None:
         page.goto(viewer.url)
         shown = Shown(viewer, page)
         shown.wait(lambda: (np.ptp(shown.picture(), axis=(0, 1)) > 30).any(), "grey splats")
-        assert {row.label for row in viewer.model.rows()} == {-1}
+        assert {row.label for row in viewer.state.model.rows()} == {-1}
         source.ready = True
         shown.wait(lambda: shown.looks_like(1) and shown.looks_like(2), "the classes")
         shown.tab("Save")
@@ -274,20 +278,18 @@ def test_a_browser_gets_images_until_it_has_shown_that_it_draws_fast(
     chromium: Browser, monkeypatch: pytest.MonkeyPatch, limit: float, draws: bool
 ) -> None:
     monkeypatch.setattr(clients, "SLOW", limit)
-    taken: list[bool] = []
-    stop = clients.ClientRenderer.stop_images
-    monkeypatch.setattr(clients.ClientRenderer, "stop_images", lambda renderer: (stop(renderer), taken.append(True)))
     viewer = Viewer(ViewModel(SCENE, LEARNT), clean_views(1), listener=listen(port=18080), draw=AUTO)
     with closing(viewer), opened_page(chromium, 960, 640, tolerated="computeBoundingSphere") as page:
         page.goto(viewer.url)
         shown = Shown(viewer, page)
         shown.wait(lambda: shown.looks_like(1), "the first picture")
+        (renderer,) = viewer.renderers.by_client.values()
         if draws:
-            shown.wait(lambda: taken, "the browser to draw")
+            shown.wait(lambda: renderer.frames is None, "the browser to draw")
         else:
             shown.says("This browser draws slowly")
-        assert viewer.renderers.drawing == draws and bool(viewer.renderers.bytes_sent) == draws
-        viewer.change(lambda model: model.isolate(2))
+        assert (renderer.nodes is not None) == draws
+        viewer.state.change(lambda model: model.isolate(2))
         shown.wait(lambda: shown.looks_like(2) and not shown.looks_like(1), "the mug alone")
 
 

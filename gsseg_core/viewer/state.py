@@ -1,0 +1,169 @@
+"""What a viewer shows and what people change of it, apart from the browsers that they do it in."""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsseg_core.data.view import View
+from gsseg_core.errors import SettingsError
+from gsseg_core.learn.learner import Progress, silent
+from gsseg_core.raster.backends import make_operator
+from gsseg_core.scene.camera import Camera
+from gsseg_core.segmentation import Segmentation
+from gsseg_core.viewer.corrections import Corrections
+from gsseg_core.viewer.model import BY_RELIABILITY, MODES, ClassRow, Labelling, ViewModel, completed
+from gsseg_core.viewer.picking import ViewVotes
+from gsseg_core.viewer.picture import Picture, cut
+
+
+class ViewerState:
+    """A segmentation, how it is shown, and its corrections; safe to change from several threads.
+
+    Parameters
+    ----------
+    model : ViewModel
+        What to show.
+    views : sequence of View
+        Those that the segmentation was learnt from.
+    reliability : mapping from the name of a view to float
+        How far each can be trusted, in [0, 1], as far as that is known.
+    device : str
+        Where clicks and corrections are rendered.
+
+    Attributes
+    ----------
+    model, views, reliability, device
+        As above.
+    corrections : Corrections
+        What people drew.
+    added_names : dict of int to str
+        Classes that were added in the viewer.
+    stale : threading.Event
+        Set by every change: what browsers show is out of date.
+    """
+
+    def __init__(self, model: ViewModel, views: Sequence[View], reliability: Mapping[str, float], device: str) -> None:
+        self.model, self.views, self.reliability, self.device = model, tuple(views), dict(reliability), device
+        self.corrections = Corrections(model.scene, device=device)
+        self.added_names: dict[int, str] = {}
+        self.stale = threading.Event()
+        self._learnt = model.labelling
+        self._view_votes: ViewVotes | None = None
+        self._view_votes_lock = threading.Lock()
+        self._lock = threading.RLock()
+        self._recut()
+
+    def seen(self) -> tuple[Picture, list[ClassRow]]:
+        """Return the scene as it is to be seen now, and the list of classes."""
+        with self._lock:
+            model = self.model
+            return Picture(model.scene, self._parts, model.shown(), model.colors()), model.rows()
+
+    def change(self, action: Callable[[ViewModel], object]) -> None:
+        """Change what is shown, and have the browsers follow; changes that come fast are shown together."""
+        with self._lock:
+            action(self.model)
+        self.stale.set()
+
+    def set_mode(self, mode: str, progress: Progress = silent) -> None:
+        """Colour by something else; `progress` is told of the views where their votes have to be collected for it.
+
+        Raises
+        ------
+        SettingsError
+            There is no such mode, or it is the reliability of the views, and that is not known.
+        """
+        if mode not in MODES:
+            raise SettingsError(f"colour by {mode!r}; expected one of {', '.join(MODES)}")
+        if mode == BY_RELIABILITY and self.model.reliability is None:
+            if not self.reliability or not self.views:
+                raise SettingsError(
+                    "view reliability is not known; expected --data, and a report.json of `gsseg segment --learner em` "
+                    "beside the segmentation"
+                )
+            self.model.reliability = self.view_votes(progress).mean_reliability(self.reliability)
+        self.change(lambda model: setattr(model, "mode", mode))
+
+    def view_votes(self, progress: Progress = silent) -> ViewVotes:
+        """Return the votes of each view for each Gaussian; collected when first asked for."""
+        with self._view_votes_lock:
+            if self._view_votes is None:
+                self._view_votes = ViewVotes(self.model.scene, self.views, device=self.device, progress=progress)
+            return self._view_votes
+
+    def label_map(self, camera: Camera) -> np.ndarray:
+        """Render labels (H, W) int64 of what is shown, -1 where nothing is."""
+        with self._lock:
+            labelling, shown = self.model.labelling, self.model.shown()
+        # The last channel is for what has no class, so that it is a region as well.
+        one_hot = np.eye(labelling.probabilities.shape[1] + 1, dtype=np.float32)[np.maximum(labelling.labels, -1)]
+        image = make_operator(self.model.scene, camera, self.device).without(~shown).render(one_hot)
+        labels = np.where(image.max(axis=2) > 0, image.argmax(axis=2), -1)
+        labels[labels == one_hot.shape[1] - 1] = -1
+        return labels
+
+    def correct(self, view: View) -> int:
+        """Learn what was drawn in a picture; return how many Gaussians that changed.
+
+        Raises
+        ------
+        NoUsableViewsError
+            Nothing was drawn on any Gaussian.
+        """
+        with self._lock:
+            before = self.model.labelling.labels
+            self.corrections.add(view)
+            self._relabel()
+            return int(np.count_nonzero(before != self.model.labelling.labels))
+
+    def undo(self) -> bool:
+        """Take the last correction back; return whether there was one."""
+        with self._lock:
+            undone = self.corrections.undo()
+            self._relabel()
+        return undone
+
+    def replace(self, learnt: Labelling) -> None:
+        """Show what a live source has learnt by now, under the same corrections."""
+        with self._lock:
+            self._learnt = learnt
+            self._relabel()
+
+    def selection_ply(self) -> bytes:
+        """Write what is shown as a 3DGS PLY.
+
+        Raises
+        ------
+        EmptySceneError
+            Nothing is shown.
+        """
+        with self._lock:
+            shown = self.model.shown()
+        return _as_file(lambda path: self.model.scene.subset(shown).save(path), "selection.ply")
+
+    def segmentation_npz(self) -> bytes:
+        """Write labels and class probabilities, corrections included, as a `segmentation.npz`."""
+        labels, probabilities, names = self.model.labelling
+        nothing, none = np.zeros(len(labels), bool), np.empty((0, probabilities.shape[1]), np.float32)
+        result = Segmentation(labels, completed(probabilities), names, self.model.scene.digest, nothing, none)
+        return _as_file(result.with_ids(self.model.ids()).save, "segmentation.npz")
+
+    def _relabel(self) -> None:
+        self.model.relabel(self.corrections.apply(self._learnt, self.added_names))
+        self._recut()
+        self.stale.set()
+
+    def _recut(self) -> None:
+        self._parts = cut(self.model.labelling.labels, self.model.confidence)
+
+
+def _as_file(write: Callable[[Path], Any], name: str) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        write(Path(folder) / name)
+        return (Path(folder) / name).read_bytes()
