@@ -73,10 +73,9 @@ class DemoScene:
 
 
 def build_demo(folder: str | os.PathLike[str], seed: int = 0) -> DemoScene:
-    """Write the demo scene to a folder as a dataset like any other; the same seed gives the same files.
+    """Write the demo scene to a folder as a dataset like any other.
 
-    The seed is that of the Gaussians' defects and of the errors in the masks; the solids and the cameras are always the
-    same.
+    The seed is that of the Gaussians' defects and of the errors in the masks; all else is always the same.
 
     Raises
     ------

@@ -32,15 +32,10 @@ def palette(num_classes: int) -> np.ndarray:
     Every colour is the one of a fixed set that lies farthest, in OKLab, from all the earlier ones, so the colours of a
     smaller palette are the first ones of a larger one. Beyond about 1,500 classes they start to repeat.
 
-    Parameters
-    ----------
-    num_classes : int
-        K, the number of labels, background included.
-
     Returns
     -------
     ndarray (K, 3) uint8, read-only
-        Row 0 is `BACKGROUND`.
+        One for each of the K labels; row 0 is `BACKGROUND`.
     """
     levels = np.arange(15, 256, 16)
     candidates = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -74,10 +69,6 @@ def overlay(image: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.nda
         Label of each pixel; every one below K.
     colors : ndarray (K, 3) uint8
         `palette(K)`.
-
-    Returns
-    -------
-    ndarray (H, W, 3) uint8
     """
     named = labels > 0
     tint = colors[np.maximum(labels, 0)].astype(np.float32)
@@ -101,10 +92,6 @@ def contact_sheet(images: Sequence[np.ndarray], captions: Sequence[str], columns
         One for each picture.
     columns : int
         Pictures in a row.
-
-    Returns
-    -------
-    ndarray (H, W, 3) uint8
     """
     gap, text = 12, 14
     height, width = np.max([image.shape[:2] for image in images], axis=0).tolist()
@@ -132,10 +119,6 @@ def legend(class_names: Mapping[int, str], colors: np.ndarray, counts: np.ndarra
         `palette(K)`.
     counts : array (K,) of int
         What to write behind each name, such as the number of Gaussians.
-
-    Returns
-    -------
-    ndarray (H, W, 3) uint8
     """
     margin, line, font = 16, 26, ImageFont.load_default(15)
     entries = [(str(k), _shorten(name, font, 260), f"{counts[k]:,}") for k, name in class_names.items()]

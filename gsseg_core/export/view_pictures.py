@@ -52,10 +52,8 @@ class Drawn(NamedTuple):
         Where from.
     labels : (H, W) int32
         Class of each pixel.
-    overlay : (H, W, 3) uint8
-        The scene, tinted by class.
-    image : (H, W, 3) uint8
-        The scene in its own colours.
+    overlay, image : (H, W, 3) uint8
+        The scene tinted by class, and in its own colours.
     """
 
     view: View
@@ -113,7 +111,7 @@ def write_overview(
 def draw_worst_views(
     scene: GaussianScene, views: Mapping[str, View], checks: Sequence[ViewCheck], count: int = 4, *, device: str = "cpu"
 ) -> np.ndarray:
-    """Draw the worst views: the mask, what the other views predict, and in red where the two differ.
+    """Draw the worst views: the mask, what the other views predict, and in red where the two differ; (H, W, 3) uint8.
 
     Parameters
     ----------
@@ -125,12 +123,6 @@ def draw_worst_views(
         Of all views, or of some, with what was predicted; at least one.
     count : int
         Views at most, one a row.
-    device : str
-        Where the scene is rendered.
-
-    Returns
-    -------
-    (H, W, 3) uint8
     """
     images, captions = [], []
     colors = palette(len(checks[0].counts))

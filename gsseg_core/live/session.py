@@ -39,6 +39,9 @@ VOTES_LIMIT = 2 << 30
 LIVE = "votes"
 """Name of the learner that fuses views as they arrive."""
 
+Report = Callable[[str, int, int, float], None]
+"""Told of stage, done, total, and the loss (nats per labelled pixel; NaN at first)."""
+
 
 class LiveSession:
     """Fuses views as they arrive, learns better class probabilities when asked, and segments at any time.
@@ -126,7 +129,7 @@ class LiveSession:
         return self._learnt is not None or self.num_fused > 0
 
     def fuse(self, view: View, era: object = None) -> Rejection | None:
-        """Add a view to the votes, and keep it for `learn`.
+        """Add a view with a mask to the votes, and keep it for `learn`.
 
         A view that is kept under the same name is replaced, its votes taken back: it still is one view. The names of
         views that are not kept any more are not known, so that under one of these comes another view.
@@ -137,7 +140,7 @@ class LiveSession:
             With a mask.
         era : object, optional
             What `era` was when the view was taken: if that has changed, the view belongs to what was forgotten, and is
-            not used. Such a view is not counted as rejected here.
+            neither used nor counted as rejected.
 
         Returns
         -------
@@ -176,7 +179,7 @@ class LiveSession:
         *,
         num_views: int | None = None,
         max_steps: int | None = None,
-        report: Callable[[str, int, int, float], None] = lambda stage, done, total, loss: None,
+        report: Report = lambda stage, done, total, loss: None,
         watch: Stopwatch | None = None,
     ) -> Outcome:
         """Learn class probabilities from the views kept, or from the train views of a dataset.
@@ -193,8 +196,8 @@ class LiveSession:
             Use this many views, spread evenly.
         max_steps : int, optional
             Stop after this many steps.
-        report : callable
-            Called after every view with stage, done, total, and the loss (nats per labelled pixel; NaN at first).
+        report : Report
+            Called after every view.
         watch : Stopwatch, optional
             Gets the seconds of each stage.
 
@@ -376,9 +379,7 @@ class LiveSession:
             self._live.forget(next(iter(self._live.views)))
 
 
-def _fitted(
-    name: str, learner: Learner, views: list[View], report: Callable[[str, int, int, float], None], watch: Stopwatch
-) -> Outcome:
+def _fitted(name: str, learner: Learner, views: list[View], report: Report, watch: Stopwatch) -> Outcome:
     """Have a learner observe views, fit and be calibrated."""
 
     def progress(stage: str, done: int, total: int) -> None:

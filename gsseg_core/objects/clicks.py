@@ -67,10 +67,8 @@ def click_labels(
 
     Parameters
     ----------
-    scene : GaussianScene
-        N Gaussians.
-    camera : Camera
-        Where the clicks were made.
+    scene, camera
+        What the clicks were made on, and where.
     inside : sequence of (row, column)
         Pixels of the object, at least one. Each adds the region around it.
     outside : sequence of (row, column)

@@ -29,8 +29,8 @@ SECTIONS: Mapping[str, tuple[str, Callable[[PageInputs], sections.Content | None
     "confusion": ("Confusion between classes", sections.confusion),
     "reliability": ("Views by reliability", sections.reliability),
     "confidence": ("Confidence", sections.confidence),
-    "time": ("Time", sections.time),
-    "settings": ("Settings and versions", sections.settings),
+    "time": ("Time", lambda run: run.report),
+    "settings": ("Settings and versions", lambda run: run.report),
 }
 """Sections of the page by anchor: title, and what is handed to the macro of that name; None leaves the section out."""
 

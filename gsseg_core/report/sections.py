@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -181,27 +181,3 @@ def confidence(run: PageInputs) -> Content:
         "series": ["learnt", "from their neighbours"],
         "bins": np.transpose(counts).tolist(),
     }
-
-
-def time(run: PageInputs) -> Content:
-    """Seconds per stage."""
-    return {"seconds": run.report["seconds"], "total": sum(run.report["seconds"].values())}
-
-
-def settings(run: PageInputs) -> Content:
-    """All that one needs to compare two runs, or to repeat one; nested settings as `outer.inner`."""
-    report = run.report
-    ids = {name: report["ids"][name] for name in ("objects", "segments")} if "ids" in report else {}
-    settings = {"scene digest": report["scene"]["digest"][:16], **report["settings"]}
-    return {
-        "settings": [*_flat(settings), *_flat({"ids": ids})],
-        "versions": list(_flat(report["versions"])),
-    }
-
-
-def _flat(settings: Mapping[str, Any], outer: str = "") -> Iterable[tuple[str, Any]]:
-    for name, value in settings.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{outer}{name}.")
-        else:
-            yield f"{outer}{name}", value

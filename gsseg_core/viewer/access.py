@@ -36,21 +36,16 @@ HeaderValues = Callable[[str], Sequence[str]]
 
 
 class Listener:
-    """Listens on a socket, and checks requests. Use it in a `with`, or close it.
-
-    Parameters
-    ----------
-    opened : socket
-        It listens.
-    host : str
-        As the user gave it.
+    """Listens on a socket that was opened for a host as the user gave it, and checks requests; close it at last.
 
     Attributes
     ----------
     socket : socket
-        The same.
+        It listens.
     port : int
         Its port.
+    everywhere : bool
+        Whether it listens at all addresses of this machine.
     token : str or None
         What a browser must show; None where only this machine can connect.
     """
@@ -80,20 +75,7 @@ class Listener:
         return f"http://{name}:{self.port}" + (f"/?token={self.token}" if self.token else "")
 
     def refusal(self, path: str, values: HeaderValues) -> str | None:
-        """Say why a request is not answered, be it for a page or for a websocket.
-
-        Parameters
-        ----------
-        path : str
-            With the query.
-        values : callable
-            Gives all values of a header.
-
-        Returns
-        -------
-        str or None
-            None if it is answered.
-        """
+        """Say why a request for a path, query included, is not answered, for a page or a websocket; None if it is."""
         host = _only(values("Host"))
         if host is None or not self._is_called(host):
             return (
@@ -111,8 +93,7 @@ class Listener:
     def headers(self, path: str, values: HeaderValues) -> dict[str, str]:
         """Make the headers of every page that is sent: what it may load and connect to, and who may show it.
 
-        That is its own server alone, since viser's page connects to any that its address names, as
-        `?websocket=...`, and does what that says.
+        That is its own server alone: viser's page connects to any that its address names, as `?websocket=...`.
         """
         host = _only(values("Host"))
         own = "'self' data: blob:"
@@ -159,14 +140,7 @@ class Listener:
 
 
 def listen(host: str = "127.0.0.1", port: int = 8080) -> Listener:
-    """Listen at an address of this machine; if the port is taken, at the next one that is free.
-
-    Parameters
-    ----------
-    host : str
-        Name or address.
-    port : int
-        From 1 to 65535.
+    """Listen at a name or address of this machine; if the port is taken, at the next one that is free.
 
     Raises
     ------

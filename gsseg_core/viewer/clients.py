@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -32,9 +31,6 @@ _FAINT = 2
 
 _PATIENCE = 60.0
 _SMALL = (48, 64)
-
-# A browser may leave while its picture is made. That is no news.
-warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
 
 
 class ClientRenderer:
@@ -68,16 +64,8 @@ class ClientRenderer:
 class ClientRenderers:
     """Renders for all browsers that are connected to a server.
 
-    Parameters
-    ----------
-    server : viser.ViserServer
-        To which they connect.
-    scene : GaussianScene
-        What they look at.
-    drawn_by : str
-        One of `DRAWN_BY`. In `AUTO`, a browser gets images until it has shown that it draws fast.
-    device : str
-        Where images are drawn.
+    `drawn_by` is one of `DRAWN_BY`: in `AUTO`, a browser gets images until it has shown that it draws fast. `device` is
+    where images are drawn.
 
     Attributes
     ----------

@@ -77,13 +77,6 @@ class Corrections:
 
         q' = normalise( q + TRUST e c )
 
-    Parameters
-    ----------
-    scene : GaussianScene
-        N Gaussians.
-    device : str
-        Where views are rendered.
-
     Attributes
     ----------
     views : list of View

@@ -40,12 +40,7 @@ _HEARD = ("ViewerCameraMessage", "ScenePointerMessage", "GuiUpdateMessage", "Get
 
 
 def start_server(listener: Listener) -> viser.ViserServer:
-    """Start viser's server.
-
-    Parameters
-    ----------
-    listener : Listener
-        Where, and who is answered. It has to stay open as long as the server runs.
+    """Start viser's server on a listener, which has to stay open as long as the server runs.
 
     Raises
     ------
@@ -94,10 +89,8 @@ def _guarding(listener: Listener) -> Iterator[threading.Event]:
         websockets.asyncio.server.serve = real  # type: ignore[misc]
 
 
-def understood(
-    data: Any,  # bytes of one message
-) -> bool:
-    """Whether a browser's message is one that the viewer can use.
+def understood(data: Any) -> bool:
+    """Whether the bytes of a browser's message are one that the viewer can use.
 
     Not so where it is no message that a page of ours sends, has other fields or types than viser says, or numbers that
     mean nothing: NaN, infinities, a window without a height, a direction of no length.
@@ -147,10 +140,8 @@ def _sets(update: _messages.GuiUpdateMessage) -> bool:
 
 
 _CHECKS: dict[str, Callable[[Any], bool]] = {
-    "ViewerCameraMessage": _sees,
-    "ScenePointerMessage": _points,
-    "GuiUpdateMessage": _sets,
-}
+    "ViewerCameraMessage": _sees, "ScenePointerMessage": _points, "GuiUpdateMessage": _sets
+}  # fmt: skip
 
 
 class _Connection(ServerConnection):

@@ -30,13 +30,6 @@ class Frames:
 
     A change is answered by a coarse image at once, and by a fine one when no other has followed. What has become
     outdated while an image was drawn is left out, so the browser is never more than one image behind.
-
-    Parameters
-    ----------
-    client : viser.ClientHandle
-        The browser.
-    device : str
-        Where images are drawn.
     """
 
     def __init__(self, client: viser.ClientHandle, device: str = "cpu") -> None:

@@ -25,21 +25,16 @@ from gsseg_core.viewer.picture import Picture, cut
 class ViewerState:
     """A segmentation, how it is shown, and its corrections; safe to change from several threads.
 
-    Parameters
+    Attributes
     ----------
     model : ViewModel
-        What to show.
-    views : sequence of View
+        What is shown.
+    views : tuple of View
         Those that the segmentation was learnt from.
-    reliability : mapping from the name of a view to float
+    reliability : dict from the name of a view to float
         How far each can be trusted, in [0, 1], as far as that is known.
     device : str
         Where clicks and corrections are rendered.
-
-    Attributes
-    ----------
-    model, views, reliability, device
-        As above.
     corrections : Corrections
         What people drew.
     added_names : dict of int to str
