@@ -128,9 +128,7 @@ def look_from(cameras: Iterable[Camera], preview: Preview) -> list[dict[str, Any
 
 def up_of(cameras: Iterable[Camera]) -> list[float]:
     """Guess which way is up, (3,) of length 1: people hold cameras upright."""
-    up = np.zeros(3)
-    for camera in cameras:
-        up -= camera.world_to_camera[1, :3]
+    up = -np.sum([camera.world_to_camera[1, :3] for camera in cameras] or [np.zeros(3)], axis=0)
     length = float(np.linalg.norm(up))
     return (up / length).tolist() if length > 1e-6 else [0.0, -1.0, 0.0]
 

@@ -15,7 +15,6 @@ from gsseg_core.report.pictures import PICTURE_PX, THUMBNAIL_PX, ViewImages, dra
 from gsseg_core.report.preview import look_from, make_preview, up_of
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
-from gsseg_core.text import percent
 
 LOOKS = 8
 """Views from which the preview can be looked at."""
@@ -109,21 +108,12 @@ def views_shown(run: PageInputs) -> Content | None:
     """Show some views three times: their mask, the prediction, and where the two differ."""
     confusions = {view["name"]: view["confusions"] for view in run.reliability}
     source = "what the other views predict" if run.evidence.held_out else "what was learnt, from this view too"
-    captions = ("its mask", source, "red where the two differ")
     views = []
     for what, check in run.evidence.examples():
         triple = draw_triple(check, run.evidence.views[check.name], run.images, run.colors)
-        views.append(
-            {
-                "name": check.name,
-                "remark": f"{what}: {percent(check.reliability)} the same",
-                "pictures": [
-                    (caption, jpeg_uri(image, PICTURE_PX)) for caption, image in zip(captions, triple, strict=True)
-                ],
-                "confusions": confusions.get(check.name, []),
-            }
-        )
-    return {"views": views} if views else None
+        pictures = [jpeg_uri(image, PICTURE_PX) for image in triple]
+        views.append((what, check, pictures, confusions.get(check.name, [])))
+    return {"views": views, "captions": ("its mask", source, "red where the two differ")} if views else None
 
 
 def classes(run: PageInputs) -> Content:
