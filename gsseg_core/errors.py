@@ -5,9 +5,15 @@ A message is one line. It names the file (or topic), what was found there, and w
 
 from __future__ import annotations
 
+from gsseg_core.text import one_line
+
 
 class GssegError(Exception):
     """Base of all errors of gsseg; the command line prints it as one line and exits with code 2."""
+
+    def __str__(self) -> str:
+        """Give the message on one line, whatever names from files and messages it holds."""
+        return one_line(super().__str__())
 
 
 class SceneFileError(GssegError):

@@ -11,6 +11,10 @@ _JOINERS = "\u200c\u200d"
 """They change how their neighbours are written, as in Persian and in emoji, and nothing else."""
 
 
+_LONGEST = 1000
+"""Characters of a message at most."""
+
+
 def printable(text: str) -> str:
     r"""Return a text on one line, in which every character that steers or hides is seen as its escape.
 
@@ -26,6 +30,12 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(c if _stays(c) else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def one_line(text: str) -> str:
+    """Give a message that holds foreign text as one `printable` line; of a very long one, its beginning and its end."""
+    line = printable(text)
+    return line if len(line) <= _LONGEST else f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 3 :]}"
 
 
 def clipped(value: object, most: int = 80) -> str:

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsseg_core.text import printable
+from gsseg_core.errors import GssegError, SceneFileError
+from gsseg_core.text import one_line, printable
 
 
 @pytest.mark.parametrize(
@@ -49,3 +50,10 @@ def test_any_text_is_one_line_that_can_be_encoded_and_a_second_time_changes_noth
     shown.encode()
     assert not {unicodedata.category(c) for c in shown} & {"Cc", "Cs", "Zl", "Zp"}
     assert shown.splitlines() in ([shown], []) and printable(shown) == shown
+
+
+@pytest.mark.parametrize("name", ["a\nb", "\x1b[31mred", "x" * 1_000_000, "\u202e" * 5_000])
+def test_an_error_about_any_name_is_one_short_line_that_ends_with_what_was_wrong(name: str) -> None:
+    shown = str(SceneFileError(f"{name}: does not exist"))
+    assert shown.isprintable() and len(shown) <= 1000 and shown.endswith(": does not exist")
+    assert str(GssegError(shown)) == shown == one_line(shown)

@@ -10,9 +10,7 @@ from collections.abc import Iterator
 from typing import TextIO
 
 from gsseg_core.errors import WriteError
-from gsseg_core.text import printable
-
-_LONGEST = 2000
+from gsseg_core.text import one_line
 
 
 def prepare() -> None:
@@ -50,11 +48,8 @@ def flush() -> None:
 
 def note(text: str) -> None:
     """Write a line for people to standard error; where that cannot be written, nobody reads it."""
-    line = printable(text)
-    if len(line) > _LONGEST:
-        line = f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 2 :]}"
     try:
-        print(f"gsseg: {line}", file=sys.stderr, flush=True)
+        print(f"gsseg: {one_line(text)}", file=sys.stderr, flush=True)
     except OSError:
         abandon(sys.stderr)
 

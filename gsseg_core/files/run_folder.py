@@ -120,13 +120,16 @@ def require_own_folder(out: Path, kind: str, earlier: Earlier) -> None:
 
     Raises
     ------
-    PathTakenError
-        It is such a folder.
+    PathTakenError, WriteError
+        It is such a folder, or cannot be looked into.
     """
-    _refuse_no_folder(out)
-    if not out.is_dir():
-        return
-    there = (path.name for path in out.iterdir() if path.name not in (RUN_FILE, LOCK_FILE))
+    try:
+        _refuse_no_folder(out)
+        if not out.is_dir():
+            return
+        there = [path.name for path in out.iterdir() if path.name not in (RUN_FILE, LOCK_FILE)]
+    except OSError as error:  # Also where a name is too long.
+        raise _unwritable(out, error) from error
     foreign = sorted(name for name in there if not _STAGING.fullmatch(name))
     if foreign and not _own(out, kind, earlier):
         raise PathTakenError(
@@ -177,10 +180,7 @@ class StagedRun:
                 os.fsync(probe.fileno())
             os.unlink(self._staging / "probe")
         except OSError as error:
-            raise WriteError(
-                f"{self.out}: cannot be written ({error.strerror or error}); expected a folder that can be made or "
-                "written to, with free space"
-            ) from error
+            raise _unwritable(self.out, error) from error
 
     def claim(self, places: Iterable[str]) -> None:
         """Refuse, by name, a place that the run will write and that is taken by what is not of an earlier one.
@@ -304,6 +304,11 @@ def _finish(out: Path) -> None:
     except OSError as error:
         raise _unfinished(out, error) from error
     shutil.rmtree(staging, ignore_errors=True)
+
+
+def _unwritable(out: Path, error: OSError) -> WriteError:
+    expected = "a folder that can be made or written to, with free space"
+    return WriteError(f"{out}: cannot be written ({error.strerror or error}); expected {expected}")
 
 
 def _unfinished(out: Path, error: OSError) -> WriteError:

@@ -27,6 +27,9 @@ from gsseg_ros.node.workspace import Run, Workspace
 FEEDBACK_PERIOD = 0.1
 """Seconds between two messages of feedback, at least; a new stage is always told."""
 
+MAX_STEPS = 100_000
+"""Steps at most that a goal may ask for: so many over any number of views can be counted in feedback."""
+
 
 class LearnAction:
     """Runs one learn job at a time; a second goal is aborted with BUSY. Canceled or failed, it changes nothing.
@@ -80,6 +83,8 @@ class LearnAction:
         learner = request.learner or "em"
         if learner not in LEARNERS:
             raise InvalidRequestError(f"learner is '{learner[:60]}'; expected one of {', '.join(LEARNERS)}")
+        if request.max_steps > MAX_STEPS:
+            raise InvalidRequestError(f"max_steps is {request.max_steps}; expected at most {MAX_STEPS}")
         dataset = None
         if request.dataset_path:
             with run.watch.stage("load"):

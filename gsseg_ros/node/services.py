@@ -24,6 +24,7 @@ from gsseg_core.files.earlier_outputs import earlier_segment
 from gsseg_core.files.json_files import write_json
 from gsseg_core.files.run_folder import require_own_folder, staged_run
 from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.text import one_line
 from gsseg_ros.errors import InvalidRequestError, error_code
 from gsseg_ros.node.jobs import Turns
 from gsseg_ros.node.outputs import Outputs
@@ -77,14 +78,14 @@ def explain(node: LifecycleNode, error: Exception) -> str:
         node.get_logger().warning(str(error))
         return str(error)
     node.get_logger().error(describe(error))
-    return f"unexpected {type(error).__name__}: {error}; the node's log has the details"
+    return one_line(f"unexpected {type(error).__name__}: {error}; the node's log has the details")
 
 
 def describe(error: Exception) -> str:
     """Describe an error in one line if it was foreseen, with its traceback if not."""
     if isinstance(error, GssegError):
         return str(error)
-    return f"unexpected {type(error).__name__}: {error}\n{traceback.format_exc()}"
+    return one_line(f"unexpected {type(error).__name__}: {error}") + f"\n{traceback.format_exc()}"
 
 
 def refinement(request: Any, workspace: Workspace) -> RefineSettings:

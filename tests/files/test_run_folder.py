@@ -17,7 +17,7 @@ from test_atomic import small_files_only
 
 from gsseg_core.errors import PathTakenError, SettingsError, WriteError
 from gsseg_core.files import run_folder
-from gsseg_core.files.run_folder import COMMIT_FILE, RUN_FILE, settle, staged_run
+from gsseg_core.files.run_folder import COMMIT_FILE, RUN_FILE, nothing_earlier, require_own_folder, settle, staged_run
 
 FIRST = ["a.npz", "classes/1_cup.ply", "classes/2_box.ply", "old/gone.png", "report.json"]
 SECOND = ["a.npz", "classes/1_cup.ply", "classes/3_ball.ply", "new/here.png", "report.json"]
@@ -278,3 +278,8 @@ def test_a_lock_that_is_never_released_is_one_clear_error(tmp_path: Path, monkey
     with run_folder._locked(tmp_path), pytest.raises(WriteError, match="another process of gsseg"):
         write(tmp_path, FIRST)
     assert time.monotonic() - started < 30
+
+
+def test_a_folder_whose_name_is_too_long_for_the_disk_is_one_clear_error(tmp_path: Path) -> None:
+    with pytest.raises(WriteError, match="name too long"):
+        require_own_folder(tmp_path / ("x" * 300), "segment", nothing_earlier)

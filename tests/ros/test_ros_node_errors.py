@@ -145,6 +145,12 @@ CASES = [
     Case("learn", "UNKNOWN", "starved", "unexpected MemoryError"),
 ]  # fmt: skip
 MORE_CASES = [
+    Case("load_state", "FILE_NOT_FOUND", "main", "a\\nb: does not exist", {"path": "a\nb"}),
+    Case("load_scene", "FILE_NOT_FOUND", "main", "x: does not exist", {"path": "x" * 5000}),
+    Case("export", "WRITE_FAILED", "main", "name too long", {"directory": "x" * 300}),
+    Case("segment", "NO_TRANSFORM", "main", "frame_id is '\\x1b[31mred'", nowhere("\x1b[31mred")),
+    Case("learn", "INVALID_REQUEST", "main", "learner is '\\u202eabc'", {"learner": "\u202eabc"}),
+    Case("learn", "INVALID_REQUEST", "main", "max_steps is 4294967295; expected at most", {"max_steps": 2**32 - 1}),
     Case("segment", "INVALID_REQUEST", "main", "min_confidence is nan", {"min_confidence": float("nan")}),
     Case("render_view", "INVALID_VIEWPOINT", "main", "all zeros: was it filled in?", {
         "viewpoint_camera": nowhere()["viewpoint_camera"],
