@@ -7,7 +7,6 @@ import re
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from gsseg_core.files.earlier_outputs import earlier_classes
 from gsseg_core.files.run_folder import staged_run
@@ -41,18 +40,14 @@ def write_classes(scene: GaussianScene, segmentation: Segmentation, folder: Path
     confidence, paths = segmentation.confidence, {}
     for k in np.flatnonzero(segmentation.counts()).tolist():
         members = segmentation.labels == k
-        vertices = scene.vertices[members]
+        vertices = _with_confidence(scene.vertices[members], k, confidence[members])
         paths[k] = folder / class_file_name(k, segmentation.class_names[k])
-        write_vertices(paths[k], with_confidence(vertices, k, confidence[members]), run)
+        write_vertices(paths[k], vertices, run)
     return paths
 
 
-def with_confidence(
-    vertices: npt.NDArray[np.void],  # (M,)
-    label: int,
-    confidence: np.ndarray,  # (M,)
-) -> npt.NDArray[np.void]:
-    """Add the properties `label` (int32) and `confidence` (float32) to vertices; earlier ones are replaced."""
+def _with_confidence(vertices: np.ndarray, label: int, confidence: np.ndarray) -> np.ndarray:
+    """Add properties `label` (int32) and `confidence` (M,) (float32) to vertices (M,); earlier ones are replaced."""
     kept = [name for name in vertices.dtype.names or () if name not in ("label", "confidence")]
     types = [(name, vertices.dtype[name]) for name in kept]
     out = np.empty(len(vertices), [*types, ("label", np.int32), ("confidence", np.float32)])

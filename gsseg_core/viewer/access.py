@@ -31,6 +31,12 @@ MOST_TRIED = 1000
 _LOOPBACK_NAMES = ("localhost", "127.0.0.1", "[::1]")
 _HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:[0-9]{1,5})?")
 
+_WHY_NOT = {
+    errno.EADDRNOTAVAIL: "it is no address of this machine; expected one, or 127.0.0.1, or 0.0.0.0 for all of them, "
+    "see --host",
+    errno.EACCES: "that is not allowed; expected a port above 1023, see --port",
+}
+
 HeaderValues = Callable[[str], Sequence[str]]
 """All values of a header in a request, by its name."""
 
@@ -157,18 +163,11 @@ def listen(host: str = "127.0.0.1", port: int = 8080) -> Listener:
         except OSError as error:
             if error.errno == errno.EADDRINUSE:
                 continue
-            raise SettingsError(f"cannot listen at {printable(host)}, port {candidate}: {_expected(error)}") from error
+            why = _WHY_NOT.get(error.errno or 0, f"{error.strerror}; expected an address of this machine, see --host")
+            raise SettingsError(f"cannot listen at {printable(host)}, port {candidate}: {why}") from error
     raise SettingsError(
         f"cannot listen at {printable(host)}: ports {port} to {last} are all taken; expected a free one, see --port"
     )
-
-
-def _expected(error: OSError) -> str:
-    if error.errno == errno.EADDRNOTAVAIL:
-        return "it is no address of this machine; expected one, or 127.0.0.1, or 0.0.0.0 for all of them, see --host"
-    if error.errno == errno.EACCES:
-        return "that is not allowed; expected a port above 1023, see --port"
-    return f"{error.strerror}; expected an address of this machine, see --host"
 
 
 def _resolved(host: str) -> tuple[int, tuple[Any, ...]]:
