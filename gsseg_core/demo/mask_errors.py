@@ -60,13 +60,12 @@ def resize(labels: np.ndarray, label: int, shift: int) -> None:
 
 
 def mistake_objects(
-    labels: np.ndarray,  # (H, W)
-    rng: np.random.Generator,
-    missed: float,
-    swapped: float,
-    missed_label: int,
+    labels: np.ndarray, rng: np.random.Generator, missed: float, swapped: float, missed_label: int
 ) -> np.ndarray:
-    """Miss objects, whose pixels become `missed_label`, and give others the label of another one; none meets both."""
+    """Miss objects of a map (H, W), whose pixels become `missed_label`, and give others the label of another one.
+
+    `missed` and `swapped` are probabilities of an object, which meets one of the two.
+    """
     objects = objects_in(labels)
     fate = rng.random(len(objects))
     others = (np.arange(len(objects)) + rng.integers(1, max(len(objects), 2), len(objects))) % max(len(objects), 1)

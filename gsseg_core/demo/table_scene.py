@@ -87,7 +87,10 @@ def build_demo(folder: str | os.PathLike[str], seed: int = 0) -> DemoScene:
     root = Path(folder)
     scene_rng, mask_rng = np.random.default_rng(seed).spawn(2)
     parts, cameras = _furnish(), _make_cameras()
-    scene, truth = _make_gaussians(parts, np.array([camera.center for camera in cameras]), scene_rng)
+    viewpoints = np.array([camera.center for camera in cameras])
+    pieces = [_float(scene_rng), *(_cover(part, parts, viewpoints, scene_rng) for part in parts)]
+    *properties, truth = (np.concatenate(arrays) for arrays in zip(*pieces, strict=True))
+    scene, truth = GaussianScene.from_arrays(*properties), truth.astype(np.int32)
     test = [camera.name for camera in cameras[TEST_EVERY // 2 :: TEST_EVERY]]
     train = [camera.name for camera in cameras if camera.name not in test]
 
@@ -263,24 +266,8 @@ def _as_3dgs(camera: Camera) -> dict[str, object]:
 # Gaussians
 
 
-def _make_gaussians(
-    parts: list[Part],
-    viewpoints: np.ndarray,  # (V, 3)
-    rng: np.random.Generator,
-) -> tuple[GaussianScene, np.ndarray]:
-    """Discs on the surfaces, some stray Gaussians inside, and floaters; with the true label of each."""
-    pieces = [_float(rng), *(_cover(part, parts, viewpoints, rng) for part in parts)]
-    means, quats, scales, opacities, sh, truth = (np.concatenate(arrays) for arrays in zip(*pieces, strict=True))
-    return GaussianScene.from_arrays(means, quats, scales, opacities, sh), truth.astype(np.int32)
-
-
-def _cover(
-    part: Part,
-    parts: list[Part],
-    viewpoints: np.ndarray,  # (V, 3)
-    rng: np.random.Generator,
-) -> tuple[np.ndarray, ...]:
-    """Gaussians of one part: means, quats, scales, opacities, sh, labels."""
+def _cover(part: Part, parts: list[Part], viewpoints: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """Gaussians of one part seen from viewpoints (V, 3): means, quats, scales, opacities, sh, labels."""
     spacing = _SPACING.get(CLASS_NAMES[part.label], _OBJECT_SPACING)
     # A disc reaches beyond the edge of its face, and pixels blur it; training draws discs back from outlines.
     drawn_back = 0.9 * spacing if part.label else 0.0
@@ -336,13 +323,9 @@ def _float(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
 
 
 def _shade(
-    part: Part,
-    parts: list[Part],
-    points: np.ndarray,  # (M, 3)
-    normals: np.ndarray,  # (M, 3)
-    rng: np.random.Generator,
+    part: Part, parts: list[Part], points: np.ndarray, normals: np.ndarray, rng: np.random.Generator
 ) -> np.ndarray:
-    """(M, 4, 3) SH coefficients: lit by the sky and by a lamp that casts soft shadows, with a sheen."""
+    """SH coefficients (M, 4, 3) at points (M, 3), lit by the sky and a lamp that casts soft shadows, with a sheen."""
     start = points + 1e-3 * normals
     lamp = np.zeros(len(points))
     for offset in rng.normal(0, 0.12, (3, 3)):

@@ -194,12 +194,11 @@ def _without_floaters(points: Array, weights: Array) -> npt.NDArray[np.bool_]:
     return kept
 
 
-def _turned(
-    offsets: Array,  # (M, 3)
-    share: Array,  # (M,)
-    axes: Array,  # (3, 3)
-) -> Array:
-    """Find the axes (3, 3) of the smallest box around points, beginning with these and with the sides of their hull."""
+def _turned(offsets: Array, share: Array, axes: Array) -> Array:
+    """Find the axes (3, 3) of the smallest box around points (M, 3), each with its share (M,) of the weight.
+
+    It begins with the axes given, and with the sides of the points' hull.
+    """
     along = offsets @ axes
     low, high = _quantile(along, share, TRIM), -_quantile(-along, share, TRIM)
     points = offsets[((along >= low) & (along <= high)).all(axis=1)]

@@ -69,13 +69,8 @@ class ViewImages:
         return image
 
 
-def draw_triple(
-    check: ViewCheck,
-    view: View,
-    images: ViewImages,
-    colors: np.ndarray,  # (K, 3)
-) -> Triple:
-    """Lay a view's mask, and what is predicted, over its image, and show where they differ."""
+def draw_triple(check: ViewCheck, view: View, images: ViewImages, colors: np.ndarray) -> Triple:
+    """Lay a view's mask and what is predicted over its image, in colours (K, 3) of classes; show where they differ."""
     image, mask, predicted = images.of(view), view.read_labels(), check.prediction()
     grey = image.mean(axis=2, keepdims=True)
     unknown = (mask == UNKNOWN) | (predicted == UNKNOWN)
@@ -86,12 +81,9 @@ def draw_triple(
 
 
 def thumbnails(
-    classes: Iterable[int],
-    evidence: Evidence,
-    images: ViewImages,
-    colors: np.ndarray,  # (K, 3)
+    classes: Iterable[int], evidence: Evidence, images: ViewImages, colors: np.ndarray
 ) -> dict[int, tuple[str, np.ndarray]]:
-    """Cut classes out of the views that show them best.
+    """Cut classes out of the views that show them best, outlined in their colours (K, 3).
 
     That is, of the views in which most pixels are predicted as the class and labelled so, the one with the most; less
     if the margin cuts the object, or if the view's image would have to be rendered.
@@ -142,12 +134,8 @@ def _candidates(evidence: Evidence, k: int) -> list[ViewCheck]:
     return [check for agreed, check in sorted(pixels, key=lambda pair: -pair[0])[:CANDIDATES] if agreed]
 
 
-def _crop(
-    image: np.ndarray,  # (H, W, 3)
-    own: np.ndarray,  # (H, W) bool
-    color: np.ndarray,  # (3,)
-) -> np.ndarray:
-    """Cut a square around an object, the rest dimmed, the object outlined in its colour."""
+def _crop(image: np.ndarray, own: np.ndarray, color: np.ndarray) -> np.ndarray:
+    """Cut a square out of an image (H, W, 3), around an object (H, W) bool, outlined in its colour; the rest dimmed."""
     rows, columns = np.flatnonzero(own.any(axis=1)), np.flatnonzero(own.any(axis=0))
     # What makes up the object; a few pixels elsewhere should not shrink it to a dot.
     top, bottom = _extent(own[rows].sum(axis=1), rows)

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
 import viser
@@ -33,6 +34,7 @@ _PATIENCE = 60.0
 _SMALL = (48, 64)
 
 
+@dataclass
 class ClientRenderer:
     """Renders for one browser, which draws by itself, gets images, or both.
 
@@ -44,15 +46,16 @@ class ClientRenderer:
         The images that it gets.
     """
 
-    def __init__(self, nodes: SplatNodes | None, frames: Frames | None) -> None:
-        self.nodes, self.frames = nodes, frames
+    nodes: SplatNodes | None
+    frames: Frames | None
 
     def show(self, picture: Picture) -> None:
         """Show a picture from now on."""
+        frames = self.frames  # It may be closed by another thread.
         if self.nodes:
             self.nodes.show(picture.nodes)
-        if self.frames:
-            self.frames.show(picture)
+        if frames:
+            frames.show(picture)
 
     def close(self) -> None:
         """Send no more images."""

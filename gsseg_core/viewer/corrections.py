@@ -54,14 +54,8 @@ def box(camera: Camera, corner: Sequence[float], opposite: Sequence[float], labe
     return _view(camera, (x >= left) & (x <= right) & (y >= top) & (y <= bottom), label)
 
 
-def region(
-    camera: Camera,
-    label_map: np.ndarray,  # (H, W) int
-    column: float,
-    row: float,
-    label: int,
-) -> View:
-    """Draw the connected region of one label around a pixel, as it is shown now; see `disc`."""
+def region(camera: Camera, label_map: np.ndarray, column: float, row: float, label: int) -> View:
+    """Draw the connected region of one label of a map (H, W) around a pixel, as it is shown now; see `disc`."""
     _check_inside(camera, column, row)
     parts, _ = ndimage.label(label_map == label_map[int(row), int(column)])
     return _view(camera, parts == parts[int(row), int(column)], label)

@@ -46,12 +46,8 @@ class Node(NamedTuple):
     visible: bool
 
 
-def cut(
-    labels: np.ndarray,  # (N,) int32
-    confidence: np.ndarray,  # (N,) float32
-    max_nodes: int = MAX_NODES,
-) -> dict[Key, np.ndarray]:
-    """Cut a scene by label and confidence, as finely as the number of nodes allows.
+def cut(labels: np.ndarray, confidence: np.ndarray, max_nodes: int = MAX_NODES) -> dict[Key, np.ndarray]:
+    """Cut a scene by label (N,) int32 and confidence (N,) float32, as finely as the number of nodes allows.
 
     Returns
     -------

@@ -61,11 +61,8 @@ class Viewpoint:
         self._server.scene.remove_by_name(_MASK)
         self._server.flush()
 
-    def _hang(
-        self,
-        view: View,
-        pose: np.ndarray,  # (4, 4) camera to world
-    ) -> None:
+    def _hang(self, view: View, pose: np.ndarray) -> None:
+        """Hang the mask of a view right before its camera, of which the pose (4, 4) is camera to world."""
         camera, model = view.camera, self._state.model
         labels = view.read_labels()
         image = background_image(model.scene, make_operator(model.scene, camera, self._state.device))
