@@ -32,20 +32,14 @@ class Viewer:
 
     Parameters
     ----------
-    model : ViewModel
-        What to show.
-    views : sequence of View
-        Those that the segmentation was learnt from; the camera can jump to them.
-    reliability : mapping from the name of a view to float
-        How far each can be trusted, in [0, 1], as far as that is known.
+    model, views, reliability, device
+        What to show, and what is known of it, as in `ViewerState`; the server draws on the device, too.
     source : LiveSource, optional
         Class probabilities that change while the viewer runs.
     listener : Listener, optional
         Where to listen, and who is answered; it is closed with the viewer. By default, what `listen` gives.
     draw : str
         Who draws: 'browser'; 'server', this program, which sends images; or 'auto', the browser if it is fast.
-    device : str
-        Where clicks and corrections are rendered, and what the server draws.
 
     Attributes
     ----------
