@@ -31,31 +31,22 @@ class CSRRows(NamedTuple):
     data: np.ndarray
 
     @classmethod
-    def from_dense(
-        cls,
-        array: np.ndarray,  # (N, K)
-    ) -> CSRRows:
+    def from_dense(cls, array: np.ndarray) -> CSRRows:  # (N, K)
         """Keep the entries that are not zero."""
         array = np.ascontiguousarray(array)
         indptr = np.zeros(len(array) + 1, np.int64)
         _count(array, indptr[1:])
         np.cumsum(indptr, out=indptr)
         rows = cls(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], array.dtype))
-        _fill(array, *rows)
+        _fill(array, rows)
         return rows
 
     @classmethod
-    def vstack(
-        cls,
-        parts: Sequence[CSRRows],  # at least one
-    ) -> CSRRows:
+    def vstack(cls, parts: Sequence[CSRRows]) -> CSRRows:  # at least one
         """Stack rows below each other."""
-        lengths = np.concatenate([np.diff(part.indptr) for part in parts])
-        return cls(
-            starts(lengths),
-            np.concatenate([part.indices for part in parts]),
-            np.concatenate([part.data for part in parts]),
-        )
+        indptrs, indices, data = zip(*parts, strict=True)
+        lengths = np.concatenate([np.diff(indptr) for indptr in indptrs])
+        return cls(starts(lengths), np.concatenate(indices), np.concatenate(data))
 
     def with_data(self, data: np.ndarray) -> CSRRows:
         """Replace the entries and keep where they stand."""
@@ -67,28 +58,21 @@ class CSRRows(NamedTuple):
         self.write(out)
         return out
 
-    def write(
-        self,
-        out: np.ndarray,  # (N, K)
-    ) -> None:
+    def write(self, out: np.ndarray) -> None:  # (N, K)
         """Write the entries into an array, and leave the rest of it as it is."""
-        _write(*self, out)
+        _write(self, out)
 
     def united(self, other: CSRRows) -> tuple[CSRRows, CSRRows]:
         """Give both arrays the pattern of either, filled up with explicit zeros."""
         indptr = np.zeros_like(self.indptr)
-        _count_united(self.indptr, self.indices, other.indptr, other.indices, indptr[1:])
+        _count_united(self, other, indptr[1:])
         np.cumsum(indptr, out=indptr)
-        indices = np.empty(indptr[-1], np.uint32)
-        data = np.empty(indptr[-1], self.data.dtype), np.empty(indptr[-1], other.data.dtype)
-        _unite(*self, *other, indptr, indices, *data)
-        return CSRRows(indptr, indices, data[0]), CSRRows(indptr, indices, data[1])
+        united = CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], self.data.dtype))
+        united_other = united.with_data(np.empty(indptr[-1], other.data.dtype))
+        _unite(self, other, united, united_other.data)
+        return united, united_other
 
-    def scattered(
-        self,
-        ids: np.ndarray,  # (N,) distinct
-        count: int,
-    ) -> CSRRows:
+    def scattered(self, ids: np.ndarray, count: int) -> CSRRows:  # (N,) distinct
         """Scatter row i to row ids[i] of `count` rows; the others are empty."""
         source = np.full(count, -1, np.int64)
         source[ids] = np.arange(len(ids))
@@ -100,7 +84,7 @@ class CSRRows(NamedTuple):
 
     def normalised(self) -> CSRRows:
         """Scale each row of float32 to sum 1, in place; rows of zeros stay zero."""
-        _normalise(self.indptr, self.data)
+        _normalise(self)
         return self
 
     def nonzero(self) -> CSRRows:
@@ -108,35 +92,25 @@ class CSRRows(NamedTuple):
         kept = self.data != 0
         return CSRRows(starts(kept)[self.indptr], self.indices[kept], self.data[kept])
 
-    def take(
-        self,
-        ids: np.ndarray,  # (M,)
-    ) -> CSRRows:
+    def take(self, ids: np.ndarray) -> CSRRows:  # (M,)
         """Copy some rows: M of them."""
         indptr = starts((self.indptr[1:] - self.indptr[:-1])[ids])
         rows = CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], self.data.dtype))
-        _take(*self, ids, *rows)
+        _take(self, ids, rows)
         return rows
 
-    def positions(
-        self,
-        ids: np.ndarray,  # (M,)
-    ) -> CSRRows:
+    def positions(self, ids: np.ndarray) -> CSRRows:  # (M,)
         """Find where in `data` the entries of some rows stand: M rows of int64."""
         return self.with_data(np.arange(len(self.data))).take(ids)
 
 
-def starts(
-    counts: np.ndarray,  # (n,)
-) -> np.ndarray:
+def starts(counts: np.ndarray) -> np.ndarray:  # (n,)
     """Return the offset at which each of n consecutive parts begins, and the end of the last: (n + 1,) int64."""
     return np.concatenate([[0], np.cumsum(counts)])
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def largest(
-    array: np.ndarray,  # (N, K) float32
-) -> tuple[np.ndarray, np.ndarray]:
+def largest(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # (N, K) float32
     """Find the largest entry of each row, (N,) float32, and its column, (N,) int32: the first of equal ones.
 
     0 and column -1 where no entry is above 0.
@@ -161,7 +135,8 @@ def _count(array: np.ndarray, counts: np.ndarray) -> None:
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _fill(array: np.ndarray, indptr: np.ndarray, indices: np.ndarray, data: np.ndarray) -> None:
+def _fill(array: np.ndarray, rows: CSRRows) -> None:
+    indptr, indices, data = rows
     for i in nb.prange(array.shape[0]):
         z = indptr[i]
         if z < indptr[i + 1]:
@@ -172,14 +147,16 @@ def _fill(array: np.ndarray, indptr: np.ndarray, indices: np.ndarray, data: np.n
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _write(indptr: np.ndarray, indices: np.ndarray, data: np.ndarray, out: np.ndarray) -> None:
+def _write(rows: CSRRows, out: np.ndarray) -> None:
+    indptr, indices, data = rows
     for i in nb.prange(out.shape[0]):
         for z in range(indptr[i], indptr[i + 1]):
             out[i, indices[z]] = data[z]
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _normalise(indptr: np.ndarray, data: np.ndarray) -> None:
+def _normalise(rows: CSRRows) -> None:
+    indptr, _, data = rows
     for i in nb.prange(indptr.shape[0] - 1):
         total = np.float32(0.0)
         for z in range(indptr[i], indptr[i + 1]):
@@ -190,25 +167,20 @@ def _normalise(indptr: np.ndarray, data: np.ndarray) -> None:
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _take(
-    indptr: np.ndarray,
-    indices: np.ndarray,
-    data: np.ndarray,
-    ids: np.ndarray,
-    taken_indptr: np.ndarray,
-    taken_indices: np.ndarray,
-    taken: np.ndarray,
-) -> None:
+def _take(rows: CSRRows, ids: np.ndarray, taken: CSRRows) -> None:
+    indptr, indices, data = rows
+    taken_indptr, taken_indices, taken_data = taken
     for m in nb.prange(ids.shape[0]):
         first = indptr[ids[m]]
         for j in range(taken_indptr[m + 1] - taken_indptr[m]):
-            taken_indices[taken_indptr[m] + j], taken[taken_indptr[m] + j] = indices[first + j], data[first + j]
+            z = taken_indptr[m] + j
+            taken_indices[z], taken_data[z] = indices[first + j], data[first + j]
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _count_united(
-    indptr: np.ndarray, indices: np.ndarray, other_indptr: np.ndarray, other_indices: np.ndarray, counts: np.ndarray
-) -> None:
+def _count_united(one: CSRRows, other: CSRRows, counts: np.ndarray) -> None:
+    indptr, indices, _ = one
+    other_indptr, other_indices, _ = other
     for i in nb.prange(counts.shape[0]):
         a, b, n = indptr[i], other_indptr[i], 0
         while a < indptr[i + 1] or b < other_indptr[i + 1]:
@@ -221,18 +193,10 @@ def _count_united(
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _unite(
-    indptr: np.ndarray,
-    indices: np.ndarray,
-    data: np.ndarray,
-    other_indptr: np.ndarray,
-    other_indices: np.ndarray,
-    other_data: np.ndarray,
-    united_indptr: np.ndarray,
-    united_indices: np.ndarray,
-    united_data: np.ndarray,
-    united_other: np.ndarray,
-) -> None:
+def _unite(one: CSRRows, other: CSRRows, united: CSRRows, united_other: np.ndarray) -> None:
+    indptr, indices, data = one
+    other_indptr, other_indices, other_data = other
+    united_indptr, united_indices, united_data = united
     for i in nb.prange(indptr.shape[0] - 1):
         a, b = indptr[i], other_indptr[i]
         for z in range(united_indptr[i], united_indptr[i + 1]):

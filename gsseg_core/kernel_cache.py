@@ -18,11 +18,8 @@ def candidates() -> list[str]:
     """List the folders that numba tries, in its order."""
     user = "~/Library/Caches" if sys.platform == "darwin" else os.environ.get("XDG_CACHE_HOME", "~/.cache")
     own = os.path.join(os.path.dirname(os.path.abspath(__file__)), "__pycache__")
-    return [
-        *filter(None, [os.environ.get("NUMBA_CACHE_DIR")]),
-        own,
-        os.path.join(os.path.expanduser(user), "numba"),
-    ]
+    chosen = filter(None, [os.environ.get("NUMBA_CACHE_DIR")])
+    return [*chosen, own, os.path.join(os.path.expanduser(user), "numba")]
 
 
 def writable(folder: str) -> bool:

@@ -48,12 +48,7 @@ class Evaluation:
         self._area = np.zeros((3, 0), np.int64)  # pixels per class: in both, in the truth, in the prediction
         self._band = np.zeros((3, 0), np.int64)  # the same, of boundary bands
 
-    def add(
-        self,
-        truth: np.ndarray,  # (H, W)
-        prediction: np.ndarray,  # (H, W)
-        name: str = "view",
-    ) -> None:
+    def add(self, truth: np.ndarray, prediction: np.ndarray, name: str = "view") -> None:  # both (H, W)
         """Add one view.
 
         Parameters
@@ -146,25 +141,18 @@ class Evaluation:
             `views`, `mean_iou`, `mean_accuracy`, `mean_boundary_iou`, and `classes`: for each class that occurs its
             `id`, `name`, `iou`, `accuracy`, `boundary_iou` and `pixels` in the truth.
         """
-        names = class_names or {}
-        iou, accuracy, boundary = self.iou, self.accuracy, self.boundary_iou
-        return {
-            "views": self.num_views,
-            "mean_iou": _plain(self.mean_iou),
-            "mean_accuracy": _plain(self.mean_accuracy),
-            "mean_boundary_iou": _plain(self.mean_boundary_iou),
-            "classes": [
-                {
-                    "id": k,
-                    "name": class_name(names, k),
-                    "iou": _plain(iou[k]),
-                    "accuracy": _plain(accuracy[k]),
-                    "boundary_iou": _plain(boundary[k]),
-                    "pixels": int(self._area[1, k]),
-                }
-                for k in np.flatnonzero(self._area.any(axis=0)).tolist()
-            ],
-        }
+        scores = {"iou": self.iou, "accuracy": self.accuracy, "boundary_iou": self.boundary_iou}
+        classes = [
+            {
+                "id": k,
+                "name": class_name(class_names or {}, k),
+                **{name: _plain(values[k]) for name, values in scores.items()},
+                "pixels": int(self._area[1, k]),
+            }
+            for k in np.flatnonzero(self._area.any(axis=0)).tolist()
+        ]
+        means = {f"mean_{name}": _plain(_mean(values)) for name, values in scores.items()}
+        return {"views": self.num_views, **means, "classes": classes}
 
 
 def iou(both: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -172,47 +160,23 @@ def iou(both: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return _ratio(both, first + second - both)
 
 
-def boundary_band(
-    labels: np.ndarray,  # (H, W)
-    width: int,
-) -> np.ndarray:
-    """Find the pixels on the inner boundary of their own class, of all classes at once.
+def boundary_band(labels: np.ndarray, width: int) -> np.ndarray:  # (H, W) of a signed type; pixels
+    """Find the pixels on the inner boundary of their own class, of all classes at once: (H, W) bool.
 
     A pixel is in the band of its class c unless all pixels up to `width` rows and columns away are c; what lies
     outside the image is no class. For each class this is the mask minus its erosion by `width` steps of a 3x3 square,
     as boundary IoU defines it. A square is all one label exactly where its smallest and largest label are the same.
-
-    Parameters
-    ----------
-    labels : array (H, W) of int
-        At least `UNKNOWN`, in a signed type.
-    width : int
-        In pixels.
-
-    Returns
-    -------
-    ndarray (H, W) bool
     """
     size = 2 * width + 1
     lowest = ndimage.minimum_filter(labels, size, mode="constant", cval=UNKNOWN - 1)
     highest = ndimage.maximum_filter(labels, size, mode="constant", cval=UNKNOWN - 1)
-    band: np.ndarray = lowest != highest
-    return band
+    return np.asarray(lowest != highest)
 
 
 def evaluate_folders(pred_dir: str | Path, truth_dir: str | Path) -> Evaluation:
     """Compare every `<stem>.png` in one folder of label images with the file of the same name in another.
 
     Truth without a prediction is ignored, since a folder of true masks holds the train views too.
-
-    Parameters
-    ----------
-    pred_dir, truth_dir : path
-        Folders of 8- or 16-bit label images.
-
-    Returns
-    -------
-    Evaluation
 
     Raises
     ------
@@ -241,12 +205,8 @@ def evaluate_folders(pred_dir: str | Path, truth_dir: str | Path) -> Evaluation:
 
 
 def _count(
-    truth: np.ndarray,  # (H, W)
-    prediction: np.ndarray,  # (H, W)
-    in_truth: np.ndarray,  # (H, W)
-    in_prediction: np.ndarray,  # (H, W)
-    size: int,
-) -> np.ndarray:
+    truth: np.ndarray, prediction: np.ndarray, in_truth: np.ndarray, in_prediction: np.ndarray, size: int
+) -> np.ndarray:  # of (H, W)
     """(3, size), pixels per class that count in both, in the truth, in the prediction."""
     in_both = in_truth & in_prediction & (truth == prediction)
     chosen = truth[in_both], truth[in_truth], prediction[in_prediction]
@@ -258,8 +218,7 @@ def _grow(counts: np.ndarray, size: int) -> np.ndarray:
 
 
 def _ratio(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    ratio: np.ndarray = np.divide(part, whole, out=np.full(part.shape, np.nan), where=whole > 0)
-    return ratio
+    return np.asarray(np.divide(part, whole, out=np.full(part.shape, np.nan), where=whole > 0))
 
 
 def _mean(values: np.ndarray) -> float:

@@ -25,7 +25,6 @@ from gsseg_core.export.view_pictures import (
     write_overview,
     write_pictures,
 )
-from gsseg_core.files.earlier_outputs import earlier_render, earlier_segment
 from gsseg_core.files.json_files import write_json
 from gsseg_core.files.run_folder import StagedRun, staged_run
 from gsseg_core.learn.calibrate import Calibration, calibrate
@@ -52,56 +51,26 @@ PICTURED_VIEWS = 12
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """What a run learns from.
-
-    Attributes
-    ----------
-    scene : GaussianScene
-        What is segmented.
-    root : Path
-        Folder of the dataset.
-    train, pictured : list of View
-        Those to learn from, and those to draw.
-    class_names : mapping from class to name
-        Classes as they are learnt, numbered without gaps.
-    class_ids : tuple of int, optional
-        Ids of these classes in the dataset; None where the classes are objects.
-    objects : ObjectTable, optional
-        The objects that the ids of the views were found to be.
-    """
+    """What a run learns from."""
 
     scene: GaussianScene
-    root: Path
+    root: Path  # of the dataset
     train: list[View]
     pictured: list[View]
-    class_names: Mapping[int, str]
-    class_ids: tuple[int, ...] | None
-    objects: ObjectTable | None = None
+    class_names: Mapping[int, str]  # of classes as they are learnt, numbered without gaps
+    class_ids: tuple[int, ...] | None  # of these classes in the dataset; None where the classes are objects
+    objects: ObjectTable | None = None  # which the ids of the views were found to be
 
 
 @dataclass(frozen=True, eq=False)
 class Assessment:
-    """What is known of the views once they have been learnt from.
+    """What is known of the views once they have been learnt from."""
 
-    Attributes
-    ----------
-    views : mapping from name to View
-        Those that were used.
-    checks : list of ViewCheck, optional
-        Their masks beside what the other views predict; None where the learner cannot tell.
-    calibration : Calibration
-        The temperature.
-    objective : list of float
-        The learner's objective after each step.
-    report : mapping
-        `views` in `report.json`.
-    """
-
-    views: Mapping[str, View]
-    checks: list[ViewCheck] | None
+    views: Mapping[str, View]  # by name, those that were used
+    checks: list[ViewCheck] | None  # their masks beside what the others predict; None where the learner cannot tell
     calibration: Calibration
-    objective: list[float]
-    report: Mapping[str, Any]
+    objective: list[float]  # of the learner, after each step
+    report: Mapping[str, Any]  # `views` in `report.json`
 
 
 def segment_places(class_names: Mapping[int, str], views: Iterable[View]) -> list[str]:
@@ -175,7 +144,7 @@ def segment(
         refine or RefineSettings(), GraphSettings() if graph else None,
     )  # fmt: skip
     watch = Stopwatch()
-    with staged_run(out, "segment", earlier=earlier_segment, places=segment_places({}, [])) as run:
+    with staged_run(out, "segment", places=segment_places({}, [])) as run:
         settings.check()
         with ExitStack() as workers:
             with watch.stage("load"):
@@ -188,11 +157,8 @@ def segment(
             fitted = _learn(inputs, settings, client, watch, progress)
             assessment = _assess(fitted, inputs.class_names, watch, progress)
         probabilities, evidence = fitted.codes_, fitted.evidence()
-        settings = replace(
-            settings,
-            graph=settings.graph if is_scarce(evidence) else None,
-            learner_settings=getattr(fitted, "settings", None),
-        )
+        graph_settings = settings.graph if is_scarce(evidence) else None
+        settings = replace(settings, graph=graph_settings, learner_settings=getattr(fitted, "settings", None))
         del fitted  # Its votes take as much memory as all that follows.
         with watch.stage("refine"):
             if settings.graph:
@@ -225,14 +191,8 @@ def _load(scene_path: str | os.PathLike[str], data: str | os.PathLike[str], sett
     class_ids = None if settings.ids == PER_VIEW else dataset.class_ids
     if class_ids is not None:
         dataset = dataset.numbered()
-    return Inputs(
-        scene,
-        dataset.root,
-        spread(dataset.views("train"), settings.views),
-        spread(dataset.views("all"), PICTURED_VIEWS),
-        {} if class_ids is None else dataset.class_names,
-        class_ids,
-    )
+    train, pictured = spread(dataset.views("train"), settings.views), spread(dataset.views("all"), PICTURED_VIEWS)
+    return Inputs(scene, dataset.root, train, pictured, {} if class_ids is None else dataset.class_names, class_ids)
 
 
 def _associate(inputs: Inputs, device: str, progress: Progress) -> Inputs:
@@ -294,18 +254,12 @@ def _write(
     with watch.stage("pictures"):
         images, evidence, pictures = _picture(run, inputs, assessment, result, settings.device)
     report = RunReport.of(
-        scene,
-        named,
-        views=assessment.report,
-        settings=settings.as_dict(),
-        objective=assessment.objective,
+        scene, named, run=run.id, views=assessment.report, settings=settings.as_dict(), seconds=watch.seconds,
+        objective=assessment.objective, calibration=assessment.calibration.as_dict(),
+        ids=None if inputs.objects is None else inputs.objects.summary(),
         plys={k: str(path.relative_to(folder)) for k, path in plys.items()},
         pictures=[str(path.relative_to(folder)) for path in pictures],
-        seconds=watch.seconds,
-        run=run.id,
-        calibration=assessment.calibration.as_dict(),
-        ids=None if inputs.objects is None else inputs.objects.summary(),
-    )
+    )  # fmt: skip
     with watch.stage("report page"):
         write_report_page(folder / "report.html", PageInputs(report.as_dict(), scene, result, evidence, images))
     return replace(report, page="report.html", seconds=watch.seconds)
@@ -362,7 +316,7 @@ def render(
     names = [view_file_name(view.name) for view in views]
     overlays = []
     places = [*names, *(f"overlays/{name}" for name in (*names, "contact_sheet.png", "legend.png"))]
-    with staged_run(out, "render", earlier=earlier_render, places=places) as run:
+    with staged_run(out, "render", places=places) as run:
         for done, (_, labels, image, _) in enumerate(draw_views(scene, numbered, views, device=device)):
             progress("render", done, len(views))
             write_mask(run.folder / names[done], ids[labels], bits, run.id)

@@ -22,15 +22,11 @@ def silent(stage: str, done: int, total: int) -> None:
 @contextmanager
 def progress_bars(quiet: bool = False) -> Iterator[Progress]:
     """Show progress while the body runs, unless `quiet`; what is yielded is called with stage, done, total."""
-    if quiet:
-        yield silent
-        return
     bars = _Bars()
     try:
-        yield bars
+        yield silent if quiet else bars
     finally:
-        # An error message must not end up on the line of an unfinished bar.
-        bars.close()
+        bars.close()  # An error message must not end up on the line of an unfinished bar.
 
 
 class _Bars:

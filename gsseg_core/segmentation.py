@@ -33,14 +33,10 @@ FORMAT = "gsseg-segmentation-1"
 
 
 class LabelMap(NamedTuple):
-    """Class and confidence of every pixel of a rendered view.
+    """Class (H, W) int32 and confidence (H, W) float32 of every pixel of a rendered view.
 
-    Attributes
-    ----------
-    labels : (H, W) int32
-        Class of each pixel.
-    confidence : (H, W) float32
-        Its probability, at most 1; of a calibrated segmentation, the share of pixels so sure in which it is right.
+    The confidence is the probability of the class; of a calibrated segmentation, the share of pixels so sure in which
+    it is right.
     """
 
     labels: np.ndarray
@@ -114,24 +110,18 @@ class Segmentation:
         """Label learnt codes, after KNN clustering unless that is switched off, and leave the filter to the caller."""
         names = {k: class_name(class_names, k) for k in range(codes.shape[1])}
         probabilities, clustered = codes, np.zeros(len(codes), bool)
-        observed: np.ndarray = largest(codes)[0] > 0
         if settings.cluster:
-            refined = cluster(scene.means, codes, observed, settings.k, settings.beta, neighbours_of(scene, settings.k))
+            observed, neighbours = largest(codes)[0] > 0, neighbours_of(scene, settings.k)
+            refined = cluster(scene.means, codes, observed, settings.k, settings.beta, neighbours)
             probabilities, clustered = refined.probabilities, refined.changed
         _, labels = largest(probabilities)  # -1, which is UNOBSERVED, where nothing is known
         return cls(labels, probabilities, names, scene.digest, clustered, codes[clustered])
 
     def filtered(self, scene: GaussianScene, settings: RefineSettings) -> Segmentation:
         """Take the outliers out of each object: the paper's statistical filter."""
-        removed = statistical_filter(
-            scene.means,
-            self.labels,
-            settings.k,
-            settings.filter_sigmas,
-            self.probabilities.shape[1],
-            neighbours_of(scene, settings.k),
-        )
-        return replace(self, labels=np.where(removed, np.int32(REMOVED), self.labels))
+        k, classes = settings.k, self.probabilities.shape[1]
+        out = statistical_filter(scene.means, self.labels, k, settings.filter_sigmas, classes, neighbours_of(scene, k))
+        return self._without(out)
 
     def calibrated(self, temperature: float) -> Segmentation:
         """Bring all probabilities to a temperature, as `gsseg_core.learn.calibrate` fits it; labels and pictures stay.
@@ -145,7 +135,7 @@ class Segmentation:
     def selected(self, classes: Collection[int], min_confidence: float = 0.0) -> Segmentation:
         """Keep the labels of some classes, and there only of Gaussians at least so sure; the others are removed."""
         kept = np.isin(self.labels, list(classes)) & (self.confidence >= min_confidence)
-        return replace(self, labels=np.where(kept | (self.labels < 0), self.labels, np.int32(REMOVED)))
+        return self._without(~kept & (self.labels >= 0))
 
     @property
     def class_ids(self) -> np.ndarray:
@@ -156,6 +146,9 @@ class Segmentation:
     def num_classes(self) -> int:
         """Largest id + 1; K, unless ids have gaps."""
         return max(self.class_names) + 1
+
+    def _without(self, out: np.ndarray) -> Segmentation:  # (N,) bool
+        return replace(self, labels=np.where(out, np.int32(REMOVED), self.labels))
 
     def numbered(self) -> Segmentation:
         """Give the classes numbers without gaps, in the order of their ids, so that column k is class k."""
@@ -169,26 +162,19 @@ class Segmentation:
         """Give classes that are numbered without gaps ids of their own, (K,) different ones in any order."""
         labels = np.where(self.labels >= 0, np.array(ids, np.int32)[np.maximum(self.labels, 0)], self.labels)
         order, names = np.argsort(ids).tolist(), list(self.class_names.values())
+        result = replace(self, labels=labels, class_names={ids[k]: names[k] for k in order})
         if order == list(range(len(ids))):
-            return replace(self, labels=labels, class_names=dict(zip(ids, names, strict=True)))
-        return replace(
-            self,
-            labels=labels,
-            probabilities=self.probabilities[:, order],
-            class_names={ids[k]: names[k] for k in order},
-            learnt=self.learnt[:, order],
-        )
+            return result
+        return replace(result, probabilities=self.probabilities[:, order], learnt=self.learnt[:, order])
 
     @property
     def confidence(self) -> np.ndarray:
         """Largest probability of each Gaussian, (N,) float32; 0 where unobserved."""
-        confidence: np.ndarray = self.probabilities.max(axis=1)
-        return confidence
+        return np.asarray(self.probabilities.max(axis=1))
 
     def counts(self) -> np.ndarray:
         """Count the Gaussians of each class by id, (num_classes,) int64."""
-        counts: np.ndarray = np.bincount(self.labels[self.labels >= 0], minlength=self.num_classes)
-        return counts
+        return np.bincount(self.labels[self.labels >= 0], minlength=self.num_classes)
 
     def render(self, operator: ViewOperator) -> LabelMap:
         """Label map of a view: the class of the largest blended probability in each pixel.
@@ -211,8 +197,7 @@ class Segmentation:
         for camera in cameras:
             operator = make_operator(scene, camera, device)
             silhouettes.append(Silhouette.of(scene, operator, self.render(operator).labels))
-        out = carve(scene, self.labels, silhouettes)
-        return replace(self, labels=np.where(out, np.int32(REMOVED), self.labels))
+        return self._without(carve(scene, self.labels, silhouettes))
 
     def blend(self, operator: ViewOperator) -> np.ndarray:
         """Blend what was learnt into a view, (H, W, K) float32, not calibrated; rows sum to what is known of a pixel.
@@ -246,16 +231,8 @@ class Segmentation:
         """
         header = {"format": FORMAT, "scene": self.scene_digest, "class_names": self.class_names,
                   "temperature": self.temperature, **({} if run is None else {"run": run})}  # fmt: skip
-        write_npz(
-            path,
-            header,
-            labels=self.labels,
-            probabilities=self.probabilities,
-            class_ids=self.class_ids,
-            confidence=self.confidence,
-            clustered=self.clustered,
-            learnt=self.learnt,
-        )
+        names = ("labels", "probabilities", "class_ids", "confidence", "clustered", "learnt")
+        write_npz(path, header, **{name: getattr(self, name) for name in names})
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], scene: GaussianScene) -> Segmentation:

@@ -4,12 +4,13 @@ A compiler that is left alone with a loop of sixteen unrolls it, cuts it into ot
 operations are written as LLVM vectors of sixteen float32, which every processor gets in widths of its own: one register
 of AVX-512, two of AVX, four of NEON.
 
-The functions below are for compiled code only. Each takes C-contiguous float32 arrays whose last axis has sixteen
-entries, and counts rows over all the other axes.
+Each `operation` below is a function for compiled code only. It takes C-contiguous float32 arrays whose last axis has
+sixteen entries, and counts rows over all the other axes.
 """
 
 from __future__ import annotations
 
+import functools
 import struct
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -32,13 +33,9 @@ ROW, BITS = ir.VectorType(F32, LANES), ir.VectorType(I32, LANES)
 
 # 2^f on [-1/2, 1/2]: the polynomial of degree 5 of least relative error, 7.5e-8; the constant term first.
 _EXP2 = (
-    1.0000000716549167,
-    0.6931469670642137,
-    0.24022119722687324,
-    0.055507132738379344,
-    0.009675541397010753,
-    0.0013276472058267423,
-)
+    1.0000000716549167, 0.6931469670642137, 0.24022119722687324,
+    0.055507132738379344, 0.009675541397010753, 0.0013276472058267423,
+)  # fmt: skip
 
 
 class _RowType(types.Type):
@@ -75,9 +72,8 @@ class Builder:
 
     def element(self, position: int, number: Any) -> Any:
         """Address of one entry of the array that is argument `position`."""
-        array = self.context.make_array(self.signature.args[position])(
-            self.context, self.llvm, self.arguments[position]
-        )
+        kind = self.context.make_array(self.signature.args[position])
+        array = kind(self.context, self.llvm, self.arguments[position])
         return self.llvm.gep(array.data, [number], source_etype=F32)
 
     def load(self, address: Any) -> Any:
@@ -87,10 +83,6 @@ class Builder:
     def store(self, value: Any, address: Any) -> None:
         """Write a row."""
         self.llvm.store(value, address, align=4)
-
-    def scalar(self, position: int) -> Any:
-        """Argument `position`, a float32, sixteen times."""
-        return self.spread(self.arguments[position])
 
     def spread(self, value: Any) -> Any:
         """Sixteen times a float32."""
@@ -102,10 +94,9 @@ class Builder:
         """Sixteen truth values as the low bits of an int64."""
         return self.llvm.zext(self.llvm.bitcast(lanes, ir.IntType(LANES)), I64)
 
-    def lanes(self, position: int) -> Any:
-        """Low bits of argument `position`, an int64, as sixteen truth values."""
-        low = self.llvm.trunc(self.arguments[position], ir.IntType(LANES))
-        return self.llvm.bitcast(low, ir.VectorType(ir.IntType(1), LANES))
+    def lanes(self, bits: Any) -> Any:
+        """Low bits of an int64 as sixteen truth values."""
+        return self.llvm.bitcast(self.llvm.trunc(bits, ir.IntType(LANES)), ir.VectorType(ir.IntType(1), LANES))
 
     def least(self, a: Any, b: Any) -> Any:
         """Take the smaller one in each lane."""
@@ -151,192 +142,136 @@ def constant(value: float) -> Any:
     return ir.Constant(ROW, [struct.unpack("f", struct.pack("f", value))[0]] * LANES)
 
 
-@intrinsic
-def first_bit(typing: Any, bits: Any) -> tuple[Any, Callable[..., Any]]:
+def operation(result: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Make a function for compiled code of one that writes its instructions.
+
+    The latter is given a `Builder`, and then the arguments, which have the types `kinds`, None for any. What it returns
+    is of the type `result`, nothing if that is void.
+    """
+
+    def make(write: Callable[..., Any]) -> Any:
+        @functools.wraps(write)
+        def typed(typing: Any, *given: Any) -> tuple[Any, Callable[..., Any]]:
+            def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+                value = write(Builder(context, builder, signature, arguments), *arguments)
+                return context.get_dummy_value() if value is None else value
+
+            taken = (any_kind if kind is None else kind for kind, any_kind in zip(kinds, given, strict=True))
+            return result(*taken), generate
+
+        return intrinsic(typed)
+
+    return make
+
+
+@operation(types.int64, types.int64)
+def first_bit(row: Builder, bits: Any) -> Any:
     """Position of the lowest bit that is set; there must be one."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
-
-    return types.int64(types.int64), generate
+    return row.llvm.cttz(bits, ir.Constant(ir.IntType(1), 1))
 
 
-@intrinsic
-def count_bits(typing: Any, bits: Any) -> tuple[Any, Callable[..., Any]]:
+@operation(types.int64, types.int64)
+def count_bits(row: Builder, bits: Any) -> Any:
     """How many bits are set."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.ctpop(arguments[0])
-
-    return types.int64(types.int64), generate
+    return row.llvm.ctpop(bits)
 
 
-@intrinsic
-def count_at_most(typing: Any, numbers: Any, i: Any, limit: Any) -> tuple[Any, Callable[..., Any]]:
+@operation(types.int64, None, None, types.int32)
+def count_at_most(row: Builder, numbers: Any, i: Any, limit: Any) -> Any:
     """Count which of the sixteen int32 in row i are not above a limit."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        row = Builder(context, builder, signature, arguments)
-        address = builder.bitcast(row.row(0), ir.PointerType(BITS))
-        first = builder.insert_element(ir.Constant(BITS, ir.Undefined), arguments[2], ir.Constant(I32, 0))
-        most = builder.shuffle_vector(first, first, ir.Constant(BITS, [0] * LANES))
-        found = builder.icmp_signed("<=", builder.load(address, align=4, typ=BITS), most)
-        return builder.ctpop(row.bits(found))
-
-    return types.int64(numbers, i, types.int32), generate
+    address = row.llvm.bitcast(row.row(0), ir.PointerType(BITS))
+    first = row.llvm.insert_element(ir.Constant(BITS, ir.Undefined), limit, ir.Constant(I32, 0))
+    most = row.llvm.shuffle_vector(first, first, ir.Constant(BITS, [0] * LANES))
+    found = row.llvm.icmp_signed("<=", row.llvm.load(address, align=4, typ=BITS), most)
+    return row.llvm.ctpop(row.bits(found))
 
 
-@intrinsic
-def nothing(typing: Any) -> tuple[Any, Callable[..., Any]]:
+@operation(row_type)
+def nothing(row: Builder) -> Any:
     """Sixteen zeros."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return constant(0.0)
-
-    return row_type(), generate
+    return constant(0.0)
 
 
-@intrinsic
-def store_row(typing: Any, target: Any, i: Any, a: Any) -> tuple[Any, Callable[..., Any]]:
+@operation(types.void, None, None, None)
+def store_row(row: Builder, target: Any, i: Any, a: Any) -> None:
     """Set target[i] to sixteen numbers."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        row = Builder(context, builder, signature, arguments)
-        row.store(arguments[2], row.row(0))
-        return context.get_dummy_value()
-
-    return types.void(target, i, a), generate
+    row.store(a, row.row(0))
 
 
-@intrinsic
-def load_row(typing: Any, source: Any, i: Any) -> tuple[Any, Callable[..., Any]]:
+@operation(row_type, None, None)
+def load_row(row: Builder, source: Any, i: Any) -> Any:
     """Read source[i]."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        row = Builder(context, builder, signature, arguments)
-        return row.load(row.row(0))
-
-    return row_type(source, i), generate
+    return row.load(row.row(0))
 
 
-@intrinsic
-def squared_distances(typing: Any, points: Any, i: Any, x: Any, y: Any, z: Any) -> tuple[Any, Callable[..., Any]]:
+@operation(row_type, None, None, types.float32, types.float32, types.float32)
+def squared_distances(row: Builder, points: Any, i: Any, x: Any, y: Any, z: Any) -> Any:
     """From (x, y, z) to sixteen points, whose coordinates are points[i] to points[i + 2]; unfused, as scalars are."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        row = Builder(context, builder, signature, arguments)
-        total = None
-        for axis in range(3):
-            number = builder.add(arguments[1], ir.Constant(arguments[1].type, axis))
-            offset = builder.fsub(row.load(row.address(0, number)), row.scalar(2 + axis))
-            square = builder.fmul(offset, offset)
-            total = square if total is None else builder.fadd(total, square)
-        return total
-
-    number = types.float32
-    return row_type(points, i, number, number, number), generate
+    total = None
+    for axis, center in enumerate((x, y, z)):
+        number = row.llvm.add(i, ir.Constant(i.type, axis))
+        offset = row.llvm.fsub(row.load(row.address(0, number)), row.spread(center))
+        square = row.llvm.fmul(offset, offset)
+        total = square if total is None else row.llvm.fadd(total, square)
+    return total
 
 
-@intrinsic
-def at_most(typing: Any, a: Any, limit: Any) -> tuple[Any, Callable[..., Any]]:
+@operation(types.int64, None, types.float32)
+def at_most(row: Builder, a: Any, limit: Any) -> Any:
     """Bits of the lanes that are not above a limit."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        row = Builder(context, builder, signature, arguments)
-        return row.bits(builder.fcmp_ordered("<=", arguments[0], row.scalar(1)))
-
-    return types.int64(a, types.float32), generate
+    return row.bits(row.llvm.fcmp_ordered("<=", a, row.spread(limit)))
 
 
-@intrinsic
-def add_where(typing: Any, total: Any, a: Any, lanes: Any) -> tuple[Any, Callable[..., Any]]:
+@operation(row_type, None, None, types.int64)
+def add_where(row: Builder, total: Any, a: Any, bits: Any) -> Any:
     """Add two rows in the lanes of the bits that are set; elsewhere the first stays."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        row = Builder(context, builder, signature, arguments)
-        return builder.select(row.lanes(2), builder.fadd(arguments[0], arguments[1]), arguments[0])
-
-    return row_type(total, a, types.int64), generate
+    return row.llvm.select(row.lanes(bits), row.llvm.fadd(total, a), total)
 
 
-@intrinsic
-def add_product(typing: Any, total: Any, a: Any, b: Any) -> tuple[Any, Callable[..., Any]]:
+@operation(row_type, None, None, None)
+def add_product(row: Builder, total: Any, a: Any, b: Any) -> Any:
     """Add a product of two rows."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        row = Builder(context, builder, signature, arguments)
-        return row.fma(arguments[1], arguments[2], arguments[0])
-
-    return row_type(total, a, b), generate
+    return row.fma(a, b, total)
 
 
-@intrinsic
-def add_scaled(typing: Any, total: Any, a: Any, factor: Any) -> tuple[Any, Callable[..., Any]]:
+@operation(row_type, None, None, types.float32)
+def add_scaled(row: Builder, total: Any, a: Any, factor: Any) -> Any:
     """Add a multiple of a row."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        row = Builder(context, builder, signature, arguments)
-        return row.fma(row.scalar(2), arguments[1], arguments[0])
-
-    return row_type(total, a, types.float32), generate
+    return row.fma(row.spread(factor), a, total)
 
 
-@intrinsic
-def add_product_where(typing: Any, total: Any, a: Any, b: Any, lanes: Any) -> tuple[Any, Callable[..., Any]]:
+@operation(row_type, None, None, None, types.int64)
+def add_product_where(row: Builder, total: Any, a: Any, b: Any, bits: Any) -> Any:
     """Add a product of two rows in the lanes of the bits that are set."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        row = Builder(context, builder, signature, arguments)
-        return builder.select(row.lanes(3), row.fma(arguments[1], arguments[2], arguments[0]), arguments[0])
-
-    return row_type(total, a, b, types.int64), generate
+    return row.llvm.select(row.lanes(bits), row.fma(a, b, total), total)
 
 
-@intrinsic
-def add_scaled_where(typing: Any, total: Any, a: Any, factor: Any, lanes: Any) -> tuple[Any, Callable[..., Any]]:
+@operation(row_type, None, None, types.float32, types.int64)
+def add_scaled_where(row: Builder, total: Any, a: Any, factor: Any, bits: Any) -> Any:
     """Add a multiple of a row in the lanes of the bits that are set."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        row = Builder(context, builder, signature, arguments)
-        return builder.select(row.lanes(3), row.fma(row.scalar(2), arguments[1], arguments[0]), arguments[0])
-
-    return row_type(total, a, types.float32, types.int64), generate
+    return row.llvm.select(row.lanes(bits), row.fma(row.spread(factor), a, total), total)
 
 
-@intrinsic
-def sum_row(typing: Any, a: Any) -> tuple[Any, Callable[..., Any]]:
+@operation(types.float32, None)
+def sum_row(row: Builder, a: Any) -> Any:
     """Sum of the sixteen."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return Builder(context, builder, signature, arguments).sum(arguments[0])
-
-    return types.float32(a), generate
+    return row.sum(a)
 
 
-@intrinsic
-def dot(typing: Any, a: Any, i: Any, b: Any, j: Any) -> tuple[Any, Callable[..., Any]]:
+@operation(types.float32, None, None, None, None)
+def dot(row: Builder, a: Any, i: Any, b: Any, j: Any) -> Any:
     """Sum of a[i] * b[j] over the sixteen."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        row = Builder(context, builder, signature, arguments)
-        return row.sum(builder.fmul(row.load(row.row(0)), row.load(row.row(2))))
-
-    return types.float32(a, i, b, j), generate
+    return row.sum(row.llvm.fmul(row.load(row.row(0)), row.load(row.row(2))))
 
 
-@intrinsic
-def prefetch(typing: Any, table: Any, row: Any) -> tuple[Any, Callable[..., Any]]:
+@operation(types.void, None, types.intp)
+def prefetch(row: Builder, table: Any, i: Any) -> None:
     """Ask for a row of any array to be in the cache soon."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        array = context.make_array(signature.args[0])(context, builder, arguments[0])
-        stride = builder.extract_value(array.strides, 0)
-        address = builder.gep(array.data, [builder.mul(arguments[1], stride)], source_etype=ir.IntType(8))
-        kind = ir.FunctionType(ir.VoidType(), [ir.PointerType(ir.IntType(8)), I32, I32, I32])
-        insert: Any = cgutils.get_or_insert_function
-        function = insert(builder.module, kind, "llvm.prefetch.p0")
-        address = builder.bitcast(address, ir.PointerType(ir.IntType(8)))
-        builder.call(function, [address, ir.Constant(I32, 0), ir.Constant(I32, 3), ir.Constant(I32, 1)])
-        return context.get_dummy_value()
-
-    return types.void(table, types.intp), generate
+    llvm, bytes_at = row.llvm, ir.PointerType(ir.IntType(8))
+    array = row.context.make_array(row.signature.args[0])(row.context, llvm, table)
+    stride = llvm.extract_value(array.strides, 0)
+    address = llvm.gep(array.data, [llvm.mul(i, stride)], source_etype=ir.IntType(8))
+    insert: Any = cgutils.get_or_insert_function
+    function = insert(llvm.module, ir.FunctionType(ir.VoidType(), [bytes_at, I32, I32, I32]), "llvm.prefetch.p0")
+    hints = [ir.Constant(I32, hint) for hint in (0, 3, 1)]  # to be read, and kept near; data, no code
+    llvm.call(function, [llvm.bitcast(address, bytes_at), *hints])

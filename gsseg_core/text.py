@@ -21,11 +21,6 @@ def printable(text: str) -> str:
     What a terminal obeys (ANSI sequences, backspaces, line ends), what turns the reading direction around, what is
     invisible, and halves of surrogate pairs, as in file names that are no UTF-8, become what Python writes for them:
     `\x1b`, `\u202e`, `\udcff`. The result can be encoded. Letters, marks, emoji and spaces of all languages stay.
-
-    Parameters
-    ----------
-    text : str
-        Of any origin.
     """
     if text.isprintable():
         return text

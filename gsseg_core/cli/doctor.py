@@ -1,10 +1,27 @@
-"""The command `gsseg doctor`."""
+"""The command `gsseg doctor`: what this machine has of what gsseg needs, and how to get the rest.
+
+Nothing of ROS is imported here, only looked for.
+"""
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
+import os
+import platform
+import re
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib import metadata
+from itertools import groupby
 
+from gsseg_core import kernel_cache
 from gsseg_core.cli.terminal import note, tell
+from gsseg_core.errors import GssegError
 
 DESCRIPTION = """
 Prints the versions of gsseg, Python and its packages, the devices, whether the kernels run and where they are cached,
@@ -15,6 +32,34 @@ EXAMPLES = """
   gsseg doctor
 """
 
+_REQUIREMENT = re.compile(r"(?P<name>[A-Za-z0-9._-]+)")
+_EXTRA = re.compile(r"""extra\s*==\s*["'](?P<extra>[^"']+)["']""")
+# For those who use gsseg; the extras for those who develop it are looked for by their own tools.
+_EXTRAS_FOR = {
+    "view": "gsseg view, the scene in the browser",
+    "ros": "the ROS 2 nodes, on a machine without ROS from apt",
+    "distributed": "gsseg segment --scheduler, several machines",
+    "gsplat": "--device cuda, on a machine with an NVIDIA GPU",
+}
+_ROS_MODULES = {
+    "rclpy": "ROS 2 itself: source its setup file, or see the extra ros above",
+    "gsseg_msgs": "the messages: pip install ./msg_defs, or colcon build",
+    "gsseg_ros": "the nodes: they come with gsseg",
+    "tf2_ros": "only for pose_source tf; apt install ros-jazzy-tf2-ros",
+}
+_ROS_VARIABLES = ("ROS_DISTRO", "RMW_IMPLEMENTATION", "ROS_DOMAIN_ID")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of what `gsseg doctor` prints."""
+
+    group: str
+    name: str
+    state: str
+    mark: str = "ok"  # "-" for an option that is missing, "!!" for something without which gsseg does not work, or ""
+    fix: str = ""  # what to do, if anything
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the command takes: nothing."""
@@ -22,8 +67,150 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Look, and print what was found."""
-    from gsseg_core.cli.machine_check import describe, examine, works
-
     findings = examine(note)
     tell(describe(findings))
     return 0 if works(findings) else 2
+
+
+def examine(say: Callable[[str], object] = lambda text: None) -> list[Finding]:
+    """Look at this machine, and segment a handful of Gaussians to see whether the core works.
+
+    `say` is told if kernels have to be compiled, which takes a minute.
+    """
+    return [*_versions(), *_packages(), *_devices(), *_kernels(say), *_formats(), *_extras(), *_ros()]
+
+
+def works(findings: list[Finding]) -> bool:
+    """Whether nothing is missing without which gsseg does not work."""
+    return all(finding.mark != "!!" for finding in findings)
+
+
+def describe(findings: list[Finding]) -> str:
+    """Write findings as text for a terminal, group by group, and the verdict."""
+    width = max(len(finding.name) for finding in findings)
+    lines: list[str] = []
+    for group, of_group in groupby(findings, lambda finding: finding.group):
+        lines += ["", group] if lines else [group]
+        for finding in of_group:
+            lines.append(f"  {finding.mark:2}  {finding.name.ljust(width)}  {finding.state}".rstrip())
+            if finding.fix:
+                lines.append(f"      {' ' * width}  -> {finding.fix}")
+    missing = sum(finding.mark == "-" for finding in findings)
+    verdict = "gsseg works here" if works(findings) else "gsseg does not work here: see what is marked !!"
+    options = f"; what is marked - ({missing}) is needed only by those who use it" if missing else ""
+    return "\n".join([*lines, "", verdict + options])
+
+
+def _versions() -> Iterator[Finding]:
+    yield Finding("machine", "gsseg", metadata.version("gsseg"))
+    supported = (3, 10) <= sys.version_info[:2] <= (3, 13)
+    mark, fix = ("ok", "") if supported else ("!!", "use Python 3.10 to 3.13")
+    yield Finding("machine", "Python", f"{platform.python_version()}, {sys.executable}", mark, fix)
+    yield Finding("machine", "system", f"{platform.system()} {platform.release()}, {platform.machine()}")
+
+
+def _packages() -> Iterator[Finding]:
+    for name in _requirements(""):
+        found = _version(name)
+        fix = "" if found else f"pip install {name}"
+        yield Finding("packages", name, found or "missing", "ok" if found else "!!", fix)
+
+
+def _extras() -> Iterator[Finding]:
+    for extra, purpose in _EXTRAS_FOR.items():
+        names = _requirements(extra)
+        missing = [name for name in names if not _version(name)]
+        if missing:
+            fix = f"pip install 'gsseg[{extra}]'"
+            yield Finding("options", extra, f"{purpose}: lacks {', '.join(missing)}", "-", fix)
+        elif names:
+            yield Finding("options", extra, purpose)
+
+
+def _devices() -> Iterator[Finding]:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    try:
+        import numba
+
+        threads = f"{numba.get_num_threads()} threads on {cores} cores"
+        fix = "NUMBA_NUM_THREADS is set; unset it to use all cores" if numba.get_num_threads() < cores else ""
+        yield Finding("devices", "cpu", threads, "ok", fix)
+    except ImportError:
+        yield Finding("devices", "cpu", f"{cores} cores")
+    try:
+        import torch
+
+        gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
+    except (ImportError, OSError, RuntimeError) as error:
+        fix = "pip install --force-reinstall torch"
+        yield Finding("devices", "cuda", f"PyTorch does not load ({error})", "!!", fix)
+        return
+    if gpus:
+        yield Finding("devices", "cuda", ", ".join(gpus))
+    elif shutil.which("nvidia-smi"):
+        fix = "install PyTorch's CUDA build, and look whether nvidia-smi shows a GPU"
+        yield Finding("devices", "cuda", f"PyTorch {torch.__version__} sees no GPU", "-", fix)
+    else:
+        yield Finding("devices", "cuda", "no GPU; everything runs on the CPU")
+
+
+def _kernels(say: Callable[[str], object]) -> Iterator[Finding]:
+    start = time.perf_counter()
+    try:
+        from gsseg_core.raster.votes import add_votes
+        from gsseg_core.warm_up import SIDE, warm_up
+
+        warm_up(say=say)
+    except (ImportError, OSError, RuntimeError, GssegError) as error:
+        fix = "install the packages marked !! above"
+        yield Finding("kernels", "run", f"{type(error).__name__}: {error}", "!!", fix)
+        return
+    seconds, compiled = (
+        time.perf_counter() - start,
+        "from the cache" if add_votes.stats.cache_hits else "compiled just now",
+    )
+    yield Finding("kernels", "run", f"segmented {SIDE**2:,} Gaussians in {seconds:.1f} s, {compiled}")
+    if kernel_cache.FOLDER:
+        yield Finding("kernels", "cache", add_votes.stats.cache_path or kernel_cache.FOLDER)
+    else:
+        state = f"none: cannot write to {' or '.join(kernel_cache.candidates())}"
+        fix = f"{kernel_cache.REMEDY}; else every run compiles for a minute or two"
+        yield Finding("kernels", "cache", state, "-", fix)
+
+
+def _formats() -> Iterator[Finding]:
+    with suppress(ImportError):  # What is missing is said above.
+        from gsseg_core.data.camera_formats.table import CAMERA_FORMATS
+        from gsseg_core.scene.scene_formats import SCENE_FORMATS
+
+        for group, formats in (("scene formats", SCENE_FORMATS), ("camera formats", CAMERA_FORMATS)):
+            for known in formats:
+                yield Finding(group, known.name, known.looked_for)
+
+
+def _ros() -> Iterator[Finding]:
+    for name, fix in _ROS_MODULES.items():
+        found = importlib.util.find_spec(name) is not None
+        yield Finding("ROS 2", name, "found" if found else "missing", "ok" if found else "-", "" if found else fix)
+    programs = [name for name in ("segment_node", "replay_node") if shutil.which(name)]
+    state = f"{' and '.join(programs)} can be started" if programs else "not on the PATH; in a workspace: ros2 run"
+    yield Finding("ROS 2", "programs", state, "ok" if programs else "-")
+    for name in _ROS_VARIABLES:
+        yield Finding("ROS 2", name, os.environ.get(name, "not set"), "")
+
+
+def _requirements(extra: str) -> list[str]:
+    """List the names of packages that gsseg asks for, those of an extra, or ("") those that it always needs."""
+    names = []
+    for line in metadata.requires("gsseg") or []:
+        name, belongs = _REQUIREMENT.match(line), _EXTRA.search(line)
+        if name and (belongs["extra"] if belongs else "") == extra:
+            names.append(name["name"])
+    return sorted(set(names))
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return ""

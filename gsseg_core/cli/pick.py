@@ -40,7 +40,6 @@ def run(options: argparse.Namespace) -> int:
     from gsseg_core.data.view import View
     from gsseg_core.export.pictures import overlay, palette, save_png
     from gsseg_core.export.view_pictures import background_image
-    from gsseg_core.files.earlier_outputs import earlier_pick
     from gsseg_core.files.run_folder import staged_run
     from gsseg_core.objects.pick import pick_clicks, pick_mask, read_object_mask
     from gsseg_core.raster.backends import make_operator
@@ -54,7 +53,7 @@ def run(options: argparse.Namespace) -> int:
     camera, out = cameras[options.view], Path(options.out)
     scene = GaussianScene.load(options.scene)
     load_kernels(options.quiet, options.device)
-    with staged_run(out, "pick", earlier=earlier_pick, places=("object.ply", "pick.npz", "pick.png")) as run:
+    with staged_run(out, "pick", places=("object.ply", "pick.npz", "pick.png")) as run:
         if options.mask:
             view = View.from_arrays(camera, read_object_mask(options.mask, options.label))
             picked = pick_mask(scene, view, device=options.device)

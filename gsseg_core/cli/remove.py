@@ -23,14 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the command takes."""
     parser.add_argument("scene", metavar="SCENE.ply", help="trained 3DGS scene")
     parser.add_argument("--segmentation", required=True, metavar="FILE", help="segmentation.npz of this scene")
-    parser.add_argument(
-        "--class",
-        dest="classes",
-        action="append",
-        required=True,
-        metavar="NAME",
-        help="id or name of a class to leave out, a number being an id; may be given several times",
-    )
+    classes = "id or name of a class to leave out, a number being an id; may be given several times"
+    parser.add_argument("--class", dest="classes", action="append", required=True, metavar="NAME", help=classes)
     parser.add_argument("--out", required=True, metavar="PLY", help="file to write")
 
 

@@ -36,13 +36,8 @@ def run(options: argparse.Namespace) -> int:
     load_kernels(options.quiet, options.device)
     with progress_bars(options.quiet) as progress:
         paths = pipeline.render(
-            options.scene,
-            options.data,
-            options.segmentation,
-            options.out,
-            split=options.split,
-            device=options.device,
-            progress=progress,
-        )
+            options.scene, options.data, options.segmentation, options.out,
+            split=options.split, device=options.device, progress=progress,
+        )  # fmt: skip
     tell(f"{counted(len(paths), 'label map')} in {options.out}, overlays in {options.out}/overlays")
     return 0

@@ -25,55 +25,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the command takes."""
     add_scene(parser)
     parser.add_argument("--out", required=True, metavar="OUT", help="folder to write to")
+    labels = "folder of the masks in DATASET (default: labels)"
+    parser.add_argument("--labels", default="labels", metavar="DIR", help=labels)
     parser.add_argument(
-        "--labels", default="labels", metavar="DIR", help="folder of the masks in DATASET (default: labels)"
-    )
-    learning = parser.add_argument_group("learning")
-    learning.add_argument("--learner", choices=tuple(LEARNERS), default=DEFAULT, help="default: %(default)s")
-    learning.add_argument(
-        "--views", type=int, metavar="N", help="learn from N train views, spread evenly (default: all)"
-    )
-    refinement = parser.add_argument_group("refinement")
-    refinement.add_argument(
-        "--k", type=int, default=RefineSettings.k, help="neighbours in KNN and filter (default: %(default)s)"
-    )
-    refinement.add_argument(
-        "--beta",
-        type=float,
-        default=RefineSettings.beta,
-        help="confidence below which KNN decides (default: %(default)s)",
-    )
-    refinement.add_argument(
-        "--no-graph", action="store_true", help="few views: leave what they hardly saw to KNN, without spreading codes"
-    )
-    refinement.add_argument(
-        "--no-knn", action="store_true", help="leave uncertain and unobserved Gaussians as they are"
-    )
-    refinement.add_argument(
-        "--no-filter", action="store_true", help="keep Gaussians that lie far from the rest of their object"
-    )
-    refinement.add_argument(
-        "--carve", action="store_true", help="cut objects to their silhouettes in the views, in place of the filter"
-    )
-    learning.add_argument("--seed", type=int, default=0, help="for learners that draw at random (default: %(default)s)")
-    parser.add_argument(
-        "--ids",
-        choices=("global", "per-view"),
-        default="global",
+        "--ids", choices=("global", "per-view"), default="global",
         help="whether an id means the same in every view, or holds in its own view only (default: %(default)s)",
-    )
-    learning.add_argument(
-        "--memory-budget",
-        type=int,
-        default=2048,
-        metavar="MIB",
-        help="for prepared views; those beyond it are prepared anew in each step (default: %(default)s)",
-    )
-    learning.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help=f"learn on the workers of this Dask scheduler ({' and '.join(distributed_learners())})",
-    )
+    )  # fmt: skip
+    add = parser.add_argument_group("learning").add_argument
+    add("--learner", choices=tuple(LEARNERS), default=DEFAULT, help="default: %(default)s")
+    add("--views", type=int, metavar="N", help="learn from N train views, spread evenly (default: all)")
+    add("--seed", type=int, default=0, help="for learners that draw at random (default: %(default)s)")
+    budget = "for prepared views; those beyond it are prepared anew in each step (default: %(default)s)"
+    add("--memory-budget", type=int, default=2048, metavar="MIB", help=budget)
+    learners = " and ".join(distributed_learners())
+    add("--scheduler", metavar="ADDRESS", help=f"learn on the workers of this Dask scheduler ({learners})")
+    add = parser.add_argument_group("refinement").add_argument
+    k, beta = RefineSettings.k, RefineSettings.beta
+    add("--k", type=int, default=k, help="neighbours in KNN and filter (default: %(default)s)")
+    add("--beta", type=float, default=beta, help="confidence below which KNN decides (default: %(default)s)")
+    for name, effect in {
+        "--no-graph": "few views: leave what they hardly saw to KNN, without spreading codes",
+        "--no-knn": "leave uncertain and unobserved Gaussians as they are",
+        "--no-filter": "keep Gaussians that lie far from the rest of their object",
+        "--carve": "cut objects to their silhouettes in the views, in place of the filter",
+    }.items():
+        add(name, action="store_true", help=effect)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -81,31 +57,18 @@ def run(options: argparse.Namespace) -> int:
     # The rasteriser's kernels load with the pipeline; `gsseg --help` need not wait for them.
     from gsseg_core import pipeline
 
+    is_filtered = not (options.no_filter or options.carve)
     refine = RefineSettings(
-        k=options.k,
-        beta=options.beta,
-        cluster=not options.no_knn,
-        filter=not (options.no_filter or options.carve),
-        carve=options.carve,
+        k=options.k, beta=options.beta, cluster=not options.no_knn, filter=is_filtered, carve=options.carve
     )
     load_kernels(options.quiet, options.device)
     with progress_bars(options.quiet) as progress:
         report = pipeline.segment(
-            options.scene,
-            options.data,
-            options.out,
-            labels=options.labels,
-            learner=options.learner,
-            views=options.views,
-            refine=refine,
-            graph=not options.no_graph,
-            device=options.device,
-            memory_budget=options.memory_budget << 20,
-            seed=options.seed,
-            scheduler=options.scheduler,
-            ids=options.ids,
-            progress=progress,
-        )
+            options.scene, options.data, options.out, labels=options.labels, learner=options.learner,
+            views=options.views, refine=refine, graph=not options.no_graph, device=options.device,
+            memory_budget=options.memory_budget << 20, seed=options.seed, scheduler=options.scheduler,
+            ids=options.ids, progress=progress,
+        )  # fmt: skip
     from gsseg_core.text import segment_summary
 
     tell(segment_summary(report, options.out))

@@ -12,12 +12,8 @@ from gsseg_core.raster.backends import devices, rasteriser_of
 def add_scene(parser: argparse.ArgumentParser) -> None:
     """Add the scene, the dataset, the device and `--quiet`."""
     parser.add_argument("scene", metavar="SCENE.ply", help="trained 3DGS scene")
-    parser.add_argument(
-        "--data",
-        required=True,
-        metavar="DATASET",
-        help="folder with cameras, labels/<stem>.png, classes.json, split.json",
-    )
+    data = "folder with cameras, labels/<stem>.png, classes.json, split.json"
+    parser.add_argument("--data", required=True, metavar="DATASET", help=data)
     add_device(parser)
     add_quiet(parser)
 

@@ -33,22 +33,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the command takes."""
     parser.add_argument("scene", metavar="SCENE.ply", help="trained 3DGS scene")
     parser.add_argument("--segmentation", metavar="FILE", help="segmentation.npz of this scene")
-    parser.add_argument(
-        "--data", metavar="DATASET", help="folder of the views that it was learnt from, for jumping to them"
-    )
+    data = "folder of the views that it was learnt from, for jumping to them"
+    parser.add_argument("--data", metavar="DATASET", help=data)
     parser.add_argument("--ros", action="store_true", help="follow the ROS 2 node `gsseg` while it learns")
-    parser.add_argument(
-        "--host",
-        default="127.0.0.1",
-        help="0.0.0.0 lets others look who have the token of the address (default: %(default)s)",
-    )
+    host = "0.0.0.0 lets others look who have the token of the address (default: %(default)s)"
+    parser.add_argument("--host", default="127.0.0.1", help=host)
     parser.add_argument("--port", type=int, default=8080, help="default: %(default)s, or the next one that is free")
-    parser.add_argument(
-        "--draw",
-        choices=("auto", "browser", "server"),
-        default="auto",
-        help="who draws: the browser; the server, which sends it images; or (default) the browser if it is fast",
-    )
+    draw = "who draws: the browser; the server, which sends it images; or (default) the browser if it is fast"
+    parser.add_argument("--draw", choices=("auto", "browser", "server"), default="auto", help=draw)
     parser.add_argument("--open", action="store_true", help="open the page, too")
     add_device(parser)
     add_quiet(parser)
@@ -91,13 +83,7 @@ def _show(options: argparse.Namespace, listener: Listener, viewer_module: Module
     mode = BY_CLASS if options.segmentation or options.ros else TRUE_COLOURS
     model = ViewModel(scene, labelling, mode=mode, class_ids=tuple(class_ids or ()))
     viewer = viewer_module.Viewer(
-        model,
-        views,
-        reliability,
-        source,
-        listener=listener,
-        draw=options.draw,
-        device=options.device,
+        model, views, reliability, source, listener=listener, draw=options.draw, device=options.device
     )
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # A browser may leave at any moment.
     with closing(viewer), suppress(KeyboardInterrupt):  # How it is meant to end.

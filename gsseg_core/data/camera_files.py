@@ -15,19 +15,9 @@ from gsseg_core.text import quoted
 
 
 def read_cameras(folder: str | os.PathLike[str], within: Path | None = None) -> list[Camera]:
-    """Read the cameras of a dataset folder, from the first of `CAMERA_FORMATS` that it has.
+    """Read the cameras of a dataset folder, from the first of `CAMERA_FORMATS` that it has, in the order of the file.
 
-    Parameters
-    ----------
-    folder : path
-        The dataset.
-    within : pathlib.Path, optional
-        A folder below which the files must lie, links followed.
-
-    Returns
-    -------
-    list of Camera
-        In the order of the file. Names are the stems of the image names.
+    Names are the stems of the image names. With `within`, the files must lie below that folder, links followed.
 
     Raises
     ------
@@ -55,7 +45,5 @@ def read_cameras(folder: str | os.PathLike[str], within: Path | None = None) -> 
             raise CameraFileError(f"{path}: an image has the name {flaw}")
     stem, count = Counter(camera.name for camera in cameras).most_common(1)[0]
     if count > 1:
-        raise CameraFileError(
-            f"{path}: {count} images have the stem {quoted(stem)}; expected another stem for each image"
-        )
+        raise CameraFileError(f"{path}: {count} images have the stem {quoted(stem)}; expected another one for each")
     return cameras

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from gsseg_core.errors import ClassesFileError, SettingsError
-from gsseg_core.files.json_files import kind_of, read_json
+from gsseg_core.files.json_files import read_object
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.text import clipped, quoted
 
@@ -40,9 +40,7 @@ def read_classes(path: str | os.PathLike[str], within: Path | None = None) -> di
         of at most 200 characters.
     """
     path = Path(path)
-    content = read_json(path, ClassesFileError, within)
-    if not isinstance(content, dict):
-        raise ClassesFileError(f'{path}: holds {kind_of(content)}; expected an object such as {{"1": "chair"}}')
+    content = read_object(path, ClassesFileError, 'an object such as {"1": "chair"}', within)
     names = {0: BACKGROUND_NAME}
     for key, name in content.items():
         if not re.fullmatch(r"0|[1-9][0-9]{0,4}", key) or int(key) > MAX_LABEL:
@@ -64,22 +62,16 @@ def flaw_of_class_name(name: str) -> str:
     """Say what is wrong with the name of a class, as the end of "has the name ...", or "" if it is usable."""
     if not name.strip():
         return f"{quoted(name)}; expected text"
-    return _flaw(name) or (
-        f"{quoted(name)} of {len(name):,} characters; expected at most {MAX_CLASS_NAME}"
-        if len(name) > MAX_CLASS_NAME
-        else ""
-    )
+    is_long = len(name) > MAX_CLASS_NAME
+    too_long = f"{quoted(name)} of {len(name):,} characters; expected at most {MAX_CLASS_NAME}" if is_long else ""
+    return _flaw(name) or too_long
 
 
 def flaw_of_view_name(name: str) -> str:
     """Say what is wrong with the name of a view, as the end of "has the name ...", or "" if it is usable."""
-    flaw = _flaw(name)
-    size = 0 if flaw else len(name.encode())
-    return flaw or (
-        f"{quoted(name)} of {size:,} bytes; expected at most {MAX_VIEW_NAME}, since files are called after it"
-        if size > MAX_VIEW_NAME
-        else ""
-    )
+    size = len(name.encode(errors="replace"))
+    wanted = f"expected at most {MAX_VIEW_NAME}, since files are called after it"
+    return _flaw(name) or (f"{quoted(name)} of {size:,} bytes; {wanted}" if size > MAX_VIEW_NAME else "")
 
 
 def listed(names: Iterable[str]) -> str:
@@ -94,13 +86,6 @@ def class_ids(wanted: Iterable[str], class_names: Mapping[int, str]) -> list[int
 
     A number is the id of a class where there is one; everything else is a name.
 
-    Parameters
-    ----------
-    wanted : iterable of str
-        Names or ids.
-    class_names : mapping from id to name
-        All classes.
-
     Raises
     ------
     SettingsError
@@ -114,10 +99,8 @@ def class_ids(wanted: Iterable[str], class_names: Mapping[int, str]) -> list[int
             known = listed(f"{k} ({clipped(known)})" for k, known in class_names.items())
             raise SettingsError(f"class {quoted(name)} does not exist; expected one of {known}")
         if len(meant) > 1:
-            raise SettingsError(
-                f"{len(meant)} classes have the name {quoted(name)}; expected one of their ids, "
-                f"{listed(map(str, meant))}"
-            )
+            found = f"{len(meant)} classes have the name {quoted(name)}"
+            raise SettingsError(f"{found}; expected one of their ids, {listed(map(str, meant))}")
         ids += meant
     return list(dict.fromkeys(ids))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
+from collections import Counter
 from collections.abc import Collection
 from dataclasses import replace
 from functools import cached_property
@@ -12,11 +13,12 @@ from pathlib import Path
 from gsseg_core.data.camera_files import read_cameras
 from gsseg_core.data.class_names import BACKGROUND_NAME, class_name, read_classes
 from gsseg_core.data.mask_files import SUPERVISES, mask_files, read_supervises
-from gsseg_core.data.split_file import read_split
 from gsseg_core.data.view import View
-from gsseg_core.errors import ClassesFileError, SettingsError
+from gsseg_core.errors import ClassesFileError, SettingsError, SplitFileError
 from gsseg_core.files.confined_files import require_folder_below
 from gsseg_core.files.input_files import READABLE_IMAGES, is_there
+from gsseg_core.files.json_files import read_object
+from gsseg_core.text import clipped, quoted
 
 
 class Dataset:
@@ -64,17 +66,10 @@ class Dataset:
         supervised = read_supervises(supervises, masks, stems, self._declared, self._within)
         images = _images_by_stem(self.root / "images", self._within)
         self._views = {
-            camera.name: View(
-                camera,
-                masks.get(camera.name),
-                images.get(camera.name),
-                self._declared,
-                supervised.get(camera.name),
-                self._within,
-            )
-            for camera in self.cameras
+            name: View(camera, masks.get(name), images.get(name), self._declared, supervised.get(name), self._within)
+            for name, camera in zip(stems, self.cameras, strict=True)
         }
-        self._split = read_split(self.root / "split.json", self._views, self._within)
+        self._split = _read_split(self.root / "split.json", self._views, self._within)
 
     def views(self, split: str = "all") -> list[View]:
         """List the views of a split, "train", "test" or "all"; without `split.json` all views are for training."""
@@ -105,15 +100,8 @@ class Dataset:
     def numbered(self, ids: Collection[int] | None = None) -> Dataset:
         """Renumber the classes without gaps, so that one large id costs no more memory than any other.
 
-        Parameters
-        ----------
-        ids : collection of int, optional
-            Ids that the masks may hold, ascending from 0; `class_ids` by default.
-
-        Returns
-        -------
-        Dataset
-            The same, with labels, names and number of classes by place among the ids; itself if they have no gaps.
+        Labels, names and number of classes are by place among `ids`, which the masks may hold, ascending from 0;
+        `class_ids` by default. Returns the dataset itself if they have no gaps.
         """
         ids = self.class_ids if ids is None else tuple(int(i) for i in ids)
         if ids == tuple(range(len(ids))):
@@ -131,3 +119,35 @@ def _images_by_stem(folder: Path, within: Path | None) -> dict[str, Path]:
         return {}
     require_folder_below(folder, within)
     return {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in READABLE_IMAGES}
+
+
+def _read_split(path: Path, views: Collection[str], within: Path | None = None) -> dict[str, list[str]]:
+    """Read `split.json`: stems of the views by "train" and "test"; without a file, all are for training.
+
+    Raises
+    ------
+    SplitFileError
+        The file is broken, names a view without a camera, or one twice.
+    PathNotAllowedError
+        Links lead out of the folder `within`.
+    """
+    if not is_there(path, SplitFileError):
+        return {"train": list(views), "test": []}
+    expected = '{"train": [stems], "test": [stems]}'
+    content = read_object(path, SplitFileError, expected, within)
+    if "train" not in content:
+        raise SplitFileError(f'{path}: no "train" in it; expected {expected}')
+    split = {name: content.get(name, []) for name in ("train", "test")}
+    for name, stems in split.items():
+        if not isinstance(stems, list) or not all(isinstance(stem, str) for stem in stems):
+            raise SplitFileError(f'{path}: "{name}" is {clipped(stems)}; expected a list of image stems')
+        unknown_stems = [stem for stem in stems if stem not in views]
+        if unknown_stems:
+            raise SplitFileError(
+                f'{path}: "{name}" names views without a camera ({len(unknown_stems)}, the first '
+                f"{quoted(unknown_stems[0])}); expected stems such as {quoted(next(iter(views)))}"
+            )
+    stem, count = Counter(split["train"] + split["test"] or [""]).most_common(1)[0]
+    if count > 1:
+        raise SplitFileError(f"{path}: stem {quoted(stem)} occurs {count} times; expected each stem once, in one split")
+    return split

@@ -13,7 +13,7 @@ from itertools import product
 from pathlib import Path
 
 from gsseg_core.data.camera_formats.table import CAMERA_FORMATS
-from gsseg_core.data.label_images import mask_bits
+from gsseg_core.data.label_images import mask_header
 from gsseg_core.data.mask_files import SUPERVISES, mask_files
 from gsseg_core.errors import GssegError
 from gsseg_core.files.input_files import READABLE_IMAGES
@@ -55,44 +55,29 @@ def camera_hint(folder: Path) -> str:
 
 
 def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
-    """Hint at masks of the cameras' names, if a dataset has none where they were looked for.
-
-    Parameters
-    ----------
-    root : pathlib.Path
-        The dataset.
-    labels : str
-        Its sub-folder in which masks were looked for.
-    stems : collection of str
-        Names of the cameras: the stems of the masks' names.
-    """
+    """Hint at masks of the cameras' names `stems`, if a dataset has none in its sub-folder `labels`."""
     stem = next(iter(stems), "<stem>")
     looked = f"; looked for {root / labels}/{stem}.png ({stem}.npz, or a folder {stem}/) and so on"
     classes = _folders_by_class(root / labels, stems)
     if classes:
-        return (
-            f"{looked}, but {labels}/ has a folder for each class, such as {classes[0].name}/: make one for each view, "
-            f"{labels}/{stem}/<class id>.png ({_MORE})"
-        )
+        wrong = f"{labels}/ has a folder for each class, such as {classes[0].name}/"
+        return f"{looked}, but {wrong}: make one for each view, {labels}/{stem}/<class id>.png ({_MORE})"
     others = [(len(_masks(path, stems)), path) for path in _folders(root) if path != root / labels]
     count, folder = max(others, key=lambda found: found[0], default=(0, root))
     if count:
         name = os.path.relpath(folder, root)
         return f"{looked}, found {count} masks of these names in {name}/: type --labels {shlex.quote(name)}"
     if not (root / labels).is_dir():
-        photos = [path for path in _folders(root) if _stems(path) & set(stems)]
-        return f"{looked}, but there is no folder {labels}/" + (
-            f" ({photos[0].name}/ holds photos; a 2D segmenter makes masks of them)" if photos else ""
-        )
+        photos = [path.name for path in _folders(root) if _stems(path) & set(stems)]
+        hint = f" ({photos[0]}/ holds photos; a 2D segmenter makes masks of them)" if photos else ""
+        return f"{looked}, but there is no folder {labels}/{hint}"
     there = sorted(path for path in (root / labels).iterdir() if path.name != SUPERVISES)
     found = [path for path in there if path.suffix.lower() in _MASKS or _has_detections(path)]
     if not found:
         return f"{looked}, but {labels}/ holds no mask"
     if found[0].is_file() and found[0].suffix.lower() not in (".png", ".npz"):
-        return (
-            f"{looked}, but {labels}/ holds files such as {found[0].name}; expected label images as PNG, and "
-            f"probabilities as {stem}.npz or {stem}/<class id>.tif ({_MORE})"
-        )
+        expected = f"label images as PNG, and probabilities as {stem}.npz or {stem}/<class id>.tif ({_MORE})"
+        return f"{looked}, but {labels}/ holds files such as {found[0].name}; expected {expected}"
     return f"{looked}, but {labels}/ holds names such as {found[0].name}: rename them to the names of the images"
 
 
@@ -132,7 +117,7 @@ def _masks(folder: Path, stems: Collection[str]) -> list[Path]:
         found = list(mask_files(folder, stems).values())
         images = [path for path in found if path.suffix.lower() == ".png"]
         if images:
-            mask_bits(images[0])
+            mask_header(images[0])
     except (GssegError, OSError):
         return []
     return [path for path in found if path.is_file() or _has_detections(path)]

@@ -51,8 +51,7 @@ class LabelEvidence:
         """Mass of each label on no class in particular, (L,) float32."""
         if self.mass is None:
             return np.zeros(len(self.classes), np.float32)
-        rest: np.ndarray = np.maximum(1 - self.mass.sum(axis=1), 0)
-        return rest
+        return np.asarray(np.maximum(1 - self.mass.sum(axis=1), 0))
 
     @cached_property
     def has_none_of_these(self) -> bool:
@@ -73,10 +72,7 @@ class LabelEvidence:
             return np.ones(len(self.rest), bool)
         return np.asarray(self.mass.any(axis=1))
 
-    def without(
-        self,
-        labels: np.ndarray,  # (L,) bool
-    ) -> LabelEvidence:
+    def without(self, labels: np.ndarray) -> LabelEvidence:  # (L,) bool
         """Return the evidence without that of these labels, of a mask in which all classes were looked for."""
         mass = np.eye(len(self.classes), dtype=np.float32) if self.mass is None else self.mass
         return LabelEvidence(self.classes, np.where(labels[:, None], np.float32(0), mass))
@@ -91,12 +87,9 @@ class LabelEvidence:
         """Plausibility of each word under each label, (L, W) float32; None where label l is word l."""
         if self.mass is None:
             return None
-        plausible: np.ndarray = self.mass
         if self.supervised is None:
-            plausible = self.mass + self.rest[:, None]
-        elif self.has_none_of_these:
-            plausible = np.column_stack([self.mass, self.rest])
-        return plausible
+            return np.asarray(self.mass + self.rest[:, None])
+        return np.column_stack([self.mass, self.rest]) if self.has_none_of_these else self.mass
 
     @cached_property
     def votes(self) -> CSRRows:
@@ -149,16 +142,11 @@ class LabelEvidence:
             return self.classes
         if not len(self.classes):
             return np.full(len(self.mass), UNKNOWN, np.int32)
-        named: np.ndarray = np.where(
-            self.mass.max(axis=1) >= self.rest, self.classes[self.mass.argmax(axis=1)], UNKNOWN
-        )
-        return named.astype(np.int32)
+        is_named = self.mass.max(axis=1) >= self.rest
+        return np.where(is_named, self.classes[self.mass.argmax(axis=1)], np.int32(UNKNOWN))
 
 
-def resolved_votes(
-    votes: CSRRows,  # int64
-    possible: np.ndarray,  # (K,) bool: ids that are classes
-) -> CSRRows:
+def resolved_votes(votes: CSRRows, possible: np.ndarray) -> CSRRows:  # int64; (K,) bool, ids that are classes
     """Resolve signed votes into votes of at least 0; they stay as they are if none is negative.
 
     A class with more votes against it than for it is dropped. If all classes but one were looked for at a Gaussian,
@@ -166,11 +154,10 @@ def resolved_votes(
     """
     if votes.data.min(initial=0) >= 0:
         return votes
-    counts, ids = np.empty(len(votes.indptr) - 1, np.int64), np.flatnonzero(possible)
-    _count_resolved(*votes, ids, counts)
-    start = starts(counts)
-    out = CSRRows(start, np.empty(start[-1], np.uint32), np.empty(start[-1], np.int64))
-    _write_resolved(*votes, ids, *out)
+    ids = np.flatnonzero(possible)
+    indptr = starts(_count_resolved(votes, ids))
+    out = CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], np.int64))
+    _write_resolved(votes, ids, out)
     return out
 
 
@@ -215,13 +202,10 @@ def _frequency(
     return frequency
 
 
-def _scaled(
-    rows: np.ndarray,  # (U, K)
-) -> np.ndarray:
+def _scaled(rows: np.ndarray) -> np.ndarray:  # (U, K)
     """Scale rows to sum 1; rows of zeros stay zero."""
     total = rows.sum(axis=1, keepdims=True)
-    scaled: np.ndarray = np.divide(rows, total, out=np.zeros_like(rows), where=total > 0)
-    return scaled
+    return np.asarray(np.divide(rows, total, out=np.zeros_like(rows), where=total > 0))
 
 
 @nb.njit(nogil=True)
@@ -231,10 +215,7 @@ def vote_units(weight: np.float32, votes: np.float64, units: float) -> np.int64:
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def is_resolved(
-    votes: np.ndarray,  # (N, K) int64
-    possible: np.ndarray,  # (K,) bool: ids that are classes
-) -> np.ndarray:
+def is_resolved(votes: np.ndarray, possible: np.ndarray) -> np.ndarray:  # (N, K) int64; (K,) bool, ids that are classes
     """Tell which Gaussians have a vote for a class, or only one class left, (N,) bool."""
     out = np.empty(votes.shape[0], np.bool_)
     for i in nb.prange(votes.shape[0]):
@@ -248,12 +229,8 @@ def is_resolved(
 
 
 @nb.njit(nogil=True, cache=True)
-def _only_class_left(
-    classes: np.ndarray,  # of one row
-    votes: np.ndarray,  # of it
-    ids: np.ndarray,  # of all classes, ascending
-) -> tuple[int, int]:
-    """Return the one class without votes where all others have some, and any against; -1 if there is no such class."""
+def _only_class_left(classes: np.ndarray, votes: np.ndarray, ids: np.ndarray) -> tuple[int, int]:
+    """Return the one of all classes `ids` without votes where the others of a row have some, any against; else -1."""
     voted, least, against, place = 0, 2**63 - 1, False, 0
     for z in range(votes.shape[0]):
         if votes[z] != 0:
@@ -290,28 +267,20 @@ def resolve_row(
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _count_resolved(
-    start: np.ndarray,  # (N + 1,)
-    classes: np.ndarray,  # (Z,)
-    votes: np.ndarray,  # (Z,)
-    ids: np.ndarray,  # of all classes
-    counts: np.ndarray,  # (N,) out
-) -> None:
+def _count_resolved(rows: CSRRows, ids: np.ndarray) -> np.ndarray:
+    """Count the entries that each row has once it is resolved, (N,) int64."""
+    indptr, classes, votes = rows
+    counts = np.empty(indptr.shape[0] - 1, np.int64)
     for i in nb.prange(counts.shape[0]):
-        row = slice(start[i], start[i + 1])
+        row = slice(indptr[i], indptr[i + 1])
         counts[i] = (votes[row] > 0).sum() + (_only_class_left(classes[row], votes[row], ids)[0] >= 0)
+    return counts
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _write_resolved(
-    start: np.ndarray,  # (N + 1,)
-    classes: np.ndarray,  # (Z,)
-    votes: np.ndarray,  # (Z,)
-    ids: np.ndarray,  # of all classes
-    kept_start: np.ndarray,  # (N + 1,)
-    kept_classes: np.ndarray,  # out
-    kept_votes: np.ndarray,  # out
-) -> None:
-    for i in nb.prange(start.shape[0] - 1):
-        row = slice(start[i], start[i + 1])
-        resolve_row(classes[row], votes[row], ids, kept_classes[kept_start[i] :], kept_votes[kept_start[i] :])
+def _write_resolved(rows: CSRRows, ids: np.ndarray, kept: CSRRows) -> None:
+    indptr, classes, votes = rows
+    kept_indptr, kept_classes, kept_votes = kept
+    for i in nb.prange(indptr.shape[0] - 1):
+        row = slice(indptr[i], indptr[i + 1])
+        resolve_row(classes[row], votes[row], ids, kept_classes[kept_indptr[i] :], kept_votes[kept_indptr[i] :])

@@ -36,17 +36,8 @@ class Mask(NamedTuple):
 def read_mask(path: str | os.PathLike[str], within: Path | None = None) -> Mask:
     """Read a label image: a PNG with 8- or 16-bit gray values, or palette indices, as labels.
 
-    Parameters
-    ----------
-    path : path
-        The file.
-    within : pathlib.Path, optional
-        A folder below which it must lie, links followed.
-
-    Returns
-    -------
-    Mask
-        `labels` (H, W) int32 with `UNKNOWN` for 255 (8 bits) or 65535 (16 bits), and `bits`.
+    Its labels (H, W) int32 are `UNKNOWN` where the file has 255 (8 bits) or 65535 (16 bits). With `within`, it must lie
+    below that folder, links followed.
 
     Raises
     ------
@@ -55,7 +46,7 @@ def read_mask(path: str | os.PathLike[str], within: Path | None = None) -> Mask:
     PathNotAllowedError
         It lies elsewhere.
     """
-    bits = mask_bits(path, within)
+    bits = mask_header(path, within).bits
     # Other formats are lossy or ambiguous about integers, whatever the file is named.
     with open_image(path, MaskFormatError, "PNG", "a whole label image", ("PNG",), within) as image:
         labels = np.array(image).astype(np.int32)
@@ -69,11 +60,6 @@ class MaskHeader(NamedTuple):
     bits: int
     width: int
     height: int
-
-
-def mask_bits(path: str | os.PathLike[str], within: Path | None = None) -> int:
-    """Bits per label of a PNG, 8 or 16, from its header alone; raises as `read_mask` does."""
-    return mask_header(path, within).bits
 
 
 def mask_header(path: str | os.PathLike[str], within: Path | None = None) -> MaskHeader:
@@ -134,26 +120,12 @@ def run_text(run: str | None) -> PngInfo:
 
 
 class PackedLabels:
-    """A label image in memory, compressed: it takes a few bytes per outline and next to none per area.
-
-    Parameters
-    ----------
-    labels : (H, W) of int
-        From `UNKNOWN` to `MAX_LABEL`.
-
-    Attributes
-    ----------
-    largest : int
-        The largest label.
-    nbytes : int
-        Memory that it takes.
-    """
+    """A label image (H, W) of `UNKNOWN` to `MAX_LABEL` in memory: a few bytes per outline and next to none per area."""
 
     def __init__(self, labels: npt.NDArray[np.integer[Any]]) -> None:
-        self.largest = int(labels.max()) if labels.size else UNKNOWN
-        self._shape, self._dtype = labels.shape, np.min_scalar_type(-self.largest - 2)
+        largest = int(labels.max()) if labels.size else UNKNOWN
+        self._shape, self._dtype = labels.shape, np.min_scalar_type(-largest - 2)
         self._data = zlib.compress(labels.astype(self._dtype).tobytes(), level=1)
-        self.nbytes = len(self._data)
 
     def unpack(self) -> npt.NDArray[np.int32]:
         """Return the labels, (H, W) int32, in memory of their own."""

@@ -13,18 +13,18 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.data.soft_masks import SeenLabels, combine_detections, quantise
+from gsseg_core.data.soft_masks import SeenLabels, check_forms, combine_detections, quantise
 from gsseg_core.errors import MaskFormatError, MaskSizeError, SupervisesFileError, UnknownLabelError
 from gsseg_core.files.confined_files import require_folder_below
 from gsseg_core.files.input_files import check_pixels, is_there, open_image
-from gsseg_core.files.json_files import kind_of, read_json
+from gsseg_core.files.json_files import read_object
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.npz_files import NpzArrays, open_arrays
 from gsseg_core.scene.camera import Camera
 from gsseg_core.text import clipped, quoted
 
 SUPERVISES = "supervises.json"
-_PROBABILITIES, _CLASSES, _UNKNOWN = "probabilities", "classes", "unknown"
+_UNKNOWN = "unknown"
 _DETECTIONS = (".png", ".tif", ".tiff")
 _ANY = "*"
 
@@ -46,10 +46,8 @@ def mask_files(folder: Path, stems: Iterable[str], within: Path | None = None) -
     wanted = set(stems)
     for path in sorted(folder.iterdir()):
         is_folder = path.is_dir()
-        if not is_folder and path.suffix.lower() not in (".png", ".npz"):
-            continue
         stem = path.name if is_folder else path.stem
-        if stem not in wanted:
+        if stem not in wanted or not (is_folder or path.suffix.lower() in (".png", ".npz")):
             continue
         if stem in found:
             raise MaskFormatError(f"{folder}: has {found[stem].name} and {path.name}; expected one mask per view")
@@ -78,28 +76,23 @@ def read_supervises(
     """
     if not is_there(path, SupervisesFileError):
         return {}
-    content = read_json(path, SupervisesFileError, within)
-    if not isinstance(content, dict):
-        raise SupervisesFileError(f'{path}: holds {kind_of(content)}; expected {{"*": [ids]}} or stems and ids')
+    content = read_object(path, SupervisesFileError, '{"*": [ids]} or stems and ids', within)
     known, entries = set(stems), {}
     for stem, ids in content.items():
         if stem != _ANY and stem not in known:
-            raise SupervisesFileError(
-                f"{path}: names the view {quoted(stem)}, which has no camera; expected stems, or '*'"
-            )
+            found = f"names the view {quoted(stem)}, which has no camera"
+            raise SupervisesFileError(f"{path}: {found}; expected stems, or '*'")
         if stem in masks and masks[stem].suffix.lower() != ".png":
             raise SupervisesFileError(
                 f"{path}: names {masks[stem].name}, which says itself what it supervises; expected label images (.png)"
             )
         if not isinstance(ids, list) or not ids or any(type(i) is not int or not 0 <= i <= MAX_LABEL for i in ids):
-            raise SupervisesFileError(
-                f"{path}: {quoted(stem)} has {clipped(ids)}; expected a list of ids 0 to {MAX_LABEL}"
-            )
+            found = f"{quoted(stem)} has {clipped(ids)}"
+            raise SupervisesFileError(f"{path}: {found}; expected a list of ids 0 to {MAX_LABEL}")
         unknown_ids = [i for i in ids if class_names is not None and i not in class_names]
         if unknown_ids:
-            raise SupervisesFileError(
-                f"{path}: {quoted(stem)} has the class {unknown_ids[0]}; expected ids of classes.json"
-            )
+            found = f"{quoted(stem)} has the class {unknown_ids[0]}"
+            raise SupervisesFileError(f"{path}: {found}; expected ids of classes.json")
         entries[stem] = tuple(sorted(set(ids)))
     pngs = [stem for stem, mask in masks.items() if mask.suffix.lower() == ".png"]
     return {stem: entries.get(stem, entries.get(_ANY, ())) for stem in pngs if stem in entries or _ANY in entries}
@@ -113,16 +106,9 @@ def read_soft_mask(
 ) -> SeenLabels:
     """Read probabilities (.npz) or a folder of detections.
 
-    Parameters
-    ----------
-    path : pathlib.Path
-        The file or folder.
-    class_names : mapping from id to name, optional
-        If given, an npz without `classes` must have a probability for each id up to the largest.
-    camera : Camera, optional
-        Whose size it must have, which is found out before any pixel is read.
-    within : pathlib.Path, optional
-        A folder below which it must lie, links followed.
+    With `class_names`, an npz without `classes` must have a probability for each id up to the largest. With a camera,
+    the mask must have its size, which is found out before any pixel is read. With `within`, it must lie below that
+    folder, links followed.
 
     Raises
     ------
@@ -131,48 +117,33 @@ def read_soft_mask(
     PathNotAllowedError
         It lies elsewhere.
     """
-    return (
-        _read_detections(path, camera, within)
-        if path.is_dir()
-        else _read_probabilities(path, class_names, camera, within)
-    )
-
-
-def _read_probabilities(
-    path: Path, class_names: Mapping[int, str] | None, camera: Camera | None, within: Path | None
-) -> SeenLabels:
+    if path.is_dir():
+        return _read_detections(path, camera, within)
     with open_arrays(path, "an npz with probabilities (K, H, W)", MaskFormatError, within) as arrays:
-        if _PROBABILITIES not in arrays.names:
+        if "probabilities" not in arrays.names:
             found = clipped(", ".join(arrays.names)) or "nothing"
             raise MaskFormatError(f"{path}: holds {found}; expected an array 'probabilities'")
         _check_claims(path, arrays, class_names, camera)
-        probabilities = arrays.read(_PROBABILITIES)
-        classes, unknown = (arrays.read(name) if name in arrays.names else None for name in (_CLASSES, _UNKNOWN))
+        probabilities = arrays.read("probabilities")
+        classes, unknown = (arrays.read(name) if name in arrays.names else None for name in ("classes", _UNKNOWN))
     return quantise(probabilities, classes, unknown=unknown, source=str(path))  # type: ignore[arg-type]
 
 
 def _check_claims(path: Path, arrays: NpzArrays, class_names: Mapping[int, str] | None, camera: Camera | None) -> None:
-    """Check the headers of the arrays, before any is read."""
-    claimed = arrays.header(_PROBABILITIES)
-    if len(claimed.shape) != 3 or claimed.dtype.kind != "f":
-        raise MaskFormatError(f"{path}: probabilities are {claimed}; expected float16 or float32 (K, H, W)")
-    count, height, width = claimed.shape
+    """Check what the headers of the arrays say, before any array is read."""
+    probabilities = arrays.header("probabilities")
+    classes, unknown = (arrays.header(name) if name in arrays.names else None for name in ("classes", _UNKNOWN))
+    shape, size = probabilities.shape, None if camera is None else (camera.height, camera.width)
+    if len(shape) == 3 and shape[:2] == size != shape[1:]:
+        raise MaskFormatError(
+            f"{path}: probabilities are {probabilities}, the classes last; expected (K, H, W), the classes first"
+        )
+    check_forms(probabilities, classes, unknown, str(path))
+    count, height, width = shape
     if camera is not None:
-        size = (camera.height, camera.width)
-        if (height, width) != size and claimed.shape[:2] == size:
-            raise MaskFormatError(
-                f"{path}: probabilities are {claimed}, the classes last; expected (K, H, W), the classes first"
-            )
         camera.check_mask_size(width, height, str(path))
     check_pixels(width, height, str(path), MaskFormatError)
-    if _UNKNOWN in arrays.names and arrays.header(_UNKNOWN).shape != (height, width):
-        raise MaskSizeError(
-            f"{path}: unknown has shape {arrays.header(_UNKNOWN).shape}; expected {(height, width)}, as the maps"
-        )
-    if _CLASSES in arrays.names:
-        if arrays.header(_CLASSES).shape != (count,):
-            raise UnknownLabelError(f"{path}: classes are {arrays.header(_CLASSES)}; expected {count} ids, one per map")
-    elif class_names is not None and count != max(class_names) + 1:
+    if classes is None and class_names is not None and count != max(class_names) + 1:
         raise UnknownLabelError(
             f"{path}: holds probabilities of {count} classes; expected {max(class_names) + 1}, up to the largest id of "
             "classes.json, or an array 'classes' with their ids"

@@ -8,7 +8,7 @@ of the others loses is bounded: no probability changes by as much as one step, s
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
@@ -18,6 +18,7 @@ from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN, PackedLabels
 from gsseg_core.errors import MaskFormatError, MaskSizeError, UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
+from gsseg_core.files.npz_files import Header
 from gsseg_core.text import clipped
 
 STEPS = (16, 8, 4, 2, 1)
@@ -37,6 +38,13 @@ class SeenLabels(NamedTuple):
 
     labels: npt.NDArray[np.int32]
     evidence: LabelEvidence | None = None
+
+    @property
+    def largest(self) -> int:
+        """Largest class on which the mask has evidence, `UNKNOWN` if there is none."""
+        if self.evidence is not None:
+            return self.evidence.largest
+        return int(self.labels.max()) if self.labels.size else UNKNOWN
 
     def named(self) -> npt.NDArray[np.int32]:
         """Reduce the mask to one class per pixel, (H, W) int32; `UNKNOWN` where it leaves the class open."""
@@ -64,17 +72,15 @@ class SeenLabels(NamedTuple):
         if self.evidence is None:
             return SeenLabels(numbers)
         classes, mass, supervised = self.evidence.classes, self.evidence.mass, self.evidence.supervised
-        return SeenLabels(
-            self.labels, LabelEvidence(table[classes], mass, None if supervised is None else table[supervised])
-        )
+        supervised = None if supervised is None else table[supervised]
+        return SeenLabels(self.labels, LabelEvidence(table[classes], mass, supervised))
 
 
 class PackedMask:
     """A soft or partial mask in memory, its prototypes compressed like a plain one's labels."""
 
     def __init__(self, seen: SeenLabels) -> None:
-        self._labels, self._evidence = PackedLabels(seen.labels), seen.evidence
-        self.largest = self._labels.largest if seen.evidence is None else seen.evidence.largest
+        self._labels, self._evidence, self.largest = PackedLabels(seen.labels), seen.evidence, seen.largest
 
     def unpack(self) -> SeenLabels:
         """Return what was packed; the labels in memory of their own."""
@@ -115,14 +121,22 @@ def quantise(
     UnknownLabelError
         `classes` are not C different ids from 0 to `MAX_LABEL`.
     """
-    probabilities = np.asarray(probabilities)
-    supervised = None if classes is None else _checked_classes(classes, len(probabilities), source)
-    _check_probabilities(probabilities, source)
-    if unknown is not None:
-        _check_unknown(unknown, probabilities.shape[1:], source)
-    ids = np.arange(len(probabilities), dtype=np.int32) if classes is None else np.asarray(classes, np.int32)
-    order = np.argsort(ids)
-    occurs = [c for c in order if probabilities[c].max(initial=0) > 0]
+    given = None if classes is None else np.asarray(classes)
+    check_forms(probabilities, given, unknown, source)
+    if given is not None and (given.min() < 0 or given.max() > MAX_LABEL or len(np.unique(given)) < len(given)):
+        raise UnknownLabelError(
+            f"{source}: classes are {str(given.tolist())[1:-1][:60]}; expected different ids from 0 to {MAX_LABEL}"
+        )
+    _check_range(probabilities, f"{source}: probabilities")
+    total = float(probabilities.sum(axis=0, dtype=np.float32).max(initial=0))
+    if total > 1 + TOLERANCE:
+        raise MaskFormatError(
+            f"{source}: probabilities of a pixel sum to {total:.3f}; expected at most 1 (what detectors say "
+            "that do not know of each other goes into one image per class)"
+        )
+    ids = np.arange(len(probabilities), dtype=np.int32) if given is None else given.astype(np.int32)
+    supervised = None if given is None else np.sort(ids)
+    occurs = [c for c in np.argsort(ids) if probabilities[c].max(initial=0) > 0]
     values = np.ascontiguousarray(np.moveaxis(probabilities[occurs], 0, -1), np.float32)  # (H, W, C')
     for steps in STEPS:
         parts = _rounded(values, steps).reshape(values.shape[0] * values.shape[1], -1 if occurs else 0)
@@ -131,6 +145,24 @@ def quantise(
             break
     mass = parts[firsts] / np.float32(steps)
     return _tidied(labels.reshape(values.shape[:2]).astype(np.int32), ids[occurs], mass, supervised, unknown)
+
+
+_Form = npt.NDArray[Any] | Header
+
+
+def check_forms(probabilities: _Form, classes: _Form | None, unknown: _Form | None, source: str) -> None:
+    """Raise the errors of `quantise` that types and shapes tell, those of arrays or what headers claim of them."""
+    if len(probabilities.shape) != 3 or probabilities.dtype.kind != "f" or not probabilities.shape[0]:
+        raise MaskFormatError(
+            f"{source}: probabilities are {Header.of(probabilities)}; expected float16 or float32 (K, H, W)"
+        )
+    count, *size = probabilities.shape
+    if classes is not None and (classes.shape != (count,) or classes.dtype.kind not in "iu"):
+        raise UnknownLabelError(f"{source}: classes are {Header.of(classes)}; expected {count} ids, one per map")
+    if unknown is not None and unknown.dtype.kind != "b":
+        raise MaskFormatError(f"{source}: unknown is {unknown.dtype}; expected bool, true where nothing is known")
+    if unknown is not None and unknown.shape != tuple(size):
+        raise MaskSizeError(f"{source}: unknown has shape {unknown.shape}; expected {tuple(size)}, as the maps")
 
 
 def combine_detections(
@@ -145,20 +177,9 @@ def combine_detections(
     that was looked for, with a probability in proportion to p_k prod_{c != k} (1 - p_c), and none of these with
     prod_c (1 - p_c). For one detector that is p and 1 - p.
 
-    Parameters
-    ----------
-    detections : mapping from class to (H, W) of bool or float
-        Probability of this class in each pixel, in [0, 1]. A detector that ran and found nothing gives zeros; of a
-        class that is not here nothing is known.
-    unknown : (H, W) bool, optional
-        Where no detector gives evidence.
-    source : str
-        What messages call the mask.
-
-    Raises
-    ------
-    MaskFormatError, MaskSizeError, UnknownLabelError
-        As `quantise`.
+    A detector gives bool, or float: the probability of its class in each pixel, in [0, 1]. One that ran and found
+    nothing gives zeros; of a class that is not here nothing is known, nor anything where it is `unknown`. Messages call
+    the mask `source`, and errors are those of `quantise`.
     """
     if not detections:
         raise MaskFormatError(f"{source}: holds no detections; expected at least one class, zeros where it is not seen")
@@ -167,9 +188,7 @@ def combine_detections(
     shape = arrays[classes[0]].shape
     for k, array in arrays.items():
         if array.ndim != 2 or array.dtype.kind not in "bf":
-            raise MaskFormatError(
-                f"{source}: class {k} is {array.dtype} of shape {array.shape}; expected bool or float (H, W)"
-            )
+            raise MaskFormatError(f"{source}: class {k} is {Header.of(array)}; expected bool or float (H, W)")
         if array.shape != shape:
             raise MaskSizeError(
                 f"{source}: class {k} is {array.shape[1]} x {array.shape[0]} pixels; expected {shape[1]} x {shape[0]}, "
@@ -184,11 +203,7 @@ def combine_detections(
     return quantise(alone, classes, unknown=unknown, source=source)
 
 
-def restrict(
-    labels: npt.NDArray[np.integer],  # (H, W)
-    supervised: Collection[int],
-    source: str = "labels",
-) -> SeenLabels:
+def restrict(labels: npt.NDArray[np.integer], supervised: Collection[int], source: str = "labels") -> SeenLabels:
     """Give a plain mask the evidence of a segmenter that looked for some classes only; its 0 means "none of these".
 
     0 is a class as any other if it is among them.
@@ -214,16 +229,12 @@ def restrict(
     return SeenLabels(table[labels], LabelEvidence(named, mass, looked_for))
 
 
-def _rounded(
-    values: npt.NDArray[np.float32],  # (H, W, C)
-    steps: int,
-) -> npt.NDArray[np.uint8]:
+def _rounded(values: npt.NDArray[np.float32], steps: int) -> npt.NDArray[np.uint8]:  # (H, W, C)
     scaled = values * np.float32(steps)
-    parts = np.rint(scaled)
+    parts: npt.NDArray[np.float32] = np.rint(scaled)
     over = parts.sum(axis=2) > steps
     parts[over] = np.floor(scaled[over])
-    rounded: npt.NDArray[np.uint8] = parts.astype(np.uint8)
-    return rounded
+    return parts.astype(np.uint8)
 
 
 def _tidied(
@@ -244,38 +255,9 @@ def _tidied(
     labels = number[labels]
     occurs = mass.any(axis=0)
     classes, mass = classes[occurs], mass[:, occurs]
-    if supervised is None and (mass.max(axis=1, initial=0) == 1).all():
-        plain = np.append(classes[mass.argmax(axis=1)] if len(mass) else classes[:0], np.int32(UNKNOWN))
-        return SeenLabels(plain[labels])
-    return SeenLabels(labels, LabelEvidence(classes, mass, supervised))
-
-
-def _checked_classes(classes: Sequence[int], count: int, source: str) -> npt.NDArray[np.int32]:
-    ids = np.asarray(classes)
-    if ids.ndim != 1 or ids.dtype.kind not in "iu" or len(ids) != count or count == 0:
-        raise UnknownLabelError(
-            f"{source}: classes are {ids.dtype} of shape {ids.shape}; expected {count} ids, one per map"
-        )
-    if ids.min() < 0 or ids.max() > MAX_LABEL or len(np.unique(ids)) < count:
-        raise UnknownLabelError(
-            f"{source}: classes are {str(ids.tolist())[1:-1][:60]}; expected different ids from 0 to {MAX_LABEL}"
-        )
-    return np.sort(ids).astype(np.int32)
-
-
-def _check_probabilities(probabilities: npt.NDArray[np.generic], source: str) -> None:
-    if probabilities.ndim != 3 or probabilities.dtype.kind != "f" or not len(probabilities):
-        raise MaskFormatError(
-            f"{source}: probabilities are {probabilities.dtype} of shape {probabilities.shape}; "
-            "expected float16 or float32 (K, H, W)"
-        )
-    _check_range(probabilities, f"{source}: probabilities")
-    total = float(probabilities.sum(axis=0, dtype=np.float32).max(initial=0))
-    if total > 1 + TOLERANCE:
-        raise MaskFormatError(
-            f"{source}: probabilities of a pixel sum to {total:.3f}; expected at most 1 (what detectors say "
-            "that do not know of each other goes into one image per class)"
-        )
+    evidence = LabelEvidence(classes, mass, supervised)
+    seen = SeenLabels(labels, evidence)
+    return SeenLabels(seen.named()) if evidence.is_certain else seen
 
 
 def _check_range(values: npt.NDArray[np.generic], what: str) -> None:
@@ -287,17 +269,8 @@ def _check_range(values: npt.NDArray[np.generic], what: str) -> None:
         raise MaskFormatError(f"{what}: values are {found}; expected probabilities from 0 to 1")
 
 
-def _check_unknown(unknown: npt.NDArray[np.generic], shape: tuple[int, ...], source: str) -> None:
-    if unknown.dtype.kind != "b":
-        raise MaskFormatError(f"{source}: unknown is {unknown.dtype}; expected bool, true where nothing is known")
-    if unknown.shape != shape:
-        raise MaskSizeError(f"{source}: unknown has shape {unknown.shape}; expected {shape}, as the probabilities")
-
-
 @nb.njit(nogil=True, cache=True)
-def _group(
-    rows: np.ndarray,  # (P, C) uint8
-) -> tuple[np.ndarray, np.ndarray]:
+def _group(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # (P, C) uint8
     """Assign numbers to different rows in order of first occurrence: number of each row (P,), and first row of each."""
     count, size = rows.shape[0], 64
     while size < 2 * count:

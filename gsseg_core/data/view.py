@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.data.label_images import UNKNOWN, mask_bits, mask_header, read_mask
+from gsseg_core.data.label_images import UNKNOWN, mask_header, read_mask
 from gsseg_core.data.mask_files import read_soft_mask
 from gsseg_core.data.soft_masks import PackedMask, SeenLabels, combine_detections, quantise, restrict
 from gsseg_core.errors import MaskFormatError, SettingsError, UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
+from gsseg_core.files.npz_files import Header
 from gsseg_core.scene.camera import Camera
 
 
@@ -78,18 +79,14 @@ class View:
         MaskFormatError, MaskSizeError, UnknownLabelError
             The labels are not whole numbers, not of the camera's size, or not among the classes.
         """
-        array = np.asarray(labels)
+        array, source = np.asarray(labels), f"view '{camera.name}'"
         if array.ndim != 2 or array.dtype.kind not in "iu":
-            raise MaskFormatError(
-                f"view '{camera.name}': labels are {array.dtype} of shape {array.shape}; expected integers (H, W)"
-            )
-        source = f"view '{camera.name}'"
-        view = cls(camera, class_names=class_names)
-        camera.check_mask_size(array.shape[1], array.shape[0], source)
-        view._check_ids(array, source)
-        if supervised is None:
-            return replace(view, _mask=PackedMask(SeenLabels(array)))
-        return cls.from_seen(camera, restrict(array, supervised, source), class_names)
+            raise MaskFormatError(f"{source}: labels are {Header.of(array)}; expected integers (H, W)")
+        seen = SeenLabels(array)
+        if supervised is not None:
+            cls(camera, class_names=class_names)._check_seen(seen, source)
+            seen = restrict(array, supervised, source)
+        return cls.from_seen(camera, seen, class_names)
 
     @classmethod
     def from_probabilities(
@@ -149,13 +146,7 @@ class View:
 
     @classmethod
     def from_seen(cls, camera: Camera, seen: SeenLabels, class_names: Mapping[int, str] | None = None) -> View:
-        """Build a view from labels with their evidence.
-
-        Raises
-        ------
-        MaskSizeError, UnknownLabelError
-            The labels are not of the camera's size, or have evidence on classes that there are not.
-        """
+        """Build a view from labels with their evidence, unless their size or classes do not fit: see `from_arrays`."""
         view = cls(camera, class_names=class_names)
         view._check_seen(seen, f"view '{camera.name}'")
         return replace(view, _mask=PackedMask(seen))
@@ -174,16 +165,13 @@ class View:
     def mask_bits(self) -> int | None:
         """Bits per label of a label image, 8 or 16 (of other masks: as many as labels need); None without a mask."""
         if self.mask_path is not None and self.mask_path.suffix.lower() == ".png":
-            return mask_bits(self.mask_path, self.within)
+            return mask_header(self.mask_path, self.within).bits
         return (8 if self.largest_label < 255 else 16) if self.has_mask else None
 
     @property
     def largest_label(self) -> int:
         """Largest class on which the mask has evidence, `UNKNOWN` (-1) if there is none."""
-        if self._mask is not None:
-            return self._mask.largest
-        seen = self.read_seen()
-        return int(seen.labels.max()) if seen.evidence is None else seen.evidence.largest
+        return self.read_seen().largest if self._mask is None else self._mask.largest
 
     def class_ids(self) -> set[int]:
         """Classes on which the mask has evidence."""
@@ -206,13 +194,7 @@ class View:
         return self.read_seen().named()
 
     def read_seen(self) -> SeenLabels:
-        """Read the labels of the mask with their evidence; those of a soft or partial mask are prototypes.
-
-        Raises
-        ------
-        MaskFormatError, MaskSizeError, UnknownLabelError
-            As `read_labels`.
-        """
+        """Read the labels of the mask with their evidence, or raise as `read_labels`; of a soft mask, prototypes."""
         source = str(self.mask_path or f"view '{self.name}'")
         if self.numbering is not None:
             names = dict(zip(self.numbering, self.class_names.values(), strict=True)) if self.class_names else None
@@ -237,26 +219,17 @@ class View:
 
     def _check_seen(self, seen: SeenLabels, source: str) -> None:
         self.camera.check_mask_size(seen.labels.shape[1], seen.labels.shape[0], source)
-        self._check_ids(seen.labels if seen.evidence is None else seen.evidence.concerned, source)
-
-    def _check_ids(self, labels: npt.NDArray[np.integer[Any]], source: str) -> None:
-        if labels.size and self._knows_all(int(labels.min()), int(labels.max())):
+        labels = seen.labels if seen.evidence is None else seen.evidence.concerned
+        names: Container[int] = range(MAX_LABEL + 1) if self.class_names is None else self.class_names
+        low, high = (int(labels.min()), int(labels.max())) if labels.size else (0, -1)
+        if low >= UNKNOWN and high <= MAX_LABEL and all(i in names for i in range(max(low, 0), high + 1)):
             return  # As usual; to list the labels of an image takes ten times as long.
-        ids = np.unique(labels)
-        if self.class_names is None:
-            unknown = ids[(ids < UNKNOWN) | (ids > MAX_LABEL)].tolist()
-            expected = f"0 to {MAX_LABEL}, or {UNKNOWN} for unknown"
-        else:
-            unknown = [i for i in ids.tolist() if i != UNKNOWN and i not in self.class_names]
-            expected = f"ids from {min(self.class_names)} to {max(self.class_names)} that classes.json names"
+        unknown = [i for i in np.unique(labels).tolist() if i != UNKNOWN and i not in names]
         if unknown:
+            expected = f"0 to {MAX_LABEL}, or {UNKNOWN} for unknown"
+            if self.class_names is not None:
+                expected = f"ids from {min(self.class_names)} to {max(self.class_names)} that classes.json names"
             raise UnknownLabelError(f"{source}: mask holds the labels {str(unknown)[1:-1][:60]}; expected {expected}")
-
-    def _knows_all(self, lowest: int, largest: int) -> bool:
-        """Tell whether all ids from one to another are classes, or `UNKNOWN`."""
-        if self.class_names is None or lowest < UNKNOWN or largest > MAX_LABEL:
-            return lowest >= UNKNOWN and largest <= MAX_LABEL
-        return all(i in self.class_names for i in range(max(lowest, 0), largest + 1))
 
 
 def spread(views: Sequence[View], count: int | None) -> list[View]:

@@ -94,7 +94,7 @@ def build_demo(folder: str | os.PathLike[str], seed: int = 0) -> DemoScene:
     test = [camera.name for camera in cameras[TEST_EVERY // 2 :: TEST_EVERY]]
     train = [camera.name for camera in cameras if camera.name not in test]
 
-    with staged_run(root, "demo", earlier=_earlier_demo) as run:
+    with staged_run(root, "demo") as run:
         scene.save(run.folder / "scene.ply")
         with write_atomically(run.folder / "truth.npz") as temporary:
             np.savez_compressed(temporary, labels=truth)
@@ -107,14 +107,6 @@ def build_demo(folder: str | os.PathLike[str], seed: int = 0) -> DemoScene:
             if camera.name in train:
                 write_mask(run.folder / "labels" / f"{camera.name}.png", corrupt(labels, mask_rng), bits=8)
     return DemoScene(root, scene, truth, dict(enumerate(CLASS_NAMES)), train, test)
-
-
-def _earlier_demo(root: Path) -> list[str]:
-    """Files of a demo of gsseg before it wrote manifests, which is known by its truth."""
-    if not ((root / "truth.npz").is_file() and (root / "labels_true").is_dir()):
-        return []
-    masks = [f"{folder}/{camera.name}.png" for folder in ("labels", "labels_true") for camera in _make_cameras()]
-    return ["scene.ply", "truth.npz", "cameras.json", "classes.json", "split.json", *masks]
 
 
 # The room

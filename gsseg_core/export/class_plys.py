@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from gsseg_core.files.earlier_outputs import earlier_classes
 from gsseg_core.files.run_folder import staged_run
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.ply import write_vertices
@@ -30,7 +29,7 @@ def export_classes(scene: GaussianScene, segmentation: Segmentation, folder: str
         Something cannot be written; an earlier export is unchanged.
     """
     folder = Path(folder)
-    with staged_run(folder, "classes", earlier=earlier_classes) as run:
+    with staged_run(folder, "classes") as run:
         written = write_classes(scene, segmentation, run.folder, run.id)
     return {k: folder / path.name for k, path in written.items()}
 

@@ -24,17 +24,8 @@ def write_atomically(path: str | os.PathLike[str], *, suffix: str | None = None)
     it raises, the temporary file is removed and the earlier file remains; after a kill the next write into the same
     folder removes it. A link to a file stays, and what it points to is replaced.
 
-    Parameters
-    ----------
-    path : path
-        Where the file shall be. Its parent folders are created.
-    suffix : str, optional
-        Suffix of the temporary name, for writers that go by it; that of `path` by default.
-
-    Yields
-    ------
-    pathlib.Path
-        Name of an empty file, which the body must write.
+    Parent folders are created. What is yielded is the name of an empty file, which the body must write. It ends with
+    `suffix`, for writers that go by it; by default with that of `path`.
 
     Raises
     ------

@@ -31,13 +31,7 @@ def require_below(place: str, path: str | os.PathLike[str], within: Path) -> Non
 
 
 def require_folder_below(path: Path, within: Path | None) -> None:
-    """Refuse to list a folder that lies elsewhere; what it lists is still to be opened with `open_input`.
-
-    Raises
-    ------
-    PathNotAllowedError
-        Its links lead out of `within`.
-    """
+    """Refuse, as `require_below`, to list a folder; what it lists is still to be opened with `open_input`."""
     if within is not None:
         require_below(os.path.realpath(path), path, within)
 
@@ -46,17 +40,8 @@ def require_folder_below(path: Path, within: Path | None) -> None:
 def pinned_folder(folder: Path, within: Path) -> Iterator[Path]:
     """Give a second name of a folder, under which it stays the same folder whatever becomes of its path.
 
-    Parameters
-    ----------
-    folder : pathlib.Path
-        Below `within` or that itself, without links; it is made where it is missing.
-    within : pathlib.Path
-        A folder, without links.
-
-    Yields
-    ------
-    pathlib.Path
-        The second name. In the errors of gsseg that the body raises the first one stands in its place.
+    The folder is made where it is missing, below `within` or that itself; both are without links. In the errors of
+    gsseg that the body raises, the first name stands in the place of the second.
 
     Raises
     ------

@@ -6,7 +6,9 @@ import errno
 import os
 import stat
 import struct
+import tokenize
 import warnings
+import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,20 +32,15 @@ _KINDS = {
     stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket",
     stat.S_IFCHR: "a device", stat.S_IFBLK: "a device",
 }  # fmt: skip
-# What Pillow and zlib raise on damaged bytes.
-_DAMAGED = (OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError, OverflowError, MemoryError,
-            RuntimeError, struct.error, zlib.error, Image.DecompressionBombError)  # fmt: skip
+DAMAGED = (
+    OSError, SyntaxError, ValueError, TypeError, AttributeError, LookupError, ArithmeticError, EOFError, MemoryError,
+    RuntimeError, struct.error, zlib.error, zipfile.BadZipFile, tokenize.TokenError, Image.DecompressionBombError,
+)  # fmt: skip
+"""What Pillow, NumPy, zipfile and zlib raise on damaged bytes; RuntimeError where a flipped bit says "encrypted"."""
 
 
 def open_input(path: str | os.PathLike[str], within: Path | None = None) -> BufferedReader:
-    """Open a file for reading; links are followed.
-
-    Parameters
-    ----------
-    path : path
-        The file.
-    within : pathlib.Path, optional
-        A folder below which the file must lie in the end.
+    """Open a file for reading; links are followed, and with `within` must lead to a file below that folder.
 
     Raises
     ------
@@ -128,34 +125,22 @@ def open_image(
 ) -> Iterator[Image.Image]:
     """Open an image whose header claims no more pixels than any camera takes; its pixels are not read yet.
 
-    Parameters
-    ----------
-    path : path
-        The file.
-    error : subclass of GssegError
-        What is raised, also for pixels that the body finds to be damaged.
-    kind, expected : str
-        What it is called, and what it should be, for messages.
-    formats : tuple of str, optional
-        Of Pillow; all by default.
-    within : pathlib.Path, optional
-        A folder below which it must lie, links followed.
+    `error` is raised, also for pixels that the body finds to be damaged; messages call the image a `kind`, and say what
+    was `expected`. `formats` are those of Pillow, all by default. With `within`, it must lie below that folder, links
+    followed.
     """
     try:
         file = open_input(path, within)
     except OSError as cause:
         raise error(f"{path}: cannot be read ({reason(cause)}); expected {expected}") from cause
     try:
-        with file, _opened(file, formats) as image:
+        with file:
+            with warnings.catch_warnings():  # Pillow warns of images that are within our own limit.
+                warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+                image = Image.open(file, formats=formats)
             check_pixels(*image.size, str(path), error)
             yield image
-    except _DAMAGED as cause:
+    except DAMAGED as cause:
         # Of what it does not know, Pillow tells nothing but the address of the object that it was handed.
         why = "of no known format" if isinstance(cause, UnidentifiedImageError) else reason(cause)
         raise error(f"{path}: broken {kind} ({why}); expected {expected}") from cause
-
-
-def _opened(file: BufferedReader, formats: tuple[str, ...] | None) -> Image.Image:
-    with warnings.catch_warnings():  # Pillow warns of images that are within our own limit.
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        return Image.open(file, formats=formats)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 from gsseg_core.errors import GssegError
 from gsseg_core.files.atomic import write_atomically
@@ -32,6 +33,14 @@ def read_json(path: Path, error: type[GssegError], within: Path | None = None) -
         return json.loads(content.decode("utf-8-sig"))
     except (ValueError, RecursionError) as cause:
         raise error(f"{path}: not valid JSON ({clipped(cause, 160)})") from cause
+
+
+def read_object(path: Path, error: type[GssegError], expected: str, within: Path | None = None) -> dict[str, Any]:
+    """Read a JSON file, as `read_json`, that must hold an object: `expected`, in messages."""
+    content = read_json(path, error, within)
+    if not isinstance(content, dict):
+        raise error(f"{path}: holds {kind_of(content)}; expected {expected}")
+    return content
 
 
 def kind_of(content: object) -> str:

@@ -5,12 +5,10 @@ from __future__ import annotations
 import json
 import math
 import os
-import struct
 import tokenize
 import zipfile
-import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,20 +17,14 @@ import numpy.typing as npt
 
 from gsseg_core.errors import GssegError, StateFileError, StateMismatchError
 from gsseg_core.files.atomic import write_atomically
-from gsseg_core.files.input_files import open_input, reason
+from gsseg_core.files.input_files import DAMAGED, open_input, reason
 from gsseg_core.files.limits import LIMITS, MAX_LABEL
 from gsseg_core.text import clipped, quoted
 
-# What NumPy, zipfile and zlib raise on damaged bytes; RuntimeError where a flipped bit says "encrypted".
-_DAMAGED = (
-    OSError, KeyError, IndexError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, MemoryError,
-    ArithmeticError, struct.error, zipfile.BadZipFile, zlib.error, SyntaxError, tokenize.TokenError,
-)  # fmt: skip
 SHARES_TOLERANCE = 0.01
 """Probabilities of a row may sum to so much more or less than 1."""
 
 _SUFFIX = ".npy"
-_PIECE = 1 << 20
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
@@ -41,11 +33,15 @@ class UnfitError(ValueError):
 
 
 class Header(NamedTuple):
-    """Shape, order and type that an array of an npz claims to have."""
+    """Shape and type that an array of an npz claims to have."""
 
     shape: tuple[int, ...]
-    fortran: bool
     dtype: np.dtype[Any]
+
+    @classmethod
+    def of(cls, array: npt.NDArray[Any] | Header) -> Header:
+        """Take shape and type of an array."""
+        return cls(array.shape, array.dtype)
 
     def __str__(self) -> str:
         """Type and shape, for messages."""
@@ -53,22 +49,9 @@ class Header(NamedTuple):
 
 
 class NpzArrays:
-    """The arrays of an npz; nothing that is wrong with one of them takes more memory than was asked for.
+    """The arrays of an open npz, and their `names`; what is wrong with one takes no more memory than was asked for.
 
-    Parameters
-    ----------
-    archive : zipfile.ZipFile
-        The open file.
-
-    Attributes
-    ----------
-    names : list of str
-        Of the arrays.
-
-    Raises
-    ------
-    UnfitError
-        The arrays claim more than `Limits.max_npz_bytes`.
+    Arrays that claim more than `Limits.max_npz_bytes` are an `UnfitError`.
     """
 
     def __init__(self, archive: zipfile.ZipFile) -> None:
@@ -101,16 +84,7 @@ class NpzArrays:
     def read(self, name: str) -> npt.NDArray[Any]:
         """Read an array; whoever calls has looked at its `header`."""
         with self._archive.open(name + _SUFFIX) as member:
-            header = _read_header(member, name)
-            array = np.empty(header.shape, header.dtype, order="F" if header.fortran else "C")
-            target = array.reshape(-1, order="A").view(np.uint8) if array.size else np.empty(0, np.uint8)
-            done = 0
-            while done < len(target):
-                piece = member.read(min(_PIECE, len(target) - done))
-                if not piece:
-                    raise ValueError(f"array {name!r} ends after {done:,} of {len(target):,} bytes")
-                target[done : done + len(piece)] = np.frombuffer(piece, np.uint8)
-                done += len(piece)
+            array: npt.NDArray[Any] = np.lib.format.read_array(member, allow_pickle=False)
             if member.read(1):  # and so the checksum has been compared, too
                 raise ValueError(f"array {name!r} is longer than its header says")
             return array
@@ -128,9 +102,10 @@ def _read_header(member: Any, name: str) -> Header:
         version = np.lib.format.read_magic(member)
         if version not in _HEADERS:
             raise ValueError(f"version {version}")
-        header = Header(*_HEADERS[version](member))
+        shape, _, dtype = _HEADERS[version](member)
     except (ValueError, SyntaxError, TypeError, tokenize.TokenError) as error:
         raise ValueError(f"array {name!r} is none of NumPy's ({clipped(error)})") from error
+    header = Header(shape, dtype)
     # Of Python objects, NumPy would say how to load them all the same, which is what an attacker wants.
     if header.dtype.hasobject or header.dtype.kind == "V" or any(size < 0 for size in header.shape):
         raise ValueError(f"array {name!r} is {header}; expected numbers")
@@ -183,35 +158,21 @@ def write_npz(path: str | os.PathLike[str], header: dict[str, Any], **arrays: np
         np.savez_compressed(file, allow_pickle=False, **arrays, header=np.array(json.dumps(header)))
 
 
-_BEGINNING = 1024
-"""Bytes of a header that are enough to tell its format."""
-
-
 @contextmanager
 def open_arrays(path: Path, expected: str, error: type[GssegError], within: Path | None = None) -> Iterator[NpzArrays]:
-    """Open an npz; whatever goes wrong with its arrays in the body counts as damage to the file.
+    """Open an npz that should be `expected`, such as "a saved state"; raise `error` if it is missing or damaged.
 
-    Parameters
-    ----------
-    path : pathlib.Path
-        The file.
-    expected : str
-        What it should be, for messages: "a saved state".
-    error : subclass of GssegError
-        What is raised: the file is missing or damaged, or no regular file.
-    within : pathlib.Path, optional
-        A folder below which it must lie, links followed.
+    Whatever goes wrong with its arrays in the body counts as damage to the file. With `within`, it must lie below that
+    folder, links followed.
     """
     try:
         with open_input(path, within) as opened, zipfile.ZipFile(opened) as archive:
             yield NpzArrays(archive)
-    except GssegError:
-        raise
     except UnfitError as cause:
         raise error(f"{path}: {cause}") from cause
     except FileNotFoundError as cause:
         raise error(f"{path}: does not exist; expected {expected}") from cause
-    except _DAMAGED as cause:
+    except DAMAGED as cause:
         raise error(f"{path}: is not {expected}, or is damaged ({reason(cause)})") from cause
 
 
@@ -219,23 +180,9 @@ def open_arrays(path: Path, expected: str, error: type[GssegError], within: Path
 def open_npz(
     path: Path, what: str, file_format: str, digest: str, within: Path | None = None
 ) -> Iterator[tuple[NpzArrays, Any]]:
-    """Open an npz with a JSON header, of a given format and scene.
+    """Open an npz with a JSON header, which must say `file_format` under "format" and `digest` under "scene".
 
-    Parameters
-    ----------
-    path : pathlib.Path
-        The file.
-    what : str
-        What it should be, for messages: "a saved state".
-    file_format, digest : str
-        What the header must say under "format" and "scene".
-    within : pathlib.Path, optional
-        A folder below which the file must lie, links followed.
-
-    Yields
-    ------
-    NpzArrays, dict
-        The arrays and the header. Whatever goes wrong with them in the body counts as damage to the file.
+    What is yielded, the arrays and the header, is as safe as that of `open_arrays`.
 
     Raises
     ------
@@ -261,20 +208,7 @@ def open_npz(
 
 
 def npz_format(path: Path) -> str:
-    """Read from the header of an npz what it says that it is; empty if it is missing, damaged or says nothing.
-
-    Only the first bytes are looked at: whether the rest is whole, and of which scene, does not matter.
-    """
-    if not path.is_file():
-        return ""
-    try:
-        with zipfile.ZipFile(path) as file, file.open("header.npy") as header:
-            # NumPy stores text as UTF-32, after a line on its type that is shorter than 256 bytes.
-            beginning = header.read(_BEGINNING)
-    except _DAMAGED:
-        return ""
-    for order in ("utf-32-le", "utf-32-be"):
-        _, said, rest = beginning.partition('{"format": "'.encode(order))
-        if said:
-            return rest[: len(rest) // 4 * 4].decode(order, "replace").partition('"')[0]
+    """Read from the header of an npz what it says that it is; empty if it is missing, damaged or says nothing."""
+    with suppress(GssegError), open_arrays(path, "an npz with a header", GssegError) as arrays:
+        return str(json.loads(arrays.text("header"))["format"])
     return ""

@@ -77,10 +77,7 @@ class Camera:
         """Position (3,) of the camera in the world."""
         return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
 
-    def project(
-        self,
-        points: npt.ArrayLike,  # (M, 3)
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    def project(self, points: npt.ArrayLike) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:  # (M, 3)
         """Project world points into the image.
 
         Parameters

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -37,10 +37,7 @@ def _rest(count: int) -> tuple[str, ...]:
     return tuple(f"f_rest_{i}" for i in range(count))
 
 
-def _columns(
-    vertices: npt.NDArray[np.void],  # (N,)
-    names: tuple[str, ...],
-) -> npt.NDArray[np.float32]:
+def _columns(vertices: npt.NDArray[np.void], names: tuple[str, ...]) -> npt.NDArray[np.float32]:  # (N,)
     """Properties side by side, (N, len(names)): a view where they lie so in memory, else a copy."""
     with np.errstate(over="ignore"):  # doubles beyond float32 become infinite, which validation reports
         columns: npt.NDArray[np.float32] = structured_to_unstructured(vertices[list(names)], dtype=np.float32)
@@ -100,11 +97,11 @@ class GaussianScene:
     @classmethod
     def from_arrays(
         cls,
-        means: npt.ArrayLike,  # (N, 3)
-        quats: npt.ArrayLike,  # (N, 4)
-        scales: npt.ArrayLike,  # (N, 3)
-        opacities: npt.ArrayLike,  # (N,)
-        sh: npt.ArrayLike,  # (N, (d + 1)^2, 3)
+        means: npt.ArrayLike,
+        quats: npt.ArrayLike,
+        scales: npt.ArrayLike,
+        opacities: npt.ArrayLike,
+        sh: npt.ArrayLike,
     ) -> GaussianScene:
         """Build a scene from activated values; it equals what `load` reads back after `save`.
 
@@ -132,12 +129,9 @@ class GaussianScene:
         arrays = {name: np.asarray(values, np.float64) for name, values in given.items()}
         n = len(np.atleast_1d(arrays["means"]))
         shapes: dict[str, list[tuple[int, ...]]] = {
-            "means": [(n, 3)],
-            "quats": [(n, 4)],
-            "scales": [(n, 3)],
-            "opacities": [(n,)],
+            "means": [(n, 3)], "quats": [(n, 4)], "scales": [(n, 3)], "opacities": [(n,)],
             "sh": [(n, (d + 1) ** 2, 3) for d in range(spherical_harmonics.MAX_DEGREE + 1)],
-        }
+        }  # fmt: skip
         for name, array in arrays.items():
             if array.shape not in shapes[name]:
                 expected = " or ".join(map(str, shapes[name]))
@@ -151,14 +145,10 @@ class GaussianScene:
         rest = rest.transpose(0, 2, 1).reshape(n, 3 * rest.shape[1])  # all of red, then green, then blue
         opacity = np.clip(arrays["opacities"], 1e-7, 1 - 1e-7)
         columns = {
-            _MEANS: arrays["means"],
-            ("nx", "ny", "nz"): np.zeros((n, 3)),
-            DC: dc,
-            _rest(rest.shape[1]): rest,
-            _OPACITY: np.log(opacity / (1 - opacity))[:, None],
-            _SCALES: np.log(arrays["scales"]),
+            _MEANS: arrays["means"], ("nx", "ny", "nz"): np.zeros((n, 3)), DC: dc, _rest(rest.shape[1]): rest,
+            _OPACITY: np.log(opacity / (1 - opacity))[:, None], _SCALES: np.log(arrays["scales"]),
             _QUATS: arrays["quats"],
-        }
+        }  # fmt: skip
         vertices = np.empty(n, [(name, np.float32) for names in columns for name in names])
         with np.errstate(over="ignore"):
             for names, values in columns.items():
@@ -174,11 +164,10 @@ class GaussianScene:
         if len(vertices) == 0:
             raise EmptySceneError(f"{source}: holds no Gaussian (0 vertices); expected at least one")
         means, logits, log_scales, quats = (_columns(vertices, names) for names in (_MEANS, _OPACITY, _SCALES, _QUATS))
-        _check_finite(means, "positions", source)
-        _check_finite(logits, "opacities", source, _ANY)
-        _check_finite(log_scales, "scales", source, _ANY)
-        _check_finite(quats, "rotations", source, _ANY)
-        _check_finite(_columns(vertices, sh_names), "SH coefficients", source)
+        for values, what in ((logits, "opacities"), (log_scales, "scales"), (quats, "rotations")):
+            _check_finite(values, what, source, _ANY)
+        for values, what in ((means, "positions"), (_columns(vertices, sh_names), "SH coefficients")):
+            _check_finite(values, what, source, LIMITS.max_value)
 
         lengths = np.linalg.norm(quats.astype(np.float64), axis=1, keepdims=True)
         zero = np.flatnonzero(lengths == 0)
@@ -218,14 +207,8 @@ class GaussianScene:
         picked = np.arange(len(self))[index].reshape(-1)
         if picked.size == 0:
             raise EmptySceneError(f"{self.path or 'scene'}: none of its {len(self)} Gaussians is in the subset")
-        return GaussianScene(
-            self.means[picked],
-            self.quats[picked],
-            self.scales[picked],
-            self.opacities[picked],
-            self.vertices[picked],
-            self.path,
-        )
+        arrays = ("means", "quats", "scales", "opacities", "vertices")
+        return replace(self, **{name: getattr(self, name)[picked] for name in arrays})
 
     @property
     def sh_degree(self) -> int:
@@ -255,10 +238,7 @@ class GaussianScene:
         geometry = _columns(self.vertices, _MEANS + _OPACITY + _SCALES + _QUATS)
         return hashlib.sha256(np.ascontiguousarray(geometry, "<f4").data).hexdigest()
 
-    def colors(
-        self,
-        camera_center: npt.ArrayLike | None = None,  # (3,)
-    ) -> npt.NDArray[np.float32]:
+    def colors(self, camera_center: npt.ArrayLike | None = None) -> npt.NDArray[np.float32]:  # (3,)
         """Evaluate the colours (N, 3), RGB float32 in [0, 1], seen from `camera_center`; of degree 0 only if None."""
         if camera_center is None:
             return spherical_harmonics.to_rgb(_columns(self.vertices, DC)[:, None, :], self.means)
@@ -287,12 +267,7 @@ def _check_properties(vertices: npt.NDArray[np.void], source: str) -> tuple[str,
     return DC + rest
 
 
-def _check_finite(
-    values: npt.NDArray[np.float32],  # (N, C)
-    what: str,
-    source: str,
-    most: float = LIMITS.max_value,
-) -> None:
+def _check_finite(values: npt.NDArray[np.float32], what: str, source: str, most: float) -> None:  # (N, C)
     if values.size and not (values.min() >= -most and values.max() <= most):
         bad = np.flatnonzero(~(np.abs(values) <= most).all(axis=1))
         raise SceneValueError(

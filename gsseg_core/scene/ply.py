@@ -20,19 +20,10 @@ _MAX_HEADER = 1 << 20
 
 
 def read_vertices(path: str | os.PathLike[str], within: Path | None = None) -> npt.NDArray[np.void]:
-    """Read the `vertex` element of a PLY file, ascii or binary of either byte order.
+    """Read the `vertex` element of a PLY file, ascii or binary of either byte order; others are ignored.
 
-    Parameters
-    ----------
-    path : path
-        The PLY file. Elements other than `vertex` are ignored.
-    within : pathlib.Path, optional
-        A folder below which the file must lie, links followed.
-
-    Returns
-    -------
-    numpy.ndarray
-        Structured array (N,), one field per property in the file's order and type, native byte order, in memory.
+    With `within`, the file must lie below that folder, links followed. The structured array (N,) has one field per
+    property in the file's order and type, native byte order, in memory.
 
     Raises
     ------

@@ -10,9 +10,7 @@ import numpy.typing as npt
 Number = TypeVar("Number", bound=np.floating[Any])
 
 
-def rotations(
-    quats: npt.NDArray[Number],  # (M, 4) w, x, y, z, unit
-) -> npt.NDArray[Number]:
+def rotations(quats: npt.NDArray[Number]) -> npt.NDArray[Number]:  # (M, 4) w, x, y, z, unit
     """Rotation matrices (M, 3, 3) of quaternions, of the same precision; columns are the local axes in the world."""
     w, x, y, z = quats.T
     rows = [

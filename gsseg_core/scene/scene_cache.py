@@ -19,12 +19,7 @@ class PerScene(Generic[T]):
         self._known: WeakKeyDictionary[GaussianScene, T] = WeakKeyDictionary()
         self._making = threading.Lock()
 
-    def of(
-        self,
-        scene: GaussianScene,
-        make: Callable[[], T],
-        fits: Callable[[T], bool] = lambda _: True,
-    ) -> T:
+    def of(self, scene: GaussianScene, make: Callable[[], T], fits: Callable[[T], bool] = lambda _: True) -> T:
         """Return the value of a scene; `make` computes it where none is cached that fits."""
         with self._making:
             known = self._known.get(scene)

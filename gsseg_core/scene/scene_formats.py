@@ -18,17 +18,10 @@ from gsseg_core.scene.ply import read_vertices
 
 @dataclass(frozen=True)
 class SceneFormat:
-    """A format of scenes.
+    """A format of scenes: what messages call it, its reader, and the suffixes of its files.
 
-    Attributes
-    ----------
-    name : str
-        What messages call it.
-    read : callable
-        Reads the Gaussians as a structured array (N,) with the properties of a 3DGS PLY. It gets the file, and a
-        folder below which that must lie, or None.
-    suffixes : tuple of str
-        A file with one of these is of this format.
+    The reader gets a file, and a folder below which that must lie, or None. It returns the Gaussians as a structured
+    array (N,) with the properties of a 3DGS PLY.
     """
 
     name: str
@@ -46,19 +39,9 @@ SCENE_FORMATS = [SceneFormat("3DGS PLY", read_vertices, (".ply",))]
 
 
 def read_scene(path: str | os.PathLike[str], within: Path | None = None) -> npt.NDArray[np.void]:
-    """Read a scene of any of `SCENE_FORMATS`.
+    """Read a scene of any of `SCENE_FORMATS`, a structured array (N,) with the properties of a 3DGS PLY.
 
-    Parameters
-    ----------
-    path : path
-        The file.
-    within : pathlib.Path, optional
-        A folder below which it must lie, links followed.
-
-    Returns
-    -------
-    numpy.ndarray
-        Structured array (N,) with the properties of a 3DGS PLY.
+    With `within`, the file must lie below that folder, links followed.
 
     Raises
     ------
@@ -86,7 +69,7 @@ def scene_hint(path: Path) -> str:
     """Tell where a scene lies, if a folder or nothing was found in its place."""
     if path.is_dir():
         # Trainers write point_cloud/iteration_30000/point_cloud.ply; the one of most steps is wanted.
-        trained = sorted(path.glob("point_cloud/iteration_*"), key=_iteration)
+        trained = sorted(path.glob("point_cloud/iteration_*"), key=lambda folder: (len(folder.name), folder.name))
         found = [scene for folder in (*trained, path) for scene in _scenes_in(folder)]
         return f"; it is a folder: type {shlex.quote(str(found[-1]))}" if found else "; it is a folder without a scene"
     if not path.exists():
@@ -98,8 +81,3 @@ def scene_hint(path: Path) -> str:
 def _scenes_in(folder: Path) -> list[Path]:
     suffixes = {suffix for known in SCENE_FORMATS for suffix in known.suffixes}
     return sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes) if folder.is_dir() else []
-
-
-def _iteration(path: Path) -> int:
-    number = path.name.rpartition("_")[2]
-    return int(number) if number.isdecimal() else -1

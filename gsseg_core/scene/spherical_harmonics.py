@@ -19,23 +19,8 @@ _C1 = sqrt(3 / (4 * pi))
 _C2 = sqrt(15 / (4 * pi))
 
 
-def basis(
-    directions: npt.NDArray[np.floating],  # (N, 3)
-    degree: int,
-) -> npt.NDArray[np.float32]:
-    """Evaluate all harmonics up to `degree`.
-
-    Parameters
-    ----------
-    directions : ndarray (N, 3)
-        Unit vectors.
-    degree : int
-        0 to 3.
-
-    Returns
-    -------
-    ndarray (N, (degree + 1)^2) float32
-        One column per harmonic, band after band.
+def basis(directions: npt.NDArray[np.floating], degree: int) -> npt.NDArray[np.float32]:  # (N, 3)
+    """Evaluate all harmonics up to `degree`, 0 to 3, for unit vectors: (N, (degree + 1)^2) float32, band after band.
 
     Raises
     ------
@@ -50,13 +35,8 @@ def basis(
         columns += [-_C1 * y, _C1 * z, -_C1 * x]
     if degree >= 2:
         xx, yy, zz = x * x, y * y, z * z
-        columns += [
-            _C2 * x * y,
-            -_C2 * y * z,
-            sqrt(5 / (16 * pi)) * (2 * zz - xx - yy),
-            -_C2 * x * z,
-            _C2 / 2 * (xx - yy),
-        ]
+        middle = sqrt(5 / (16 * pi)) * (2 * zz - xx - yy)
+        columns += [_C2 * x * y, -_C2 * y * z, middle, -_C2 * x * z, _C2 / 2 * (xx - yy)]
     if degree >= 3:
         a, b, c = sqrt(35 / (32 * pi)), sqrt(105 / (4 * pi)), sqrt(21 / (32 * pi))
         columns += [
@@ -75,19 +55,9 @@ def to_rgb(
     sh: npt.NDArray[np.float32],  # (N, (d + 1)^2, 3)
     directions: npt.NDArray[np.floating],  # (N, 3)
 ) -> npt.NDArray[np.float32]:
-    """Colours seen along `directions`, from the camera to each Gaussian, as 3DGS defines them: 0.5 + sum, in [0, 1].
+    """Colours (N, 3) seen along `directions`, as 3DGS defines them: 0.5 + sum, RGB float32 clipped to [0, 1].
 
-    Parameters
-    ----------
-    sh : ndarray (N, (d + 1)^2, 3)
-        Coefficients, band after band, RGB last.
-    directions : ndarray (N, 3)
-        Unit vectors.
-
-    Returns
-    -------
-    ndarray (N, 3) float32
-        RGB, clipped to [0, 1].
+    The directions are unit vectors from the camera to each Gaussian; coefficients go band after band, RGB last.
     """
     degree = round(sqrt(sh.shape[1])) - 1
     rgb: npt.NDArray[np.float32] = np.einsum("nb,nbc->nc", basis(directions, degree), sh)

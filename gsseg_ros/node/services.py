@@ -20,7 +20,6 @@ from gsseg_core.errors import GssegError
 from gsseg_core.export.class_plys import write_classes
 from gsseg_core.export.summary import RunReport
 from gsseg_core.files.confined_files import pinned_folder
-from gsseg_core.files.earlier_outputs import earlier_segment
 from gsseg_core.files.json_files import write_json
 from gsseg_core.files.run_folder import require_own_folder, staged_run
 from gsseg_core.refine.settings import RefineSettings
@@ -234,7 +233,7 @@ class Services:
     def export(self, request: Export.Request, response: Export.Response) -> None:
         """Write the files that the command line writes."""
         directory, settings = self.workspace.path(request.directory, EXPORT_FOLDER), self.workspace.settings
-        require_own_folder(directory, "segment", earlier_segment)  # Before the work, and again below.
+        require_own_folder(directory, "segment")  # Before the work, and again below.
         with self.workspace.run("export") as run:
             selection, refine = self._select(request, run)
             self.workspace.number(run)
@@ -243,7 +242,7 @@ class Services:
             with (
                 run.watch.stage("write"),
                 pinned_folder(directory, self.workspace.root) as folder,
-                staged_run(folder, "segment", earlier=earlier_segment, only_own=True) as staged,
+                staged_run(folder, "segment", only_own=True) as staged,
             ):
                 result.save(staged.folder / "segmentation.npz", staged.id)
                 plys = write_classes(session.scene, result, staged.folder / "classes", staged.id)

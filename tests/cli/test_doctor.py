@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from gsseg_core import kernel_cache
-from gsseg_core.cli import machine_check as doctor
+from gsseg_core.cli import doctor
 from gsseg_core.cli.arguments import COMMANDS, build_parser, command_module
 from gsseg_core.cli.completion import SHELLS, subparsers
-from gsseg_core.cli.machine_check import Finding, describe, examine, works
+from gsseg_core.cli.doctor import Finding, describe, examine, works
 from gsseg_core.cli.main import main
 
 
@@ -179,8 +179,6 @@ def test_doctor_reports_kernels_that_do_not_run(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_doctor_looks_for_ros_without_importing_it() -> None:
-    program = (
-        "import sys; from gsseg_core.cli.machine_check import examine; examine(); sys.exit('rclpy' in sys.modules)"
-    )
+    program = "import sys; from gsseg_core.cli.doctor import examine; examine(); sys.exit('rclpy' in sys.modules)"
     environment = {**os.environ, "PYTHONPATH": str(Path(doctor.__file__).parents[2])}
     subprocess.run([sys.executable, "-c", program], check=True, env=environment)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from small_scenes import balls_on_a_table
 
-from gsseg_core.cli import machine_check
 from gsseg_core.cli.main import main
 from gsseg_core.data.camera_files import read_cameras
 from gsseg_core.data.camera_formats.table import CAMERA_FORMATS, CameraFormat
@@ -21,7 +20,7 @@ from gsseg_core.scene.scene_formats import SCENE_FORMATS, SceneFormat
 @pytest.fixture
 def doctor(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> pytest.CaptureFixture[str]:
     """`gsseg doctor` without the kernels, which take long."""
-    monkeypatch.setattr(machine_check, "_kernels", lambda say: [])
+    monkeypatch.setattr("gsseg_core.cli.doctor._kernels", lambda say: [])
     return capsys
 
 

@@ -142,7 +142,7 @@ def a_file(out: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "said"),
     [(read_only, "out: cannot be written"), (linked_classes, "classes: is a link"), (a_file, "out: is not a folder"),
-     (own_report, "report.json: was not written by gsseg")],
+     (own_report, "segmentation.npz: was not written by gsseg")],
 )  # fmt: skip
 def test_an_out_that_cannot_be_written_or_holds_what_is_not_ours_is_said_before_learning(
     place: Path,
@@ -180,21 +180,6 @@ def test_render_never_writes_over_the_masks(place: Path, capsys: pytest.CaptureF
     assert main([*command(place, "render"), "--out", f"{place}/data/labels"]) == 2
     assert "view2.png: was not written by gsseg render" in capsys.readouterr().err
     assert contents(place / "data") == before
-
-
-def test_results_of_a_version_without_manifests_are_replaced(place: Path) -> None:
-    for name in ("out", "maps"):
-        (place / name / RUN_FILE).unlink()
-    (place / "out/pictures/overlay_mine.png").write_text("mine")
-    (place / "maps/mine.png").write_text("mine")
-    (place / "out/classes/9_gone.ply").write_bytes((place / "out/classes/1_red_ball.ply").read_bytes())
-    assert main(command(place)) == 0 and main(command(place, "render")) == 0
-    assert not (place / "out/classes/9_gone.ply").exists()
-    for mine in (place / "out/pictures/overlay_mine.png", place / "maps/mine.png"):
-        assert mine.read_text() == "mine"
-        mine.unlink()
-    assert len({run_id(path) for path in results(place / "out")}) == 1
-    assert len({run_id(path) for path in results(place / "maps")}) == 1
 
 
 def test_single_files_replace_no_device_and_keep_links(place: Path, capsys: pytest.CaptureFixture[str]) -> None:

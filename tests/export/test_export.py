@@ -110,16 +110,6 @@ def test_names_that_are_taken_are_refused_and_nothing_is_written(tmp_path: Path)
     assert (tmp_path / "file").read_text() == "a file"
 
 
-def test_an_export_of_an_earlier_version_is_replaced(tmp_path: Path) -> None:
-    """It had no manifest: its PLYs are known by their names and the property `label`."""
-    folder = tmp_path / "classes"
-    export_classes(SCENE, RESULT, folder)
-    (folder / RUN_FILE).unlink()
-    SCENE.save(folder / "9_mine.ply")
-    export_classes(SCENE, only(2), folder)
-    assert sorted(path.name for path in visible(folder)) == ["2_cup_mug.ply", "9_mine.ply"]
-
-
 @pytest.mark.parametrize("name", ["a" * 300, "\x00", "\ud800", "a/b", "椅" * 120])
 def test_every_name_of_a_view_gives_a_file_name_that_can_be_written(tmp_path: Path, name: str) -> None:
     file_name = view_file_name(name, "overlay_")

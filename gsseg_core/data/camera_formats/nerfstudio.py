@@ -9,7 +9,7 @@ import numpy as np
 
 from gsseg_core.data.camera_formats.entries import Entry, camera_of, entries, inverse_pose
 from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError
-from gsseg_core.files.json_files import kind_of, read_json
+from gsseg_core.files.json_files import read_object
 from gsseg_core.scene.camera import Camera
 from gsseg_core.text import clipped
 
@@ -19,9 +19,7 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 def read_nerfstudio(path: Path, within: Path | None) -> list[Camera]:
     """Read `transforms.json`: camera-to-world poses in OpenGL axes (y up, z backward), intrinsics per file or frame."""
-    content = read_json(path, CameraFileError, within)
-    if not isinstance(content, dict):
-        raise CameraFileError(f"{path}: holds {kind_of(content)}; expected an object with 'frames'")
+    content = read_object(path, CameraFileError, "an object with 'frames'", within)
     shared = {key: value for key, value in content.items() if key != "frames"}
     cameras = []
     for frame in entries(path, content.get("frames"), "a list 'frames'"):

@@ -16,19 +16,11 @@ from gsseg_core.scene.camera import Camera
 
 @dataclass(frozen=True)
 class CameraFormat:
-    """A format of cameras.
+    """A format of cameras: the program that writes it, its reader, and the files by which it is recognised.
 
-    Attributes
-    ----------
-    name : str
-        What messages call it: the program that writes it.
-    read : callable
-        Reads the cameras in the order of the file. It gets the file, or the folder of a format with `folders`, and a
-        folder below which all that is read must lie, or None.
-    files : tuple of str
-        A dataset that has one of these files is of this format.
-    folders : tuple of str
-        Sub-folders of the dataset in which they are looked for, in this order; none for the dataset itself.
+    A dataset that has one of `files`, in one of its sub-folders `folders` or itself, is of this format. The reader gets
+    the file, or the folder of a format with `folders`, and a folder below which all that is read must lie, or None. It
+    returns the cameras in the order of the file.
     """
 
     name: str
