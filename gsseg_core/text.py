@@ -62,13 +62,11 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [[clipped(cell, 60) for cell in row] for row in (header, *rows)]
     widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
     lines.insert(1, ["-" * width for width in widths])
-    return "\n".join(
-        "  ".join(
-            cell.ljust(width) if i == 0 else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
-        )
-        for line in lines
-    )
+    laid_out = []
+    for first, *others in lines:
+        cells = [cell.rjust(width) for cell, width in zip(others, widths[1:], strict=True)]
+        laid_out.append("  ".join([first.ljust(widths[0]), *cells]))
+    return "\n".join(laid_out)
 
 
 def counted(count: int, thing: str, things: str = "") -> str:
@@ -91,23 +89,24 @@ def segment_summary(report: Mapping[str, Any], out: str) -> str:
     ]
     views, gaussians = report["views"], report["gaussians"]
     rejected = ", ".join(f"{count} {why}" for why, count in views["rejected"].items())
+    used = f"{counted(views['used'], 'view')} used" + (f", rejected: {rejected}" if rejected else "")
     checked = [view for view in views.get("reliability", []) if view["reliability"] is not None]
     worst = ", ".join(f"{clipped(view['name'])} ({percent(view['reliability'])})" for view in checked[:LEAST])
-    return "\n\n".join(
-        [
-            table(["class", "Gaussians", "confidence"], classes),
-            f"{counted(views['used'], 'view')} used"
-            + (f", rejected: {rejected}" if rejected else "")
-            + (f"\nmasks that agree least with the other views: {worst}" if worst else "")
-            + "\n"
-            f"{counted(report['scene']['gaussians'], 'Gaussian')}: {gaussians['labelled']:,} labelled "
-            f"({gaussians['from_neighbours']:,} of them by their neighbours), {gaussians['removed']:,} removed by the "
-            f"filter, {gaussians['unobserved']:,} unobserved",
-            seconds_table(report["seconds"]),
-            f"Objects: {out}/classes\nPictures: {out}/pictures\n"
-            f"Labels: {out}/segmentation.npz\nReport: {out}/report.html, to look at; {out}/report.json",
-        ]
-    )
+    if worst:
+        used += f"\nmasks that agree least with the other views: {worst}"
+    return f"""{table(["class", "Gaussians", "confidence"], classes)}
+
+{used}
+{counted(report["scene"]["gaussians"], "Gaussian")}: {gaussians["labelled"]:,} labelled \
+({gaussians["from_neighbours"]:,} of them by their neighbours), {gaussians["removed"]:,} removed by the filter, \
+{gaussians["unobserved"]:,} unobserved
+
+{seconds_table(report["seconds"])}
+
+Objects: {out}/classes
+Pictures: {out}/pictures
+Labels: {out}/segmentation.npz
+Report: {out}/report.html, to look at; {out}/report.json"""
 
 
 def evaluation_summary(scores: Mapping[str, Any]) -> str:

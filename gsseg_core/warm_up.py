@@ -26,8 +26,7 @@ SIDE = 72
 
 class _FirstCompilation(event.Listener):
     def __init__(self, say: Callable[[str], object]) -> None:
-        self._say = say
-        self._said = False
+        self._say, self._said = say, False
 
     def on_start(self, begun: event.Event) -> None:
         if not self._said:
@@ -57,13 +56,8 @@ def telling(say: Callable[[str], object]) -> AbstractContextManager[object]:
 def _segment_something(device: str) -> None:
     x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-1.5, 1.5, SIDE), np.linspace(-1.5, 1.5, SIDE)))
     means, ones, light = np.stack([x, y, 4 + 0.1 * x], axis=1), np.ones(len(x)), np.where(x < 0, -1.0, 1.0)
-    scene = GaussianScene.from_arrays(
-        means,
-        np.tile([1.0, 0, 0, 0], (len(x), 1)),
-        np.full((len(x), 3), 0.05),
-        0.9 * ones,
-        np.tile(light[:, None, None], (1, 1, 3)),
-    )
+    quats, sh = np.tile([1.0, 0, 0, 0], (len(x), 1)), np.tile(light[:, None, None], (1, 1, 3))
+    scene = GaussianScene.from_arrays(means, quats, np.full((len(x), 3), 0.05), 0.9 * ones, sh)
     # The square is larger than the image: edges are only where the classes meet, and so the outline is moved there.
     K = np.array([[48.0, 0, 16], [0, 48, 16], [0, 0, 1]])
     camera = Camera("warm_up", 32, 32, K, np.eye(4))

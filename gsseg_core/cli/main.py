@@ -55,12 +55,11 @@ def _run(arguments: Sequence[str] | None) -> int:
     from gsseg_core.freed_memory import keep_freed_memory
 
     keep_freed_memory()
-    if arguments is not None:
+    try:
+        if arguments is None:
+            interrupts.raise_once()
         code: int = options.run(options)
         return code
-    try:
-        interrupts.raise_once()
-        code = options.run(options)
-        return code
     finally:
-        interrupts.leave_at_once()
+        if arguments is None:
+            interrupts.leave_at_once()

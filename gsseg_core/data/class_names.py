@@ -45,8 +45,6 @@ def read_classes(path: str | os.PathLike[str], within: Path | None = None) -> di
     for key, name in content.items():
         if not re.fullmatch(r"0|[1-9][0-9]{0,4}", key) or int(key) > MAX_LABEL:
             raise ClassesFileError(f"{path}: id {quoted(key)} is unusable; expected whole numbers from 0 to 65534")
-        if not isinstance(name, str):
-            raise ClassesFileError(f"{path}: id {key} has the name {quoted(name)}; expected text")
         if flaw := flaw_of_class_name(name):
             raise ClassesFileError(f"{path}: id {key} has the name {flaw}")
         names[int(key)] = name
@@ -58,9 +56,9 @@ def class_name(names: Mapping[int, str], k: int) -> str:
     return names.get(k, f"class_{k:02d}")
 
 
-def flaw_of_class_name(name: str) -> str:
+def flaw_of_class_name(name: object) -> str:
     """Say what is wrong with the name of a class, as the end of "has the name ...", or "" if it is usable."""
-    if not name.strip():
+    if not isinstance(name, str) or not name.strip():
         return f"{quoted(name)}; expected text"
     is_long = len(name) > MAX_CLASS_NAME
     too_long = f"{quoted(name)} of {len(name):,} characters; expected at most {MAX_CLASS_NAME}" if is_long else ""

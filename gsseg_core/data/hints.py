@@ -98,29 +98,25 @@ def _folders(root: Path) -> list[Path]:
 
 
 def _subfolders(folder: Path) -> list[Path]:
-    try:
+    with suppress(OSError):
         return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
-    except OSError:
-        return []
+    return []
 
 
 def _stems(folder: Path) -> set[str]:
-    try:
+    with suppress(OSError):
         return {path.stem for path in folder.iterdir() if path.suffix.lower() in _MASKS}
-    except OSError:
-        return set()
+    return set()
 
 
 def _masks(folder: Path, stems: Collection[str]) -> list[Path]:
     """List masks of the given stems, of every kind; none where the first label image is a photo."""
-    try:
+    with suppress(GssegError, OSError):
         found = list(mask_files(folder, stems).values())
-        images = [path for path in found if path.suffix.lower() == ".png"]
-        if images:
-            mask_header(images[0])
-    except (GssegError, OSError):
-        return []
-    return [path for path in found if path.is_file() or _has_detections(path)]
+        for image in [path for path in found if path.suffix.lower() == ".png"][:1]:
+            mask_header(image)
+        return [path for path in found if path.is_file() or _has_detections(path)]
+    return []
 
 
 def _has_detections(folder: Path) -> bool:

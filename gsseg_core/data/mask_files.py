@@ -77,22 +77,19 @@ def read_supervises(
     if not is_there(path, SupervisesFileError):
         return {}
     content = read_object(path, SupervisesFileError, '{"*": [ids]} or stems and ids', within)
-    known, entries = set(stems), {}
+    known, entries = {*stems, _ANY}, {}
     for stem, ids in content.items():
-        if stem != _ANY and stem not in known:
-            found = f"names the view {quoted(stem)}, which has no camera"
-            raise SupervisesFileError(f"{path}: {found}; expected stems, or '*'")
-        if stem in masks and masks[stem].suffix.lower() != ".png":
-            raise SupervisesFileError(
-                f"{path}: names {masks[stem].name}, which says itself what it supervises; expected label images (.png)"
-            )
-        if not isinstance(ids, list) or not ids or any(type(i) is not int or not 0 <= i <= MAX_LABEL for i in ids):
-            found = f"{quoted(stem)} has {clipped(ids)}"
-            raise SupervisesFileError(f"{path}: {found}; expected a list of ids 0 to {MAX_LABEL}")
-        unknown_ids = [i for i in ids if class_names is not None and i not in class_names]
-        if unknown_ids:
-            found = f"{quoted(stem)} has the class {unknown_ids[0]}"
-            raise SupervisesFileError(f"{path}: {found}; expected ids of classes.json")
+        flaw, of_stem = "", f"{quoted(stem)} has"
+        if stem not in known:
+            flaw = f"names the view {quoted(stem)}, which has no camera; expected stems, or '*'"
+        elif stem in masks and masks[stem].suffix.lower() != ".png":
+            flaw = f"names {masks[stem].name}, which says itself what it supervises; expected label images (.png)"
+        elif not isinstance(ids, list) or not ids or any(type(i) is not int or not 0 <= i <= MAX_LABEL for i in ids):
+            flaw = f"{of_stem} {clipped(ids)}; expected a list of ids 0 to {MAX_LABEL}"
+        elif class_names is not None and (unknown_ids := [i for i in ids if i not in class_names]):
+            flaw = f"{of_stem} the class {unknown_ids[0]}; expected ids of classes.json"
+        if flaw:
+            raise SupervisesFileError(f"{path}: {flaw}")
         entries[stem] = tuple(sorted(set(ids)))
     pngs = [stem for stem, mask in masks.items() if mask.suffix.lower() == ".png"]
     return {stem: entries.get(stem, entries.get(_ANY, ())) for stem in pngs if stem in entries or _ANY in entries}

@@ -17,15 +17,15 @@ _TEMPORARY = re.compile(r"\.gsseg-[0-9a-f]{12}(\..*)?", re.DOTALL)
 
 
 @contextlib.contextmanager
-def write_atomically(path: str | os.PathLike[str], *, suffix: str | None = None) -> Iterator[Path]:
+def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a temporary path beside `path`, and move what was written there to `path` at the end.
 
     An earlier file at `path` stays whole until the new one is complete and on the disk. If the body raises, whatever
     it raises, the temporary file is removed and the earlier file remains; after a kill the next write into the same
     folder removes it. A link to a file stays, and what it points to is replaced.
 
-    Parent folders are created. What is yielded is the name of an empty file, which the body must write. It ends with
-    `suffix`, for writers that go by it; by default with that of `path`.
+    Parent folders are created. What is yielded is the name of an empty file, which the body must write; it has the
+    suffix of `path`, for writers that go by it.
 
     Raises
     ------
@@ -45,7 +45,7 @@ def write_atomically(path: str | os.PathLike[str], *, suffix: str | None = None)
         target = _replaceable(path)
         target.parent.mkdir(parents=True, exist_ok=True)
         _remove_leftovers(target.parent)
-        temporary, lock = _locked_file(target.parent, path.suffix if suffix is None else suffix)
+        temporary, lock = _locked_file(target.parent, path.suffix)
         yield temporary
         with open(temporary, "rb+") as file:
             os.fsync(file.fileno())

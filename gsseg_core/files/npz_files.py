@@ -154,7 +154,7 @@ def check_shares(name: str, rows: npt.NDArray[np.float32]) -> None:  # (N, K)
 
 def write_npz(path: str | os.PathLike[str], header: dict[str, Any], **arrays: npt.ArrayLike) -> None:
     """Write arrays and a JSON header as one compressed npz, atomically; raises `WriteError`."""
-    with write_atomically(path, suffix=".npz") as temporary, open(temporary, "wb") as file:
+    with write_atomically(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, allow_pickle=False, **arrays, header=np.array(json.dumps(header)))
 
 

@@ -43,9 +43,7 @@ _PROBE = 1 << 16  # bytes that must fit on the disk before work begins
 
 
 @contextlib.contextmanager
-def staged_run(
-    out: str | os.PathLike[str], kind: str, *, places: Iterable[str] = (), only_own: bool = False
-) -> Iterator[StagedRun]:
+def staged_run(out: str | os.PathLike[str], kind: str, *, places: Iterable[str] = ()) -> Iterator[StagedRun]:
     """Give a run whose files, at the end of the body, become the result of their kind in `out`: all or none.
 
     Parameters
@@ -56,8 +54,6 @@ def staged_run(
         What kind of results; those of other kinds in the same folder stay.
     places : iterable of str
         Files that the run will write, as far as they are known: they are claimed at once.
-    only_own : bool
-        Refuse a folder that holds anything but holds no results of this kind.
 
     Raises
     ------
@@ -68,7 +64,7 @@ def staged_run(
     """
     run = StagedRun(Path(out), kind)
     try:
-        run.begin(only_own)
+        run.begin()
         run.claim(places)
         try:
             yield run
@@ -134,7 +130,7 @@ class StagedRun:
         self._made: list[Path] = []  # folders above the staged one that were not there, the innermost first
         self._lock = -1
 
-    def begin(self, only_own: bool) -> None:
+    def begin(self) -> None:
         """Make the folder, finish or remove what dead runs left in it, and see that something can be written there."""
         try:
             _refuse_no_folder(self.out)
@@ -143,8 +139,6 @@ class StagedRun:
             with _locked(self.out):
                 _finish(self.out)
                 _remove_dead(self.out)
-                if only_own:
-                    require_own_folder(self.out, self._kind)
                 self._staging.mkdir()
                 self._lock = _open_folder(self._staging)
                 try_lock(self._lock)

@@ -121,7 +121,7 @@ class State:
                 if evidence.supervised is not None:
                     arrays[f"supervised_{i}"] = evidence.supervised
             arrays[f"pose_{i}"] = np.stack([np.pad(view.camera.K, (0, 1)), view.camera.world_to_camera])
-        with write_atomically(path, suffix=".npz") as temporary, open(temporary, "wb") as file:
+        with write_atomically(path) as temporary, open(temporary, "wb") as file:
             np.savez_compressed(file, allow_pickle=False, header=np.array(json.dumps(header)), **arrays)
             _require_replaceable(path)  # To save takes long.
 

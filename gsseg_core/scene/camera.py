@@ -49,8 +49,10 @@ class Camera:
         """Copy the matrices and validate."""
         object.__setattr__(self, "K", np.array(self.K, np.float64))
         object.__setattr__(self, "world_to_camera", np.array(self.world_to_camera, np.float64))
-        self._check_intrinsics()
-        self._check_pose()
+        if flaw := self._flaw_of_intrinsics():
+            raise IntrinsicsError(f"{self._who}: {flaw}")
+        if flaw := self._flaw_of_pose():
+            raise PoseError(f"{self._who}: {flaw}")
 
     @property
     def fx(self) -> float:
@@ -80,11 +82,6 @@ class Camera:
     def project(self, points: npt.ArrayLike) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:  # (M, 3)
         """Project world points into the image.
 
-        Parameters
-        ----------
-        points : array (M, 3)
-            In the world.
-
         Returns
         -------
         uv : ndarray (M, 2)
@@ -109,42 +106,36 @@ class Camera:
     def _who(self) -> str:
         return f"camera '{clipped(self.name)}'"
 
-    def _check_intrinsics(self) -> None:
-        who = self._who
+    def _flaw_of_intrinsics(self) -> str:
+        """Say what is wrong with size and `K`, or "" if they are usable."""
         for side, size in (("width", self.width), ("height", self.height)):
             if not isinstance(size, (int, np.integer)) or size < 1:
-                raise IntrinsicsError(
-                    f"{who}: {side} is {clipped(size)}; expected a whole number of pixels, at least 1"
-                )
-        check_pixels(self.width, self.height, who, IntrinsicsError)
+                return f"{side} is {clipped(size)}; expected a whole number of pixels, at least 1"
+        check_pixels(self.width, self.height, self._who, IntrinsicsError)
         K = self.K
         if K.shape != (3, 3) or not np.isfinite(K).all():
-            raise IntrinsicsError(f"{who}: K is {clipped(K.tolist())}; expected 3 x 3 finite numbers")
+            return f"K is {clipped(K.tolist())}; expected 3 x 3 finite numbers"
         if self.fx <= 0 or self.fy <= 0:
-            raise IntrinsicsError(f"{who}: focal lengths are {self.fx:g} and {self.fy:g}; expected positive pixels")
+            return f"focal lengths are {self.fx:g} and {self.fy:g}; expected positive pixels"
         if K[0, 1] or K[1, 0] or K[2].tolist() != [0, 0, 1]:
-            raise IntrinsicsError(
-                f"{who}: K is {clipped(K.tolist(), 160)}; expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
-            )
+            return f"K is {clipped(K.tolist(), 160)}; expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+        return ""
 
-    def _check_pose(self) -> None:
-        who = self._who
+    def _flaw_of_pose(self) -> str:
+        """Say what is wrong with the pose, or "" if it is usable."""
         pose = self.world_to_camera
         if pose.shape != (4, 4):
-            raise PoseError(f"{who}: pose has shape {pose.shape}; expected (4, 4)")
+            return f"pose has shape {pose.shape}; expected (4, 4)"
         if not np.isfinite(pose).all():
-            raise PoseError(f"{who}: pose holds NaN or infinite numbers; expected a rigid motion")
+            return "pose holds NaN or infinite numbers; expected a rigid motion"
         if np.abs(pose).max() > LIMITS.max_value:
-            raise PoseError(
-                f"{who}: pose holds {np.abs(pose).max():.3g}; expected at most {LIMITS.max_value:g} (limit max_value)"
-            )
+            return f"pose holds {np.abs(pose).max():.3g}; expected at most {LIMITS.max_value:g} (limit max_value)"
         rotation = pose[:3, :3]
         determinant = np.linalg.det(rotation)
         if abs(determinant) < 1e-9:
-            raise PoseError(f"{who}: pose is not invertible (determinant {determinant:.3g}); expected a rigid motion")
+            return f"pose is not invertible (determinant {determinant:.3g}); expected a rigid motion"
         off = max(abs(rotation @ rotation.T - np.eye(3)).max(), abs(pose[3] - (0, 0, 0, 1)).max())
         if determinant < 0 or off > _RIGID_TOLERANCE:
-            raise PoseError(
-                f"{who}: pose is not a rigid motion (determinant {determinant:.6g}, off by {off:.3g}); expected a "
-                "rotation of determinant 1, a translation, and 0 0 0 1 as the last row"
-            )
+            rigid = "a rotation of determinant 1, a translation, and 0 0 0 1 as the last row"
+            return f"pose is not a rigid motion (determinant {determinant:.6g}, off by {off:.3g}); expected {rigid}"
+        return ""

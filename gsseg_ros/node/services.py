@@ -233,7 +233,7 @@ class Services:
     def export(self, request: Export.Request, response: Export.Response) -> None:
         """Write the files that the command line writes."""
         directory, settings = self.workspace.path(request.directory, EXPORT_FOLDER), self.workspace.settings
-        require_own_folder(directory, "segment")  # Before the work, and again below.
+        require_own_folder(directory, "segment")
         with self.workspace.run("export") as run:
             selection, refine = self._select(request, run)
             self.workspace.number(run)
@@ -242,7 +242,7 @@ class Services:
             with (
                 run.watch.stage("write"),
                 pinned_folder(directory, self.workspace.root) as folder,
-                staged_run(folder, "segment", only_own=True) as staged,
+                staged_run(folder, "segment") as staged,
             ):
                 result.save(staged.folder / "segmentation.npz", staged.id)
                 plys = write_classes(session.scene, result, staged.folder / "classes", staged.id)

@@ -40,11 +40,11 @@ def test_a_new_file_appears_with_its_folders_and_ordinary_permissions(tmp_path: 
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_the_suffix_of_the_temporary_name_can_be_chosen(tmp_path: Path) -> None:
-    with write_atomically(tmp_path / "state", suffix=".npz") as temporary:
+def test_the_temporary_name_has_the_suffix_of_the_file(tmp_path: Path) -> None:
+    with write_atomically(tmp_path / "state.npz") as temporary:
         assert temporary.suffix == ".npz"
         temporary.write_bytes(b"x")
-    assert (tmp_path / "state").read_bytes() == b"x"
+    assert (tmp_path / "state.npz").read_bytes() == b"x"
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError, SettingsError])
