@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import tempfile
 
 REMEDY = "set NUMBA_CACHE_DIR to a folder that you can write to"
 
@@ -24,16 +25,12 @@ def candidates() -> list[str]:
 
 def writable(folder: str) -> bool:
     """Whether a file can be written there; only trying tells, on read-only and full disks and for root alike."""
-    path = os.path.join(folder, f".gsseg-{os.urandom(6).hex()}")
     try:
         os.makedirs(folder, exist_ok=True)
-        with open(path, "xb") as file:
+        with tempfile.TemporaryFile(dir=folder) as file:
             file.write(bytes(4096))
     except OSError:
         return False
-    finally:
-        with contextlib.suppress(OSError):
-            os.unlink(path)
     return True
 
 

@@ -77,7 +77,7 @@ def examine(say: Callable[[str], object] = lambda text: None) -> list[Finding]:
 
     `say` is told if kernels have to be compiled, which takes a minute.
     """
-    return [*_versions(), *_packages(), *_devices(), *_kernels(say), *_formats(), *_extras(), *_ros()]
+    return [*_versions(), *_devices(), *_kernels(say), *_formats(), *_extras(), *_ros()]
 
 
 def works(findings: list[Finding]) -> bool:
@@ -107,9 +107,6 @@ def _versions() -> Iterator[Finding]:
     mark, fix = ("ok", "") if supported else ("!!", "use Python 3.10 to 3.13")
     yield Finding("machine", "Python", f"{platform.python_version()}, {sys.executable}", mark, fix)
     yield Finding("machine", "system", f"{platform.system()} {platform.release()}, {platform.machine()}")
-
-
-def _packages() -> Iterator[Finding]:
     for name in _requirements(""):
         found = _version(name)
         fix = "" if found else f"pip install {name}"
