@@ -7,6 +7,7 @@ names, so that a name with markup in it could not do harm even if it were not es
 from __future__ import annotations
 
 import base64
+import functools
 import hashlib
 import os
 from collections.abc import Callable, Mapping
@@ -73,6 +74,7 @@ def report_page(run: PageInputs) -> str:
     )
 
 
+@functools.cache  # Compiling the templates takes longer than filling them in.
 def environment() -> Environment:
     """Make what fills the templates in: every value is made printable and escaped, and none may be missing."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
