@@ -18,7 +18,7 @@ VIEWS = clean_views(12)
 def wrong_share(kind: str, strength: float, seed: int = 0) -> float:
     """Share of wrong pixels over views of a grid of objects."""
     labels = make_grid()
-    views = [View.from_arrays(ring(1)[0], labels[:48, :64]) for _ in range(40)]
+    views = [View.from_arrays(ring(1)[0], labels[:48, :64]) for _ in range(20)]
     wrong = corrupt_views(views, seed, *errors_at(kind, strength))
     return float(np.mean([view.read_labels() != labels[:48, :64] for view in wrong]))
 

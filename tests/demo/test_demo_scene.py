@@ -9,6 +9,7 @@ import pytest
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import read_mask
+from gsseg_core.demo import table_scene
 from gsseg_core.demo.solids import WALL, Box, Cone, Ellipsoid, Solid
 from gsseg_core.demo.table_scene import CLASS_NAMES, FLOATER, DemoScene, build_demo
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -72,13 +73,24 @@ def test_train_masks_have_errors_and_test_masks_stay_hidden(demo: DemoScene) -> 
     assert 0.15 < np.mean(wrong) < 0.45
 
 
-def test_the_same_seed_gives_the_same_scene_and_another_one_another(demo: DemoScene, tmp_path: Path) -> None:
-    again, other = build_demo(tmp_path / "again"), build_demo(tmp_path / "other", seed=1)
-    assert again.scene.digest == demo.scene.digest != other.scene.digest
-    name = f"labels/{demo.train[0]}.png"
-    assert (again.root / name).read_bytes() == (demo.root / name).read_bytes()
-    name = f"labels_true/{demo.train[0]}.png"
-    assert (other.root / name).read_bytes() == (demo.root / name).read_bytes()
+def test_the_same_seed_gives_the_same_scene(demo: DemoScene, demo_run: Path) -> None:
+    assert GaussianScene.load(demo_run / "scene/scene.ply").digest == demo.scene.digest
+    for name in (f"labels/{view}.png" for view in demo.train):
+        assert (demo_run / "scene" / name).read_bytes() == (demo.root / name).read_bytes()
+
+
+def test_another_seed_gives_other_gaussians_and_masks_of_the_same_solids(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(table_scene, "NUM_VIEWS", 4)
+    monkeypatch.setattr(table_scene, "_SPACING", {"background": 0.3, "table": 0.04})
+    monkeypatch.setattr(table_scene, "_OBJECT_SPACING", 0.016)
+    one, other = (build_demo(tmp_path / str(seed), seed) for seed in (0, 1))
+    assert one.scene.digest != other.scene.digest
+    for name in one.train:
+        for folder, same in (("labels", False), ("labels_true", True)):
+            masks = [(demo.root / folder / f"{name}.png").read_bytes() for demo in (one, other)]
+            assert (masks[0] == masks[1]) == same
 
 
 @pytest.mark.parametrize(

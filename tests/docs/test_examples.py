@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import read_mask
 from gsseg_core.data.view import View
+from gsseg_core.demo import table_scene
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 REPOSITORY = Path(__file__).parents[2]
@@ -39,9 +41,23 @@ def test_every_example_is_listed() -> None:
         assert path.suffix not in (".py", ".ipynb") or f"({path.name})" in listing, path.name
 
 
+def copy_with_fewer_views(demo_run: Path, folder: Path, every: int) -> list[str]:
+    """Copy the demo's scene as a dataset with every so manieth of its training views, and name these."""
+    shutil.copytree(demo_run / "scene", folder)
+    split = json.loads((folder / "split.json").read_text())
+    (folder / "split.json").write_text(json.dumps({**split, "train": split["train"][::every]}))
+    names: list[str] = split["train"][::every]
+    return names
+
+
 def test_the_notebook_runs_from_its_first_cell_to_its_last_and_stores_no_output(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, demo_run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    def demo_that_is_there(folder: str) -> SimpleNamespace:
+        copy_with_fewer_views(demo_run, Path(folder), 2)
+        return SimpleNamespace(root=Path(folder))
+
+    monkeypatch.setattr(table_scene, "build_demo", demo_that_is_there)
     notebook = json.loads(NOTEBOOK.read_text())
     assert notebook["nbformat"] == 4
     cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
@@ -58,12 +74,11 @@ def test_the_notebook_runs_from_its_first_cell_to_its_last_and_stores_no_output(
 
 def test_masks_of_a_segmenter_that_knows_no_objects_are_segmented_per_view(tmp_path: Path, demo_run: Path) -> None:
     pytest.importorskip("skimage", reason="scikit-image is not installed")
-    data = Path(shutil.copytree(demo_run / "scene", tmp_path / "data"))
-    split = json.loads((data / "split.json").read_text())
-    (data / "split.json").write_text(json.dumps({**split, "train": split["train"][::6]}))
+    data = tmp_path / "data"
+    names = copy_with_fewer_views(demo_run, data, 6)
     ran = run_example("masks_from_photos.py", data, "--scene", data / "scene.ply", "--out", "auto")
     assert ran.returncode == 0, ran.stderr
-    assert [read_mask(data / f"auto/{stem}.png").bits for stem in split["train"][::6]] == [16] * 5
+    assert [read_mask(data / f"auto/{stem}.png").bits for stem in names] == [16] * 5
     command = ["segment", f"{data}/scene.ply", "--data", str(data), "--labels", "auto", "--ids", "per-view"]
     assert main([*command, "--out", f"{tmp_path}/out", "--quiet"]) == 0
     with np.load(tmp_path / "out/segmentation.npz") as file:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -77,9 +79,17 @@ def true_labels(scene: GaussianScene, truth: np.ndarray, camera: Camera) -> np.n
     return image.argmax(axis=2).astype(np.int32)
 
 
-def clean_views(count: int = 5, prefix: str = "view", turn: float = 0.0) -> list[View]:
+@functools.cache
+def _masks_of_the_table(count: int, turn: float) -> tuple[np.ndarray, ...]:
     scene, truth = balls_on_a_table()
-    return [View.from_arrays(camera, true_labels(scene, truth, camera)) for camera in ring(count, prefix, turn)]
+    return tuple(true_labels(scene, truth, camera) for camera in ring(count, turn=turn))
+
+
+def clean_views(count: int = 5, prefix: str = "view", turn: float = 0.0) -> list[View]:
+    masks = _masks_of_the_table(count, turn)
+    return [
+        View.from_arrays(camera, labels.copy()) for camera, labels in zip(ring(count, prefix, turn), masks, strict=True)
+    ]
 
 
 def wrong_views(count: int = 8, *, seed: int = 0, missed: float = 0.2, swapped: float = 0.2) -> list[View]:
@@ -137,8 +147,10 @@ def write_dataset(
     bits: int = 8,
 ) -> Path:
     """A dataset on disk, the scene beside its cameras; every third view is for testing."""
+    masks: Iterable[np.ndarray] | None = None
     if scene is None or truth is None:
         (scene, truth), names = balls_on_a_table(), NAMES
+        masks = None if cameras else _masks_of_the_table(6, 0.0)
     cameras = cameras or ring(6)
     folder.mkdir(parents=True, exist_ok=True)
     scene.save(folder / "scene.ply")
@@ -148,8 +160,8 @@ def write_dataset(
     stems = [camera.name for camera in cameras]
     split = {"train": [s for i, s in enumerate(stems) if i % 3 != 2], "test": stems[2::3]}
     (folder / "split.json").write_text(json.dumps(split))
-    for camera in cameras:
-        write_mask(folder / "labels" / f"{camera.name}.png", true_labels(scene, truth, camera), bits)
+    for camera, labels in zip(cameras, masks or (true_labels(scene, truth, camera) for camera in cameras), strict=True):
+        write_mask(folder / "labels" / f"{camera.name}.png", labels, bits)
     return folder
 
 
