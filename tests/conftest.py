@@ -25,11 +25,15 @@ DATA = Path(os.environ.get("GSSEG_DATA") or Path(__file__).parents[2] / "shared"
 _NO_DATA = "real data not found"
 _NO_GPU = "no GPU for gsplat"
 _NO_BROWSER = "no Chromium"
+# As `gsseg view` has it: a browser may leave while it is being sent something. A thread may say so in a later test.
+_LEFT = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection:UserWarning")
 
 
-# How fast examples are drawn and run says something of the machine only.
-settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("any machine")
+# How fast examples are drawn and run says something of the machine only. Who changes what a law is about looks longer,
+# by --hypothesis-profile=long.
+settings.register_profile("short", deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=25)
+settings.register_profile("long", settings.get_profile("short"), max_examples=500)
+settings.load_profile("short")
 
 
 def pytest_configure() -> None:
@@ -40,12 +44,16 @@ def pytest_configure() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that start processes, which `make check` leaves out."""
+    """Mark the tests that start processes, which `make check` leaves out; beside each other, they begin."""
     processes.mark(items)
+    for item in items:
+        item.add_marker(_LEFT)
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        processes.put_first(items)
 
 
 @pytest.hookimpl(wrapper=True)
-def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     """Hold the tests that are left where those that start processes are left out to starting none."""
     processes.allow(item.config.option.markexpr != f"not {processes.MARKER}")
     try:

@@ -41,8 +41,6 @@ if TYPE_CHECKING:
 
 PORT = 18200
 
-# As `gsseg view` has it: a browser may leave while it is being sent something.
-pytestmark = pytest.mark.filterwarnings("ignore:Queued a .* on a closed connection:UserWarning")
 SCENE, TRUTH = balls_on_a_table()
 PLAIN = {0: "background", 1: "red ball", 2: "mug", 3: "book"}
 CAMERA = {
