@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
@@ -12,7 +12,6 @@ from gsseg_core.csr_rows import CSRRows
 codes = arrays.arrays(np.float32, st.tuples(st.integers(1, 20), st.integers(1, 6)), elements=st.sampled_from([0, 1, 2]))
 
 
-@settings(deadline=None)
 @given(codes, st.data())
 def test_rows_are_taken_as_from_an_array(array: np.ndarray, data: st.DataObject) -> None:
     ids = np.array(data.draw(st.lists(st.integers(0, len(array) - 1))), np.int32)

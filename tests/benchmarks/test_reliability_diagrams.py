@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from reliability_diagrams import ReliabilityDiagram, risk_coverage
 
@@ -37,7 +37,6 @@ def test_bins_of_a_diagram_hold_shares_means_and_hits_and_views_add_up() -> None
     assert diagram.ece == pytest.approx((2 * 0.47 + 0.1 + 3 * (1 - 1 / 3)) / 6)
 
 
-@settings(deadline=None, max_examples=30)
 @given(st.integers(1, 200), st.integers(0, 2**32 - 1))
 def test_order_of_predictions_does_not_matter(count: int, seed: int) -> None:
     rng = np.random.default_rng(seed)

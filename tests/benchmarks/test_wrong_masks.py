@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from scipy import ndimage
 from small_scenes import make_grid
@@ -150,7 +149,6 @@ def test_a_seed_gives_the_masks_that_it_gave_before_there_were_more_kinds() -> N
     assert sums == [2270022631, 720714654, 242888160]
 
 
-@hypothesis_settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 10**6), height=st.integers(1, 12), width=st.integers(1, 12), classes=st.integers(1, 4))
 def test_unknown_stays_unknown_and_labels_stay_labels_on_any_map(
     seed: int, height: int, width: int, classes: int

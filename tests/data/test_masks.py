@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
@@ -18,7 +18,6 @@ from gsseg_core.errors import ClassesFileError, MaskFormatError, SettingsError, 
 
 
 @pytest.mark.parametrize("bits", [8, 16])
-@settings(deadline=None, max_examples=20)
 @given(data=st.data())
 def test_masks_survive_a_round_trip(tmp_path_factory: pytest.TempPathFactory, bits: int, data: st.DataObject) -> None:
     ids = st.one_of(st.just(UNKNOWN), st.integers(0, 2**bits - 2))

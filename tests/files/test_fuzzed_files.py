@@ -96,7 +96,7 @@ def test_the_good_files_are_read(whole: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", READERS)
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(derandomize=True)
 @given(data=st.data())
 def test_changed_bytes_are_read_or_refused_with_one_clear_error(whole: Path, name: str, data: st.DataObject) -> None:
     content = bytearray((whole / name).read_bytes())

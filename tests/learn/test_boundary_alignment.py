@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from scipy import ndimage
@@ -76,7 +76,6 @@ def test_where_edges_are_no_stronger_along_boundaries_than_elsewhere_nothing_mov
     np.testing.assert_array_equal(align_boundaries(labels, posters, FARTHEST), labels)
 
 
-@settings(deadline=None, max_examples=60)
 @given(SMALL_MASKS, st.integers(1, 3), st.integers(0, 2**32 - 1))
 def test_pixels_move_to_regions_near_by_and_the_unknown_stays_unknown(
     labels: np.ndarray, farthest: int, seed: int
@@ -92,7 +91,6 @@ def test_pixels_move_to_regions_near_by_and_the_unknown_stays_unknown(
         assert aligned[row, column] in labels[near]
 
 
-@settings(deadline=None, max_examples=60)
 @given(st.lists(st.integers(1, 19), min_size=1, max_size=30), st.integers(1, 3), st.integers(0, 2**32 - 1))
 def test_a_view_turned_around_settles_turned_around(widths: list[int], farthest: int, seed: int) -> None:
     # Two regions, side by side: where there are more, some pixels are equally near to two, and either may be named.
@@ -103,7 +101,6 @@ def test_a_view_turned_around_settles_turned_around(widths: list[int], farthest:
     np.testing.assert_array_equal(aligned, turned)
 
 
-@settings(deadline=None, max_examples=60)
 @given(
     arrays.arrays(np.int32, st.tuples(st.integers(1, 90), st.integers(1, 20)), elements=st.integers(0, 1)),
     st.integers(1, 6),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, ring, taught, write_dataset, wrong_views
 
@@ -50,7 +50,6 @@ def as_sample(shares: np.ndarray, seen: np.ndarray) -> Sample:
 # The temperature
 
 
-@settings(deadline=None, max_examples=50)
 @given(st.integers(1, 8), st.integers(1, 5), st.floats(0.2, 5), st.integers(0, 2**32 - 1))
 def test_tempering_keeps_order_sums_and_zeros_and_can_be_undone(n: int, k: int, temperature: float, seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -266,7 +266,7 @@ def test_the_order_of_the_gaussians_does_not_matter() -> None:
     np.testing.assert_array_equal(two.observed_, one.observed_[order])
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(groups=st.lists(st.integers(0, 2), min_size=6, max_size=6), order=st.permutations(range(6)))
 def test_sums_over_views_do_not_depend_on_order_or_grouping(groups: list[int], order: list[int]) -> None:
     learner = taught(EMLearner(SCENE, NUM_CLASSES), [with_clutter(view) for view in wrong_views(6)])

@@ -86,7 +86,7 @@ def test_votes_are_the_sum_over_views_of_the_adjoint_of_the_masks() -> None:
     np.testing.assert_allclose(learner.codes_[seen], share, atol=1e-3)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(order=st.permutations(range(5)), taken=st.sets(st.integers(0, 4)))
 def test_views_taken_back_leave_no_trace_whatever_the_order(order: list[int], taken: set[int]) -> None:
     learner = VoteLearner(SCENE, NUM_CLASSES)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from scipy import ndimage
@@ -23,7 +23,6 @@ SCENE, _ = balls_on_a_table()
 SHAPES = st.tuples(st.integers(1, 12), st.integers(1, 12))
 
 
-@settings(deadline=None)
 @given(arrays.arrays(np.int32, SHAPES, elements=st.integers(-1, 2)))
 def test_connected_pixels_are_those_of_scipy(labels: np.ndarray) -> None:
     connected, first, area = connected_pixels(labels)
@@ -41,7 +40,6 @@ def test_connected_pixels_are_those_of_scipy(labels: np.ndarray) -> None:
     assert len(area) == many
 
 
-@settings(deadline=None, max_examples=30)
 @given(arrays.arrays(np.int32, st.just((40, 30)), elements=st.integers(-1, 2), fill=st.integers(0, 2)))
 def test_regions_mean_what_the_labels_were_and_only_large_ones_stand_alone(labels: np.ndarray) -> None:
     seen = split_regions(SeenLabels(labels))

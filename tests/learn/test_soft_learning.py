@@ -103,7 +103,7 @@ def test_soft_votes_are_weights_times_masses_by_a_slow_twin() -> None:
 
 
 @given(st.lists(st.integers(0, 8), min_size=1, max_size=6, unique=True), st.randoms(use_true_random=False))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_votes_are_additive_and_retracted_bit_for_bit(kept: list[int], random: object) -> None:
     views = clean_views(9)
     kinds = [blurred(v, i) if i % 3 == 0 else partial(v, i % 4) if i % 3 == 1 else v for i, v in enumerate(views)]
@@ -208,7 +208,6 @@ def test_error_models_of_partial_masks_take_none_of_these_for_the_right_word() -
 
 
 @given(st.lists(st.lists(st.integers(-3, 3), min_size=5, max_size=5), min_size=1, max_size=8), st.integers(0, 31))
-@settings(max_examples=60, deadline=None)
 def test_what_stands_of_votes_is_what_a_slow_twin_keeps(rows: list[list[int]], ids: int) -> None:
     possible = np.array([ids >> k & 1 for k in range(5)], bool)
     votes = np.array(rows, np.int64) * possible

@@ -7,7 +7,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from small_scenes import NAMES, balls_on_a_table, clean_views
 
@@ -79,7 +79,6 @@ def test_a_round_plate_gets_its_diameter_and_thickness() -> None:
     assert box.size[2] == pytest.approx(0.04, rel=0.05)
 
 
-@settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 10_000), scale=st.floats(0.01, 100), count=st.integers(1, 120))
 @example(seed=101, scale=1.0, count=3)
 @example(seed=2, scale=1.0, count=4)
@@ -99,7 +98,6 @@ def test_a_box_turns_moves_and_scales_with_the_scene(seed: int, scale: float, co
     assert farthest_corner(found.corners, expected.corners) < 4 * close
 
 
-@settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10_000), share=st.floats(0.0, 0.08), distance=st.floats(2.5, 1000))
 def test_floaters_do_not_change_the_box(seed: int, share: float, distance: float) -> None:
     rng = np.random.default_rng(seed)

@@ -50,7 +50,7 @@ def slow_tree(features: np.ndarray) -> list[tuple[frozenset[int], float]]:
     return out
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(seed=st.integers(0, 1000), height=st.integers(1, 4), width=st.integers(2, 4))
 def test_regions_merge_in_the_order_of_the_slow_twin(seed: int, height: int, width: int) -> None:
     features = np.random.default_rng(seed).normal(size=(height, width, 2))

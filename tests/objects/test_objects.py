@@ -139,7 +139,7 @@ def test_background_and_what_no_view_sees_is_never_carved() -> None:
     assert not carve(SCENE, labels, []).any()
 
 
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=5)
 @given(seed=st.integers(0, 10**6))
 def test_order_of_gaussians_and_number_of_threads_change_nothing_in_what_is_carved(seed: int) -> None:
     scene, labels, _ = with_fringe()
@@ -197,7 +197,7 @@ def test_halves_cover_what_the_whole_did_at_every_opacity() -> None:
     assert (half_opacity(o) < 0.7).all() and (half_opacity(o) > 0).all()
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 10**6))
 def test_a_picture_of_split_gaussians_is_that_of_whole_ones(seed: int) -> None:
     rng = np.random.default_rng(seed)

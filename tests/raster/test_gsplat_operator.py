@@ -15,7 +15,7 @@ import numpy as np
 import plain_gsplat
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from naive_rasteriser import naive_gsplat_view, naive_view
 from operator_backends import PLAIN, why_missing
@@ -80,7 +80,6 @@ def test_labels_are_those_of_the_cpu(backend, monkeypatch, which):
     np.testing.assert_allclose(got.codes_[both], expected.codes_[both], atol=0.05)
 
 
-@settings(deadline=None, max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 200))
 def test_the_rules_of_gsplat_move_at_most_a_fiftieth_of_a_ray(seed, n):
     scene, camera = random_view(seed, n, 20, 12)

@@ -22,7 +22,7 @@ views = st.fixed_dictionaries(
         "height": st.integers(1, 40),
     }
 )
-few = settings(deadline=None, max_examples=15)
+few = settings(max_examples=15)
 RENDERED = ("ids", "render", "transmittance", "weights", "gaussians")
 
 

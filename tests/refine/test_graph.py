@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import small_scenes
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gsseg_core.data.view import View
@@ -70,7 +70,6 @@ def test_steps_end_where_the_linear_system_is_solved() -> None:
     np.testing.assert_allclose(fast, slow, atol=5e-3)
 
 
-@settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 1000), classes=st.sampled_from([1, 2, 20]))
 def test_codes_stay_probabilities(seed: int, classes: int) -> None:
     codes, evidence = some_codes(seed, classes=classes)
@@ -80,7 +79,6 @@ def test_codes_stay_probabilities(seed: int, classes: int) -> None:
     np.testing.assert_allclose(total[total > 0], 1, atol=1e-5)
 
 
-@settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 1000), power=st.integers(-6, 6))
 def test_the_unit_of_length_does_not_matter(seed: int, power: int) -> None:
     means, colors = some_points(seed)

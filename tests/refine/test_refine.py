@@ -68,7 +68,7 @@ def test_both_steps_agree_with_their_slow_twins(n, k, on_grid):
     np.testing.assert_array_equal(statistical_filter(means, labels, k, 1.0, 5), slow_filter(means, labels, k, 1.0, 5))
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 400), k=st.integers(1, 60), on_grid=st.booleans())
 def test_order_of_gaussians_and_number_of_threads_change_no_bit(seed, n, k, on_grid):
     means, probabilities, observed, labels = scene(seed, n, on_grid=on_grid)
@@ -86,7 +86,7 @@ def test_order_of_gaussians_and_number_of_threads_change_no_bit(seed, n, k, on_g
     np.testing.assert_array_equal(removed_again, removed[shuffled])
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 10**6))
 def test_a_rigid_motion_changes_nothing(seed):
     means, probabilities, observed, labels = scene(seed, 300)

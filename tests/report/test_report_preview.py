@@ -7,7 +7,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from small_scenes import NUM_CLASSES, balls_on_a_table, look_at
 
@@ -63,7 +63,6 @@ def test_a_thinned_preview_keeps_small_classes_covers_as_much_and_is_always_the_
     assert growth == pytest.approx(np.sqrt(5), rel=0.05)
 
 
-@settings(max_examples=30, deadline=None)
 @given(st.integers(1, 40), st.integers(1, 50), st.integers(0, 1000))
 def test_no_scene_is_too_small_or_too_flat_for_a_preview(count: int, most: int, seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from pairing_events import MS, Event, S, at_all, expire, pose, send
 
@@ -130,7 +130,6 @@ class CameraPoses(ExactPoses):
         return None if found is None else rigid(np.eye(3), [found[0, 3], len(frame_id), 0])
 
 
-@settings(max_examples=30, deadline=None)
 @given(st.data())
 def test_masks_of_synchronised_cameras_get_the_camera_info_and_the_pose_of_their_own(data: st.DataObject) -> None:
     pairing = Pairing(CameraPoses())

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import plyfile
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -42,7 +42,6 @@ def vertices(draw: st.DrawFn) -> np.ndarray:
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-@settings(deadline=None, max_examples=20)
 @given(vertices=vertices())
 def test_every_encoding_reads_and_writes_back_exactly(
     tmp_path_factory: pytest.TempPathFactory, encoding: str, vertices: np.ndarray

@@ -44,7 +44,7 @@ def stack(vertices: np.ndarray, *names: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("degree", range(4))
-@settings(deadline=None, max_examples=12)
+@settings(max_examples=12)
 @given(
     seed=st.integers(0, 2**32 - 1),
     n=st.integers(1, 6),
@@ -87,7 +87,7 @@ def test_every_form_of_ply_is_read_and_written_back_exactly(
     assert GaussianScene.load(folder / "out.ply").digest == scene.digest
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 5), degree=st.integers(0, 3))
 def test_a_scene_from_arrays_is_what_is_read_back(
     tmp_path_factory: pytest.TempPathFactory, seed: int, n: int, degree: int

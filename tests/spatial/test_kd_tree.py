@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
@@ -41,7 +41,6 @@ any_points = st.builds(
 )
 
 
-@settings(max_examples=40)
 @given(points=any_points)
 def test_a_tree_holds_every_point_once_inside_the_boxes_of_all_its_nodes(points: np.ndarray) -> None:
     tree = Tree.build(points)
@@ -60,7 +59,6 @@ def test_a_tree_holds_every_point_once_inside_the_boxes_of_all_its_nodes(points:
             assert np.isinf(block[:, last - first :]).all()
 
 
-@settings(max_examples=60)
 @given(points=any_points, k=st.sampled_from([1, 2, 5, 16, 50]))
 def test_the_nearest_others_are_as_far_as_scipy_finds_them(points: np.ndarray, k: int) -> None:
     k, tree = min(k, len(points) - 1), Tree.build(points)
@@ -71,7 +69,6 @@ def test_the_nearest_others_are_as_far_as_scipy_finds_them(points: np.ndarray, k
     np.testing.assert_allclose(means, expected[tree.order].mean(axis=1), rtol=1e-5, atol=1e-6 * size)
 
 
-@settings(max_examples=20)
 @given(points=any_points, seed=st.integers(0, 100))
 def test_a_part_of_a_tree_is_a_tree_of_these_points(points: np.ndarray, seed: int) -> None:
     chosen = np.flatnonzero(np.random.default_rng(seed).random(len(points)) < 0.5)
@@ -84,7 +81,6 @@ def test_a_part_of_a_tree_is_a_tree_of_these_points(points: np.ndarray, seed: in
     np.testing.assert_allclose(np.sqrt(radii), expected, rtol=1e-5, atol=1e-6 * np.abs(points).max())
 
 
-@settings(max_examples=20)
 @given(points=any_points, seed=st.integers(0, 100))
 def test_distances_are_found_only_where_they_are_asked_for(points: np.ndarray, seed: int) -> None:
     wanted = np.random.default_rng(seed).random(len(points)) < 0.5

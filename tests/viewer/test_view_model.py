@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from small_scenes import NAMES, balls_on_a_table
 
@@ -134,7 +134,6 @@ LABELS = st.lists(st.integers(-2, 30), min_size=1, max_size=200)
 
 
 @given(LABELS, st.integers(0, 2**31), st.integers(1, 40))
-@settings(max_examples=60, deadline=None)
 def test_a_cut_has_every_gaussian_in_exactly_one_node_and_no_more_nodes_than_allowed(
     labels: list[int], seed: int, max_nodes: int
 ) -> None:
