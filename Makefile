@@ -14,21 +14,27 @@ COLCON_READY := $(COLCON_VENV)/.ready
 WARM_UP := $(BIN)/python -c 'from gsseg_core.warm_up import warm_up; warm_up(say=print)'
 
 INSTALLED := setup.py package.xml $(wildcard config/* foxglove/* launch/* resource/* rviz/* scripts/* sros2/*)
+KERNELS := $(shell grep -rl --include='*.py' numba gsseg_core)
 MSGS := $(wildcard msg_defs/*.* msg_defs/action/* msg_defs/msg/* msg_defs/srv/*)
 
 # Of tests that run beside each other: those that start nodes wait more than they work.
 TEST_WORKERS ?= 4
 
+# No bytecode of what nobody imports. pip reads this one the other way round: 0 is --no-compile, here and where it builds.
+export PIP_NO_COMPILE = 0
+
 # Both builders of the messages obey it; without it one of them compiles file after file.
 export CMAKE_BUILD_PARALLEL_LEVEL ?= $(shell nproc 2>/dev/null || echo 1)
 
-# Beside each other, threads of kernels that wait for work must leave the cores to the others: twice as fast.
-run-tests check: export OMP_WAIT_POLICY = passive
+# Beside each other, threads of kernels that wait for work must leave the cores to the others: twice as fast. Those of
+# NumPy's matrix products cannot be told to, so there is one.
+run-tests run-fast-tests: export OMP_WAIT_POLICY = passive
+run-tests run-fast-tests: export OPENBLAS_NUM_THREADS = 1
 
 # Targets that `make test` makes beside the tests.
 BESIDE ?=
 
-.PHONY: help demo demo-local view check house test lint kernels run-tests docs colcon results robustness bench clean
+.PHONY: help demo demo-local view check house environments test lint run-fast-tests run-tests docs colcon results robustness bench clean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{ printf "%-16s %s\n", $$1, $$2 }'
@@ -44,16 +50,17 @@ view: $(KERNELS_READY)  ## segment a small scene and look at it in the browser; 
 	$(BIN)/gsseg view demo_out/scene/scene.ply --segmentation demo_out/segmented/segmentation.npz \
 		--data demo_out/scene --open
 
-check: $(READY) $(ROS_READY) $(MSGS_READY)  ## lint, check the types, the order of the rooms and all that starts no process: three minutes
-	@$(MAKE) --no-print-directory lint kernels
-	$(BIN)/python -m pytest -q -W error --numprocesses=2 --dist=worksteal -m 'not processes'
+check: $(READY) $(ROS_READY) $(MSGS_READY)  ## lint, check the types, the order of the rooms and all that starts no process: a minute
+	@$(MAKE) --no-print-directory --jobs=2 --keep-going lint run-fast-tests
 
 house: $(KERNELS_READY)  ## print what the house measures, with the bar beside each
 	$(BIN)/python benchmarks/house.py
 
 test: $(READY)  ## lint, check the types and run the tests
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint kernels $(MSGS_READY)
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint $(KERNELS_READY) $(MSGS_READY)
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target --keep-going run-tests $(BESIDE)
+
+environments: $(READY) $(COLCON_READY)
 
 lint: | $(ROS_READY)
 	$(BIN)/ruff check .
@@ -61,11 +68,11 @@ lint: | $(ROS_READY)
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
 
-kernels: | $(READY)
-	$(WARM_UP)
+run-fast-tests: $(KERNELS_READY)
+	$(BIN)/python -m pytest -q -W error --numprocesses=2 --dist=worksteal -m 'not processes'
 
 run-tests:
-	$(BIN)/python -m pytest -W error --durations=20 --numprocesses=$(TEST_WORKERS) --dist=loadfile
+	$(BIN)/python -m pytest -W error --durations=20 --numprocesses=$(TEST_WORKERS) --dist=loadfile --no-loadscope-reorder
 
 docs: $(READY)  ## build the documentation into site/index.html, and refuse links that lead nowhere
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
@@ -107,8 +114,8 @@ $(READY): $(INSTALLED) pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable '.[dev]'
 	touch $@
 
-# Compiled before the first picture, so that it does not wait for them.
-$(KERNELS_READY): | $(READY)
+# Compiled before the first picture, so that it does not wait for them; and once, not by each test that needs them.
+$(KERNELS_READY): $(KERNELS) | $(READY)
 	$(WARM_UP)
 	touch $@
 
@@ -120,7 +127,7 @@ $(ROS_READY): setup.py constraints.txt | $(READY)
 # The build has an environment of its own, with versions of the generators that nothing else should see. pip hands the
 # constraints on to it only through its own environment variables; which of the two depends on pip's age.
 $(MSGS_READY): $(MSGS) | $(ROS_READY)
-	@echo 'compiling the ROS messages, which takes a minute or two'
+	@echo 'compiling the ROS messages, which takes a minute'
 	PIP_CONSTRAINT=constraints.txt PIP_BUILD_CONSTRAINT=constraints.txt \
 		$(BIN)/python -m pip install --quiet --no-deps --force-reinstall ./msg_defs
 	touch $@
