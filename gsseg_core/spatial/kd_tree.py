@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
@@ -16,54 +16,32 @@ LEAF = 16
 SUBTREE = 8  # levels of a subtree that one thread builds alone: about 4000 points
 
 
-@dataclass(frozen=True)
-class Tree:
+class Tree(NamedTuple):
     """A balanced k-d tree without pointers: node i has the children 2i and 2i + 1, and the root is 1.
 
     With L leaves, a power of two, leaf i is node L + i and holds points i * n // L to (i + 1) * n // L.
-
-    Attributes
-    ----------
-    points : (3, n) float32
-        In tree order: what is near in the array is near in space.
-    order : (n,) int32
-        Which of the points that went in each one is.
-    boxes : (2 L, 6) float32
-        Lowest and highest corner of each node's points.
-    blocks : (L, 3, LEAF) float32
-        The points once more, leaf by leaf; those that a leaf lacks are infinitely far away.
     """
 
-    points: np.ndarray
-    order: np.ndarray
-    boxes: np.ndarray
-    blocks: np.ndarray
+    points: np.ndarray  # (3, n) float32, in tree order: what is near in the array is near in space
+    order: np.ndarray  # (n,) int32: which of the points that went in each one is
+    boxes: np.ndarray  # (2 L, 6) float32: lowest and highest corner of each node's points
+    blocks: np.ndarray  # (L, 3, LEAF) float32: the points leaf by leaf; those that a leaf lacks are infinitely far away
 
     @classmethod
-    def build(
-        cls,
-        points: np.ndarray,  # (n, 3) float32, n > 0
-    ) -> Tree:
-        """Build it by halving the points along the widest axis, again and again."""
-        depth = _depth(len(points))
-        points, order = points.copy(), np.arange(len(points), dtype=np.int32)
-        boxes = np.empty((2 << depth, 6), np.float32)
+    def build(cls, points: np.ndarray) -> Tree:
+        """Halve points, (n, 3) float32 with n > 0, along their widest axis, again and again."""
+        depth, points, order = _depth(len(points)), points.copy(), np.arange(len(points), dtype=np.int32)
         if depth > SUBTREE:
-            _grow(points, order, boxes, depth)
+            _grow(points, order, depth)
         else:  # waking other threads would take longer than the work
-            _grow_subtree(points, order, boxes, depth, 0, 0)
+            _grow_subtree(points, order, depth, 0, 0)
         points = np.ascontiguousarray(points.T)
-        return cls(points, order, boxes, _blocks(points, 1 << depth))
+        return cls(points, order, *_leaves(points, 1 << depth))
 
-    def part(
-        self,
-        places: np.ndarray,  # (m,) ascending, m > 0
-    ) -> Tree:
-        """Make a tree of some of its points. Their order is kept, for it is as good: only the boxes are new."""
+    def part(self, places: np.ndarray) -> Tree:
+        """Make a tree of the points at some places, (m,) ascending with m > 0, in the order that they have here."""
         points = np.ascontiguousarray(self.points[:, places])
-        boxes = np.empty((2 << _depth(len(places)), 6), np.float32)
-        _enclose(points, boxes)
-        return Tree(points, self.order[places], boxes, _blocks(points, len(boxes) // 2))
+        return Tree(points, self.order[places], *_leaves(points, 1 << _depth(len(places))))
 
 
 def scaled(means: np.ndarray) -> np.ndarray:
@@ -87,37 +65,35 @@ def _depth(count: int) -> int:
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _grow(points: np.ndarray, order: np.ndarray, boxes: np.ndarray, depth: int) -> None:
-    top = max(depth - SUBTREE, 0)
+def _grow(points: np.ndarray, order: np.ndarray, depth: int) -> None:
+    top = depth - SUBTREE
     for level in range(top):
         for j in nb.prange(1 << level):
-            _split(points, order, boxes, depth, level, j)
+            _split(points, order, level, j)
     for j in nb.prange(1 << top):
-        _grow_subtree(points, order, boxes, depth, top, j)
+        _grow_subtree(points, order, depth, top, j)
 
 
 @nb.njit(nogil=True, cache=True)
-def _grow_subtree(points: np.ndarray, order: np.ndarray, boxes: np.ndarray, depth: int, top: int, root: int) -> None:
-    for level in range(top, depth + 1):
+def _grow_subtree(points: np.ndarray, order: np.ndarray, depth: int, top: int, root: int) -> None:
+    for level in range(top, depth):
         for j in range(root << (level - top), (root + 1) << (level - top)):
-            _split(points, order, boxes, depth, level, j)
+            _split(points, order, level, j)
 
 
 @nb.njit
-def _split(points: np.ndarray, order: np.ndarray, boxes: np.ndarray, depth: int, level: int, j: int) -> None:
-    """Box node j of a level in, and unless it is a leaf bring the lower half along its widest axis to the front."""
+def _split(points: np.ndarray, order: np.ndarray, level: int, j: int) -> None:
+    """Bring the lower half of node j of a level, along its widest axis, to the front."""
     n = points.shape[0]
-    node, first, last = (1 << level) + j, (j * n) >> level, ((j + 1) * n) >> level
+    first, last = (j * n) >> level, ((j + 1) * n) >> level
     widest, axis = np.float32(-1), 0
     for d in range(3):
         low = high = points[first, d]
         for i in range(first + 1, last):
             low, high = min(low, points[i, d]), max(high, points[i, d])
-        boxes[node, d], boxes[node, 3 + d] = low, high
         if high - low > widest:
             widest, axis = high - low, d
-    if level < depth:
-        _partition(points, order, first, last - 1, ((2 * j + 1) * n) >> (level + 1), axis)
+    _partition(points, order, first, last - 1, ((2 * j + 1) * n) >> (level + 1), axis)
 
 
 @nb.njit
@@ -146,43 +122,22 @@ def _partition(points: np.ndarray, order: np.ndarray, low: int, high: int, middl
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _enclose(points: np.ndarray, boxes: np.ndarray) -> None:
-    """Box the points of every leaf in, and then those of every node above."""
-    leaves = boxes.shape[0] // 2
+def _leaves(points: np.ndarray, leaves: int) -> tuple[np.ndarray, np.ndarray]:
+    """Make the boxes of all nodes, and the blocks of the leaves, of points (3, n) in tree order."""
+    boxes, blocks = np.empty((2 * leaves, 6), np.float32), np.full((leaves, 3, LEAF), np.float32(np.inf))
     for leaf in nb.prange(leaves):
         first, last = leaf_range(leaf, leaves, points.shape[1])
-        enclose(points, first, last, boxes[leaves + leaf])
-    for i in range(leaves - 1):
-        node = leaves - 1 - i
+        for d in range(3):
+            low = high = points[d, first]
+            for i in range(first, last):
+                blocks[leaf, d, i - first] = points[d, i]
+                low, high = min(low, points[d, i]), max(high, points[d, i])
+            boxes[leaves + leaf, d], boxes[leaves + leaf, 3 + d] = low, high
+    for node in range(leaves - 1, 0, -1):
         for d in range(3):
             boxes[node, d] = min(boxes[2 * node, d], boxes[2 * node + 1, d])
             boxes[node, 3 + d] = max(boxes[2 * node, 3 + d], boxes[2 * node + 1, 3 + d])
-
-
-@nb.njit(parallel=True, nogil=True, cache=True)
-def _blocks(points: np.ndarray, leaves: int) -> np.ndarray:
-    blocks = np.full((leaves, 3, LEAF), np.float32(np.inf))
-    for leaf in nb.prange(leaves):
-        first, last = leaf_range(leaf, leaves, points.shape[1])
-        for d in range(3):
-            for i in range(first, last):
-                blocks[leaf, d, i - first] = points[d, i]
-    return blocks
-
-
-@nb.njit
-def enclose(
-    points: np.ndarray,  # (3, n)
-    first: int,
-    last: int,
-    box: np.ndarray,  # (6,), filled: lowest and highest corner
-) -> None:
-    """Box points first to last in."""
-    for d in range(3):
-        low = high = points[d, first]
-        for i in range(first + 1, last):
-            low, high = min(low, points[d, i]), max(high, points[d, i])
-        box[d], box[3 + d] = low, high
+    return boxes, blocks
 
 
 @nb.njit(inline="always")
@@ -201,18 +156,11 @@ def leaf_of(place: int, leaves: int, n: int) -> int:
 
 
 @nb.njit(inline="always")
-def gap_to_point(boxes: np.ndarray, node: int, x: float, y: float, z: float) -> np.float32:
-    """Squared distance to a box, in float32 never above that to a point inside it, since rounding is monotonic."""
-    dx = max(max(boxes[node, 0] - x, x - boxes[node, 3]), np.float32(0))
-    dy = max(max(boxes[node, 1] - y, y - boxes[node, 4]), np.float32(0))
-    dz = max(max(boxes[node, 2] - z, z - boxes[node, 5]), np.float32(0))
-    squared: np.float32 = dx * dx + dy * dy + dz * dz
-    return squared
+def gap(boxes: np.ndarray, node: int, box: np.ndarray | tuple[float, ...]) -> np.float32:
+    """Squared distance of a node's box to another: lowest and highest corner, of a point twice the point itself.
 
-
-@nb.njit(inline="always")
-def gap_to_box(boxes: np.ndarray, node: int, box: np.ndarray) -> np.float32:
-    """Squared distance between two boxes, never above that between a point in the one and a point in the other."""
+    In float32 it is never above that between a point in the one and a point in the other, as rounding is monotonic.
+    """
     dx = max(max(boxes[node, 0] - box[3], box[0] - boxes[node, 3]), np.float32(0))
     dy = max(max(boxes[node, 1] - box[4], box[1] - boxes[node, 4]), np.float32(0))
     dz = max(max(boxes[node, 2] - box[5], box[2] - boxes[node, 5]), np.float32(0))

@@ -8,61 +8,57 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.simd import count_at_most
-from gsseg_core.spatial.kd_tree import LEAF, gap_to_point, leaf_of, leaf_range
+from gsseg_core.spatial.kd_tree import LEAF, Tree, gap, leaf_of, leaf_range
 from gsseg_core.spatial.leaf_candidates import (
+    CHUNK,
     DEPTH,
     FAR,
+    NO_SKIP,
     LeafCandidates,
     end_of_group,
     find_leaves,
     measure,
     scratch_for,
-)
+)  # fmt: skip
 
 DIGITS = 24
 """Distances are summed in steps of 2^-DIGITS of the k-th one, or finer: the precision of a float32."""
 
-CHUNK = 256  # consecutive points of one thread
 SLACK = np.float32(1.00001)  # covers float32 rounding in a bound
-TINY = np.float32(1e-30)
-NO_SKIP = np.zeros(0, np.int32)
+LEAST = np.finfo(np.float32).tiny  # a bound that even points in one place are below
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def nearest(
-    points: np.ndarray,  # (3, n)
-    boxes: np.ndarray,  # (2 L, 6)
-    blocks: np.ndarray,  # (L, 3, LEAF)
-    places: np.ndarray,  # (M,) int32 ascending, which points to look from
-    k: int,
-) -> tuple[np.ndarray, np.ndarray]:
+def nearest(tree: Tree, places: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
     """Find the squared distance to the k-th nearest other point, (M,) float32, and the mean of the k, (M,) float64.
 
-    By the triangle inequality the radius of one point bounds those of all others in its leaf.
+    They are looked for from the points at ascending places, (M,) int32. By the triangle inequality the radius of one
+    point bounds those of all others in its leaf.
     """
+    points, boxes = tree.points, tree.boxes
     m, n, leaves = places.shape[0], points.shape[1], boxes.shape[0] // 2
     radii, distances = np.empty(m, np.float32), np.empty(m, np.float64)
     bits = radii.view(np.int32)
     for chunk in nb.prange((m + CHUNK - 1) // CHUNK):
         gaps, close, candidates = np.empty(DEPTH, np.float32), np.empty(3 * k + 2 * LEAF, np.float32), scratch_for(128)
         box, bounds = np.empty(6, np.float32), np.empty((2, LEAF), np.float32)
-        close_bits, bound_bits = close.view(np.int32), bounds.view(np.int32)
+        bound_bits = bounds.view(np.int32)
         before, first = -1, chunk * CHUNK
         while first < min((chunk + 1) * CHUNK, m):
-            last = end_of_group(places, first, min((chunk + 1) * CHUNK, m), leaves, n)
+            last = end_of_group(tree, places, first)
             middle = middle_of(points, places, first, last, box)
             own, bound = places[middle], FAR
             if before >= 0:
                 bound = _farthest(points, places[before], own, radii[before])
             found = _search(points, boxes, own, k, bound, close, candidates.nodes, gaps)
-            bits[middle] = _smallest(close_bits, _fill_up(close, found), k, np.int32(0), _largest(close_bits, found))
+            bits[middle] = _smallest_of(close, found, k)
             reach = _bound(points, places, first, last, middle, radii[middle], bounds)
             candidates, found = find_leaves(boxes, box, reach, NO_SKIP, 0, candidates)
             near = candidates.near.reshape(-1)
             near_bits = near.view(np.int32)
             for q in range(first, last):
-                own, bound = places[q], bounds[1, q - first]
-                rows = measure(blocks, points[0, own], points[1, own], points[2, own], bound, found, candidates)
+                own = places[q]
+                rows = measure(tree, own, bounds[1, q - first], found, candidates)
                 _leave_out(own, leaf_of(own, leaves, n), leaves, n, rows, candidates)
                 bits[q] = _smallest(near_bits, rows, k, bound_bits[0, q - first], bound_bits[1, q - first])
                 distances[q] = _mean_root(near, LEAF * rows, k, radii[q])
@@ -88,12 +84,12 @@ def middle_of(points: np.ndarray, places: np.ndarray, first: int, last: int, box
         box[d], box[3 + d] = low, high
     best, least = first, np.float32(np.inf)
     for q in range(first, last):
-        gap = np.float32(0)
+        squared = np.float32(0)
         for d in range(3):
             off = points[d, places[q]] - np.float32(0.5) * (box[d] + box[3 + d])
-            gap += off * off
-        if gap < least:
-            best, least = q, gap
+            squared += off * off
+        if squared < least:
+            best, least = q, squared
     return best
 
 
@@ -108,7 +104,7 @@ def _distance(points: np.ndarray, i: int, j: int) -> np.float32:
 def _farthest(points: np.ndarray, known: int, own: int, radius: float) -> np.float32:
     """Bound above the squared radius of one point by that of another."""
     reach = _distance(points, known, own) + np.sqrt(radius)
-    return max(reach * reach * SLACK, TINY)
+    return max(reach * reach * SLACK, LEAST)
 
 
 @nb.njit
@@ -139,32 +135,28 @@ def _mean_root(near: np.ndarray, found: int, k: int, radius: float) -> float:
 
 @nb.njit
 def _search(
-    points: np.ndarray,  # (3, n)
-    boxes: np.ndarray,  # (2 L, 6)
-    own: int,
-    k: int,
+    points: np.ndarray, boxes: np.ndarray, own: int, k: int,  # (3, n), (2 L, 6)
     bound: float,  # above the k-th smallest squared distance
     near: np.ndarray,  # (at least 3 k + 2 LEAF,), filled
-    nodes: np.ndarray,  # (DEPTH,), scratch
-    gaps: np.ndarray,  # (DEPTH,), scratch
-) -> int:
+    nodes: np.ndarray, gaps: np.ndarray,  # (DEPTH,) each, scratch
+) -> int:  # fmt: skip
     """Collect squared distances to other points, the k smallest among them, in no order; return their number."""
     x, y, z = points[0, own], points[1, own], points[2, own]
-    leaves, n = boxes.shape[0] // 2, points.shape[1]
+    point, leaves, n = (x, y, z, x, y, z), boxes.shape[0] // 2, points.shape[1]
     found, waiting = 0, 1
     nodes[0], gaps[0] = 1, 0
     while waiting:
         waiting -= 1
-        node, gap = nodes[waiting], gaps[waiting]
-        while node < leaves and gap < bound:  # go down to the nearer child, the other one waits
+        node, away = nodes[waiting], gaps[waiting]
+        while node < leaves and away < bound:  # go down to the nearer child, the other one waits
             node, other = 2 * node, 2 * node + 1
-            gap, other_gap = gap_to_point(boxes, node, x, y, z), gap_to_point(boxes, other, x, y, z)
-            if other_gap < gap:
-                node, gap, other, other_gap = other, other_gap, node, gap
-            if other_gap < bound:
-                nodes[waiting], gaps[waiting] = other, other_gap
+            away, other_away = gap(boxes, node, point), gap(boxes, other, point)
+            if other_away < away:
+                node, away, other, other_away = other, other_away, node, away
+            if other_away < bound:
+                nodes[waiting], gaps[waiting] = other, other_away
                 waiting += 1
-        if gap >= bound:
+        if away >= bound:
             continue
         first, last = leaf_range(node - leaves, leaves, n)
         if found + last - first > near.shape[0] - LEAF:
@@ -180,9 +172,7 @@ def _search(
 @nb.njit
 def _shorten(near: np.ndarray, found: int, k: int) -> np.float32:
     """Keep the k smallest, of equal ones any; returns the largest of them."""
-    bits = near.view(np.int32)
-    limit = _smallest(bits, _fill_up(near, found), k, np.int32(0), _largest(bits, found))
-    kept = 0
+    bits, limit, kept = near.view(np.int32), _smallest_of(near, found, k), 0
     for i in range(found):
         if bits[i] < limit:
             bits[kept] = bits[i]
@@ -193,21 +183,18 @@ def _shorten(near: np.ndarray, found: int, k: int) -> np.float32:
 
 
 @nb.njit
-def _largest(bits: np.ndarray, n: int) -> np.int32:
-    largest = np.int32(0)
-    for i in range(n):
+def _smallest_of(near: np.ndarray, found: int, k: int) -> np.int32:
+    """Bits of the k-th smallest of some distances; the array has room for a row more."""
+    bits, rows, largest = near.view(np.int32), (found + LEAF - 1) // LEAF, np.int32(0)
+    for i in range(found):
         largest = max(largest, bits[i])
-    return largest
+    near[found : LEAF * rows] = FAR
+    smallest: np.int32 = _smallest(bits, rows, k, np.int32(0), largest)
+    return smallest
 
 
 @nb.njit
-def _smallest(
-    bits: np.ndarray,  # (16 rows or more,) int32
-    rows: int,
-    k: int,
-    low: np.int32,
-    high: np.int32,
-) -> np.int32:
+def _smallest(bits: np.ndarray, rows: int, k: int, low: np.int32, high: np.int32) -> np.int32:
     """Bits of the k-th smallest of sixteen times so many float32, none negative, known to be between two others.
 
     Such floats sort like their bits, so this bisects the bits: counting what is at most the middle takes a few vector
@@ -228,14 +215,3 @@ def _smallest(
     for i in range(LEAF * rows):
         largest = max(largest, bits[i] if bits[i] <= high else np.int32(0))
     return largest
-
-
-@nb.njit
-def _fill_up(
-    near: np.ndarray,  # long enough for a row more
-    found: int,
-) -> int:
-    """End the last row of sixteen with distances that nothing has; returns the number of rows."""
-    rows = (found + LEAF - 1) // LEAF
-    near[found : LEAF * rows] = FAR
-    return rows

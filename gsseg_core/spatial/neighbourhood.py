@@ -21,9 +21,17 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 from gsseg_core.simd import at_most, first_bit, load_row
-from gsseg_core.spatial.kd_tree import LEAF, Tree, enclose, leaf_range, scaled, tree_of
-from gsseg_core.spatial.knn import CHUNK, NO_SKIP, middle_of, nearest
-from gsseg_core.spatial.leaf_candidates import LeafCandidates, end_of_group, find_leaves, measure, scratch_for
+from gsseg_core.spatial.kd_tree import LEAF, Tree, leaf_range, scaled, tree_of
+from gsseg_core.spatial.knn import middle_of, nearest
+from gsseg_core.spatial.leaf_candidates import (
+    CHUNK,
+    NO_SKIP,
+    LeafCandidates,
+    end_of_group,
+    find_leaves,
+    measure,
+    scratch_for,
+)  # fmt: skip
 
 CODE_UNIT = 2.0**-24
 """Codes are summed in steps of this, which is the precision of a float32 near 1."""
@@ -56,28 +64,21 @@ class Neighbours:
     _looking: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     @classmethod
-    def among(
-        cls,
-        means: np.ndarray,  # (N, 3) float32, finite
-        k: int,
-        tree: Tree | None = None,
-    ) -> Neighbours:
-        """Begin with N > 1 points, of which none has been asked for; the tree is that of the scaled points."""
+    def among(cls, means: np.ndarray, k: int, tree: Tree | None = None) -> Neighbours:
+        """Begin with points, (N, 3) float32 with N > 1, of which none has been asked for.
+
+        The tree, if one is at hand, is that of the scaled points.
+        """
         tree, n = tree or Tree.build(scaled(means)), len(means)
         return cls(min(k, n - 1), tree, np.full(n, np.nan, np.float32), np.full(n, np.nan))
 
-    def look_for(
-        self,
-        wanted: np.ndarray | None = None,  # (N,) bool, in the order of the tree
-    ) -> Neighbours:
-        """Find what is not known yet of the points that are wanted, or of all; returns the same object."""
-        tree = self.tree
+    def look_for(self, wanted: np.ndarray | None = None) -> Neighbours:
+        """Find what is not known yet of all points, or of those wanted, (N,) bool by place; returns the same object."""
         with self._looking:
             missing = np.isnan(self.radii)
             places = np.flatnonzero(missing if wanted is None else missing & wanted).astype(np.int32)
             if len(places):
-                found = nearest(tree.points, tree.boxes, tree.blocks, places, self.k)
-                self.radii[places], self.distances[places] = found
+                self.radii[places], self.distances[places] = nearest(self.tree, places, self.k)
         return self
 
     def mean_codes(
@@ -94,22 +95,18 @@ class Neighbours:
         CSRRows
             N rows; one without entries where there is no such neighbour, or the point is not wanted.
         """
-        order, tree = self.tree.order, self.tree
+        order = self.tree.order
+        selected = np.ones(len(order), bool) if wanted is None else wanted[order]
+        asked = np.flatnonzero(selected).astype(np.int32)
         read = np.repeat(counted, np.diff(codes.indptr))
         units = np.rint(codes.data * np.float32(1 / CODE_UNIT), where=read, out=np.zeros_like(codes.data))
-        units = units.astype(np.int32)
-        selected = np.ones(len(order), bool) if wanted is None else wanted[order]
-        asked = np.flatnonzero(selected)
+        rows = codes.with_data(units.astype(np.int32))
         self.look_for(selected)
         # A block at a time is written out in full, so that of all the codes only what is not zero is ever in memory.
         parts = []
         for first in range(0, max(len(asked), 1), ROWS_AT_ONCE):
-            places = asked[first : first + ROWS_AT_ONCE].astype(np.int32)
-            out = np.zeros((len(places), num_classes), np.float32)
-            average(
-                tree.points, tree.boxes, tree.blocks, order, codes.indptr, codes.indices, units, counted, places,
-                self.radii, self.k, out,
-            )  # fmt: skip
+            places = asked[first : first + ROWS_AT_ONCE]
+            out = average(self.tree, rows, counted, places, self.radii, self.k, num_classes)
             parts.append(CSRRows.from_dense(out))
         return CSRRows.vstack(parts).scattered(order[asked], len(order))
 
@@ -130,18 +127,15 @@ class Neighbours:
         of_point = labels[tree.order].astype(np.int32)
         of_point[of_point >= num_classes] = 0
         self.look_for(of_point > 0)
-        found = pure_distances(tree.points, tree.boxes, tree.blocks, of_point, self.radii, self.distances)
+        found = pure_distances(tree, of_point, self.radii, self.distances)
         by_class = np.argsort(of_point.astype(np.int16) if num_classes < 2**15 else of_point, kind="stable")
         bounds = np.searchsorted(of_point, np.arange(1, num_classes + 1), sorter=by_class).tolist()
         for first, last in pairwise(bounds):
             members = by_class[first:last]
-            mixed = np.isnan(found[members])
+            mixed = np.flatnonzero(np.isnan(found[members])).astype(np.int32)
             # Where other classes are among the neighbours, more of its own are looked for, farther away.
-            if len(members) > 1 and mixed.any():
-                own, places = tree.part(members), np.flatnonzero(mixed).astype(np.int32)
-                found[members[places]] = nearest(
-                    own.points, own.boxes, own.blocks, places, min(self.k, len(members) - 1)
-                )[1]
+            if len(members) > 1 and len(mixed):
+                found[members[mixed]] = nearest(tree.part(members), mixed, min(self.k, len(members) - 1))[1]
         out = np.empty(len(labels))
         out[tree.order] = found
         return out
@@ -160,79 +154,63 @@ def neighbours_of(scene: GaussianScene, k: int) -> Neighbours | None:
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def average(
-    points: np.ndarray,  # (3, n)
-    boxes: np.ndarray,  # (2 L, 6)
-    blocks: np.ndarray,  # (L, 3, LEAF)
-    order: np.ndarray,  # (n,), which row each point has
-    rows: np.ndarray,  # (n + 1,) codes, as `CSRRows`
-    classes: np.ndarray,  # (Z,)
-    units: np.ndarray,  # (Z,) int32, in steps of CODE_UNIT
-    counted: np.ndarray,  # (n,) bool, by row
-    places: np.ndarray,  # (M,) int32 ascending
-    radii: np.ndarray,  # (n,), squared distance to the k-th nearest other
-    k: int,
-    out: np.ndarray,  # (M, K) in: zeros; out: mean codes, zeros where no neighbour counts
-) -> None:
-    """Mean code of the k nearest others that count; those exactly at the radius share the places that are left."""
-    leaves, n = boxes.shape[0] // 2, points.shape[1]
-    m, num_classes = places.shape[0], out.shape[1]
+    tree: Tree, codes: CSRRows, counted: np.ndarray,  # n rows, int32 in steps of CODE_UNIT; (n,) bool, by row
+    places: np.ndarray, radii: np.ndarray,  # (M,) int32 ascending; (n,), squared distance to the k-th nearest other
+    k: int, num_classes: int,
+) -> np.ndarray:  # fmt: skip
+    """Mean code of the k nearest others that count, (M, K) float32; a row of zeros where none does.
+
+    Those exactly at the radius share the places that are left.
+    """
+    m, leaves, n = len(places), len(tree.blocks), len(tree.order)
+    out = np.zeros((m, num_classes), np.float32)
     for chunk in nb.prange((m + CHUNK - 1) // CHUNK):
         sums = np.empty((2, num_classes), np.int64)  # inside the radius, and on it
         counts = np.empty((2, 2), np.int64)  # the same, and of these the ones that count
         box, candidates = np.empty(6, np.float32), scratch_for(128)
-        first = chunk * CHUNK
-        while first < min((chunk + 1) * CHUNK, m):
-            last = end_of_group(places, first, min((chunk + 1) * CHUNK, m), leaves, n)
-            middle_of(points, places, first, last, box)
-            candidates, found = find_leaves(boxes, box, _widest(radii, places, first, last), NO_SKIP, 0, candidates)
-            for q in range(first, last):
+        begin = chunk * CHUNK
+        while begin < min((chunk + 1) * CHUNK, m):
+            end = end_of_group(tree, places, begin)
+            middle_of(tree.points, places, begin, end, box)
+            reach = np.float32(0)
+            for q in range(begin, end):
+                reach = max(reach, radii[places[q]])
+            candidates, found = find_leaves(tree.boxes, box, reach, NO_SKIP, 0, candidates)
+            for q in range(begin, end):
                 own = places[q]
-                radius = radii[own]
-                reached = measure(blocks, points[0, own], points[1, own], points[2, own], radius, found, candidates)
                 sums[:], counts[:] = 0, 0
-                for h in range(reached):
+                for h in range(measure(tree, own, radii[own], found, candidates)):
                     start = leaf_range(candidates.leaves[candidates.reached[h]], leaves, n)[0]
-                    within = at_most(load_row(candidates.near, h), radius)
+                    within = at_most(load_row(candidates.near, h), radii[own])
                     while within:
                         lane = first_bit(within)
                         within &= within - 1
                         if start + lane != own:
-                            row, tied = order[start + lane], np.int64(candidates.near[h, lane] == radius)
+                            row, tied = tree.order[start + lane], np.int64(candidates.near[h, lane] == radii[own])
                             counts[tied, 0] += 1
                             if counted[row]:
                                 counts[tied, 1] += 1
-                                for e in range(rows[row], rows[row + 1]):
-                                    sums[tied, classes[e]] += units[e]
+                                for e in range(codes.indptr[row], codes.indptr[row + 1]):
+                                    sums[tied, codes.indices[e]] += codes.data[e]
                 if counts[0, 1] + counts[1, 1] > 0:
                     share = (k - counts[0, 0]) / counts[1, 0]
                     total = (counts[0, 1] + share * counts[1, 1]) / CODE_UNIT
                     for c in range(num_classes):
                         out[q, c] = (sums[0, c] + share * sums[1, c]) / total
-            first = last
-
-
-@nb.njit
-def _widest(radii: np.ndarray, places: np.ndarray, first: int, last: int) -> np.float32:
-    widest = np.float32(0)
-    for q in range(first, last):
-        widest = max(widest, radii[places[q]])
-    return widest
+            begin = end
+    return out
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def pure_distances(
-    points: np.ndarray,  # (3, n)
-    boxes: np.ndarray,  # (2 L, 6)
-    blocks: np.ndarray,  # (L, 3, LEAF)
-    labels: np.ndarray,  # (n,) int32
-    radii: np.ndarray,  # (n,)
-    distances: np.ndarray,  # (n,)
-) -> np.ndarray:
-    """Distances of the points whose neighbours within the radius all have their own, positive, label; else NaN."""
-    leaves, n = boxes.shape[0] // 2, points.shape[1]
+def pure_distances(tree: Tree, labels: np.ndarray, radii: np.ndarray, distances: np.ndarray) -> np.ndarray:
+    """Distances of the points whose neighbours within the radius all have their own, positive, label; else NaN.
+
+    All arrays are (n,) in tree order, the labels of int32.
+    """
+    leaves, n = len(tree.blocks), len(labels)
     out, of_node = np.full(n, np.nan), _labels_of_nodes(labels, leaves)
     for chunk in nb.prange((leaves + LEAF - 1) // LEAF):
-        box, candidates = np.empty(6, np.float32), scratch_for(128)
+        candidates = scratch_for(128)
         for leaf in range(chunk * LEAF, min((chunk + 1) * LEAF, leaves)):
             first, last = leaf_range(leaf, leaves, n)
             widest, label = np.float32(-1), of_node[leaves + leaf]
@@ -240,21 +218,22 @@ def pure_distances(
                 widest = max(widest, radii[q]) if labels[q] > 0 else widest
             if widest < 0:
                 continue
-            enclose(points, first, last, box)
             # A node of the leaf's own label has nothing to say; a leaf of several labels has none.
             skipped = label if label != MIXED else NOBODY
-            candidates, found = find_leaves(boxes, box, widest, of_node, skipped, candidates)
+            box = tree.boxes[leaves + leaf]
+            candidates, found = find_leaves(tree.boxes, box, widest, of_node, skipped, candidates)
             for q in range(first, last):
-                if labels[q] <= 0:
-                    continue
-                reached = measure(blocks, points[0, q], points[1, q], points[2, q], radii[q], found, candidates)
-                if _pure(labels, labels[q], radii[q], reached, leaves, candidates):
-                    out[q] = distances[q]
+                if labels[q] > 0:
+                    reached = measure(tree, q, radii[q], found, candidates)
+                    if _is_pure(labels, labels[q], radii[q], reached, leaves, candidates):
+                        out[q] = distances[q]
     return out
 
 
 @nb.njit
-def _pure(labels: np.ndarray, label: int, radius: float, reached: int, leaves: int, candidates: LeafCandidates) -> bool:
+def _is_pure(
+    labels: np.ndarray, label: int, radius: float, reached: int, leaves: int, candidates: LeafCandidates
+) -> bool:
     """Whether all points measured and within the radius have a label."""
     for h in range(reached):
         first, last = leaf_range(candidates.leaves[candidates.reached[h]], leaves, labels.shape[0])
@@ -270,11 +249,7 @@ def _labels_of_nodes(labels: np.ndarray, leaves: int) -> np.ndarray:
     of_node = np.empty(2 * leaves, np.int32)
     for leaf in range(leaves):
         first, last = leaf_range(leaf, leaves, labels.shape[0])
-        label, same = labels[first], True
-        for i in range(first + 1, last):
-            same &= labels[i] == label
-        of_node[leaves + leaf] = label if same else MIXED
-    for i in range(leaves - 1):
-        node = leaves - 1 - i
+        of_node[leaves + leaf] = labels[first] if (labels[first:last] == labels[first]).all() else MIXED
+    for node in range(leaves - 1, 0, -1):
         of_node[node] = of_node[2 * node] if of_node[2 * node] == of_node[2 * node + 1] else MIXED
     return of_node
