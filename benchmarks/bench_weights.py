@@ -29,7 +29,7 @@ from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu import label_pairs
 from gsseg_core.raster.cpu.blending import open_rays
-from gsseg_core.raster.cpu.lifted_mask import LiftedMask
+from gsseg_core.raster.cpu.lifting import Lifted
 from gsseg_core.raster.cpu.splat import WIDTH, aim, blend_block
 from gsseg_core.raster.cpu.tile_observation import TileObservation
 from gsseg_core.raster.cpu.tiling import TILE
@@ -93,33 +93,28 @@ class StoredWeights(TileObservation):
     """An observation that keeps the weights of all its records."""
 
     def __init__(self, operator: ViewOperator, labels: np.ndarray) -> None:
-        lifted = LiftedMask(operator.camera, operator._table, operator._tiles, labels)
-        super().__init__(operator.camera, operator.ids, operator._table, operator._tiles, lifted)
+        lifted = Lifted.of(operator._tiles, labels)
+        super().__init__(operator.camera.name, operator.ids, operator._tiles, lifted)
         self._first = np.concatenate([[0], np.cumsum(self._records)])
         self._kept = np.empty((self._first[-1], LANES), np.uint16)
         self._left_over = np.empty((len(self._records), TILE, TILE), np.float32)
-        store(
-            self._columns, self._camera.width, self._camera.height, self._table, self._start, self._entries,
-            self._blocks, self._first, self._kept, self._left_over,
-        )  # fmt: skip
+        store(self._tiles, self._blocks, self._first, self._kept, self._left_over)
 
     @property
     def nbytes(self) -> int:
         """What a step needs: not the Gaussians, but the weights."""
-        return super().nbytes - self._table.nbytes + self._kept.nbytes + self._left_over.nbytes
+        return super().nbytes - self._tiles.table.nbytes + self._kept.nbytes + self._left_over.nbytes
 
-    def shares(self, said: np.ndarray, rest: np.ndarray) -> VoteShares:
+    def _shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares:
         """Share out as ever, with stored weights."""
-        said, rest = np.ascontiguousarray(said, np.float32), np.ascontiguousarray(rest, np.float32)
-        mask = self._labels
+        mask = self._mask
         logs, left_over = np.zeros(len(self._records)), np.zeros(len(mask.present))
-        sums, parts = np.empty(self._slot_start[-1], np.float32), np.empty((label_pairs.PARTS, len(said)), np.float32)
+        sums = np.empty(self._slot_start[-1], np.float32)
         share_stored(
-            self._start, self._blocks, self._first, self._kept, self._left_over, mask.start, mask.present,
-            mask.span_start, mask.slots, mask.lanes, self._slot_start, self._pair, said, rest, logs, left_over,
-            sums,
+            self._tiles.start, self._blocks, self._first, self._kept, self._left_over, mask, self._slot_start,
+            self._pair, likelihood, rest, logs, left_over, sums,
         )  # fmt: skip
-        label_pairs.add_up(self._slot_start, self._pair, sums, parts)
+        parts = label_pairs.add_up(self._slot_start, self._pair, sums, len(likelihood))
         total = np.bincount(mask.present, weights=left_over, minlength=len(rest))
         return VoteShares(parts.sum(axis=0), total, float(logs.sum()))
 
@@ -157,11 +152,12 @@ def load_steps(typing: Any, source: Any, i: Any, target: Any) -> Any:
 
 
 @nb.njit(parallel=True, error_model="numpy")
-def store(columns, width, height, table, start, entries, blocks, first, kept, left_over) -> None:  # type: ignore[no-untyped-def]
+def store(tiles, blocks, first, kept, left_over) -> None:  # type: ignore[no-untyped-def]
     """Make all weights of a view once, and keep them."""
+    table, start, entries = tiles.table, tiles.start, tiles.entries
     for tile in nb.prange(start.shape[0] - 1):
         rays, lines, record = left_over[tile], np.empty((2, TILE), np.float32), np.empty((1, TILE), np.float32)
-        left, top, _ = open_rays(tile, columns, width, height, rays)
+        left, top, _ = open_rays(tiles, tile, rays)
         n = first[tile]
         for e in range(start[tile], start[tile + 1]):
             g = entries[e]
@@ -179,18 +175,18 @@ def store(columns, width, height, table, start, entries, blocks, first, kept, le
 
 @nb.njit(parallel=True, fastmath=FAST, error_model="numpy")
 def share_stored(  # type: ignore[no-untyped-def]
-    start, blocks, first, kept, final, label_start, present, span_start, slots, lanes, slot_start, sighting, said, rest,
-    logs, left_over, sums,
+    start, blocks, first, kept, final, mask, slot_start, pair, said, rest, logs, left_over, sums,
 ) -> None:  # fmt: skip
     """Do what `label_pairs.share` does."""
+    label_start, slots, lanes = mask.start, mask.slots, mask.lanes
     for tile in nb.prange(start.shape[0] - 1):
-        labels = present[label_start[tile] : label_start[tile + 1]]
+        labels = mask.present[label_start[tile] : label_start[tile + 1]]
         many = labels.shape[0]
         logs[tile] = 0.0
         if many == 0:
             continue
-        spans = span_start[tile * TILE : tile * TILE + TILE + 1]
-        here = sighting[slot_start[tile] : slot_start[tile + 1]]
+        spans = mask.span_start[tile * TILE : tile * TILE + TILE + 1]
+        here = pair[slot_start[tile] : slot_start[tile + 1]]
         value, weights = np.zeros((TILE, TILE), np.float32), np.empty((first[tile + 1] - first[tile], TILE), np.float32)
         n = 0
         for e in range(start[tile], start[tile + 1]):
@@ -211,9 +207,9 @@ def share_stored(  # type: ignore[no-untyped-def]
                         total = add_scaled_where(total, weight, said[s] * np.float32(1 / STEPS), np.int64(lanes[span]))
                 store_row(value, b, total)
         spare = left_over[label_start[tile] : label_start[tile + 1]]
-        logs[tile] = label_pairs._invert(spans, slots, lanes, rest[labels], final[tile], value, spare)
+        logs[tile] = label_pairs.invert(spans, mask, rest[labels], final[tile], value, spare)
         mine = sums[slot_start[tile] : slot_start[tile + 1]]
-        label_pairs._sum_shares(blocks[start[tile] : start[tile + 1]], many, spans, slots, lanes, value, weights, mine)
+        label_pairs.sum_shares(blocks[start[tile] : start[tile + 1]], many, spans, mask, value, weights, mine)
         mine *= np.float32(1 / STEPS)
 
 

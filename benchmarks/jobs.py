@@ -25,7 +25,7 @@ from gsseg_core.learn.learner import UNITS, Learner
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.metrics import Evaluation
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.raster.cpu.lifted_mask import LiftedMask
+from gsseg_core.raster.cpu.lifting import Lifted
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.tiling import assign
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -125,7 +125,7 @@ def _lift_view(scene: GaussianScene, view: View, runs: int) -> dict[str, Any]:
         "flops": work.flops,
         "instructions": work.instructions,
         "difference": float(np.abs(first() - votes).sum() / votes.sum()),
-        "sums": timed(lambda: LiftedMask(camera, projected.table, tiles, mask), runs),
+        "sums": timed(lambda: Lifted.of(tiles, mask), runs),
         "lift": timed(lambda: operator.vote(mask, None, total, UNITS), runs),
         "observe": timed(lambda: operator.observe(mask), runs),
         "all": timed(lambda: make_operator(scene, camera).vote(mask, None, total, UNITS), runs),

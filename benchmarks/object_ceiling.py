@@ -16,10 +16,10 @@ import numpy as np
 
 from gsseg_core.data.view import View
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.raster.cpu.blending import in_tile, open_rays
+from gsseg_core.raster.cpu.blending import corner_of, in_tile, open_rays
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.splat import WIDTH, aim, blend_block
-from gsseg_core.raster.cpu.tiling import TILE, assign
+from gsseg_core.raster.cpu.tiling import TILE, Tiles, assign
 from gsseg_core.raster.depth import BEHIND, depths, surface
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.simd import first_bit, store_row
@@ -58,7 +58,7 @@ def _cover(
         projected = project(alone, camera)
         tiles = assign(projected, camera.width, camera.height)
         depth = depths(alone, camera)[projected.ids]
-        lists = (tiles.columns, projected.table, tiles.start, tiles.entries, depth, limit, first)
+        lists = (tiles, depth, limit, first)
         nothing = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32)
         size = _walk(*lists, *nothing)
         found = np.zeros(size, np.int64), np.zeros(size, np.int64), np.zeros(size, np.float32)
@@ -73,10 +73,7 @@ def _cover(
 
 @nb.njit(cache=True, error_model="numpy")
 def _walk(
-    columns: int,
-    table: np.ndarray,  # (M, 8)
-    start: np.ndarray,  # (T + 1,)
-    entries: np.ndarray,  # (E,)
+    tiles: Tiles,
     depth: np.ndarray,  # (M,)
     limit: np.ndarray,  # (H, W)
     first: int,  # pixel of this view among those of all
@@ -87,17 +84,17 @@ def _walk(
     height, width = limit.shape
     fresh, lines = np.empty((TILE, TILE), np.float32), np.empty((2, TILE), np.float32)
     alpha, n = np.empty((1, TILE), np.float32), 0
-    for tile in range(start.shape[0] - 1):
-        left, top = (tile % columns) * TILE, (tile // columns) * TILE
-        u, v, inside = open_rays(tile, columns, width, height, fresh)
-        for e in range(start[tile], start[tile + 1]):
-            g = entries[e]
-            reached = aim(table, g, u, v, lines) & inside
+    for tile in range(tiles.columns * tiles.rows):
+        left, top = corner_of(tiles, tile)
+        u, v, inside = open_rays(tiles, tile, fresh)
+        for e in range(tiles.start[tile], tiles.start[tile + 1]):
+            g = tiles.entries[e]
+            reached = aim(tiles.table, g, u, v, lines) & inside
             while reached:
                 b = first_bit(reached)
                 reached &= reached - 1
                 fresh[b, :] = 1
-                weight, _ = blend_block(fresh, b, lines, table[g, WIDTH])
+                weight, _ = blend_block(fresh, b, lines, tiles.table[g, WIDTH])
                 store_row(alpha, 0, weight)
                 for i in range(TILE):
                     r, c = in_tile(b, i)

@@ -154,7 +154,7 @@ def _devices() -> Iterator[Finding]:
 def _kernels(say: Callable[[str], object]) -> Iterator[Finding]:
     start = time.perf_counter()
     try:
-        from gsseg_core.raster.votes import add_votes
+        from gsseg_core.raster.observation import add_votes
         from gsseg_core.warm_up import SIDE, warm_up
 
         warm_up(say=say)

@@ -15,24 +15,12 @@ if TYPE_CHECKING:
 
 
 class Rasteriser(NamedTuple):
-    """What renders the views on one kind of device.
+    """What renders the views on one kind of device."""
 
-    Attributes
-    ----------
-    devices : str
-        Regular expression of the devices' names.
-    described : str
-        The same for readers, as in "device is 'x'; expected ...".
-    module : str
-        Where its function `view_operator(scene, camera, device)` is; loaded when a view is first rendered there.
-    needs : str
-        What to install where the module does not find a package.
-    """
-
-    devices: str
-    described: str
-    module: str
-    needs: str
+    devices: str  # regular expression of the devices' names
+    described: str  # the same for readers, as in "device is 'x'; expected ..."
+    module: str  # where its `view_operator(scene, camera, device)` is; loaded when a view is first rendered there
+    needs: str  # what to install where the module does not find a package
 
 
 RASTERISERS = [

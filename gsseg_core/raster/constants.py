@@ -23,5 +23,8 @@ TINY = 1e-30
 CHANNELS = 32
 """Channels that one pass of an adjoint sums at once: bounds its memory, and fits the shared memory of every GPU."""
 
+AHEAD = 12
+"""Entries between the one that is worked on and the one that is fetched from memory."""
+
 CHUNKS = 16
 """Parts into which Gaussians are cut, to be worked on beside each other; fixed, so that threads change nothing."""

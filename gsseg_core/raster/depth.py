@@ -20,18 +20,10 @@ _EMPTY = 1e-3  # accumulated alpha below which a ray meets nothing
 
 
 class Surface(NamedTuple):
-    """What the rays of a view meet.
+    """What the rays of a view meet."""
 
-    Attributes
-    ----------
-    coverage : (H, W) float32
-        Accumulated alpha, 0 to 1.
-    depth : (H, W) float32
-        Mean depth by weight, scene units; infinite where there is nothing.
-    """
-
-    coverage: np.ndarray
-    depth: np.ndarray
+    coverage: np.ndarray  # (H, W) float32: accumulated alpha, 0 to 1
+    depth: np.ndarray  # (H, W) float32: mean depth by weight, scene units; infinite where there is nothing
 
 
 def surface(scene: GaussianScene, operator: ViewOperator) -> Surface:

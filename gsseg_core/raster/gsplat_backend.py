@@ -11,23 +11,23 @@ import copy
 import functools
 import importlib
 import math
-import threading
 import warnings
+from collections import defaultdict
 from collections.abc import Iterator
 from types import ModuleType
 from typing import NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
 
 from gsseg_core.csr_rows import starts
-from gsseg_core.errors import SceneValueError, SettingsError
+from gsseg_core.errors import SettingsError
 from gsseg_core.raster.constants import ALPHA_MAX, ALPHA_MIN, CHANNELS, DILATION, NEAR, T_MIN, TINY
 from gsseg_core.raster.observation import Observation, VoteShares
-from gsseg_core.raster.view_operator import Blended, ViewOperator, Weights
+from gsseg_core.raster.view_operator import Blended, ViewOperator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.scene_cache import PerScene
 
 TILE = 16
 """Side of the tiles that gsplat is asked for, in px."""
@@ -45,33 +45,29 @@ def load_gsplat(device: str) -> ModuleType:
     with warnings.catch_warnings():  # A CUDA build of PyTorch warns where there is no driver; the error below says it.
         warnings.simplefilter("ignore")
         count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    found = f"device is {device!r}"
     if count == 0:
         raise SettingsError(
-            f"device is {device!r}, but PyTorch {torch.__version__} sees no GPU; expected an NVIDIA GPU, its driver "
-            "and a CUDA build of PyTorch, or the device 'cpu'"
+            f"{found}, but PyTorch {torch.__version__} sees no GPU; expected an NVIDIA GPU, its driver and a CUDA "
+            "build of PyTorch, or the device 'cpu'"
         )
     if int(device.partition(":")[2] or 0) >= count:
-        raise SettingsError(
-            f"device is {device!r}, but PyTorch sees {count} GPUs; expected 'cuda:0' to 'cuda:{count - 1}'"
-        )
+        raise SettingsError(f"{found}, but PyTorch sees {count} GPUs; expected 'cuda:0' to 'cuda:{count - 1}'")
     try:
         gsplat = importlib.import_module("gsplat")
         # Its functions look for the compiled kernels at their first call; here it can be said what is missing.
         kernels = importlib.import_module("gsplat.cuda._backend")._C
     except ModuleNotFoundError as missing:
         raise SettingsError(
-            f"device is {device!r}, and the package {missing.name!r} is missing; expected gsplat: "
-            "pip install 'gsseg[gsplat]'"
+            f"{found}, and the package {missing.name!r} is missing; expected gsplat: pip install 'gsseg[gsplat]'"
         ) from missing
     except (ImportError, OSError, RuntimeError) as error:
         first = (str(error).splitlines() or ["no reason given"])[0]
-        raise SettingsError(
-            f"device is {device!r}, but gsplat's CUDA kernels do not compile or load: {first}"
-        ) from error
+        raise SettingsError(f"{found}, but gsplat's CUDA kernels do not compile or load: {first}") from error
     if kernels is None:
         raise SettingsError(
-            f"device is {device!r}, but gsplat is not compiled and finds no CUDA toolkit; expected nvcc on the PATH, "
-            "of the CUDA version that PyTorch was built for"
+            f"{found}, but gsplat is not compiled and finds no CUDA toolkit; expected nvcc on the PATH, of the CUDA "
+            "version that PyTorch was built for"
         )
     return gsplat
 
@@ -88,19 +84,17 @@ class _SceneTensors(NamedTuple):
     opacities: torch.Tensor  # (N,)
 
 
-_KNOWN: WeakKeyDictionary[GaussianScene, dict[str, _SceneTensors]] = WeakKeyDictionary()
-_MOVING = threading.Lock()
+_KNOWN: defaultdict[str, PerScene[_SceneTensors]] = defaultdict(PerScene)
 
 
 def _tensors_of(scene: GaussianScene, device: str) -> _SceneTensors:
     """Copy a scene to a device, once: its tensors are kept with it."""
-    with _MOVING:
-        known = _KNOWN.setdefault(scene, {})
-        if device not in known:
-            opacities = np.minimum(scene.opacities, ALPHA_MAX)
-            arrays = (scene.means, scene.quats, scene.scales, opacities)
-            known[device] = _SceneTensors(*(_tensor(array, device) for array in arrays))
-        return known[device]
+
+    def copied() -> _SceneTensors:
+        arrays = (scene.means, scene.quats, scene.scales, np.minimum(scene.opacities, ALPHA_MAX))
+        return _SceneTensors(*(_tensor(array, device) for array in arrays))
+
+    return _KNOWN[device].of(scene, copied)
 
 
 def _tensor(array: np.ndarray, device: str) -> torch.Tensor:
@@ -114,16 +108,7 @@ class GsplatOperator(ViewOperator):
     tile that it touches, lies on the GPU. Renders are the same from run to run and in any order of the Gaussians.
     Adjoints are not quite: gsplat adds up gradients in whatever order its threads arrive, so their last bits differ.
 
-    Parameters
-    ----------
-    scene : GaussianScene
-        It is copied to the device once, for all its views.
-    camera : Camera
-        Where from.
-    device : str
-        Name of a PyTorch device.
-    gsplat : module
-        Where gsplat's functions are.
+    The scene is copied to the device, by the name that PyTorch has for it, once for all its views.
     """
 
     def __init__(self, scene: GaussianScene, camera: Camera, device: str, gsplat: ModuleType) -> None:
@@ -182,11 +167,11 @@ class GsplatOperator(ViewOperator):
         areas: np.ndarray = (self._opacities[0] * (2 * math.pi) / torch.sqrt(xx * yy - xy * xy)).cpu().numpy()
         return areas
 
-    def rasterise(
-        self,
-        codes: torch.Tensor,  # (M, C), C from 1 to CHANNELS
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Blend codes of the visible Gaussians: image (H, W, C), differentiable, and transmittance left over (H, W)."""
+    def rasterise(self, codes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Blend codes (M, C) of what is visible, C from 1 to CHANNELS: image (H, W, C), and transmittance (H, W).
+
+        The image is differentiable with respect to the codes.
+        """
         height, width = self.camera.height, self.camera.width
         if len(codes) == 0:
             return codes.new_zeros((height, width, codes.shape[1])), codes.new_ones((height, width))
@@ -197,8 +182,7 @@ class GsplatOperator(ViewOperator):
 
     def _without(self, hidden: np.ndarray) -> GsplatOperator:
         other = copy.copy(self)
-        away = torch.tensor(hidden, device=self.device)
-        other._opacities = self._opacities.masked_fill(away, 0)
+        other._opacities = self._opacities.masked_fill(torch.tensor(hidden, device=self.device), 0)
         return other
 
     def _blend(self, codes: np.ndarray) -> Blended:
@@ -219,26 +203,20 @@ class GsplatOperator(ViewOperator):
             out[self.ids, k] = self.carry_back(_tensor(residual[..., k], self.device)).cpu().numpy()
         return out
 
-    def carry_back(
-        self,
-        residual: torch.Tensor,  # (H, W, C), C from 1 to CHANNELS
-    ) -> torch.Tensor:
-        """Carry values of pixels back to the visible Gaussians, (M, C)."""
+    def carry_back(self, residual: torch.Tensor) -> torch.Tensor:
+        """Carry values of pixels (H, W, C), C from 1 to CHANNELS, back to the visible Gaussians, (M, C)."""
         codes = torch.zeros((len(self.ids), residual.shape[2]), device=self.device)
         with torch.enable_grad():  # Whoever calls may have turned gradients off.
             image, _ = self.rasterise(codes.requires_grad_())
         return gradient(image, codes, residual)
 
-    def _weights(self, pixel: tuple[int, int] | None) -> Weights:
-        """List W, or only the row of W of one pixel. Written in PyTorch by gsplat's rules, since it lists none."""
+    def _weights(self, pixel: tuple[int, int] | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Written in PyTorch by gsplat's rules, since it lists none."""
         height, width, columns = self.camera.height, self.camera.width, self._offsets.shape[2]
         begins = [*self._offsets.flatten().tolist(), len(self._entries)]
-        tiles = range(len(begins) - 1)
-        if pixel is not None:
-            tile = pixel[0] // TILE * columns + pixel[1] // TILE
-            tiles = range(tile, tile + 1)
-        pixels, rows, weights = [np.empty(0, np.int32)], [np.empty(0, np.int32)], [np.empty(0, np.float32)]
-        for tile in tiles:
+        wanted = range(len(begins) - 1) if pixel is None else [pixel[0] // TILE * columns + pixel[1] // TILE]
+        parts = [(np.empty(0, np.int32), np.empty(0, np.int32), np.empty(0, np.float32))]
+        for tile in wanted:
             top, left = tile // columns * TILE, tile % columns * TILE
             r, c = (place.ravel() for place in np.mgrid[top : min(top + TILE, height), left : min(left + TILE, width)])
             if pixel is not None:
@@ -246,20 +224,13 @@ class GsplatOperator(ViewOperator):
             entries = self._entries[begins[tile] : begins[tile + 1]].long()
             here = self._weights_of(entries, _tensor(np.stack([c, r], axis=1) + 0.5, self.device))
             p, e = here.nonzero(as_tuple=True)
-            pixels.append((r * width + c)[p.cpu().numpy()].astype(np.int32))
-            rows.append(entries[e].cpu().numpy().astype(np.int32))
-            weights.append(here[p, e].cpu().numpy())
-        listed = np.concatenate(pixels)
-        # Entries of a tile are sorted by depth; a stable sort by pixel keeps that order within each.
-        order = np.argsort(listed, kind="stable")
-        return Weights(listed[order], self.ids[np.concatenate(rows)[order]], np.concatenate(weights)[order])
+            listed = (r * width + c)[p.cpu().numpy()].astype(np.int32)
+            parts.append((listed, entries[e].cpu().numpy().astype(np.int32), here[p, e].cpu().numpy()))
+        pixels, rows, weights = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return pixels, rows, weights
 
-    def _weights_of(
-        self,
-        entries: torch.Tensor,  # (E,) visible Gaussians of one tile, nearest first
-        pixels: torch.Tensor,  # (P, 2) centres of pixels, x and y
-    ) -> torch.Tensor:
-        """Weights of a tile's Gaussians in some of its pixels, (P, E)."""
+    def _weights_of(self, entries: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+        """Weights (P, E) of a tile's entries (E,), nearest first, in pixels with these centres, (P, 2) as x and y."""
         dx, dy = (self._means2d[0, entries] - pixels[:, None]).unbind(dim=2)
         xx, xy, yy = self._conics[0, entries].unbind(dim=1)
         half_squared = 0.5 * (xx * dx * dx + yy * dy * dy) + xy * dx * dy
@@ -281,18 +252,16 @@ def view_operator(scene: GaussianScene, camera: Camera, device: str) -> GsplatOp
 class GsplatObservation(Observation):
     """A view and its mask on a GPU."""
 
-    def __init__(
-        self,
-        operator: GsplatOperator,
-        labels: np.ndarray,  # (H, W)
-    ) -> None:
-        self._operator = operator
+    def __init__(self, operator: GsplatOperator, labels: np.ndarray) -> None:  # (H, W)
+        self.name, self._operator = operator.camera.name, operator
         known = labels >= 0
         classes, self.areas = np.unique(labels[known], return_counts=True)
         self.classes = classes.astype(np.int32)
         local = np.where(known, np.searchsorted(self.classes, labels), -1)
         self._labels = torch.tensor(local, dtype=torch.int32, device=operator.device)
-        votes = self._lift()
+        votes = np.empty((len(operator.ids), len(classes)), np.float32)  # of all that is visible: W^T onehot(y)
+        for k in chunks(len(classes)):
+            votes[:, k] = operator.carry_back(self._one_hot(k)).cpu().numpy()
         seen = votes > 0
         self._visible = np.flatnonzero(seen.any(axis=1))
         self.ids, seen = operator.ids[self._visible], seen[self._visible]
@@ -310,28 +279,10 @@ class GsplatObservation(Observation):
         """Weights summed by pair, (P,) float32."""
         return self._votes
 
-    def _lift(self) -> np.ndarray:
-        """Sum the weights of all that is visible by label: W^T onehot(y), (V, L) float32."""
-        out = np.empty((len(self._operator.ids), len(self.classes)), np.float32)
-        for k in chunks(len(self.classes)):
-            out[:, k] = self._operator.carry_back(self._one_hot(k)).cpu().numpy()
-        return out
-
-    def shares(
-        self,
-        said: np.ndarray,  # (P,)
-        rest: np.ndarray,  # (L,)
-    ) -> VoteShares:
-        """Share one vote per labelled pixel among the pairs that made it."""
-        said, rest = np.asarray(said), np.asarray(rest)
-        if said.shape != self.labels.shape or rest.shape != self.classes.shape:
-            raise SceneValueError(
-                f"view '{self._operator.camera.name}': said and rest have shapes {said.shape} and {rest.shape}; "
-                f"expected {self.labels.shape} and {self.classes.shape}"
-            )
+    def _shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares:
         rows = self._visible[self.rows]
         codes = np.zeros((len(self._operator.ids), len(rest)), np.float32)
-        codes[rows, self.labels] = said
+        codes[rows, self.labels] = likelihood
         out, total, log_likelihood = np.empty_like(codes), np.zeros(len(rest)), 0.0
         for k in chunks(len(rest)):
             # A pixel's label lies in one chunk, so each chunk has all that its pixels need.
@@ -342,11 +293,9 @@ class GsplatObservation(Observation):
         return VoteShares(out[rows, self.labels], total, log_likelihood)
 
     def _share(
-        self,
-        codes: np.ndarray,  # (M, C)
-        rest: np.ndarray,  # (C,)
-        one_hot: torch.Tensor,  # (H, W, C)
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        self, codes: np.ndarray, rest: np.ndarray, one_hot: torch.Tensor  # (M, C), (C,), (H, W, C)
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
+        """Sum shares by Gaussian, (M, C), by what the rays had left over, (C,), and log likelihoods, of C labels."""
         device = self._operator.device
         carried = _tensor(codes, device)
         with torch.enable_grad():
@@ -367,12 +316,8 @@ class GsplatObservation(Observation):
         return (self._labels[..., None] == chosen).float()
 
 
-def gradient(
-    image: torch.Tensor,  # (H, W, C)
-    codes: torch.Tensor,  # (M, C), of which the image was made
-    residual: torch.Tensor,  # (H, W, C)
-) -> torch.Tensor:
-    """Carry a residual back through a render: the gradient of <image, residual> with respect to the codes, (M, C)."""
+def gradient(image: torch.Tensor, codes: torch.Tensor, residual: torch.Tensor) -> torch.Tensor:
+    """Carry a residual (H, W, C) back through a render of codes (M, C): the gradient of <image, residual>, (M, C)."""
     if len(codes) == 0:
         return torch.zeros_like(codes)
     (carried,) = torch.autograd.grad(image, codes, residual)

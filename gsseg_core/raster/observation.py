@@ -6,28 +6,22 @@ from abc import ABC, abstractmethod
 from functools import cached_property
 from typing import NamedTuple
 
+import numba as nb
 import numpy as np
 
-from gsseg_core.data.label_evidence import LabelEvidence
-from gsseg_core.raster.votes import add_votes
+from gsseg_core.csr_rows import CSRRows
+from gsseg_core.data.label_evidence import LabelEvidence, vote_units
+from gsseg_core.errors import SceneValueError
+from gsseg_core.raster.constants import AHEAD
+from gsseg_core.simd import prefetch
 
 
 class VoteShares(NamedTuple):
-    """One vote per labelled pixel, shared among the (Gaussian, label) pairs that made it.
+    """One vote per labelled pixel, shared among the (Gaussian, label) pairs that made it; see `Observation.shares`."""
 
-    Attributes
-    ----------
-    pairs : (P,) float32
-        For each pair, the sum over the pixels of its label of w[p, i] / likelihood[p].
-    rest : (L,) float64
-        The same for what the rays had left over, T_end[p] / likelihood[p].
-    log_likelihood : float
-        Sum over the labelled pixels of log likelihood[p], natural.
-    """
-
-    pairs: np.ndarray
-    rest: np.ndarray
-    log_likelihood: float
+    pairs: np.ndarray  # (P,) float32: for each pair, the sum over the pixels of its label of w[p, i] / p(y_p)
+    rest: np.ndarray  # (L,) float64: the same for what the rays had left over, T_end[p] / p(y_p)
+    log_likelihood: float  # sum over the labelled pixels of log p(y_p), natural
 
 
 class Observation(ABC):
@@ -40,6 +34,8 @@ class Observation(ABC):
 
     Attributes
     ----------
+    name : str
+        Of the view.
     ids : (M,) int32
         Gaussians that some labelled pixel sees, as indices in the scene.
     start : (M + 1,) int64
@@ -54,6 +50,7 @@ class Observation(ABC):
         What the labels say of the classes; of a plain mask, that they are classes.
     """
 
+    name: str
     ids: np.ndarray
     start: np.ndarray
     labels: np.ndarray
@@ -87,11 +84,8 @@ class Observation(ABC):
         """Which of `ids` each pair is of, (P,) int64."""
         return np.repeat(np.arange(len(self.ids)), np.diff(self.start))
 
-    def dense(
-        self,
-        values: np.ndarray,  # (P,)
-    ) -> np.ndarray:
-        """Write one number per pair out by Gaussian and label, (M, L); zero where there is no pair."""
+    def dense(self, values: np.ndarray) -> np.ndarray:
+        """Write one number per pair, (P,), out by Gaussian and label, (M, L); zero where there is no pair."""
         out = np.zeros((len(self.ids), len(self.classes)), values.dtype)
         out[self.rows, self.labels] = values
         return out
@@ -100,35 +94,51 @@ class Observation(ABC):
     def votes(self) -> np.ndarray:
         """Sum of weights of each pair, the entries of W^T onehot(y) that are not zero: (P,) float32, in px."""
 
-    def vote(
-        self,
-        total: np.ndarray,  # (N, K) int64, added to
-        units: float,
-        sign: int = 1,
-    ) -> None:
-        """Add the votes to those of other views, or take them away, in whole units."""
-        add_votes(total, self.ids, self.start, self.labels, *self.evidence.votes, self.votes(), units, sign)
+    def vote(self, total: np.ndarray, units: float, sign: int = 1) -> None:
+        """Add the votes to those of other views, (N, K) int64, or take them away, in whole units."""
+        add_votes(total, self.ids, self.start, self.labels, self.evidence.votes, self.votes(), units, sign)
 
-    @abstractmethod
-    def shares(
-        self,
-        said: np.ndarray,  # (P,)
-        rest: np.ndarray,  # (L,)
-    ) -> VoteShares:
+    def shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares:
         """Share one vote per labelled pixel among the Gaussians that made it.
 
-        With likelihood[p] = (W said)[p, y_p] + T_end[p] rest[y_p], the share of a pair is the sum over the pixels of
-        its label of w[p, i] / likelihood[p]. It is the gradient of the log likelihood with respect to what was said.
+        With p(y_p) = (W likelihood)[p, y_p] + T_end[p] rest[y_p], the share of a pair is the sum over the pixels of its
+        label of w[p, i] / p(y_p). It is the gradient of the log likelihood with respect to that of the pairs.
 
         Parameters
         ----------
-        said : (P,) float32
-            What each Gaussian says of the label under which it is seen, at least 0.
+        likelihood : (P,) float32
+            Of the label of each pair, given its Gaussian; at least 0.
         rest : (L,) float32
-            What the background says of each label.
+            Of each label, given the background.
 
         Raises
         ------
         SceneValueError
             They are not of these shapes.
         """
+        likelihood, rest = np.ascontiguousarray(likelihood, np.float32), np.ascontiguousarray(rest, np.float32)
+        if likelihood.shape != self.labels.shape or rest.shape != self.classes.shape:
+            raise SceneValueError(
+                f"view '{self.name}': likelihood and rest have shapes {likelihood.shape} and {rest.shape}; "
+                f"expected {self.labels.shape} and {self.classes.shape}"
+            )
+        return self._shares(likelihood, rest)
+
+    @abstractmethod
+    def _shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares: ...
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def add_votes(
+    total: np.ndarray, ids: np.ndarray,  # (N, K) int64, added to; (M,) int32, distinct
+    start: np.ndarray, labels: np.ndarray,  # (M + 1,); (P,) int32: label of each pair
+    label_votes: CSRRows, votes: np.ndarray,  # L rows, float64: what a pixel of each label votes; (P,) float32
+    units: float, sign: int,  # per vote; a power of 2
+) -> None:  # fmt: skip
+    """Add a view's votes to those of other views, or take them away, exactly: in whole units."""
+    for m in nb.prange(ids.shape[0]):
+        prefetch(total, ids[min(m + AHEAD, ids.shape[0] - 1)])
+        row = total[ids[m]]
+        for s in range(start[m], start[m + 1]):
+            for j in range(label_votes.indptr[labels[s]], label_votes.indptr[labels[s] + 1]):
+                row[label_votes.indices[j]] += sign * vote_units(votes[s], label_votes.data[j], units)

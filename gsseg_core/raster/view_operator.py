@@ -15,53 +15,25 @@ from gsseg_core.scene.camera import Camera
 
 
 class Weights(NamedTuple):
-    """The non-zero entries of W, by pixel and nearest Gaussian first.
+    """The non-zero entries of W, by pixel and nearest Gaussian first."""
 
-    Attributes
-    ----------
-    pixels : (P,) int32
-        Pixel index, row * width + column.
-    gaussians : (P,) int32
-        Index in the scene.
-    weights : (P,) float32
-        alpha times the transmittance in front, in (0, 0.99].
-    """
-
-    pixels: np.ndarray
-    gaussians: np.ndarray
-    weights: np.ndarray
+    pixels: np.ndarray  # (P,) int32: row * width + column
+    gaussians: np.ndarray  # (P,) int32: index in the scene
+    weights: np.ndarray  # (P,) float32: alpha times the transmittance in front, in (0, 0.99]
 
 
 class Blended(NamedTuple):
-    """A view of the scene.
+    """A view of the scene."""
 
-    Attributes
-    ----------
-    image : (H, W, K) float32
-        Codes, blended: W q.
-    transmittance : (H, W) float32
-        What is left of each ray after the last Gaussian, in [0, 1].
-    """
-
-    image: np.ndarray
-    transmittance: np.ndarray
+    image: np.ndarray  # (H, W, K) float32: codes, blended, W q
+    transmittance: np.ndarray  # (H, W) float32: what is left of each ray after the last Gaussian, in [0, 1]
 
 
 class SilhouetteTerms(NamedTuple):
-    """What objects that stand alone in a view would lose and gain by each of their Gaussians, in px.
+    """What each object alone in a view would lose and gain by each Gaussian, in px; T_k is its transmittance."""
 
-    With T_k(p) the transmittance of object k alone in pixel p:
-
-    Attributes
-    ----------
-    stay : (M,) float64
-        Sum of alpha T_k / (1 - T_k) over the pixels that show the Gaussian's own object.
-    go : (M,) float64
-        Sum of alpha over the pixels that show another one, where that does not hide the Gaussian.
-    """
-
-    stay: np.ndarray
-    go: np.ndarray
+    stay: np.ndarray  # (M,) float64: sum of alpha T_k / (1 - T_k) over the pixels that show the Gaussian's own object
+    go: np.ndarray  # (M,) float64: sum of alpha over those that show another one, where it does not hide the Gaussian
 
 
 class ViewOperator(ABC):
@@ -84,16 +56,13 @@ class ViewOperator(ABC):
     num_gaussians: int
     ids: np.ndarray
 
-    def render(
-        self,
-        codes: np.ndarray,  # (N, K)
-    ) -> np.ndarray:
-        """Blend codes into the view: W q.
+    def render(self, codes: np.ndarray) -> np.ndarray:
+        """Blend into the view anything that a Gaussian carries, as class probabilities, colours or depths: W q.
 
         Parameters
         ----------
         codes : (N, K)
-            Anything that a Gaussian carries: class probabilities, colours, depths.
+            One row per Gaussian.
 
         Returns
         -------
@@ -106,17 +75,8 @@ class ViewOperator(ABC):
         """
         return self.blend(codes).image
 
-    def blend(
-        self,
-        codes: np.ndarray,  # (N, K)
-    ) -> Blended:
-        """Render codes, and return what is left of each ray, in one pass.
-
-        Raises
-        ------
-        SceneValueError
-            There is not one row of codes per Gaussian.
-        """
+    def blend(self, codes: np.ndarray) -> Blended:
+        """Render codes (N, K), and return what is left of each ray, in one pass; raises as `render` does."""
         codes = np.asarray(codes)
         if codes.ndim != 2 or len(codes) != self.num_gaussians:
             raise SceneValueError(f"codes have shape {codes.shape}; expected ({self.num_gaussians}, K)")
@@ -126,16 +86,13 @@ class ViewOperator(ABC):
         """Do the same for codes (N, K) of which only the entries that are not zero are at hand."""
         return self._blend(codes.dense(num_classes))
 
-    def adjoint(
-        self,
-        residual: np.ndarray,  # (H, W, K)
-    ) -> np.ndarray:
-        """Carry values of pixels back to the Gaussians that made them: W^T r.
+    def adjoint(self, residual: np.ndarray) -> np.ndarray:
+        """Carry anything that a pixel carries, as labels or a loss's gradient, back to the Gaussians: W^T r.
 
         Parameters
         ----------
         residual : (H, W, K)
-            Anything that a pixel carries: one-hot labels, the gradient of a loss.
+            Values of the pixels.
 
         Returns
         -------
@@ -150,11 +107,7 @@ class ViewOperator(ABC):
         self._check_size(residual, 3)
         return self._adjoint(residual)
 
-    def observe(
-        self,
-        labels: np.ndarray,  # (H, W) int32, negative = unknown
-        evidence: LabelEvidence | None = None,
-    ) -> Observation:
+    def observe(self, labels: np.ndarray, evidence: LabelEvidence | None = None) -> Observation:
         """Tie the view to its mask.
 
         Parameters
@@ -176,21 +129,16 @@ class ViewOperator(ABC):
         return observation
 
     def vote(
-        self,
-        labels: np.ndarray,  # (H, W) int32
-        evidence: LabelEvidence | None,
-        total: np.ndarray,  # (N, K) int64, added to
-        units: float,
-        sign: int = 1,
+        self, labels: np.ndarray, evidence: LabelEvidence | None, total: np.ndarray, units: float, sign: int = 1
     ) -> bool:
-        """Add the view's votes to those of others, W^T onehot(y): what `observe` would say, with nothing kept of it.
+        """Add the view's votes to those of others, W^T onehot(y): those of `observe`, with nothing kept of it.
 
         Parameters
         ----------
         labels, evidence
-            The mask, as for `observe`.
+            The mask, as for `observe`, which also says what is raised.
         total : (N, K) int64
-            Votes in units, of K classes, among them all that the mask speaks of.
+            Votes in units, of K classes, among them all that the mask speaks of; added to.
         units : float
             Units per px of weight; a power of 2.
         sign : int
@@ -200,20 +148,12 @@ class ViewOperator(ABC):
         -------
         bool
             Whether a labelled pixel sees any Gaussian.
-
-        Raises
-        ------
-        MaskSizeError
-            The labels are not of the camera's size.
         """
         self._check_size(labels, 2)
         return self._vote(labels, evidence, total, units, sign)
 
-    def without(
-        self,
-        hidden: np.ndarray,  # (N,) bool
-    ) -> ViewOperator:
-        """Make the same view of the scene without some of its Gaussians; indices stay, and nothing is projected again.
+    def without(self, hidden: np.ndarray) -> ViewOperator:
+        """Make the view without some Gaussians, (N,) bool; indices stay, and nothing is projected again.
 
         Raises
         ------
@@ -237,14 +177,9 @@ class ViewOperator(ABC):
         """Sum of the alphas of each of `ids` over an endless image, opacity * 2 pi sqrt(|S|): (M,), in px."""
 
     def silhouette_terms(
-        self,
-        labels: np.ndarray,  # (M,) int32
-        kept: np.ndarray,  # (M,)
-        asked: np.ndarray,  # (M,) bool
-        depths: np.ndarray,  # (M,) float32
-        shown: np.ndarray,  # (H, W) int32
-        hidden_from: np.ndarray,  # (H, W) float32
-    ) -> SilhouetteTerms:
+        self, labels: np.ndarray, kept: np.ndarray, asked: np.ndarray, depths: np.ndarray, shown: np.ndarray,
+        hidden_from: np.ndarray,
+    ) -> SilhouetteTerms:  # fmt: skip
         """Weigh what speaks for each Gaussian in its object, and what against it, were each object alone in the view.
 
         Parameters
@@ -282,21 +217,22 @@ class ViewOperator(ABC):
         SettingsError
             The pixel is not in the image, or only one of its coordinates is given.
         """
-        if row is None and column is None:
-            return self._weights(None)
-        height, width = self.camera.height, self.camera.width
-        if row is None or column is None or not (0 <= row < height and 0 <= column < width):
-            raise SettingsError(
-                f"view '{self.camera.name}': pixel is (row {row}, column {column}); "
-                f"expected a row from 0 to {height - 1} and a column from 0 to {width - 1}"
-            )
-        return self._weights((row, column))
+        height, width, pixel = self.camera.height, self.camera.width, None
+        if row is not None or column is not None:
+            if row is None or column is None or not (0 <= row < height and 0 <= column < width):
+                raise SettingsError(
+                    f"view '{self.camera.name}': pixel is (row {row}, column {column}); "
+                    f"expected a row from 0 to {height - 1} and a column from 0 to {width - 1}"
+                )
+            pixel = row, column
+        pixels, rows, weights = self._weights(pixel)
+        # Of each pixel they come nearest first, and a stable sort keeps that order.
+        order = np.argsort(pixels, kind="stable")
+        return Weights(pixels[order], self.ids[rows[order]], weights[order])
 
     @abstractmethod
-    def _without(
-        self,
-        hidden: np.ndarray,  # (M,) bool
-    ) -> ViewOperator: ...
+    def _without(self, hidden: np.ndarray) -> ViewOperator:
+        """Make the view without some of `ids`, (M,) bool."""
 
     @abstractmethod
     def _blend(self, codes: np.ndarray) -> Blended: ...
@@ -305,7 +241,8 @@ class ViewOperator(ABC):
     def _adjoint(self, residual: np.ndarray) -> np.ndarray: ...
 
     @abstractmethod
-    def _weights(self, pixel: tuple[int, int] | None) -> Weights: ...
+    def _weights(self, pixel: tuple[int, int] | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """List pixels and places in `ids`, both (P,) int32, and weights, (P,) float32, nearest first in each pixel."""
 
     @abstractmethod
     def _observe(self, labels: np.ndarray) -> Observation: ...

@@ -13,17 +13,24 @@ So there are no atomic operations, and the result does not depend on the number 
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
 
+from gsseg_core.raster.constants import AHEAD
 from gsseg_core.raster.cpu.splat import OPEN, SIDE, WIDTH, aim, blend_block
-from gsseg_core.raster.cpu.tiling import TILE
+from gsseg_core.raster.cpu.tiling import TILE, Tiles
 from gsseg_core.simd import first_bit, prefetch, store_row
 
-AHEAD = 12
-"""Entries between the one that is blended and the one that is fetched from memory."""
+
+class Records(NamedTuple):
+    """The rows of W that belong to one tile, as far as not every ray had ended."""
+
+    rays: np.ndarray  # (16, 16) float32: final transmittance, by block
+    weights: np.ndarray  # (R, 16) float32: pixel by pixel of each record's block
+    blocks: np.ndarray  # (R,) uint8: block of each record
+    ends: np.ndarray  # (E_t,) int32: one past the last record of each entry that was blended
 
 
 @nb.njit(inline="always")
@@ -59,71 +66,57 @@ def tile_of_turn(turn: int, columns: int, rows: int, stride: int) -> int:
 
 
 @nb.njit(inline="always")
-def open_rays(
-    tile: int,
-    columns: int,  # tiles across
-    width: int,  # px
-    height: int,  # px
-    transmittance: np.ndarray,  # (16, 16) float32 out, by block
-) -> tuple[Any, Any, int]:
-    """Begin with a tile: the pixel centre of its corner, and a bit for each of its blocks that is in the image."""
-    left, top, live = (tile % columns) * TILE, (tile // columns) * TILE, 0
+def corner_of(tiles: Tiles, tile: int) -> tuple[int, int]:
+    """Column and row of the first pixel of a tile."""
+    return (tile % tiles.columns) * TILE, (tile // tiles.columns) * TILE
+
+
+@nb.njit(inline="always")
+def open_rays(tiles: Tiles, tile: int, rays: np.ndarray) -> tuple[Any, Any, int]:
+    """Begin with a tile: the pixel centre of its corner, and a bit for each of its blocks that is in the image.
+
+    Transmittances, (16, 16) float32 by block, are set to 1 in the image and to 0 elsewhere.
+    """
+    (left, top), live = corner_of(tiles, tile), 0
     for r in range(TILE):
         for c in range(TILE):
             b, lane = in_block(r, c)
-            inside = top + r < height and left + c < width
-            transmittance[b, lane] = 1.0 if inside else 0.0
+            inside = top + r < tiles.height and left + c < tiles.width
+            rays[b, lane] = 1.0 if inside else 0.0
             live |= inside << b
     return np.float32(left + 0.5), np.float32(top + 0.5), live
 
 
 @nb.njit(inline="always")
-def aim_next(
-    table: np.ndarray,  # (M, 8)
-    entries: np.ndarray,  # (E,)
-    e: int,
-    last: int,
-    left: float,
-    top: float,
-    lines: np.ndarray,  # (2, 2, 16) float32 out: those of entry e + 1 go to (e + 1) % 2
-) -> int:
-    """Aim the entry after e, before e is blended.
+def aim_next(tiles: Tiles, e: int, last: int, left: float, top: float, lines: np.ndarray) -> int:
+    """Aim the entry after e, before e is blended: its lines, (2, 2, 16) float32, go to number (e + 1) % 2.
 
     How many blocks an entry reaches, no processor guesses; where it is known a whole entry early, a wrong guess costs
     little. That saves a quarter of the lift.
     """
     if e + 1 == last:
         return 0
-    prefetch(table, entries[min(e + AHEAD, last - 1)])
-    return aim(table, entries[e + 1], left, top, lines[(e + 1) % 2])  # type: ignore[no-any-return]
+    prefetch(tiles.table, tiles.entries[min(e + AHEAD, last - 1)])
+    return aim(tiles.table, tiles.entries[e + 1], left, top, lines[(e + 1) % 2])  # type: ignore[no-any-return]
 
 
 @nb.njit(fastmath={"contract"}, error_model="numpy")
-def blend_tile(
-    tile: int,
-    columns: int,  # tiles across
-    width: int,  # px
-    height: int,  # px
-    table: np.ndarray,  # (M, 8) projected Gaussians
-    entries: np.ndarray,  # (E,) rows of the table, by tile, nearest first
-    first: int,  # entries of this tile
-    last: int,
-    transmittance: np.ndarray,  # (16, 16) float32 out, by block
-    weights: np.ndarray,  # (16 * (last - first), 16) float32 out: the records
-    blocks: np.ndarray,  # (16 * (last - first),) uint8 out: block of each record
-    ends: np.ndarray,  # (last - first,) int32 out: one past the last record of each entry
-) -> int:
-    """Make the records of one tile; returns how many of its entries were blended before every ray had ended."""
-    left, top, live = open_rays(tile, columns, width, height, transmittance)
+def blend_tile(tiles: Tiles, tile: int) -> Records:
+    """Make the records of one tile."""
+    first, last = tiles.start[tile], tiles.start[tile + 1]
+    # Sized for the worst case; pages that no record reaches are never touched.
+    rays, weights = np.empty((TILE, TILE), np.float32), np.empty((TILE * (last - first), TILE), np.float32)
+    blocks, ends = np.empty(TILE * (last - first), np.uint8), np.empty(last - first, np.int32)
+    left, top, live = open_rays(tiles, tile, rays)
     lines = np.empty((2, 2, TILE), np.float32)
-    n, ahead = 0, aim_next(table, entries, first - 1, last, left, top, lines)
+    n, ahead = 0, aim_next(tiles, first - 1, last, left, top, lines)
     for e in range(first, last):
-        reached, own, wide = ahead & live, lines[e % 2], table[entries[e], WIDTH]
-        ahead = aim_next(table, entries, e, last, left, top, lines)
+        reached, own, wide = ahead & live, lines[e % 2], tiles.table[tiles.entries[e], WIDTH]
+        ahead = aim_next(tiles, e, last, left, top, lines)
         while reached:
             b = first_bit(reached)
             reached &= reached - 1
-            weight, bits = blend_block(transmittance, b, own, wide)
+            weight, bits = blend_block(rays, b, own, wide)
             store_row(weights, n, weight)
             blocks[n] = b
             n += bits > OPEN
@@ -131,5 +124,5 @@ def blend_tile(
                 live &= ~(1 << b)
         ends[e - first] = n
         if not live:
-            return e - first + 1
-    return last - first
+            return Records(rays, weights, blocks, ends[: e - first + 1])
+    return Records(rays, weights, blocks, ends)

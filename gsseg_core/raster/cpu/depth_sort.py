@@ -12,10 +12,8 @@ PARTS = 4
 """Parts that are counted and moved beside each other; fixed, so that threads change nothing."""
 
 
-def sort_by_depth(
-    depth: np.ndarray,  # (M,) float32 > 0
-) -> tuple[np.ndarray, np.ndarray]:
-    """Order (M,) int32 that sorts depths, nearest first, and the sorted depths; equal ones stay in their order.
+def sort_by_depth(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Order (M,) int32 that sorts depths, (M,) float32 > 0, and the sorted depths; equal ones stay in their order.
 
     A radix sort: every pass moves the keys stably by one digit, the least significant first.
     """
@@ -43,13 +41,10 @@ def _count_digits(keys: np.ndarray, shift: int, counts: np.ndarray) -> None:
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def _move(
-    keys: np.ndarray,  # (M,) uint32
-    order: np.ndarray,  # (M,) int32
-    shift: int,
+    keys: np.ndarray, order: np.ndarray, shift: int,  # (M,) uint32, (M,) int32
     place: np.ndarray,  # (PARTS, 2^DIGIT_BITS) where the next key of each digit goes
-    moved_keys: np.ndarray,
-    moved_order: np.ndarray,
-) -> None:
+    moved_keys: np.ndarray, moved_order: np.ndarray,  # (M,) out, each
+) -> None:  # fmt: skip
     count, mask = keys.shape[0], np.uint32((1 << DIGIT_BITS) - 1)
     for chunk in nb.prange(PARTS):
         for i in range(chunk * count // PARTS, (chunk + 1) * count // PARTS):

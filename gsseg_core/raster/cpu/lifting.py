@@ -7,49 +7,61 @@ through what is in front of it. What reached none is left out of all later passe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
 
+from gsseg_core.csr_rows import starts
 from gsseg_core.raster.cpu.blending import aim_next, in_tile, open_rays, stride_of, tile_of_turn
 from gsseg_core.raster.cpu.splat import OPEN, WIDTH, blend_block
-from gsseg_core.raster.cpu.tiling import TILE
+from gsseg_core.raster.cpu.tiling import TILE, Tiles
 from gsseg_core.simd import FAST, LANES, add_where, count_bits, first_bit, nothing, sum_row
 
 
-@dataclass(frozen=True)
-class Labels:
-    """A mask, cut into tiles; each tile gives the labels in it numbers of its own.
+class Labels(NamedTuple):
+    """A mask, cut into tiles; each tile gives the labels in it numbers of its own."""
 
-    Attributes
-    ----------
-    start : (T + 1,) int64, present : (start[-1],) int32
-        Labels of tile t are present[start[t]:start[t + 1]].
-    span_start : (16 T + 1,) int64
-        Spans of block b of tile t are those from span_start[16 t + b] to the next.
-    slots : (S,) int32
-        Which of its tile's labels a span is.
-    lanes : (S,) int32
-        Bit i is set where pixel i of the block has the label.
-    """
+    start: np.ndarray  # (T + 1,) int64: labels of tile t are present[start[t]:start[t + 1]]
+    present: np.ndarray  # (start[-1],) int32
+    span_start: np.ndarray  # (16 T + 1,) int64: spans of block b of tile t are from span_start[16 t + b] to the next
+    slots: np.ndarray  # (S,) int32: which of its tile's labels a span is
+    lanes: np.ndarray  # (S,) int32: bit i is set where pixel i of the block has the label
 
-    start: np.ndarray
-    present: np.ndarray
-    span_start: np.ndarray
-    slots: np.ndarray
-    lanes: np.ndarray
+
+class Lifted(NamedTuple):
+    """A mask lifted into a view: the weights of every entry, summed by label."""
+
+    classes: np.ndarray  # (L,) int32: labels that occur in the mask, ascending
+    areas: np.ndarray  # (L,) int64: pixels of each label
+    labels: Labels  # the mask cut into tiles; its labels are positions in `classes`
+    slot_start: np.ndarray  # (T + 1,) int64: where each tile's sums begin, one for each entry and label of the tile
+    reached: np.ndarray  # (E,) uint16: blocks with a label in which the entry has a weight, one bit each
+    sums: np.ndarray  # (slot_start[-1],) float32: sum of weights, in px
+    counts: np.ndarray  # (T, 3) int64: entries with such a block, their blocks, sums above zero
+
+    @classmethod
+    def of(cls, tiles: Tiles, mask: np.ndarray) -> Lifted:
+        """Lift a mask, (H, W) and negative where unknown, into a view."""
+        mask = np.ascontiguousarray(mask, np.int32)
+        cut, areas = _cut(mask, tiles.columns, tiles.rows, int(mask.max(initial=0)) + 1)
+        classes = np.flatnonzero(areas).astype(np.int32)
+        position = np.zeros(len(areas), np.int32)
+        position[classes] = np.arange(len(classes))
+        labels = Labels(*cut)._replace(present=position[cut[1]])
+        slot_start = starts(np.diff(tiles.start) * np.diff(labels.start))
+        return cls(classes, areas[classes], labels, slot_start, *_lift(tiles, labels, slot_start))
+
+    @property
+    def sees(self) -> bool:
+        """Whether a labelled pixel sees any Gaussian."""
+        return bool(self.counts[:, 0].any())
 
 
 @nb.njit(nogil=True, cache=True)
-def cut_labels(
-    labels: np.ndarray,  # (H, W) int32, negative = unknown
-    columns: int,
-    rows: int,
-    num_labels: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Make what `Labels` holds, and count the pixels of each label, (num_labels,) int64."""
-    height, width = labels.shape
+def _cut(mask: np.ndarray, columns: int, rows: int, num_labels: int) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """Make what `Labels` holds of a mask (H, W) int32, and count the pixels of each label, (num_labels,) int64."""
+    height, width = mask.shape
     start = np.zeros(columns * rows + 1, np.int64)
     present = np.empty(height * width, np.int32)
     span_start = np.zeros(columns * rows * TILE + 1, np.int64)
@@ -59,12 +71,12 @@ def cut_labels(
     n = spans = 0
     for tile in range(columns * rows):
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
-        alike = _is_uniform(labels, left, top)
+        alike = _is_uniform(mask, left, top)
         for b in range(TILE):
             begin = spans
             for lane in range(1 if alike else LANES):
                 r, c = in_tile(b, lane)
-                label = labels[top + r, left + c] if top + r < height and left + c < width else -1
+                label = mask[top + r, left + c] if top + r < height and left + c < width else -1
                 if label < 0:
                     continue
                 if slot_of[label] < 0:
@@ -81,109 +93,68 @@ def cut_labels(
         for i in range(start[tile], n):
             slot_of[present[i]] = -1
         start[tile + 1] = n
-    return start, present[:n].copy(), span_start, slots[:spans].copy(), lanes[:spans].copy(), areas
+    return (start, present[:n].copy(), span_start, slots[:spans].copy(), lanes[:spans].copy()), areas
 
 
 @nb.njit
-def _is_uniform(labels: np.ndarray, left: int, top: int) -> bool:
+def _is_uniform(mask: np.ndarray, left: int, top: int) -> bool:
     """Whether a tile lies in the image as a whole, and all its pixels have one label, or none has."""
-    if top + TILE > labels.shape[0] or left + TILE > labels.shape[1]:
+    if top + TILE > mask.shape[0] or left + TILE > mask.shape[1]:
         return False
     different = 0
     for r in range(top, top + TILE):
         for c in range(left, left + TILE):
-            different |= labels[r, c] ^ labels[top, left]
+            different |= mask[r, c] ^ mask[top, left]
     return different == 0
 
 
 @nb.njit(parallel=True, nogil=True, cache=True, fastmath=FAST, error_model="numpy")
-def lift(
-    columns: int,
-    width: int,
-    height: int,
-    table: np.ndarray,  # (M, 8)
-    start: np.ndarray,  # (T + 1,)
-    entries: np.ndarray,  # (E,)
-    label_start: np.ndarray,  # (T + 1,)
-    span_start: np.ndarray,  # (16 T + 1,)
-    slots: np.ndarray,  # (S,)
-    lanes: np.ndarray,  # (S,)
-    slot_start: np.ndarray,  # (T + 1,) where each tile's sums begin: one for each entry and label
-    reached: np.ndarray,  # (E,) uint16 out: blocks with a label in which the entry has a weight, one bit each
-    sums: np.ndarray,  # (slot_start[-1],) float32 out: sum of weights
-    counts: np.ndarray,  # (T, 3) int64 out: entries with a block, their blocks, sums above zero
-) -> None:
-    """Blend the view, and sum weights by entry and label."""
-    rows = (start.shape[0] - 1) // columns
-    stride = stride_of(rows)
-    for turn in nb.prange(rows * columns):
-        tile = tile_of_turn(turn, columns, rows, stride)
-        label_count = label_start[tile + 1] - label_start[tile]
-        first, last = start[tile], start[tile + 1]
-        reached[first:last] = 0
-        with_block = blocks = positive = 0
+def _lift(tiles: Tiles, labels: Labels, slot_start: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Blend the view, and sum weights by entry and label: the last three attributes of `Lifted`."""
+    reached, sums = np.empty(len(tiles.entries), np.uint16), np.empty(slot_start[-1], np.float32)
+    counts = np.empty((len(slot_start) - 1, 3), np.int64)
+    stride = stride_of(tiles.rows)
+    for turn in nb.prange(tiles.rows * tiles.columns):
+        tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
+        label_count = labels.start[tile + 1] - labels.start[tile]
+        blocks = reached[tiles.start[tile] : tiles.start[tile + 1]]
+        blocks[:] = 0
+        with_block = num_blocks = positive = 0
         if label_count:
             own = sums[slot_start[tile] : slot_start[tile + 1]]
             own[:] = 0.0
             if label_count == 1:  # The compiler makes a shorter loop of this.
-                _lift_tile(
-                    tile,
-                    columns,
-                    width,
-                    height,
-                    table,
-                    entries,
-                    first,
-                    last,
-                    span_start,
-                    slots,
-                    lanes,
-                    reached,
-                    own,
-                    1,
-                )
+                _lift_tile(tiles, labels, tile, blocks, own, 1)
             else:
-                _lift_tile(
-                    tile, columns, width, height, table, entries, first, last, span_start, slots, lanes, reached, own,
-                    label_count,
-                )  # fmt: skip
-            for e in range(first, last):
-                with_block += reached[e] > 0
-                blocks += count_bits(np.int64(reached[e]))
-            for i in range(own.shape[0]):
+                _lift_tile(tiles, labels, tile, blocks, own, label_count)
+            for e in range(len(blocks)):
+                with_block += blocks[e] > 0
+                num_blocks += count_bits(np.int64(blocks[e]))
+            for i in range(len(own)):
                 positive += own[i] > 0
-        counts[tile, 0], counts[tile, 1], counts[tile, 2] = with_block, blocks, positive
+        counts[tile, 0], counts[tile, 1], counts[tile, 2] = with_block, num_blocks, positive
+    return reached, sums, counts
 
 
 @nb.njit(inline="always")
 def _lift_tile(
-    tile: int,
-    columns: int,
-    width: int,
-    height: int,
-    table: np.ndarray,
-    entries: np.ndarray,
-    first: int,
-    last: int,
-    span_start: np.ndarray,
-    slots: np.ndarray,
-    lanes: np.ndarray,
-    reached: np.ndarray,
-    sums: np.ndarray,  # (E_t * label_count,)
-    label_count: int,
-) -> None:
+    tiles: Tiles, labels: Labels, tile: int,
+    reached: np.ndarray, sums: np.ndarray, label_count: int,  # (E_t,), (E_t * label_count,) in: zeros; out
+) -> None:  # fmt: skip
     rays, lines = np.empty((TILE, TILE), np.float32), np.empty((2, 2, TILE), np.float32)
-    left, top, live = open_rays(tile, columns, width, height, rays)
+    left, top, live = open_rays(tiles, tile, rays)
+    spans = labels.span_start[tile * TILE : tile * TILE + TILE + 1]
     labelled = np.zeros(TILE, np.int64)  # one bit per pixel of each block
     for b in range(TILE):
-        for span in range(span_start[tile * TILE + b], span_start[tile * TILE + b + 1]):
-            labelled[b] |= lanes[span]
+        for span in range(spans[b], spans[b + 1]):
+            labelled[b] |= labels.lanes[span]
         if not labelled[b]:
             live &= ~(1 << b)
-    ahead = aim_next(table, entries, first - 1, last, left, top, lines)
+    first, last = tiles.start[tile], tiles.start[tile + 1]
+    ahead = aim_next(tiles, first - 1, last, left, top, lines)
     for e in range(first, last):
-        blocks, own, wide = ahead & live, lines[e % 2], table[entries[e], WIDTH]
-        ahead = aim_next(table, entries, e, last, left, top, lines)
+        blocks, own, wide = ahead & live, lines[e % 2], tiles.table[tiles.entries[e], WIDTH]
+        ahead = aim_next(tiles, e, last, left, top, lines)
         hit = np.int64(0)
         # Lane by lane, as long as the label stays the same: most blocks have one label, and most entries too.
         current, lanewise = np.int64(-1), nothing()
@@ -197,14 +168,14 @@ def _lift_tile(
             if label_count == 1:
                 current, lanewise = np.int64(0), add_where(lanewise, weight, labelled[b])
                 continue
-            for span in range(span_start[tile * TILE + b], span_start[tile * TILE + b + 1]):
-                if slots[span] != current:
+            for span in range(spans[b], spans[b + 1]):
+                if labels.slots[span] != current:
                     if current >= 0:
                         sums[(e - first) * label_count + current] += sum_row(lanewise)
-                    current, lanewise = np.int64(slots[span]), nothing()
-                lanewise = add_where(lanewise, weight, np.int64(lanes[span]))
+                    current, lanewise = np.int64(labels.slots[span]), nothing()
+                lanewise = add_where(lanewise, weight, np.int64(labels.lanes[span]))
         if current >= 0:
             sums[(e - first) * label_count + current] += sum_row(lanewise)
-        reached[e] = hit
+        reached[e - first] = hit
         if not live:
             return

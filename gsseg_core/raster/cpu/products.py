@@ -8,10 +8,12 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
+from gsseg_core.csr_rows import CSRRows
+from gsseg_core.raster.constants import AHEAD
 from gsseg_core.raster.cpu.blending import (
-    AHEAD,
     aim_next,
     blend_tile,
+    corner_of,
     in_block,
     in_tile,
     open_rays,
@@ -19,7 +21,7 @@ from gsseg_core.raster.cpu.blending import (
     tile_of_turn,
 )
 from gsseg_core.raster.cpu.splat import OPEN, WIDTH, blend_block
-from gsseg_core.raster.cpu.tiling import TILE
+from gsseg_core.raster.cpu.tiling import TILE, Tiles
 from gsseg_core.simd import FAST, add_scaled, dot, first_bit, load_row, prefetch, store_row
 
 FEW = 4
@@ -27,96 +29,59 @@ FEW = 4
 
 
 @nb.njit(inline="always")
-def _scratch(entries: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    # Sized for the worst case; pages that no record reaches are never touched.
-    return (
-        np.empty((TILE, TILE), np.float32),
-        np.empty((TILE * entries, TILE), np.float32),
-        np.empty(TILE * entries, np.uint8),
-        np.empty(entries, np.int32),
-    )
-
-
-@nb.njit(inline="always")
 def _put(
-    tile: int,
-    columns: int,
-    values: np.ndarray,  # (16, K, 16) by block
-    rays: np.ndarray,  # (16, 16) by block
-    out: np.ndarray,  # (H, W, K) out
-    left_over: np.ndarray,  # (H, W) out
-) -> None:
+    tiles: Tiles, tile: int, values: np.ndarray, rays: np.ndarray,  # (16, K, 16), (16, 16) by block
+    out: np.ndarray, left_over: np.ndarray,  # (H, W, K), (H, W) out
+) -> None:  # fmt: skip
     """Write a tile into the image."""
-    height, width, channels = out.shape
-    left, top = (tile % columns) * TILE, (tile // columns) * TILE
-    for r in range(min(TILE, height - top)):
-        for c in range(min(TILE, width - left)):
+    left, top = corner_of(tiles, tile)
+    for r in range(min(TILE, tiles.height - top)):
+        for c in range(min(TILE, tiles.width - left)):
             b, lane = in_block(r, c)
             left_over[top + r, left + c] = rays[b, lane]
-            for k in range(channels):
+            for k in range(out.shape[2]):
                 out[top + r, left + c, k] = values[b, k, lane]
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def render(
-    columns: int,
-    table: np.ndarray,  # (M, 8)
-    start: np.ndarray,  # (T + 1,)
-    entries: np.ndarray,  # (E,)
-    rows_of: np.ndarray,  # (M + 1,) codes, as `CSRRows`
-    classes: np.ndarray,  # (Z,) uint32
-    codes: np.ndarray,  # (Z,) float32
-    out: np.ndarray,  # (H, W, K) float32 out
-    left_over: np.ndarray,  # (H, W) float32 out: final transmittance
-) -> None:
-    """Blend codes into the image, W q."""
-    height, width, channels = out.shape
-    rows = (start.shape[0] - 1) // columns
-    stride = stride_of(rows)
-    for turn in nb.prange(rows * columns):
-        tile = tile_of_turn(turn, columns, rows, stride)
-        first, last = start[tile], start[tile + 1]
-        rays, weights, blocks, ends = _scratch(last - first)
-        used = blend_tile(tile, columns, width, height, table, entries, first, last, rays, weights, blocks, ends)
-        values = np.zeros((TILE, channels, TILE), np.float32)
+def render(tiles: Tiles, codes: CSRRows, channels: int) -> tuple[np.ndarray, np.ndarray]:
+    """Blend codes of the M projected Gaussians, float32: W q, (H, W, K) float32, and final transmittance, (H, W)."""
+    out, left_over = _blank(tiles, channels)
+    stride = stride_of(tiles.rows)
+    for turn in nb.prange(tiles.rows * tiles.columns):
+        tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
+        records, values = blend_tile(tiles, tile), np.zeros((TILE, channels, TILE), np.float32)
         n = 0
-        for e in range(used):
-            g = entries[first + e]
-            for i in range(n, ends[e]):
-                weight, begin = load_row(weights, i), np.int64(blocks[i]) * channels
-                for z in range(rows_of[g], rows_of[g + 1]):
-                    k = begin + np.int64(classes[z])
-                    store_row(values, k, add_scaled(load_row(values, k), weight, codes[z]))
-            n = ends[e]
-        _put(tile, columns, values, rays, out, left_over)
+        for e in range(len(records.ends)):
+            g = tiles.entries[tiles.start[tile] + e]
+            for i in range(n, records.ends[e]):
+                weight, begin = load_row(records.weights, i), np.int64(records.blocks[i]) * channels
+                for z in range(codes.indptr[g], codes.indptr[g + 1]):
+                    k = begin + np.int64(codes.indices[z])
+                    store_row(values, k, add_scaled(load_row(values, k), weight, codes.data[z]))
+            n = records.ends[e]
+        _put(tiles, tile, values, records.rays, out, left_over)
+    return out, left_over
 
 
 @nb.njit(parallel=True, nogil=True, cache=True, fastmath={"contract"}, error_model="numpy")
-def render_few(
-    columns: int,
-    table: np.ndarray,  # (M, 8)
-    start: np.ndarray,  # (T + 1,)
-    entries: np.ndarray,  # (E,)
-    codes: np.ndarray,  # (M, K) float32
-    out: np.ndarray,  # (H, W, K) float32 out
-    left_over: np.ndarray,  # (H, W) float32 out: final transmittance
-) -> None:
-    """Do what `render` does for a few channels that hardly have zeros: weights are used where they are made."""
-    height, width, channels = out.shape
-    rows = (start.shape[0] - 1) // columns
-    stride = stride_of(rows)
-    for turn in nb.prange(rows * columns):
-        tile = tile_of_turn(turn, columns, rows, stride)
-        first, last = start[tile], start[tile + 1]
+def render_few(tiles: Tiles, codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Do what `render` does for codes (M, K) float32 with few zeros, K small: weights are used where they are made."""
+    channels = codes.shape[1]
+    out, left_over = _blank(tiles, channels)
+    stride = stride_of(tiles.rows)
+    for turn in nb.prange(tiles.rows * tiles.columns):
+        tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
+        last = tiles.start[tile + 1]
         rays, lines = np.empty((TILE, TILE), np.float32), np.empty((2, 2, TILE), np.float32)
         values = np.zeros((TILE, channels, TILE), np.float32)
-        left, top, live = open_rays(tile, columns, width, height, rays)
-        ahead = aim_next(table, entries, first - 1, last, left, top, lines)
-        for e in range(first, last):
-            g = entries[e]
-            prefetch(codes, entries[min(e + AHEAD, last - 1)])
-            reached, own, wide = ahead & live, lines[e % 2], table[g, WIDTH]
-            ahead = aim_next(table, entries, e, last, left, top, lines)
+        left, top, live = open_rays(tiles, tile, rays)
+        ahead = aim_next(tiles, tiles.start[tile] - 1, last, left, top, lines)
+        for e in range(tiles.start[tile], last):
+            g = tiles.entries[e]
+            prefetch(codes, tiles.entries[min(e + AHEAD, last - 1)])
+            reached, own, wide = ahead & live, lines[e % 2], tiles.table[g, WIDTH]
+            ahead = aim_next(tiles, e, last, left, top, lines)
             while reached:
                 b = first_bit(reached)
                 reached &= reached - 1
@@ -127,92 +92,67 @@ def render_few(
                     live &= ~(1 << b)
             if not live:
                 break
-        _put(tile, columns, values, rays, out, left_over)
+        _put(tiles, tile, values, rays, out, left_over)
+    return out, left_over
+
+
+@nb.njit(inline="always")
+def _blank(tiles: Tiles, channels: int) -> tuple[np.ndarray, np.ndarray]:
+    size = tiles.height, tiles.width
+    return np.empty((*size, channels), np.float32), np.empty(size, np.float32)
 
 
 @nb.njit(parallel=True, nogil=True, cache=True, fastmath=FAST)
-def adjoint_entries(
-    columns: int,
-    table: np.ndarray,  # (M, 8)
-    start: np.ndarray,  # (T + 1,)
-    entries: np.ndarray,  # (E,)
-    residual: np.ndarray,  # (H, W, C) float32, C <= CHANNELS
-    sums: np.ndarray,  # (E, C) float32 out
-) -> None:
-    """Sum weight times residual over the pixels of each entry: the part of W^T r that one tile adds to a Gaussian."""
-    height, width, channels = residual.shape
-    rows = (start.shape[0] - 1) // columns
-    stride = stride_of(rows)
-    for turn in nb.prange(rows * columns):
-        tile = tile_of_turn(turn, columns, rows, stride)
-        first, last = start[tile], start[tile + 1]
-        rays, weights, blocks, ends = _scratch(last - first)
-        used = blend_tile(tile, columns, width, height, table, entries, first, last, rays, weights, blocks, ends)
-        left, top = (tile % columns) * TILE, (tile // columns) * TILE
+def adjoint(tiles: Tiles, residual: np.ndarray) -> np.ndarray:
+    """Carry values of pixels, (H, W, C) float32 with C <= CHANNELS, back to the Gaussians: W^T r, (M, C) float32."""
+    channels = residual.shape[2]
+    sums, out = np.empty((len(tiles.entries), channels), np.float32), np.zeros((len(tiles.table), channels), np.float32)
+    stride = stride_of(tiles.rows)
+    for turn in nb.prange(tiles.rows * tiles.columns):
+        tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
+        first, records, (left, top) = tiles.start[tile], blend_tile(tiles, tile), corner_of(tiles, tile)
         values = np.zeros((TILE, channels, TILE), np.float32)
-        for r in range(min(TILE, height - top)):
-            for c in range(min(TILE, width - left)):
+        for r in range(min(TILE, tiles.height - top)):
+            for c in range(min(TILE, tiles.width - left)):
                 b, lane = in_block(r, c)
                 for k in range(channels):
                     values[b, k, lane] = residual[top + r, left + c, k]
-        sums[first:last] = 0.0
+        sums[first : tiles.start[tile + 1]] = 0.0
         n = 0
-        for e in range(used):
-            for i in range(n, ends[e]):
+        for e in range(len(records.ends)):
+            for i in range(n, records.ends[e]):
                 for k in range(channels):
-                    sums[first + e, k] += dot(values, blocks[i] * channels + k, weights, i)
-            n = ends[e]
-
-
-@nb.njit(parallel=True, nogil=True, cache=True)
-def reduce_entries(
-    gaussian_start: np.ndarray,  # (M + 1,)
-    gaussian_entries: np.ndarray,  # (E,)
-    sums: np.ndarray,  # (E, C)
-    out: np.ndarray,  # (M, C) float32 out
-) -> None:
-    """Add up each Gaussian's entries, in tile order."""
-    for g in nb.prange(out.shape[0]):
-        out[g] = 0.0
-        for i in range(gaussian_start[g], gaussian_start[g + 1]):
-            e = gaussian_entries[i]
-            for k in range(out.shape[1]):
-                out[g, k] += sums[e, k]
+                    sums[first + e, k] += dot(values, records.blocks[i] * channels + k, records.weights, i)
+            n = records.ends[e]
+    for g in nb.prange(len(out)):  # each Gaussian's entries are added up in tile order
+        for i in range(tiles.gaussian_start[g], tiles.gaussian_start[g + 1]):
+            for k in range(channels):
+                out[g, k] += sums[tiles.gaussian_entries[i], k]
+    return out
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def list_weights(
-    columns: int,
-    width: int,
-    height: int,
-    table: np.ndarray,  # (M, 8)
-    start: np.ndarray,  # (T + 1,)
-    entries: np.ndarray,  # (E,)
-    wanted: np.ndarray,  # (U,) tiles
+    tiles: Tiles, wanted: np.ndarray,  # (U,) tiles
     place: np.ndarray,  # (U + 1,) int64: where each tile's part begins; with empty lists, counts out (in place[1:])
-    pixels: np.ndarray,  # (P,) int32 out
-    rows_of: np.ndarray,  # (P,) int32 out: row of the table
+    pixels: np.ndarray, rows: np.ndarray,  # (P,) int32 out: pixel; row of the table
     values: np.ndarray,  # (P,) float32 out
-) -> None:
+) -> None:  # fmt: skip
     """Count the non-zero weights of each tile, or write them where a first call's counts say."""
     for i in nb.prange(wanted.shape[0]):
-        tile = wanted[i]
-        first, last = start[tile], start[tile + 1]
-        rays, weights, blocks, ends = _scratch(last - first)
-        used = blend_tile(tile, columns, width, height, table, entries, first, last, rays, weights, blocks, ends)
-        left, top = (tile % columns) * TILE, (tile // columns) * TILE
-        position = place[i] if values.shape[0] else 0
+        tile, position = wanted[i], place[i] if len(values) else 0
+        records, (left, top) = blend_tile(tiles, tile), corner_of(tiles, tile)
         n = 0
-        for e in range(used):
-            for record in range(n, ends[e]):
+        for e in range(len(records.ends)):
+            for record in range(n, records.ends[e]):
                 for lane in range(TILE):
-                    if weights[record, lane] > 0:
-                        if values.shape[0]:
-                            r, c = in_tile(blocks[record], lane)
-                            pixels[position] = (top + r) * width + left + c
-                            rows_of[position] = entries[first + e]
-                            values[position] = weights[record, lane]
+                    if records.weights[record, lane] > 0:
+                        if len(values):
+                            r, c = in_tile(records.blocks[record], lane)
+                            pixels[position] = (top + r) * tiles.width + left + c
+                            rows[position] = tiles.entries[tiles.start[tile] + e]
+                            values[position] = records.weights[record, lane]
                         position += 1
-            n = ends[e]
-        if not values.shape[0]:
+            n = records.ends[e]
+        if not len(values):
             place[i + 1] = position

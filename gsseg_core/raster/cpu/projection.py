@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
@@ -48,9 +49,6 @@ NUMBERS = 20
 AHEAD = 32
 """How many rows ahead memory is asked for."""
 
-SHORT = 32
-"""Gaussians at one depth, at most, that are sorted by insertion."""
-
 
 @dataclass(frozen=True)
 class Projected:
@@ -70,6 +68,38 @@ class Projected:
     table: np.ndarray
 
 
+class _Lens(NamedTuple):
+    """A camera as the kernels take it."""
+
+    viewmat: np.ndarray  # (4, 4) world to camera
+    K: np.ndarray  # (3, 3)
+    width: float  # px
+    height: float
+    x_low: float  # between these x / z and these y / z the camera is linearised
+    x_high: float
+    y_low: float
+    y_high: float
+
+    @classmethod
+    def of(cls, camera: Camera) -> _Lens:
+        width, height = float(camera.width), float(camera.height)
+        fx, fy, cx, cy = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+        across, down = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
+        return cls(
+            camera.world_to_camera, camera.K, width, height,
+            -cx / fx - across, (width - cx) / fx + across, -cy / fy - down, (height - cy) / fy + down,
+        )  # fmt: skip
+
+
+class _Splats(NamedTuple):
+    """Gaussians as the kernels take them."""
+
+    means: np.ndarray  # (N, 3)
+    quats: np.ndarray  # (N, 4) w, x, y, z
+    scales: np.ndarray  # (N, 3)
+    log_opacities: np.ndarray  # (N,)
+
+
 def project(scene: GaussianScene, camera: Camera) -> Projected:
     """Project a scene and sort what is visible by depth.
 
@@ -77,15 +107,12 @@ def project(scene: GaussianScene, camera: Camera) -> Projected:
     those that are alike in all of it.
     """
     table, depth, ids = _scratch(len(scene))
-    found = np.zeros(CHUNKS, np.int64)
-    _project(
-        scene.means, scene.quats, scene.scales, scene.log_opacities, camera.world_to_camera, camera.K,
-        float(camera.width), float(camera.height), table, depth, ids, found,
-    )  # fmt: skip
+    splats = _Splats(scene.means, scene.quats, scene.scales, scene.log_opacities)
+    found = _project(splats, _Lens.of(camera), table, depth, ids)
     begins = np.arange(CHUNKS) * len(scene) // CHUNKS
     rows = np.concatenate([np.arange(first, first + count) for first, count in zip(begins, found, strict=True)])
     order, depth = sort_by_depth(depth[rows])
-    _break_ties(order, rows, depth, table)
+    _break_ties(order, rows, np.flatnonzero(depth[1:] == depth[:-1]), table)
     return Projected(*_gather(rows, order, ids, table))
 
 
@@ -101,55 +128,34 @@ def _scratch(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return kept
 
 
-def _break_ties(
-    order: np.ndarray,  # (M,) of `rows`, sorted by depth; changed in place
-    rows: np.ndarray,  # (M,) of the table
-    depth: np.ndarray,  # (M,) sorted
-    table: np.ndarray,  # (N, 8)
-) -> None:
-    tied = np.flatnonzero(depth[1:] == depth[:-1])
-    left = _break_short_ties(order, rows, tied, table)
-    if len(left):
-        group = rows[order[left]]
-        keys = (*table[group].T[::-1], depth[left])
-        order[left] = order[left][np.lexsort(keys)]
-
-
 @nb.njit(nogil=True, cache=True)
-def _break_short_ties(
-    order: np.ndarray,  # (M,)
-    rows: np.ndarray,  # (M,)
-    tied: np.ndarray,  # (Z,) places whose depth is that of the next place, ascending
-    table: np.ndarray,  # (N, 8)
-) -> np.ndarray:
-    """Sort runs of equal depth by their rows of the table; returns the places of those too long for it."""
-    left, n = np.empty(2 * tied.shape[0], np.int64), 0
+def _break_ties(
+    order: np.ndarray, rows: np.ndarray,  # (M,) of the next, sorted by depth, changed in place; (M,) of the table
+    tied: np.ndarray, table: np.ndarray,  # (Z,) places whose depth is that of the next place, ascending; (N, 8)
+) -> None:  # fmt: skip
+    """Sort runs of equal depth by their rows of the table, and then by place: insertion sorts of ever closer ones."""
     t = 0
     while t < tied.shape[0]:
         first = last = tied[t]
         while t < tied.shape[0] and tied[t] == last:
             t, last = t + 1, last + 1
-        last += 1
-        if last - first > SHORT:
-            for m in range(first, last):
-                left[n] = m
-                n += 1
-        else:
-            for m in range(first + 1, last):
-                moving, free = order[m], m
-                while free > first and _is_before(table[rows[moving]], table[rows[order[free - 1]]]):
-                    order[free] = order[free - 1]
-                    free -= 1
-                order[free] = moving
-    return left[:n].copy()
+        run, step = order[first : last + 1], last + 1 - first
+        while step > 1:
+            step = max(step * 5 // 11, 1)
+            for m in range(step, run.shape[0]):
+                moving, free = run[m], m
+                while free >= step and _is_before(table, rows, moving, run[free - step]):
+                    run[free] = run[free - step]
+                    free -= step
+                run[free] = moving
 
 
 @nb.njit
-def _is_before(one: np.ndarray, other: np.ndarray) -> bool:
-    for j in range(one.shape[0]):
-        if one[j] != other[j]:
-            return bool(one[j] < other[j])
-    return False
+def _is_before(table: np.ndarray, rows: np.ndarray, one: int, other: int) -> bool:
+    for column in range(table.shape[1]):
+        if table[rows[one], column] != table[rows[other], column]:
+            return bool(table[rows[one], column] < table[rows[other], column])
+    return bool(one < other)
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
@@ -168,71 +174,47 @@ def _gather(rows: np.ndarray, order: np.ndarray, ids: np.ndarray, table: np.ndar
 
 @nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def _project(
-    means: np.ndarray,  # (N, 3)
-    quats: np.ndarray,  # (N, 4) w, x, y, z
-    scales: np.ndarray,  # (N, 3)
-    log_opacities: np.ndarray,  # (N,)
-    viewmat: np.ndarray,  # (4, 4)
-    K: np.ndarray,  # (3, 3)
-    width: float,
-    height: float,
-    table: np.ndarray,  # (N, 8) out, at the beginning of each chunk's part
-    depth: np.ndarray,  # (N,) out, the same
-    ids: np.ndarray,  # (N,) out, the same
-    found: np.ndarray,  # (CHUNKS,) out: how many
-) -> None:
-    limits = _limits(K, width, height)
+    splats: _Splats, lens: _Lens,
+    table: np.ndarray, depth: np.ndarray, ids: np.ndarray,  # (N, 8), (N,), (N,) out, where each chunk's part begins
+) -> np.ndarray:  # fmt: skip
+    """Project what is visible; returns how many Gaussians of each chunk that are, (CHUNKS,)."""
+    count, found = splats.means.shape[0], np.zeros(CHUNKS, np.int64)
     for chunk in nb.prange(CHUNKS):
-        first, last = chunk * means.shape[0] // CHUNKS, (chunk + 1) * means.shape[0] // CHUNKS
+        first, last = chunk * count // CHUNKS, (chunk + 1) * count // CHUNKS
         near, shown, who = np.empty(BATCH, np.bool_), np.empty(BATCH, np.bool_), np.empty(BATCH, np.int64)
         lanes = np.empty(NUMBERS * BATCH, np.float64)
         n = first
         for begin in range(first, last, BATCH):
             end = min(begin + BATCH, last)
-            _find_near(
-                means[begin:end], scales[begin:end], log_opacities[begin:end], viewmat, K, width, height, limits, near
-            )
-            count = _collect(begin, near[: end - begin], means, quats, scales, log_opacities, who, lanes)
-            _project_near(count, lanes, shown, viewmat, K, width, height, limits)
-            n = _keep_shown(count, who, lanes, shown, n, table, depth, ids)
+            _find_near(splats.means[begin:end], splats.scales[begin:end], splats.log_opacities[begin:end], lens, near)
+            close = _collect(begin, near[: end - begin], splats, who, lanes)
+            _project_near(close, lanes, shown, lens)
+            for j in range(close):  # without a branch: what is not shown is overwritten
+                for column in range(8):
+                    table[n, column] = lanes[(OUT + column) * BATCH + j]
+                depth[n], ids[n] = lanes[DEPTH * BATCH + j], who[j]
+                n += shown[j]
         found[chunk] = n - first
-
-
-@nb.njit
-def _limits(
-    K: np.ndarray,  # (3, 3)
-    width: float,
-    height: float,
-) -> tuple[float, float, float, float]:
-    """Between which x / z and y / z the camera is linearised."""
-    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
-    return -cx / fx - margin_x, (width - cx) / fx + margin_x, -cy / fy - margin_y, (height - cy) / fy + margin_y
+    return found
 
 
 @nb.njit(error_model="numpy", fastmath={"contract", "nnan", "ninf", "nsz"})
 def _find_near(
-    means: np.ndarray,  # (B, 3)
-    scales: np.ndarray,  # (B, 3)
-    log_opacities: np.ndarray,  # (B,)
-    viewmat: np.ndarray,  # (4, 4)
-    K: np.ndarray,  # (3, 3)
-    width: float,
-    height: float,
-    limits: tuple[float, float, float, float],
-    near: np.ndarray,  # (BATCH,) bool out
-) -> None:
+    means: np.ndarray, scales: np.ndarray, log_opacities: np.ndarray,  # (B, 3), (B, 3), (B,)
+    lens: _Lens, near: np.ndarray,  # (BATCH,) bool out
+) -> None:  # fmt: skip
     """Throw out most of what is off the image before the costly part, by instructions for several Gaussians at once.
 
     The reach is bounded by the longest axis and opacity 1, with sqrt(a^2 + b^2) <= |a| + |b|, twice, and with the
     outermost ray at which the camera is linearised. All is multiplied by depth, so nothing is divided.
     """
-    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    r00, r01, r02, tx = viewmat[0, 0], viewmat[0, 1], viewmat[0, 2], viewmat[0, 3]
-    r10, r11, r12, ty = viewmat[1, 0], viewmat[1, 1], viewmat[1, 2], viewmat[1, 3]
-    r20, r21, r22, tz = viewmat[2, 0], viewmat[2, 1], viewmat[2, 2], viewmat[2, 3]
-    x_low, x_high, y_low, y_high = limits
-    across, down = fx * (1.0 + max(abs(x_low), abs(x_high))), fy * (1.0 + max(abs(y_low), abs(y_high)))
+    pose, fx, fy, cx, cy = lens.viewmat, lens.K[0, 0], lens.K[1, 1], lens.K[0, 2], lens.K[1, 2]
+    r00, r01, r02, tx = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
+    r10, r11, r12, ty = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
+    r20, r21, r22, tz = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
+    width, height = lens.width, lens.height
+    across = fx * (1.0 + max(abs(lens.x_low), abs(lens.x_high)))
+    down = fy * (1.0 + max(abs(lens.y_low), abs(lens.y_high)))
     for i in range(means.shape[0]):
         mx, my, mz = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
         z = r20 * mx + r21 * my + r22 * mz + tz
@@ -247,15 +229,9 @@ def _find_near(
 
 @nb.njit
 def _collect(
-    begin: int,
-    near: np.ndarray,  # (B,) bool: which of the Gaussians from `begin` on
-    means: np.ndarray,  # (N, 3)
-    quats: np.ndarray,  # (N, 4)
-    scales: np.ndarray,  # (N, 3)
-    log_opacities: np.ndarray,  # (N,)
-    who: np.ndarray,  # (BATCH,) int64 out: which they are
-    lanes: np.ndarray,  # (NUMBERS * BATCH,) out: what is known of them, number after number
-) -> int:
+    begin: int, near: np.ndarray, splats: _Splats,  # (B,) bool: which of the Gaussians from `begin` on
+    who: np.ndarray, lanes: np.ndarray,  # (BATCH,) int64 out; (NUMBERS * BATCH,) out, number after number
+) -> int:  # fmt: skip
     """Put those that may be visible side by side, for instructions on several of them; returns how many there are."""
     n = 0
     for j in range(near.shape[0]):
@@ -264,11 +240,11 @@ def _collect(
     for j in range(n):
         i = who[j]
         for axis in range(3):
-            lanes[(MEAN + axis) * BATCH + j] = means[i, axis]
-            lanes[(SCALES + axis) * BATCH + j] = scales[i, axis]
+            lanes[(MEAN + axis) * BATCH + j] = splats.means[i, axis]
+            lanes[(SCALES + axis) * BATCH + j] = splats.scales[i, axis]
         for part in range(4):
-            lanes[(QUAT + part) * BATCH + j] = quats[i, part]
-        lanes[OPACITY * BATCH + j] = log_opacities[i]
+            lanes[(QUAT + part) * BATCH + j] = splats.quats[i, part]
+        lanes[OPACITY * BATCH + j] = splats.log_opacities[i]
     return n
 
 
@@ -276,30 +252,24 @@ def _collect(
 def _project_near(
     count: int,
     lanes: np.ndarray,  # (NUMBERS * BATCH,) in: what `_collect` put there; out: what the table holds, and depth
-    shown: np.ndarray,  # (BATCH,) bool out
-    viewmat: np.ndarray,  # (4, 4)
-    K: np.ndarray,  # (3, 3)
-    width: float,
-    height: float,
-    limits: tuple[float, float, float, float],
-) -> None:
+    shown: np.ndarray, lens: _Lens,  # (BATCH,) bool out
+) -> None:  # fmt: skip
     """Project those that may be visible.
 
     Divisions and roots cost more than all else here, so each is done once. Nothing may be contracted: the last of a
     batch are projected one by one, and must come out as the others do.
     """
-    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    v00, v01, v02, tx = viewmat[0, 0], viewmat[0, 1], viewmat[0, 2], viewmat[0, 3]
-    v10, v11, v12, ty = viewmat[1, 0], viewmat[1, 1], viewmat[1, 2], viewmat[1, 3]
-    v20, v21, v22, tz = viewmat[2, 0], viewmat[2, 1], viewmat[2, 2], viewmat[2, 3]
-    x_low, x_high, y_low, y_high = limits
+    pose, fx, fy, cx, cy = lens.viewmat, lens.K[0, 0], lens.K[1, 1], lens.K[0, 2], lens.K[1, 2]
+    v00, v01, v02, tx = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
+    v10, v11, v12, ty = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
+    v20, v21, v22, tz = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
     for j in range(count):
         mx, my, mz = lanes[MEAN * BATCH + j], lanes[(MEAN + 1) * BATCH + j], lanes[(MEAN + 2) * BATCH + j]
         z = v20 * mx + v21 * my + v22 * mz + tz
         inverse = 1.0 / z
         x, y = (v00 * mx + v01 * my + v02 * mz + tx) * inverse, (v10 * mx + v11 * my + v12 * mz + ty) * inverse
         u, v = fx * x + cx, fy * y + cy
-        xc, yc = min(max(x, x_low), x_high), min(max(y, y_low), y_high)
+        xc, yc = min(max(x, lens.x_low), lens.x_high), min(max(y, lens.y_low), lens.y_high)
         cut = max((lanes[OPACITY * BATCH + j] - LOG_ALPHA_MIN) * (1.0 / HALF_LOG2E), 0.0)
         # Rows of J R_view, with J the Jacobian of the pinhole projection.
         ax, ay, az = fx * inverse * (v00 - xc * v20), fx * inverse * (v01 - xc * v21), fx * inverse * (v02 - xc * v22)
@@ -310,22 +280,15 @@ def _project_near(
         r00, r01, r02 = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy - qw * qz), 2 * (qx * qz + qw * qy)
         r10, r11, r12 = 2 * (qx * qy + qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz - qw * qx)
         r20, r21, r22 = 2 * (qx * qz - qw * qy), 2 * (qy * qz + qw * qx), 1 - 2 * (qx * qx + qy * qy)
-        a0, a1, a2 = (
-            s0 * (ax * r00 + ay * r10 + az * r20),
-            s1 * (ax * r01 + ay * r11 + az * r21),
-            s2 * (ax * r02 + ay * r12 + az * r22),
-        )
-        b0, b1, b2 = (
-            s0 * (bx * r00 + by * r10 + bz * r20),
-            s1 * (bx * r01 + by * r11 + bz * r21),
-            s2 * (bx * r02 + by * r12 + bz * r22),
-        )
+        a0, b0 = s0 * (ax * r00 + ay * r10 + az * r20), s0 * (bx * r00 + by * r10 + bz * r20)
+        a1, b1 = s1 * (ax * r01 + ay * r11 + az * r21), s1 * (bx * r01 + by * r11 + bz * r21)
+        a2, b2 = s2 * (ax * r02 + ay * r12 + az * r22), s2 * (bx * r02 + by * r12 + bz * r22)
         sxx = a0 * a0 + a1 * a1 + a2 * a2 + DILATION
         sxy = a0 * b0 + a1 * b1 + a2 * b2
         syy = b0 * b0 + b1 * b1 + b2 * b2 + DILATION
         reach_x, reach_y = min(np.sqrt(cut * sxx), REACH_MAX), min(np.sqrt(cut * syy), REACH_MAX)
-        across = (u + reach_x >= 0.5) & (u - reach_x <= width - 0.5)
-        shown[j] = across & (v + reach_y >= 0.5) & (v - reach_y <= height - 0.5)
+        across = (u + reach_x >= 0.5) & (u - reach_x <= lens.width - 0.5)
+        shown[j] = across & (v + reach_y >= 0.5) & (v - reach_y <= lens.height - 0.5)
         inverse_syy = 1.0 / syy
         lanes[(OUT + U) * BATCH + j] = u
         lanes[(OUT + V) * BATCH + j] = v
@@ -337,23 +300,3 @@ def _project_near(
         lanes[(OUT + Y_REACH) * BATCH + j] = reach_y
         lanes[(OUT + X_TURN) * BATCH + j] = min(max(sxy * (reach_x / sxx), -REACH_MAX), REACH_MAX)
         lanes[DEPTH * BATCH + j] = z
-
-
-@nb.njit
-def _keep_shown(
-    count: int,
-    who: np.ndarray,  # (BATCH,)
-    lanes: np.ndarray,  # (NUMBERS * BATCH,)
-    shown: np.ndarray,  # (BATCH,) bool
-    n: int,
-    table: np.ndarray,  # (N, 8) out, from row n on
-    depth: np.ndarray,  # (N,) out, the same
-    ids: np.ndarray,  # (N,) out, the same
-) -> int:
-    """Write down those that are visible; returns the row after the last one."""
-    for j in range(count):
-        for column in range(8):
-            table[n, column] = lanes[(OUT + column) * BATCH + j]
-        depth[n], ids[n] = lanes[DEPTH * BATCH + j], who[j]
-        n += shown[j]
-    return n

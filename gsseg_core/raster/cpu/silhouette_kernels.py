@@ -5,9 +5,9 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from gsseg_core.raster.cpu.blending import in_block, open_rays, stride_of, tile_of_turn
+from gsseg_core.raster.cpu.blending import corner_of, in_block, open_rays, stride_of, tile_of_turn
 from gsseg_core.raster.cpu.splat import WIDTH, aim, blend_block
-from gsseg_core.raster.cpu.tiling import TILE
+from gsseg_core.raster.cpu.tiling import TILE, Tiles
 from gsseg_core.simd import first_bit, store_row
 
 _ROUNDING = np.float32(1e-3)  # of 1 - T, below which a pixel is as good as empty
@@ -15,26 +15,16 @@ _ROUNDING = np.float32(1e-3)  # of 1 - T, below which a pixel is as good as empt
 
 @nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nnan", "nsz"})
 def silhouette_terms(
-    columns: int,
-    table: np.ndarray,  # (M, 8)
-    start: np.ndarray,  # (T + 1,)
-    entries: np.ndarray,  # (E,)
-    labels: np.ndarray,  # (M,) int32; those above 0 are objects
-    num_labels: int,
-    kept: np.ndarray,  # (M,)
-    asked: np.ndarray,  # (M,) bool
-    depths: np.ndarray,  # (M,)
-    shown: np.ndarray,  # (H, W)
-    hidden_from: np.ndarray,  # (H, W)
-    stay: np.ndarray,  # (E,) out
-    go: np.ndarray,  # (E,) out
-) -> None:
+    tiles: Tiles, labels: np.ndarray, num_labels: int,  # (M,) int32; those above 0 are objects
+    kept: np.ndarray, asked: np.ndarray, depths: np.ndarray,  # (M,), (M,) bool, (M,)
+    shown: np.ndarray, hidden_from: np.ndarray,  # (H, W), (H, W)
+    stay: np.ndarray, go: np.ndarray,  # (E,) out, each
+) -> None:  # fmt: skip
     """Sum by entry the reasons of its Gaussian to stay with its object, and to go; see `SilhouetteTerms`."""
-    height, width = shown.shape
-    rows = (start.shape[0] - 1) // columns
-    stride = stride_of(rows)
-    for turn in nb.prange(rows * columns):
-        tile = tile_of_turn(turn, columns, rows, stride)
+    table, start, entries = tiles.table, tiles.start, tiles.entries
+    stride = stride_of(tiles.rows)
+    for turn in nb.prange(tiles.rows * tiles.columns):
+        tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
         # Only labels of those who are asked matter here.
         slots, count = np.full(num_labels, -1, np.int64), 0
         for e in range(start[tile], start[tile + 1]):
@@ -45,8 +35,8 @@ def silhouette_terms(
         if not count:
             continue
         fresh, lines = np.empty((TILE, TILE), np.float32), np.empty((2, TILE), np.float32)
-        left, top, inside = open_rays(tile, columns, width, height, fresh)
-        limit = _cut(hidden_from, tile, columns)
+        left, top, inside = open_rays(tiles, tile, fresh)
+        limit = _cut(hidden_from, *corner_of(tiles, tile))
         through = np.ones((count, TILE, TILE), np.float32)  # T_k
         alpha = np.empty((1, TILE), np.float32)
         for e in range(start[tile], start[tile + 1]):
@@ -62,7 +52,8 @@ def silhouette_terms(
         need, excess = np.zeros_like(through), np.zeros_like(through)
         for label in range(1, num_labels):
             if slots[label] >= 0:
-                _weigh(shown, label, tile, columns, through[slots[label]], need[slots[label]], excess[slots[label]])
+                slot = slots[label]
+                _weigh(shown, label, *corner_of(tiles, tile), through[slot], need[slot], excess[slot])
         for e in range(start[tile], start[tile + 1]):
             g = entries[e]
             if asked[g]:
@@ -79,14 +70,9 @@ def silhouette_terms(
 
 
 @nb.njit
-def _cut(
-    image: np.ndarray,  # (H, W)
-    tile: int,
-    columns: int,
-) -> np.ndarray:
-    """One tile of an image, by block, (16, 16) float32; 0 outside of it."""
+def _cut(image: np.ndarray, left: int, top: int) -> np.ndarray:
+    """One tile of an image (H, W), by block, (16, 16) float32; 0 outside of it."""
     out = np.zeros((TILE, TILE), np.float32)
-    left, top = (tile % columns) * TILE, (tile // columns) * TILE
     for r in range(min(TILE, image.shape[0] - top)):
         for c in range(min(TILE, image.shape[1] - left)):
             out[in_block(r, c)] = image[top + r, left + c]
@@ -95,12 +81,9 @@ def _cut(
 
 @nb.njit(inline="always")
 def _alphas(
-    lines: np.ndarray,  # (2, 16) from `aim`
-    b: int,
-    wide: float,
-    fresh: np.ndarray,  # (16, 16) scratch
-    alpha: np.ndarray,  # (1, 16) out
-) -> None:
+    lines: np.ndarray, b: int, wide: float,  # (2, 16) from `aim`
+    fresh: np.ndarray, alpha: np.ndarray,  # (16, 16) scratch, (1, 16) out
+) -> None:  # fmt: skip
     """Alpha of a Gaussian in block b: `blend_block` makes it of rays that nothing has met yet."""
     fresh[b, :] = 1
     weight, _ = blend_block(fresh, b, lines, wide)
@@ -109,15 +92,9 @@ def _alphas(
 
 @nb.njit(fastmath={"contract", "nnan", "nsz"}, error_model="numpy")
 def _weigh(
-    shown: np.ndarray,  # (H, W)
-    label: int,
-    tile: int,
-    columns: int,
-    through: np.ndarray,  # (16, 16) T_k
-    need: np.ndarray,  # (16, 16) out: T_k / (1 - T_k) where the label is shown
-    excess: np.ndarray,  # (16, 16) out: 1 where another one is
-) -> None:
-    left, top = (tile % columns) * TILE, (tile // columns) * TILE
+    shown: np.ndarray, label: int, left: int, top: int, through: np.ndarray,  # (H, W); (16, 16) T_k
+    need: np.ndarray, excess: np.ndarray,  # (16, 16) out: T_k / (1 - T_k) where the label is shown; 1 where another is
+) -> None:  # fmt: skip
     for r in range(min(TILE, shown.shape[0] - top)):
         for c in range(min(TILE, shown.shape[1] - left)):
             b, i = in_block(r, c)

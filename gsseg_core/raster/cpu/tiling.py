@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
 
+from gsseg_core.csr_rows import starts
 from gsseg_core.raster.constants import CHUNKS
 from gsseg_core.raster.cpu.projection import Projected
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
@@ -24,30 +25,21 @@ BATCH = 256
 """Gaussians that are looked at together."""
 
 
-@dataclass(frozen=True)
-class Tiles:
-    """The image cut into tiles, row by row, and the Gaussians of each.
+class Tiles(NamedTuple):
+    """A projected view cut into tiles, row by row, with the Gaussians of each.
 
     An *entry* is one Gaussian in one tile. Entries of a tile are contiguous and sorted by depth.
-
-    Attributes
-    ----------
-    columns, rows : int
-        Number of tiles across and down.
-    start : (columns * rows + 1,) int64
-        Entries of tile t are start[t] to start[t + 1].
-    entries : (E,) int32
-        Row of each entry's Gaussian in the table of projected Gaussians.
-    gaussian_start : (M + 1,) int64, gaussian_entries : (E,) int32
-        The same relation by Gaussian: its entries, in tile order.
     """
 
-    columns: int
+    width: int  # of the image, in px
+    height: int
+    columns: int  # of tiles
     rows: int
-    start: np.ndarray
-    entries: np.ndarray
-    gaussian_start: np.ndarray
-    gaussian_entries: np.ndarray
+    table: np.ndarray  # (M, 8) float32: projected Gaussians, as `Projected` has them
+    start: np.ndarray  # (columns * rows + 1,) int64: entries of tile t are start[t] to start[t + 1]
+    entries: np.ndarray  # (E,) int32: row of each entry's Gaussian in the table
+    gaussian_start: np.ndarray  # (M + 1,) int64: the same relation by Gaussian
+    gaussian_entries: np.ndarray  # (E,) int32: its entries, in tile order
 
 
 def assign(projected: Projected, width: int, height: int) -> Tiles:
@@ -63,29 +55,20 @@ def assign(projected: Projected, width: int, height: int) -> Tiles:
             break
         capacity = most
     np.cumsum(gaussian_start, out=gaussian_start)
-    start = np.concatenate([[0], np.cumsum(place.sum(axis=0))])
+    start = starts(place.sum(axis=0))
     # From counts to places: chunks follow each other within a tile, so that its entries stay sorted by depth.
-    place[1:] = np.cumsum(place[:-1], axis=0)
-    place[0] = 0
-    place += start[:-1]
+    place = np.cumsum(place, axis=0) - place + start[:-1]
     entries, gaussian_entries = np.empty(start[-1], np.int32), np.empty(start[-1], np.int32)
     _fill(touched, gaussian_start, place, entries, gaussian_entries)
-    return Tiles(columns, rows, start, entries, gaussian_start, gaussian_entries)
+    return Tiles(width, height, columns, rows, projected.table, start, entries, gaussian_start, gaussian_entries)
 
 
 @nb.njit(inline="always")
 def _touched(
-    u: np.float32,
-    v: np.float32,
-    shear: np.float32,
-    reach: np.float32,
-    turn: np.float32,
-    cut: np.float32,  # LOG_OPACITY less its least
-    height: np.float32,
-    narrowness: np.float32,  # 1 / WIDTH
-    row: np.float32,
-    columns: np.float32,
-) -> tuple[np.int32, np.int32]:
+    u: np.float32, v: np.float32, shear: np.float32, reach: np.float32, turn: np.float32,  # of the table
+    cut: np.float32, height: np.float32, narrowness: np.float32,  # LOG_OPACITY less its least; HEIGHT; 1 / WIDTH
+    row: np.float32, columns: np.float32,
+) -> tuple[np.int32, np.int32]:  # fmt: skip
     """First and last tile column (exclusive) that a Gaussian touches in one row of tiles; without a branch."""
     top = row * np.float32(TILE) + np.float32(0.5) - v
     bottom = row * np.float32(TILE) + np.float32(TILE - 0.5) - v
@@ -114,12 +97,10 @@ def _tile_after(px: np.float32, limit: np.float32) -> np.int32:
 
 @nb.njit(error_model="numpy")
 def _touch_two_rows(
-    table: np.ndarray,  # (at most BATCH, 8)
-    columns: int,
-    rows: int,
+    table: np.ndarray, columns: int, rows: int,  # (at most BATCH, 8)
     beside: np.ndarray,  # (8 * BATCH,) scratch: the table, column after column
     found: np.ndarray,  # (6 * BATCH,) int32 out: first and last row (exclusive); tiles in the first one, and the second
-) -> None:
+) -> None:  # fmt: skip
     """Most Gaussians touch one or two rows of tiles: tell those by instructions for several Gaussians at once."""
     across = np.float32(columns)
     for j in range(table.shape[0]):
@@ -145,13 +126,11 @@ def _touch_two_rows(
 
 @nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
 def _list(
-    table: np.ndarray,  # (M, 8)
-    columns: int,
-    rows: int,
+    table: np.ndarray, columns: int, rows: int,  # (M, 8)
     per_gaussian: np.ndarray,  # (M,) out: tiles that it touches
     per_tile: np.ndarray,  # (CHUNKS, T) out: Gaussians of each chunk that touch it
     touched: np.ndarray,  # (CHUNKS, R) int32 out: these tiles, Gaussian after Gaussian, as far as they fit
-) -> int:
+) -> int:  # fmt: skip
     """List which tiles Gaussians touch; returns the capacity that the chunk with most of them needs."""
     count, capacity = table.shape[0], touched.shape[1]
     needed = np.zeros(CHUNKS, np.int64)
@@ -188,13 +167,9 @@ def _list(
 
 @nb.njit(error_model="numpy")
 def _list_many(
-    splat: np.ndarray,  # (8,) a row of the table
-    low: int,  # row of tiles
-    high: int,  # exclusive
-    columns: int,
-    touched: np.ndarray,  # (R,) int32 out, from n on, as far as they fit
-    n: int,
-) -> int:
+    splat: np.ndarray, low: int, high: int, columns: int,  # (8,) a row of the table; rows of tiles, high excluded
+    touched: np.ndarray, n: int,  # (R,) int32 out, from n on, as far as they fit
+) -> int:  # fmt: skip
     """List the tiles of a Gaussian that may touch many; returns where the next one's begin."""
     cut, narrowness, across = splat[LOG_OPACITY] - _LEAST, np.float32(1) / splat[WIDTH], np.float32(columns)
     for row in range(low, high):
@@ -211,12 +186,10 @@ def _list_many(
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def _fill(
-    touched: np.ndarray,  # (CHUNKS, R)
-    gaussian_start: np.ndarray,  # (M + 1,)
+    touched: np.ndarray, gaussian_start: np.ndarray,  # (CHUNKS, R), (M + 1,)
     place: np.ndarray,  # (CHUNKS, T) where each chunk's next entry of a tile goes
-    entries: np.ndarray,  # (E,) out
-    gaussian_entries: np.ndarray,  # (E,) out
-) -> None:
+    entries: np.ndarray, gaussian_entries: np.ndarray,  # (E,) out, each
+) -> None:  # fmt: skip
     count = gaussian_start.shape[0] - 1
     for chunk in nb.prange(CHUNKS):
         cursor, own = place[chunk], touched[chunk]
