@@ -16,24 +16,12 @@ from gsseg_core.learn.temperature import VIEWS, fit_temperature
 
 
 class Calibration(NamedTuple):
-    """A fitted temperature, and from what.
+    """A fitted temperature, and from what."""
 
-    Attributes
-    ----------
-    temperature : float
-        For `Segmentation.calibrated`.
-    views : int
-        Whose masks it was fitted to.
-    pixels : int
-        Of these.
-    held_out : bool
-        Whether the masks were predicted without learning from them.
-    """
-
-    temperature: float
-    views: int
-    pixels: int
-    held_out: bool
+    temperature: float  # for `Segmentation.calibrated`
+    views: int  # whose masks it was fitted to
+    pixels: int  # of these
+    held_out: bool  # whether the masks were predicted without learning from them
 
     def as_dict(self) -> dict[str, Any]:
         """Give it as `report.json` does."""
@@ -41,16 +29,9 @@ class Calibration(NamedTuple):
 
 
 def calibrate(learner: Learner, checker: MaskChecker | None = None, progress: Progress = silent) -> Calibration:
-    """Fit the temperature of a learner's codes.
+    """Fit the temperature of a learner's codes, after `fit`; nothing of it changes.
 
-    Parameters
-    ----------
-    learner : Learner
-        After `fit`. Nothing of it changes.
-    checker : MaskChecker, optional
-        Of this learner, if one is at hand: what it has rendered is not rendered again.
-    progress : callable, optional
-        Told of every view.
+    A checker of this learner may be at hand: what it has rendered is not rendered again.
     """
     views, checker, samples = spread(list(learner.views.values()), VIEWS), checker or MaskChecker(learner, progress), []
     for done, view in enumerate(views):

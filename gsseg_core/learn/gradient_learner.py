@@ -69,14 +69,9 @@ class GradientLearner(Learner):
     """
 
     def __init__(
-        self,
-        scene: GaussianScene,
-        num_classes: int,
-        settings: GradientSettings | None = None,
-        *,
-        device: str = "cpu",
-        memory_budget: int = MEMORY_BUDGET,
-    ) -> None:
+        self, scene: GaussianScene, num_classes: int, settings: GradientSettings | None = None, *,
+        device: str = "cpu", memory_budget: int = MEMORY_BUDGET,
+    ) -> None:  # fmt: skip
         super().__init__(scene, num_classes, device=device, memory_budget=memory_budget)
         self.settings = settings or GradientSettings()
 
@@ -122,11 +117,8 @@ class GradientLearner(Learner):
         return self
 
 
-def cross_entropy(
-    probabilities: torch.Tensor,  # (N, K)
-    observation: Observation,
-) -> torch.Tensor:
-    """CES of one view (eq. 3 and 4 of the paper), differentiable with respect to the probabilities."""
+def cross_entropy(probabilities: torch.Tensor, observation: Observation) -> torch.Tensor:
+    """CES of one view (eq. 3 and 4 of the paper), differentiable with respect to the probabilities (N, K)."""
     loss: torch.Tensor = _CrossEntropy.apply(probabilities, observation)  # type: ignore[no-untyped-call]
     return loss
 
@@ -143,10 +135,8 @@ class _CrossEntropy(torch.autograd.Function):
             likelihood, rest = codes[where], (observation.classes == 0).astype(np.float32)
         else:
             plausible = observation.evidence.plausibility(codes.shape[1])
-            likelihood, rest = (
-                (codes[observation.ids] @ plausible.T)[observation.rows, observation.labels],
-                plausible[:, 0],
-            )
+            likelihood = (codes[observation.ids] @ plausible.T)[observation.rows, observation.labels]
+            rest = plausible[:, 0]
         shares = observation.shares(likelihood, rest)
         ctx.gradient = -scale * shares.pairs
         return torch.tensor(-scale * shares.log_likelihood, dtype=probabilities.dtype)

@@ -37,6 +37,10 @@ NO_MASK, SEES_NOTHING, ALL_UNKNOWN = "no mask", "sees no Gaussian", "all pixels 
 Self = TypeVar("Self", bound="Learner")
 
 
+class UnusableViewError(Exception):
+    """A view that nothing can be learnt from; the message says why, in the words above."""
+
+
 class Learner(ABC):
     """Base class of what learns which class each Gaussian of a scene belongs to; `fit` sets what ends with "_".
 
@@ -114,10 +118,17 @@ class Learner(ABC):
         MaskFormatError, MaskSizeError, UnknownLabelError
             The mask is broken, of another size than the camera, or has labels beyond the classes.
         """
-        passing = self.memory_budget == 0 and view.name not in self.views
-        why = self._vote(view, 1) if passing else self._replace(view)
-        if why:
-            self.rejected[view.name] = why
+        try:
+            if self.memory_budget == 0 and view.name not in self.views:
+                self._vote(view, 1)
+            else:
+                observation = self._open(view)
+                if view.name in self.views:
+                    self.retract(view.name)
+                observation.vote(self._votes, UNITS)
+                self._keep(view.name, observation)
+        except UnusableViewError as why:
+            self.rejected[view.name] = str(why)
             return False
         self.rejected.pop(view.name, None)
         self.views[view.name] = view
@@ -144,8 +155,7 @@ class Learner(ABC):
             self._prepared[name].vote(self._votes, UNITS, -1)
         else:
             self._vote(self.views[name], -1)
-        del self.views[name]
-        self._prepared.pop(name, None)
+        self.forget(name)
 
     def forget(self, name: str) -> None:
         """Drop a view and its mask; its votes stay. `fit` learns from the views that are left."""
@@ -249,67 +259,53 @@ class Learner(ABC):
         """Count the rejected views by reason."""
         return dict(Counter(self.rejected.values()))
 
-    def _replace(self, view: View) -> str:
-        """Prepare a view and add its votes, in place of those of its name; returns why not, or nothing."""
-        observation, why = self._open(view)
-        if observation is not None:
-            if view.name in self.views:
-                self.retract(view.name)
-            observation.vote(self._votes, UNITS)
-            self._keep(view.name, observation)
-        return why
+    def observation(self, name: str) -> Observation:
+        """Return a view with its mask, prepared; it is kept as far as the memory budget goes."""
+        if name not in self._prepared:
+            observation = self._prepare(self.views[name], self.views[name].read_seen())
+            self._keep(name, observation)
+            return observation
+        return self._prepared[name]
 
-    def _vote(self, view: View, sign: int) -> str:
-        """Add a view's votes, or take them away, and keep nothing of it; returns why not, or nothing."""
-        seen, why = self._read(view)
-        if seen is None:
-            return why
+    def _vote(self, view: View, sign: int) -> None:
+        """Add a view's votes, or take them away, and keep nothing of it."""
+        seen = self._read(view)
         operator = make_operator(self.scene, view.camera, self.device)
-        return "" if operator.vote(*self._used_labels(seen, operator), self._votes, UNITS, sign) else SEES_NOTHING
+        if not operator.vote(*self._used_labels(seen, operator), self._votes, UNITS, sign):
+            raise UnusableViewError(SEES_NOTHING)
 
-    def _open(self, view: View) -> tuple[Observation | None, str]:
-        seen, why = self._read(view)
-        if seen is None:
-            return None, why
-        observation = self._prepare(view, seen)
-        return (observation, "") if len(observation.ids) else (None, SEES_NOTHING)
+    def _open(self, view: View) -> Observation:
+        observation = self._prepare(view, self._read(view))
+        if not len(observation.ids):
+            raise UnusableViewError(SEES_NOTHING)
+        return observation
 
-    def _prepare(self, view: View, seen: SeenLabels) -> Observation:
-        operator = make_operator(self.scene, view.camera, self.device)
-        return operator.observe(*self._used_labels(seen, operator))
-
-    def _read(self, view: View) -> tuple[SeenLabels | None, str]:
+    def _read(self, view: View) -> SeenLabels:
         if not view.has_mask:
-            return None, NO_MASK
+            raise UnusableViewError(NO_MASK)
         seen = view.read_seen()
-        self._check_labels(view, seen)
-        return (seen, "") if (seen.labels >= 0).any() else (None, ALL_UNKNOWN)
-
-    def _used_labels(self, seen: SeenLabels, operator: ViewOperator) -> SeenLabels:
-        """Turn a mask into the labels that are learnt from; here, as they are."""
-        return seen
-
-    def _check_labels(self, view: View, seen: SeenLabels) -> None:
         largest = int(seen.labels.max()) if seen.evidence is None else seen.evidence.largest
         if largest >= self.num_classes:
             raise UnknownLabelError(
                 f"{view.mask_path or view.name}: mask holds the label {largest}; expected at most "
                 f"{self.num_classes - 1}, since there are {self.num_classes} classes"
             )
+        if not (seen.labels >= 0).any():
+            raise UnusableViewError(ALL_UNKNOWN)
+        return seen
+
+    def _prepare(self, view: View, seen: SeenLabels) -> Observation:
+        operator = make_operator(self.scene, view.camera, self.device)
+        return operator.observe(*self._used_labels(seen, operator))
+
+    def _used_labels(self, seen: SeenLabels, operator: ViewOperator) -> SeenLabels:
+        """Turn a mask into the labels that are learnt from; here, as they are."""
+        return seen
 
     def _keep(self, name: str, observation: Observation) -> None:
         used = sum(kept.nbytes for kept in self._prepared.values())
         if used + observation.nbytes <= self.memory_budget:
             self._prepared[name] = observation
-
-    def observation(self, name: str) -> Observation:
-        """Return a view with its mask, prepared; it is kept as far as the memory budget goes."""
-        if name not in self._prepared:
-            view = self.views[name]
-            observation = self._prepare(view, view.read_seen())
-            self._keep(name, observation)
-            return observation
-        return self._prepared[name]
 
     def _observations(self, names: Iterable[str] | None = None) -> Iterator[tuple[str, Observation]]:
         for name in self.views if names is None else names:

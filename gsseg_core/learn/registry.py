@@ -15,18 +15,10 @@ if TYPE_CHECKING:
 
 
 class Entry(NamedTuple):
-    """Where the classes of a learner are, as "module:class": they are imported when one is made.
+    """Where the classes of a learner are, as "module:class": they are imported when one is made."""
 
-    Attributes
-    ----------
-    learner : str
-        A subclass of `gsseg_core.learn.learner.Learner`.
-    distributed : str
-        The same on the workers of a Dask cluster, which it takes first; "" if it cannot be distributed.
-    """
-
-    learner: str
-    distributed: str = ""
+    learner: str  # a subclass of `gsseg_core.learn.learner.Learner`
+    distributed: str = ""  # the same on the workers of a Dask cluster, which it takes first; "" if it cannot be
 
 
 LEARNERS = {
@@ -59,33 +51,19 @@ def check_learner(name: str, scheduler: str | None = None) -> None:
 
 
 def make_learner(
-    name: str,
-    scene: GaussianScene,
-    num_classes: int,
-    *,
-    max_steps: int | None = None,
-    seed: int = 0,
-    client: Client | None = None,
-    **where: Any,
-) -> Learner:
-    """Make a learner by its name, with its default settings.
+    name: str, scene: GaussianScene, num_classes: int, *,
+    max_steps: int | None = None, seed: int = 0, client: Client | None = None, **where: Any,
+) -> Learner:  # fmt: skip
+    """Make one of `LEARNERS` by its name, with its default settings.
 
     Parameters
     ----------
-    name : str
-        One of `LEARNERS`.
-    scene : GaussianScene
-        N Gaussians.
-    num_classes : int
-        K, the background included.
-    max_steps : int, optional
-        Steps at most, for learners that take steps.
-    seed : int
-        For learners that draw at random.
+    scene, num_classes, where
+        As `gsseg_core.learn.learner.Learner` takes them; `where` is `device` and `memory_budget`.
+    max_steps, seed
+        As `Learner.default_settings` takes them.
     client : distributed.Client, optional
         Have the workers of this Dask cluster do it, if the learner can be distributed.
-    where
-        `device` and `memory_budget`, as of `gsseg_core.learn.learner.Learner`.
 
     Raises
     ------

@@ -44,26 +44,14 @@ _TINY = 1e-12
 
 
 def tempered(
-    shares: np.ndarray,  # (..., K)
-    temperature: float,
+    shares: np.ndarray,  # (..., K) float32, not negative; a row sums to at most 1, up to rounding
+    temperature: float,  # above 0
 ) -> np.ndarray:
-    """Raise shares to the power of 1 / temperature, and scale each row back to its sum.
+    """Raise shares to the power of 1 / temperature, and scale each row back to its sum: (..., K) float32.
 
     Below 1 the largest gains, above 1 the others do. The order in a row stays, zeros stay zeros. At 1 the very same
-    array is returned. Going to a temperature and then to its reciprocal leads back, up to rounding and to entries that
-    are too small for the type.
-
-    Parameters
-    ----------
-    shares : array (..., K) of float32
-        Not negative; a row sums to at most 1, up to rounding.
-    temperature : float
-        Above 0.
-
-    Returns
-    -------
-    ndarray (..., K) float32
-        None above 1, unless the temperature is 1.
+    array is returned; else no entry is above 1. Going to a temperature and then to its reciprocal leads back, up to
+    rounding and to entries that are too small for the type.
     """
     if temperature == 1:
         return shares
@@ -79,25 +67,17 @@ def tempered(
 
 
 class Sample(NamedTuple):
-    """Pixels of one view: predicted probabilities, and labels of its mask.
+    """Pixels of one view: predicted probabilities, and labels of its mask."""
 
-    Attributes
-    ----------
-    shares : (P, C) float32
-        What is predicted of the C classes that occur in the prediction or in the mask; rows sum to 1.
-    seen : (P,) int64
-        Label of each pixel, as its column in `shares`, ascending.
+    shares: np.ndarray  # (P, C) float32: of the C classes that occur in the prediction or the mask; rows sum to 1
+    seen: np.ndarray  # (P,) int64: label of each pixel, as its column in `shares`, ascending
+
+
+def sample_pixels(image: np.ndarray, labels: np.ndarray) -> Sample:
+    """Take the pixels of a view that the temperature is fitted to: a grid, where label and prediction are known.
+
+    The image, (H, W, K), is blended of codes that have not seen the mask, (H, W) int32 and negative where unknown.
     """
-
-    shares: np.ndarray
-    seen: np.ndarray
-
-
-def sample_pixels(
-    image: np.ndarray,  # (H, W, K) blended codes that have not seen the mask
-    labels: np.ndarray,  # (H, W) int32, negative = unknown
-) -> Sample:
-    """Take the pixels of a view that the temperature is fitted to: a grid, where label and prediction are known."""
     height, width = labels.shape
     step = max(1, int(np.ceil(np.sqrt(height * width / PIXELS))))
     while -(-height // step) * -(-width // step) > PIXELS:

@@ -44,21 +44,26 @@ def connected(address: str) -> Iterator[Client]:
             f"scheduler {address}: needs Dask, which is not installed; expected: pip install 'gsseg[distributed]'"
         ) from error
     _check_scheduler(address)
-    # What it would tell is raised as an error anyway.
-    log = logging.getLogger("distributed.client")
+    with _silenced("distributed.client"):
+        try:
+            client = Client(address, timeout=PATIENCE, set_as_default=False)
+        except UNREACHABLE as error:
+            raise _no_scheduler(address, "does not answer any more") from error
+        with client:
+            _check_version(f"scheduler {address}", client.run_on_scheduler(_probe()))
+            check_workers(client, find_workers(client))
+            yield client
+
+
+@contextmanager
+def _silenced(logger: str) -> Iterator[None]:
+    """Keep what is raised as an error anyway out of Dask's log."""
+    log = logging.getLogger(logger)
     level = log.level
-    log.setLevel(logging.CRITICAL)
+    log.setLevel(logging.CRITICAL + 1)
     try:
-        client = Client(address, timeout=PATIENCE, set_as_default=False)
-    except UNREACHABLE as error:
-        log.setLevel(level)
-        raise _no_scheduler(address, "does not answer any more") from error
-    try:
-        _check_version(f"scheduler {address}", client.run_on_scheduler(_probe()))
-        check_workers(client, find_workers(client))
-        yield client
+        yield
     finally:
-        client.close()
         log.setLevel(level)
 
 
@@ -80,15 +85,10 @@ def _check_scheduler(address: str) -> None:
             answers.append(error)
 
     # In a thread, since there may be a loop in this one; and Ctrl-C need not wait for it.
-    log = logging.getLogger("distributed.core")
-    level = log.level
-    log.setLevel(logging.CRITICAL + 1)
-    try:
+    with _silenced("distributed.core"):
         thread = threading.Thread(target=wait, daemon=True)
         thread.start()
         thread.join(PATIENCE + 1)
-    finally:
-        log.setLevel(level)
     answer = answers[0] if answers else TimeoutError()
     if isinstance(answer, UNREACHABLE):
         raise _no_scheduler(address, f"does not answer within {PATIENCE:g} s") from answer

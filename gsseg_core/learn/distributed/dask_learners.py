@@ -21,22 +21,9 @@ import numpy as np
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, SchedulerError
+from gsseg_core.learn.distributed import dask_worker
 from gsseg_core.learn.distributed.dask_cluster import PATIENCE, UNREACHABLE, check_workers, find_workers, name_of
-from gsseg_core.learn.distributed.dask_worker import (
-    NotHereError,
-    Part,
-    add,
-    digest_of,
-    geometry,
-    hand_on,
-    load,
-    prepare,
-    refit_models,
-    start_models,
-    sum_gradients,
-    sum_rejected,
-    sum_votes,
-)
+from gsseg_core.learn.distributed.dask_worker import NotHereError, Part, digest_of
 from gsseg_core.learn.em.confusion_model import ErrorModel
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner import Learner, Progress, silent
@@ -50,6 +37,9 @@ ATTEMPTS = 5
 """How often a sum is begun anew where Dask cannot make good by itself what was lost."""
 
 _POLL = 0.01  # s
+
+Tell = Callable[[int], None]
+"""Called with how many views are done, time and again."""
 
 
 class _LostError(Exception):
@@ -82,7 +72,7 @@ class _OnWorkers(Learner):
         """Add views and their votes; after an error in one of them nothing has changed."""
         named = {view.name: view for view in views}
         if named:
-            votes, why = self._sum(sum_votes, named, lambda done: progress("observe", done, len(named)))
+            votes, why = self._sum(dask_worker.sum_votes, named, lambda done: progress("observe", done, len(named)))
             for name, view in named.items():
                 if why[name]:
                     self.rejected[name] = why[name]
@@ -95,14 +85,10 @@ class _OnWorkers(Learner):
         progress("observe", len(named), len(named))
 
     def _sum(
-        self,
-        task: Callable[..., Part],
-        views: Mapping[str, View],
-        tell: Callable[[int], None],
-        by_view: Mapping[str, Any] | None = None,
-        *values: Any,
-    ) -> Part:
-        """Sum up what a task makes of these views; `tell` is called with how many of them are done, time and again.
+        self, task: Callable[..., Part], views: Mapping[str, View], tell: Tell,
+        by_view: Mapping[str, Any] | None = None, *values: Any,
+    ) -> Part:  # fmt: skip
+        """Sum up what a task makes of these views.
 
         Raises
         ------
@@ -124,14 +110,9 @@ class _OnWorkers(Learner):
         raise SchedulerError(f"{name_of(self._client)}: lost results {ATTEMPTS} times; expected workers that stay")
 
     def _try_to_sum(
-        self,
-        used: list[Future],
-        task: Callable[..., Part],
-        views: Mapping[str, View],
-        tell: Callable[[int], None],
-        by_view: Mapping[str, Any],
-        values: Sequence[Any],
-    ) -> Part:
+        self, used: list[Future], task: Callable[..., Part], views: Mapping[str, View], tell: Tell,
+        by_view: Mapping[str, Any], values: Sequence[Any],
+    ) -> Part:  # fmt: skip
         shares = self._deal(views, tell)
         copies = [self._send(value, [share.worker for share in shares]) for value in values]
         used += [future for copy in copies for future in copy.values()]
@@ -143,7 +124,9 @@ class _OnWorkers(Learner):
         sums = parts
         while len(sums) > 1:  # What is between leaves and root lives only as long as it is needed there.
             pairs = zip(sums[::2], sums[1::2], strict=False)
-            sums = [self._client.submit(add, *pair, pure=False) for pair in pairs] + sums[len(sums) // 2 * 2 :]
+            sums = [self._client.submit(dask_worker.add, *pair, pure=False) for pair in pairs] + sums[
+                len(sums) // 2 * 2 :
+            ]
         used += sums
         sizes = {part.key: len(share.views) for part, share in zip(parts, shares, strict=True)}
         self._wait(used, lambda: tell(sum(sizes[part.key] for part in parts if part.done())))
@@ -152,7 +135,7 @@ class _OnWorkers(Learner):
         total: Part = self._client.gather(sums[0], direct=self._direct)
         return total
 
-    def _deal(self, views: Mapping[str, View], tell: Callable[[int], None]) -> list[_Share]:
+    def _deal(self, views: Mapping[str, View], tell: Tell) -> list[_Share]:
         """Have every worker prepare its share of the views, unless they have them."""
         held = {name: view for share in self._shares for name, view in share.views.items()}
         workers = find_workers(self._client)
@@ -160,7 +143,8 @@ class _OnWorkers(Learner):
             return self._shares
         check_workers(self._client, workers.keys() - self._dealt[0].keys())
         self._place_scene(workers, tell)
-        settings = self.num_classes, getattr(self, "settings", None), self.device, self.memory_budget
+        where = {"device": self.device, "memory_budget": self.memory_budget}
+        settings = self.num_classes, getattr(self, "settings", None), where
         names, threads = list(views), np.cumsum([0, *workers.values()])
         cuts = np.rint(threads * len(names) / threads[-1]).astype(int)
         self._shares, self._dealt = [], (workers, self.num_classes)
@@ -168,22 +152,22 @@ class _OnWorkers(Learner):
             if first < last:
                 part = {name: views[name] for name in names[first:last]}
                 sent = [_by_path(view) if self._by_path else _packed(view) for view in part.values()]
-                shard = self._submit(worker, prepare, self._scenes[worker], sent, *settings)
+                shard = self._submit(worker, dask_worker.prepare, self._scenes[worker], sent, *settings)
                 self._shares.append(_Share(worker, shard, part))
         return self._shares
 
-    def _place_scene(self, workers: Mapping[str, int], tell: Callable[[int], None]) -> None:
+    def _place_scene(self, workers: Mapping[str, int], tell: Tell) -> None:
         """See to it that each worker has the scene: from a file of its own if that is the same one, else from here."""
         self._scenes = {w: f for w, f in self._scenes.items() if w in workers and f.status == "finished"}
         absent = [worker for worker in workers if worker not in self._scenes]
         if self.scene.path is not None and absent:
             path = str(self.scene.path.resolve())
-            tried = {worker: self._submit(worker, load, path, self.scene.digest) for worker in absent}
+            tried = {worker: self._submit(worker, dask_worker.load, path, self.scene.digest) for worker in absent}
             self._wait(tried.values(), lambda: tell(0))
             self._scenes |= {worker: future for worker, future in tried.items() if future.status == "finished"}
             absent = [worker for worker in absent if worker not in self._scenes]
         if absent:
-            self._scenes |= self._send(geometry(self.scene), absent)
+            self._scenes |= self._send(dask_worker.geometry(self.scene), absent)
 
     def _submit(self, worker: str, task: Callable[..., Any], *inputs: Any) -> Future:
         """Run a task on this worker, or elsewhere should it be lost."""
@@ -208,7 +192,7 @@ class _OnWorkers(Learner):
             raise _LostError from error
         # Dask's own broadcast may wait for ever for a worker that has gone.
         for i, worker in enumerate(workers[1:]):
-            copies.append(self._submit(worker, hand_on, copies[i // 2]))
+            copies.append(self._submit(worker, dask_worker.hand_on, copies[i // 2]))
         return dict(zip(workers, copies, strict=True))
 
     def _check(self, future: Future) -> None:
@@ -252,41 +236,33 @@ class DistributedEM(_OnWorkers, EMLearner):
     checks_masks = False  # which would prepare all views here
 
     def _reject_regions(
-        self,
-        votes: CSRRows,  # int64
-        tick: Callable[[], None],
-        names: Iterable[str] | None = None,
+        self, votes: CSRRows, tick: Callable[[], None], names: Iterable[str] | None = None
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        return self._sum(sum_rejected, self.views, lambda done: tick(), None, votes)
+        return self._step(dask_worker.reject_regions, tick, None, votes)
 
     def _initial_error_models(
-        self,
-        votes: CSRRows,  # int64
-        rejected: Mapping[str, np.ndarray],  # (L,) bool
-        tick: Callable[[], None],
+        self, votes: CSRRows, rejected: Mapping[str, np.ndarray], tick: Callable[[], None],
         names: Iterable[str] | None = None,
-    ) -> dict[str, ErrorModel]:
-        models = self._sum(start_models, self.views, lambda done: tick(), rejected, votes)[1]
+    ) -> dict[str, ErrorModel]:  # fmt: skip
+        models = self._step(dask_worker.initial_error_models, tick, rejected, votes)[1]
         return {name: models[name] for name in self.views}
 
     def _e_step(
-        self,
-        codes: CSRRows,
-        models: dict[str, ErrorModel],
-        tick: Callable[[], None],
+        self, codes: CSRRows, models: dict[str, ErrorModel], tick: Callable[[], None]
     ) -> tuple[np.ndarray, dict[str, float]]:
-        return self._sum(sum_gradients, self.views, lambda done: tick(), models, codes)
+        return self._step(dask_worker.e_step, tick, models, codes)
 
     def _refit_error_models(
-        self,
-        codes: CSRRows,
-        gradient: np.ndarray,  # (Z,) int64
-        prior: np.ndarray,  # (Z,) px
-        models: dict[str, ErrorModel],
+        self, codes: CSRRows, gradient: np.ndarray, prior: np.ndarray, models: dict[str, ErrorModel],
         tick: Callable[[], None],
-    ) -> dict[str, ErrorModel]:
-        models.update(self._sum(refit_models, self.views, lambda done: tick(), models, codes, gradient, prior)[1])
+    ) -> dict[str, ErrorModel]:  # fmt: skip
+        models.update(self._step(dask_worker.refit_error_models, tick, models, codes, gradient, prior)[1])
         return models
+
+    def _step(
+        self, task: Callable[..., Part], tick: Callable[[], None], by_view: Mapping[str, Any] | None, *values: Any
+    ) -> Part:
+        return self._sum(task, self.views, lambda done: tick(), by_view, *values)
 
 
 def _by_path(view: View) -> tuple[View, str | None]:

@@ -24,7 +24,7 @@ from gsseg_core.errors import GssegError
 from gsseg_core.files.input_files import open_input
 from gsseg_core.learn.em.confusion_model import ErrorModel
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
-from gsseg_core.learn.learner import UNITS
+from gsseg_core.learn.learner import UNITS, UnusableViewError
 from gsseg_core.scene.gaussian_scene import DC, GaussianScene
 
 Part = tuple[Any, dict[str, Any]]
@@ -78,26 +78,24 @@ def digest_of(path: Path) -> str | None:
 
 
 def prepare(
-    scene: GaussianScene,
-    views: Sequence[tuple[View, str | None]],
-    num_classes: int,
-    settings: EMSettings | None,
-    device: str,
-    memory_budget: int,
-) -> Shard:
-    """Prepare views; `NotHereError` where a mask's file is not the one with the digest beside the view."""
-    shard = Shard(scene, num_classes, settings or ONLY_VOTES, device=device, memory_budget=memory_budget)
+    scene: GaussianScene, views: Sequence[tuple[View, str | None]], num_classes: int, settings: EMSettings | None,
+    where: dict[str, Any],
+) -> Shard:  # fmt: skip
+    """Prepare views; `NotHereError` where a mask's file is not the one with the digest beside the view.
+
+    The settings are those of votes if there are none; `where` is the learner's device and memory budget.
+    """
+    shard = Shard(scene, num_classes, settings or ONLY_VOTES, **where)
     shard._votes = shard._votes[:0].copy()
     with _all_threads():
         for view, digest in views:
             if digest is not None and view.mask_path is not None and digest_of(view.mask_path) != digest:
                 raise NotHereError(str(view.mask_path))
-            observation, why = shard._open(view)
-            if observation is None:
-                shard.rejected[view.name] = why
-            else:
+            try:
+                shard._keep(view.name, shard._open(view))
                 shard.views[view.name] = view
-                shard._keep(view.name, observation)
+            except UnusableViewError as why:
+                shard.rejected[view.name] = str(why)
     return shard
 
 
@@ -110,44 +108,28 @@ def sum_votes(shard: Shard, wanted: dict[str, Any]) -> Part:
     return votes, {name: shard.rejected.get(name, "") for name in wanted}
 
 
-def sum_rejected(
-    shard: Shard,
-    wanted: dict[str, Any],
-    votes: CSRRows,  # int64
-) -> Part:
+def reject_regions(shard: Shard, wanted: dict[str, None], votes: CSRRows) -> Part:
     """Sum the votes of rejected regions; beside them, which labels of each view these are."""
     with _all_threads():
         return shard._reject_regions(_as_compiled_for(votes), _go_on, wanted)
 
 
-def start_models(
-    shard: Shard,
-    rejected: dict[str, np.ndarray | None],
-    votes: CSRRows,  # int64
-) -> Part:
+def initial_error_models(shard: Shard, rejected: dict[str, np.ndarray | None], votes: CSRRows) -> Part:
     """Estimate the first error model of each view."""
+    known = {name: labels for name, labels in rejected.items() if labels is not None}
     with _all_threads():
-        known = {name: labels for name, labels in rejected.items() if labels is not None}
         return None, shard._initial_error_models(_as_compiled_for(votes), known, _go_on, rejected)
 
 
-def sum_gradients(
-    shard: Shard,
-    models: dict[str, ErrorModel],
-    codes: CSRRows,
-) -> Part:
+def e_step(shard: Shard, models: dict[str, ErrorModel], codes: CSRRows) -> Part:
     """Sum the gradient of the log-likelihood; beside it, each view's log-likelihood."""
     with _all_threads():
         return shard._e_step(_as_compiled_for(codes), models, _go_on)
 
 
-def refit_models(
-    shard: Shard,
-    models: dict[str, ErrorModel],
-    codes: CSRRows,
-    gradient: np.ndarray,  # (Z,) int64
-    prior: np.ndarray,  # (Z,)
-) -> Part:
+def refit_error_models(
+    shard: Shard, models: dict[str, ErrorModel], codes: CSRRows, gradient: np.ndarray, prior: np.ndarray  # (Z,), (Z,)
+) -> Part:  # fmt: skip
     """Re-estimate the views' error models."""
     with _all_threads():
         return None, shard._refit_error_models(_as_compiled_for(codes), gradient, prior, deepcopy(models), _go_on)

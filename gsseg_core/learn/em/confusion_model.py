@@ -43,14 +43,9 @@ class ErrorModel:
 
     @classmethod
     def from_counts(
-        cls,
-        evidence: LabelEvidence,
-        counts: np.ndarray,  # (K, L) px of each class under each label
-        prior: float,
-        outliers: float,
-        num_pixels: int,
+        cls, evidence: LabelEvidence, counts: np.ndarray, prior: float, outliers: float, num_pixels: int
     ) -> ErrorModel:
-        """Estimate a model from counts of predicted classes under each label."""
+        """Estimate a model from counts of predicted classes under each label, (K, L) px."""
         if evidence.word_plausibility is not None:
             shares = evidence.word_plausibility[evidence.informative]
             counts = counts[:, evidence.informative] @ (shares / shares.sum(axis=1, keepdims=True))
@@ -81,21 +76,18 @@ class ErrorModel:
         likelihood = np.ascontiguousarray(self.likelihood.T)
         return likelihood, np.where(self.evidence.informative[:, None], likelihood, np.float32(0))
 
-    def expected_counts(
-        self,
-        counts: np.ndarray,  # (K, L) px of each class under each label, divided by the label's likelihood
-    ) -> np.ndarray:
-        """Return the expected number of pixels (K, W) with each true class and each word seen."""
+    def expected_counts(self, counts: np.ndarray) -> np.ndarray:
+        """Return the expected number of pixels (K, W) with each true class and each word seen.
+
+        The counts are px of each class under each label, (K, L), divided by the label's likelihood.
+        """
         if self.evidence.word_plausibility is not None:
             counts = counts[:, self.evidence.informative] @ self.evidence.word_plausibility[self.evidence.informative]
         expected: np.ndarray = counts * (1 - self.outliers) * self.confusion
         return expected
 
-    def m_step(
-        self,
-        counts: np.ndarray,  # (K, W) expected px
-    ) -> None:
-        """Set the confusion matrix to its maximiser for expected counts; rows without any count stay."""
+    def m_step(self, counts: np.ndarray) -> None:
+        """Set the confusion matrix to its maximiser for expected counts, (K, W) px; rows without any count stay."""
         counts = counts.astype(np.float64)
         counts[self.evidence.correct_words(len(counts))] += self.pseudo_counts
         total = counts.sum(axis=1, keepdims=True)

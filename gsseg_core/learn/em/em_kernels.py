@@ -45,15 +45,10 @@ def rounded_to_units(_: Any, __: Any) -> Any:
 
 @nb.njit(parallel=True, nogil=True, cache=True, fastmath={"contract", "reassoc"})
 def pair_likelihood(
-    indptr: np.ndarray,  # (N + 1,) codes, as `CSRRows` with the next two
-    classes: np.ndarray,  # (Z,) uint32
-    codes: np.ndarray,  # (Z,) float32
-    order: np.ndarray,  # (M,) int32: in which to go through the Gaussians
-    ids: np.ndarray,  # (M,) int32
-    start: np.ndarray,  # (M + 1,)
-    labels: np.ndarray,  # (P,) int32
-    likelihood: np.ndarray,  # (L, K) float32
-) -> np.ndarray:
+    indptr: np.ndarray, classes: np.ndarray, codes: np.ndarray,  # (N + 1,), (Z,) uint32, (Z,) float32, as `CSRRows`
+    order: np.ndarray, ids: np.ndarray,  # (M,) int32: in which to go through the Gaussians; (M,) int32
+    start: np.ndarray, labels: np.ndarray, likelihood: np.ndarray,  # (M + 1,), (P,) int32, (L, K) float32
+) -> np.ndarray:  # fmt: skip
     """Likelihood of the label of each (Gaussian, label) pair, codes[i] . likelihood[y]: (P,) float32."""
     out = np.empty(labels.shape[0], np.float32)
     for i in nb.prange(order.shape[0]):
@@ -70,16 +65,12 @@ def pair_likelihood(
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def accumulate(
-    indptr: np.ndarray,  # (N + 1,) gradient, as `CSRRows` with the next two
-    classes: np.ndarray,  # (Z,)
+    indptr: np.ndarray, classes: np.ndarray,  # (N + 1,), (Z,), with the next as `CSRRows`
     gradient: np.ndarray,  # (Z,) int64, in units of GRADIENT_UNIT, added to
-    order: np.ndarray,  # (M,) int32: in which to go through the Gaussians
-    ids: np.ndarray,  # (M,) int32, distinct
-    start: np.ndarray,  # (M + 1,)
-    labels: np.ndarray,  # (P,) int32
-    likelihood: np.ndarray,  # (L, K) float32
-    shares: np.ndarray,  # (P,) float32
-) -> None:
+    order: np.ndarray, ids: np.ndarray,  # (M,) int32: in which to go through the Gaussians; (M,) int32, distinct
+    start: np.ndarray, labels: np.ndarray,  # (M + 1,), (P,) int32
+    likelihood: np.ndarray, shares: np.ndarray,  # (L, K) float32, (P,) float32
+) -> None:  # fmt: skip
     """Add one view's term to the gradient: sum over a Gaussian's pairs of share times likelihood of the label."""
     for i in nb.prange(order.shape[0]):
         m = order[i]
@@ -93,11 +84,9 @@ def accumulate(
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def m_step(
-    indptr: np.ndarray,  # (N + 1,) the next three, as `CSRRows`
-    codes: np.ndarray,  # (Z,) float32, changed in place
-    gradient: np.ndarray,  # (Z,) int64, in units of GRADIENT_UNIT
-    prior: np.ndarray,  # (Z,) float32, px
-) -> None:
+    indptr: np.ndarray, codes: np.ndarray,  # (N + 1,), (Z,) float32, changed in place
+    gradient: np.ndarray, prior: np.ndarray,  # (Z,) int64, in units of GRADIENT_UNIT; (Z,) float32, px
+) -> None:  # fmt: skip
     """M-step: set the codes to normalise(codes * gradient + prior), in place; rows of zeros stay zero."""
     for i in nb.prange(indptr.shape[0] - 1):
         total = np.float32(0.0)
@@ -111,11 +100,9 @@ def m_step(
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def predicted_gain(
-    indptr: np.ndarray,  # (N + 1,) the next three, as `CSRRows`
-    codes: np.ndarray,  # (Z,) float32
-    gradient: np.ndarray,  # (Z,) int64, in units of GRADIENT_UNIT
-    prior: np.ndarray,  # (Z,) float32, px
-) -> float:
+    indptr: np.ndarray, codes: np.ndarray,  # (N + 1,), (Z,) float32
+    gradient: np.ndarray, prior: np.ndarray,  # (Z,) int64, in units of GRADIENT_UNIT; (Z,) float32, px
+) -> float:  # fmt: skip
     """Slope of J along the step that `m_step` takes, in nats, at least 0: an upper bound of what it gains.
 
     With p = codes * gradient + prior, the gradient of J is p / codes, and the step leads to p / sum(p).
@@ -136,21 +123,14 @@ def predicted_gain(
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def m_step_without_view(
-    indptr: np.ndarray,  # (N + 1,) the next four, as `CSRRows`
-    classes: np.ndarray,  # (Z,)
-    codes: np.ndarray,  # (Z,) float32
-    gradient: np.ndarray,  # (Z,) int64, in units of GRADIENT_UNIT
-    prior: np.ndarray,  # (Z,) float32, px
-    order: np.ndarray,  # (M,) int32: in which to go through the Gaussians
-    ids: np.ndarray,  # (M,) int32
-    start: np.ndarray,  # (M + 1,)
-    labels: np.ndarray,  # (P,) int32
-    likelihood: np.ndarray,  # (L, K) float32
-    shares: np.ndarray,  # (P,) float32
-    out_indptr: np.ndarray,  # (M + 1,) the result, as `CSRRows` with the next two, in that order
-    out_classes: np.ndarray,  # (Z',) out
+    indptr: np.ndarray, classes: np.ndarray, codes: np.ndarray,  # (N + 1,), (Z,), (Z,) float32, as `CSRRows`
+    gradient: np.ndarray, prior: np.ndarray,  # (Z,) int64, in units of GRADIENT_UNIT; (Z,) float32, px
+    order: np.ndarray, ids: np.ndarray,  # (M,) int32: in which to go through the Gaussians; (M,) int32
+    start: np.ndarray, labels: np.ndarray,  # (M + 1,), (P,) int32
+    likelihood: np.ndarray, shares: np.ndarray,  # (L, K) float32, (P,) float32
+    out_indptr: np.ndarray, out_classes: np.ndarray,  # (M + 1,); (Z',) out; with the next as `CSRRows`, in that order
     out: np.ndarray,  # (Z',) float32 out
-) -> None:
+) -> None:  # fmt: skip
     """M-step of the Gaussians that a view sees, with the gradient less what `accumulate` added for this view."""
     for i in nb.prange(order.shape[0]):
         m = order[i]
@@ -170,16 +150,11 @@ def m_step_without_view(
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def confusion_counts(
-    indptr: np.ndarray,  # (M + 1,) codes, as `CSRRows` with the next two
-    classes: np.ndarray,  # (Z,)
-    codes: np.ndarray,  # (Z,) float32
-    order: np.ndarray,  # (M,) int32: whose rows these are
-    start: np.ndarray,  # (M + 1,)
-    labels: np.ndarray,  # (P,) int32
-    shares: np.ndarray,  # (P,) float32
-    num_classes: int,
-    num_labels: int,
-) -> np.ndarray:
+    indptr: np.ndarray, classes: np.ndarray, codes: np.ndarray,  # (M + 1,), (Z,), (Z,) float32, as `CSRRows`
+    order: np.ndarray, start: np.ndarray,  # (M,) int32: whose rows these are; (M + 1,)
+    labels: np.ndarray, shares: np.ndarray,  # (P,) int32, (P,) float32
+    num_classes: int, num_labels: int,
+) -> np.ndarray:  # fmt: skip
     """Sum over the pairs of codes[i] times share, by class and label, (K, L) float64."""
     parts = np.zeros((BLOCKS, num_classes, num_labels))
     for block in nb.prange(BLOCKS):
@@ -195,10 +170,9 @@ def confusion_counts(
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def normalise_votes(
-    votes: np.ndarray,  # (N, K) int64
-    possible: np.ndarray,  # (K,) bool: ids that are classes
+    votes: np.ndarray, possible: np.ndarray,  # (N, K) int64; (K,) bool: ids that are classes
     codes: np.ndarray,  # (N, K) float32 out
-) -> int:
+) -> int:  # fmt: skip
     """Divide the votes for classes by their sum; rows of zeros stay zero.
 
     Votes below 0 are against a class. Where there are only such, the one class without any is certain; where several
@@ -224,15 +198,11 @@ def normalise_votes(
 
 @nb.njit(nogil=True, cache=True)
 def subtract_row(
-    classes: np.ndarray,  # (n,) of one Gaussian
-    total: np.ndarray,  # (n,) int64, taken from
+    classes: np.ndarray, total: np.ndarray,  # (n,) of one Gaussian; (n,) int64, taken from
     labels: np.ndarray,  # (s,) label of each of its pairs
-    vote_indptr: np.ndarray,  # (L + 1,) votes of a pixel of each label, as `CSRRows` with the next two
-    vote_classes: np.ndarray,
-    vote: np.ndarray,  # float64
-    votes: np.ndarray,  # (s,) float32
-    units: float,  # per vote; a power of 2
-) -> None:
+    vote_indptr: np.ndarray, vote_classes: np.ndarray, vote: np.ndarray,  # votes of a pixel of each label: L `CSRRows`
+    votes: np.ndarray, units: float,  # (s,) float32; per vote, a power of 2
+) -> None:  # fmt: skip
     """Subtract one view's votes for one Gaussian, rounded as when they were added."""
     for s in range(labels.shape[0]):
         for j in range(vote_indptr[labels[s]], vote_indptr[labels[s] + 1]):
@@ -243,19 +213,12 @@ def subtract_row(
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def subtract_votes(
-    first: np.ndarray,  # (M,) where the row of each Gaussian begins
-    last: np.ndarray,  # (M,) one past its end
-    classes: np.ndarray,  # (Z,)
-    total: np.ndarray,  # (Z,) int64, taken from
-    order: np.ndarray,  # (M,) int32: whose rows these are
-    start: np.ndarray,  # (M + 1,)
-    labels: np.ndarray,  # (P,) int32: label of each pair
-    vote_indptr: np.ndarray,  # (L + 1,) votes of a pixel of each label, as `CSRRows` with the next two
-    vote_classes: np.ndarray,
-    vote: np.ndarray,  # float64
-    votes: np.ndarray,  # (P,) float32
-    units: float,  # per vote; a power of 2
-) -> None:
+    first: np.ndarray, last: np.ndarray,  # (M,) where the row of each Gaussian begins; (M,) one past its end
+    classes: np.ndarray, total: np.ndarray,  # (Z,), (Z,) int64, taken from
+    order: np.ndarray, start: np.ndarray, labels: np.ndarray,  # (M,) int32: whose rows these are; (M + 1,), (P,) int32
+    vote_indptr: np.ndarray, vote_classes: np.ndarray, vote: np.ndarray,  # as in `subtract_row`
+    votes: np.ndarray, units: float,  # (P,) float32; per vote, a power of 2
+) -> None:  # fmt: skip
     """Subtract one view's votes from those of all, row by row."""
     for i in nb.prange(order.shape[0]):
         row, seen = slice(first[i], last[i]), slice(start[order[i]], start[order[i] + 1])

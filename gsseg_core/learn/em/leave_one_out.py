@@ -13,29 +13,17 @@ from gsseg_core.raster.observation import Observation
 
 
 def leave_one_out_counts(
-    votes: CSRRows,  # int64, of all views
+    votes: CSRRows,  # int64, of all views, this one among them
     observation: Observation,
     possible: np.ndarray,  # (K,) bool: ids that are classes
-    evidence: LabelEvidence,
+    evidence: LabelEvidence,  # which the view has voted with
     power: float = 1.0,
     most: float = np.inf,
 ) -> np.ndarray:
     """Count the pixels (K, L) of each class under each label of a view by the votes of all other views.
 
-    Parameters
-    ----------
-    votes : CSRRows
-        Of all views, this one among them.
-    observation : Observation
-        The view.
-    possible : (K,) bool
-        Ids that are classes.
-    evidence : LabelEvidence
-        Of the view, which it has voted with.
-    power : float
-        Probabilities are raised to it and normalised before they are counted: above 1, majorities stand out.
-    most : float
-        A Gaussian counts at most this many times the pixels that the other views saw of it.
+    Probabilities are raised to a power, and normalised, before they are counted: above 1, majorities stand out. A
+    Gaussian counts at most `most` times the pixels that the other views saw of it.
     """
     return _count(
         *votes, observation.order, observation.ids, observation.start, observation.labels, observation.votes(),
@@ -58,23 +46,13 @@ def _raised(x: np.float32, power: float) -> np.float32:
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def _count(
-    indptr: np.ndarray,  # (N + 1,) votes of all views, as `CSRRows` with the next two
-    classes: np.ndarray,  # (Z,)
-    votes: np.ndarray,  # (Z,) int64
-    order: np.ndarray,  # (M,) in which to go through the Gaussians
-    ids: np.ndarray,  # (M,)
-    start: np.ndarray,  # (M + 1,)
-    labels: np.ndarray,  # (P,)
-    own: np.ndarray,  # (P,) float32, px
-    vote_indptr: np.ndarray,  # (L + 1,) votes of a pixel of each label, as `CSRRows` with the next two
-    vote_classes: np.ndarray,
-    vote: np.ndarray,  # float64
-    possible: np.ndarray,  # ids that are classes, ascending
-    power: float,
-    most: float,
-    num_classes: int,
-    num_labels: int,
-) -> np.ndarray:
+    indptr: np.ndarray, classes: np.ndarray, votes: np.ndarray,  # (N + 1,), (Z,), (Z,) int64: of all views, `CSRRows`
+    order: np.ndarray, ids: np.ndarray,  # (M,) in which to go through the Gaussians; (M,)
+    start: np.ndarray, labels: np.ndarray, own: np.ndarray,  # (M + 1,), (P,), (P,) float32, px
+    vote_indptr: np.ndarray, vote_classes: np.ndarray, vote: np.ndarray,  # as in `subtract_row`
+    possible: np.ndarray, power: float, most: float,  # ids that are classes, ascending
+    num_classes: int, num_labels: int,
+) -> np.ndarray:  # fmt: skip
     """Count as `leave_one_out_counts` does, row by row, so that the votes of the other views are never stored."""
     parts = np.zeros((BLOCKS, num_classes, num_labels))
     for block in nb.prange(BLOCKS):
