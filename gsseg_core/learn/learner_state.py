@@ -41,49 +41,23 @@ _VIEW_VOTES = 2.0**24 * LIMITS.max_pixels
 
 @dataclass(frozen=True, eq=False)
 class Learnt:
-    """Codes that a learner came to.
+    """Codes that a learner came to."""
 
-    Attributes
-    ----------
-    learner : str
-        Its name.
-    codes : (N, K) float32
-        Class probabilities; a row of zeros where no labelled pixel saw the Gaussian.
-    num_views : int
-        Views that it learnt from.
-    temperature : float
-        At which the codes are probabilities, see `gsseg_core.learn.calibrate`.
-    """
-
-    learner: str
-    codes: np.ndarray
-    num_views: int
-    temperature: float = 1.0
+    learner: str  # its name
+    codes: np.ndarray  # (N, K) float32: class probabilities; a row of zeros where no labelled pixel saw the Gaussian
+    num_views: int  # that it learnt from
+    temperature: float = 1.0  # at which the codes are probabilities, see `gsseg_core.learn.calibrate`
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What is saved.
+    """What is saved of one scene."""
 
-    Attributes
-    ----------
-    votes : (N, K) int64
-        Votes of all views so far, in units of `VOTE_UNIT`.
-    views : list of View
-        Those that were kept, in the order in which they came.
-    num_fused : int
-        Views in the votes, at least as many as were kept.
-    class_names : dict of int to str
-        Names by id, as far as they are known.
-    learnt : Learnt or None
-        The best codes.
-    """
-
-    votes: np.ndarray
-    views: list[View]
-    num_fused: int
-    class_names: dict[int, str] = field(default_factory=dict)
-    learnt: Learnt | None = None
+    votes: np.ndarray  # (N, K) int64: of all views so far, in units of `VOTE_UNIT`
+    views: list[View]  # those that were kept, in the order in which they came
+    num_fused: int  # views in the votes, at least as many as were kept
+    class_names: dict[int, str] = field(default_factory=dict)  # as far as they are known
+    learnt: Learnt | None = None  # the best codes
 
     def save(self, path: str | os.PathLike[str], digest: str) -> None:
         """Write the state of the scene with this digest, atomically. The scene itself is not in the file.
@@ -108,11 +82,7 @@ class State:
         }
         arrays = {"seen": seen.astype(np.int64), "votes": self.votes[seen]}
         if self.learnt is not None:
-            header["learnt"] = {
-                "learner": self.learnt.learner,
-                "num_views": self.learnt.num_views,
-                "temperature": self.learnt.temperature,
-            }
+            header["learnt"] = {name: value for name, value in vars(self.learnt).items() if name != "codes"}
             arrays["codes"] = self.learnt.codes
         for i, view in enumerate(self.views):
             arrays[f"labels_{i}"], evidence = view.read_seen()
@@ -205,11 +175,7 @@ def _read_view(file: NpzArrays, i: int, entry: dict[str, Any], num_classes: int)
     return view
 
 
-def _read_evidence(
-    file: NpzArrays,
-    i: int,
-    labels: np.ndarray,  # (H, W)
-) -> LabelEvidence:
+def _read_evidence(file: NpzArrays, i: int, labels: np.ndarray) -> LabelEvidence:
     classes = file.expect(f"classes_{i}", np.int32, (None,))
     mass = file.expect(f"mass_{i}", np.float32, (int(labels.max()) + 1, len(classes)))
     supervised = file.expect(f"supervised_{i}", np.int32, (None,)) if f"supervised_{i}" in file.names else None

@@ -21,7 +21,7 @@ import numpy as np
 
 from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.spatial.leaf_candidates import CHUNK
+from gsseg_core.spatial.knn import CHUNK
 from gsseg_core.spatial.neighbour_graph import NEIGHBOURS, Graph, graph_of
 
 CLASSES_AT_ONCE = 16

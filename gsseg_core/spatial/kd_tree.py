@@ -157,7 +157,7 @@ def leaf_of(place: int, leaves: int, n: int) -> int:
 
 @nb.njit(inline="always")
 def gap(boxes: np.ndarray, node: int, box: np.ndarray | tuple[float, ...]) -> np.float32:
-    """Squared distance of a node's box to another: lowest and highest corner, of a point twice the point itself.
+    """Squared distance of a node's box to another, (6,): lowest and highest corner, or a point twice.
 
     In float32 it is never above that between a point in the one and a point in the other, as rounding is monotonic.
     """

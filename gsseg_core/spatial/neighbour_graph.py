@@ -19,8 +19,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 from gsseg_core.simd import at_most, first_bit, load_row
 from gsseg_core.spatial.kd_tree import Tree, leaf_range, scaled, tree_of
-from gsseg_core.spatial.knn import LEAST, nearest
-from gsseg_core.spatial.leaf_candidates import NO_SKIP, find_leaves, measure, scratch_for
+from gsseg_core.spatial.knn import NO_SKIP, find_leaves, measure, nearest, scratch_for
 
 NEIGHBOURS = 12
 """Neighbours of a Gaussian in its graph, unless others are asked for."""
@@ -28,27 +27,13 @@ NEIGHBOURS = 12
 
 @dataclass(frozen=True, eq=False)
 class Graph:
-    """Neighbours of each Gaussian and the weights of the edges to them, as CSR rows in the order of a k-d tree.
+    """Neighbours of each Gaussian and the weights of the edges to them, as CSR rows in the order of a k-d tree."""
 
-    Attributes
-    ----------
-    k : int
-        Neighbours that were asked for.
-    order : (N,) int32
-        Which Gaussian each place stands for: what is near in the arrays is near in space.
-    indptr : (N + 1,) int64
-        Neighbours of place i are indices[indptr[i]:indptr[i + 1]].
-    indices : (E,) int32
-        Neighbours, as places.
-    weights : (E,) float32
-        p_ij, which sum to 1 over the neighbours of a Gaussian.
-    """
-
-    k: int
-    order: np.ndarray
-    indptr: np.ndarray
-    indices: np.ndarray
-    weights: np.ndarray
+    k: int  # neighbours that were asked for
+    order: np.ndarray  # (N,) int32: which Gaussian each place stands for
+    indptr: np.ndarray  # (N + 1,) int64: neighbours of place i are indices[indptr[i]:indptr[i + 1]]
+    indices: np.ndarray  # (E,) int32: neighbours, as places
+    weights: np.ndarray  # (E,) float32: p_ij, which sum to 1 over the neighbours of a Gaussian
 
     @classmethod
     def build(cls, means: np.ndarray, colors: np.ndarray, k: int = NEIGHBOURS, tree: Tree | None = None) -> Graph:
@@ -139,7 +124,7 @@ def _weigh(
         for e in range(indptr[i], indptr[i + 1]):
             j = indices[e]
             dx, dy, dz = points[0, i] - points[0, j], points[1, i] - points[1, j], points[2, i] - points[2, j]
-            spacing = max(np.sqrt(radii[i]) * np.sqrt(radii[j]), LEAST)
+            spacing = max(np.sqrt(radii[i]) * np.sqrt(radii[j]), np.finfo(np.float32).tiny)
             exponent = -(dx * dx + dy * dy + dz * dz) / spacing - contrast[e] * contrast[e] / 2
             weights[e] = max(np.exp(exponent), np.float32(1e-9))  # however different, it is better than none
             total += weights[e]

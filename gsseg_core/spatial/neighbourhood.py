@@ -22,16 +22,17 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 from gsseg_core.simd import at_most, first_bit, load_row
 from gsseg_core.spatial.kd_tree import LEAF, Tree, leaf_range, scaled, tree_of
-from gsseg_core.spatial.knn import middle_of, nearest
-from gsseg_core.spatial.leaf_candidates import (
+from gsseg_core.spatial.knn import (
     CHUNK,
     NO_SKIP,
     LeafCandidates,
     end_of_group,
     find_leaves,
     measure,
+    middle_of,
+    nearest,
     scratch_for,
-)  # fmt: skip
+)
 
 CODE_UNIT = 2.0**-24
 """Codes are summed in steps of this, which is the precision of a float32 near 1."""

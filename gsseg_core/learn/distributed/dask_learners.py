@@ -38,7 +38,7 @@ ATTEMPTS = 5
 
 _POLL = 0.01  # s
 
-Tell = Callable[[int], None]
+Report = Callable[[int], None]
 """Called with how many views are done, time and again."""
 
 
@@ -85,7 +85,7 @@ class _OnWorkers(Learner):
         progress("observe", len(named), len(named))
 
     def _sum(
-        self, task: Callable[..., Part], views: Mapping[str, View], tell: Tell,
+        self, task: Callable[..., Part], views: Mapping[str, View], report: Report,
         by_view: Mapping[str, Any] | None = None, *values: Any,
     ) -> Part:  # fmt: skip
         """Sum up what a task makes of these views.
@@ -100,20 +100,20 @@ class _OnWorkers(Learner):
         for _ in range(ATTEMPTS):
             used: list[Future] = []
             try:
-                return self._try_to_sum(used, task, views, tell, by_view or {}, values)
+                return self._try_to_sum(used, task, views, report, by_view or {}, values)
             except (_LostError, CancelledError):
                 self._shares = []
             finally:
-                # Also where `tell` has ended the work: what nobody waits for any more is not begun.
+                # Also where `report` has ended the work: what nobody waits for any more is not begun.
                 for future in used:
                     future.release()
         raise SchedulerError(f"{name_of(self._client)}: lost results {ATTEMPTS} times; expected workers that stay")
 
     def _try_to_sum(
-        self, used: list[Future], task: Callable[..., Part], views: Mapping[str, View], tell: Tell,
+        self, used: list[Future], task: Callable[..., Part], views: Mapping[str, View], report: Report,
         by_view: Mapping[str, Any], values: Sequence[Any],
     ) -> Part:  # fmt: skip
-        shares = self._deal(views, tell)
+        shares = self._deal(views, report)
         copies = [self._send(value, [share.worker for share in shares]) for value in values]
         used += [future for copy in copies for future in copy.values()]
         parts = []
@@ -129,20 +129,20 @@ class _OnWorkers(Learner):
             ]
         used += sums
         sizes = {part.key: len(share.views) for part, share in zip(parts, shares, strict=True)}
-        self._wait(used, lambda: tell(sum(sizes[part.key] for part in parts if part.done())))
+        self._wait(used, lambda: report(sum(sizes[part.key] for part in parts if part.done())))
         for future in used:
             self._check(future)
         total: Part = self._client.gather(sums[0], direct=self._direct)
         return total
 
-    def _deal(self, views: Mapping[str, View], tell: Tell) -> list[_Share]:
+    def _deal(self, views: Mapping[str, View], report: Report) -> list[_Share]:
         """Have every worker prepare its share of the views, unless they have them."""
         held = {name: view for share in self._shares for name, view in share.views.items()}
         workers = find_workers(self._client)
         if self._dealt == (workers, self.num_classes) and all(held.get(n) is view for n, view in views.items()):
             return self._shares
         check_workers(self._client, workers.keys() - self._dealt[0].keys())
-        self._place_scene(workers, tell)
+        self._place_scene(workers, report)
         where = {"device": self.device, "memory_budget": self.memory_budget}
         settings = self.num_classes, getattr(self, "settings", None), where
         names, threads = list(views), np.cumsum([0, *workers.values()])
@@ -156,14 +156,14 @@ class _OnWorkers(Learner):
                 self._shares.append(_Share(worker, shard, part))
         return self._shares
 
-    def _place_scene(self, workers: Mapping[str, int], tell: Tell) -> None:
+    def _place_scene(self, workers: Mapping[str, int], report: Report) -> None:
         """See to it that each worker has the scene: from a file of its own if that is the same one, else from here."""
         self._scenes = {w: f for w, f in self._scenes.items() if w in workers and f.status == "finished"}
         absent = [worker for worker in workers if worker not in self._scenes]
         if self.scene.path is not None and absent:
             path = str(self.scene.path.resolve())
             tried = {worker: self._submit(worker, dask_worker.load, path, self.scene.digest) for worker in absent}
-            self._wait(tried.values(), lambda: tell(0))
+            self._wait(tried.values(), lambda: report(0))
             self._scenes |= {worker: future for worker, future in tried.items() if future.status == "finished"}
             absent = [worker for worker in absent if worker not in self._scenes]
         if absent:
@@ -209,10 +209,10 @@ class _OnWorkers(Learner):
         if future.status != "finished":
             raise _LostError
 
-    def _wait(self, futures: Iterable[Future], tell: Callable[[], None]) -> None:
+    def _wait(self, futures: Iterable[Future], report: Callable[[], None]) -> None:
         looked = time.monotonic()
         while any(future.status == "pending" for future in futures):
-            tell()
+            report()
             time.sleep(_POLL)
             if time.monotonic() - looked > 1:
                 find_workers(self._client)

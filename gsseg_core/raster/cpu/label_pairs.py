@@ -44,12 +44,7 @@ PARTS = 4
 def keep_entries(start: np.ndarray, reached: np.ndarray, kept_start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Give a number to every entry that reaches a labelled pixel, from where those of its tile begin, (T + 1,).
 
-    Returns
-    -------
-    kept : (E, 2) int32
-        Where each entry goes, -1 if nowhere; its tile.
-    blocks : (E',) uint16
-        Blocks of those that are kept.
+    Returns where each entry goes, -1 if nowhere, and its tile, (E, 2) int32; and blocks of those kept, (E',) uint16.
     """
     kept, blocks = np.empty((len(reached), 2), np.int32), np.empty(kept_start[-1], np.uint16)
     for tile in nb.prange(start.shape[0] - 1):
@@ -74,14 +69,9 @@ def number_pairs(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Give a number to every Gaussian that is seen, and to each of its labels, and tell the entries.
 
-    Returns
-    -------
-    found : (CHUNKS, 2) int64
-        Gaussians and pairs of each chunk.
-    gaussians, counts : (M,) int32
-        Those that are seen, each chunk's from where it begins; how many labels each of them has.
-    labels : (capacity[-1],) int32, votes : (capacity[-1],) float32
-        Of each pair.
+    Returns how many Gaussians and pairs each chunk has, (CHUNKS, 2) int64; these Gaussians and how many labels each of
+    them has, both (M,) int32, each chunk's from where it begins; and, each from `capacity` on, labels and votes of the
+    pairs, int32 and float32.
     """
     count, last = len(tiles.table), len(tiles.gaussian_entries) - 1
     found, gaussians, counts = np.empty((CHUNKS, 2), np.int64), np.empty(count, np.int32), np.empty(count, np.int32)
@@ -153,14 +143,8 @@ def share(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Share one vote per labelled pixel among the pairs that made it.
 
-    Returns
-    -------
-    logs : (T,) float64
-        Sum of log likelihood, (W likelihood)[p] + T_end rest.
-    left_over : (labels of all tiles,) float64
-        Sum of T_end / likelihood by label.
-    sums : (slot_start[-1],) float32
-        Per entry and label, sum of w / likelihood.
+    With p(y_p) as in `Observation.shares`, returns sums of log p(y_p) by tile, (T,) float64; of T_end / p(y_p) by label
+    of each tile, float64 as `labels.present`; and of w / p(y_p) by entry and label, (slot_start[-1],) float32.
     """
     logs, left_over = np.zeros(len(records)), np.zeros(len(labels.present))
     sums = np.empty(slot_start[-1], np.float32)

@@ -13,7 +13,6 @@ root.
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numba as nb
@@ -50,22 +49,16 @@ AHEAD = 32
 """How many rows ahead memory is asked for."""
 
 
-@dataclass(frozen=True)
-class Projected:
+class Projected(NamedTuple):
     """The Gaussians that reach the image, nearest first.
 
-    Attributes
-    ----------
-    ids : (M,) int32
-        Index of each in the scene.
-    table : (M, 8) float32
-        Per Gaussian: centre u, v in px; shear; WIDTH = log2(e) / (2 var(x|y)) and HEIGHT = log2(e) / (2 S_yy), so that
-        log2(alpha) = LOG_OPACITY - WIDTH (dx - shear dy)^2 - HEIGHT dy^2; reach in y in px, where alpha falls to 1/255;
-        and dy at the rightmost point of that ellipse.
+    The table has of each: centre u, v in px; shear; WIDTH = log2(e) / (2 var(x|y)) and HEIGHT = log2(e) / (2 S_yy), so
+    that log2(alpha) = LOG_OPACITY - WIDTH (dx - shear dy)^2 - HEIGHT dy^2; reach in y in px, where alpha falls to
+    1/255; and dy at the rightmost point of that ellipse.
     """
 
-    ids: np.ndarray
-    table: np.ndarray
+    ids: np.ndarray  # (M,) int32: index of each in the scene
+    table: np.ndarray  # (M, 8) float32
 
 
 class _Lens(NamedTuple):
