@@ -31,7 +31,7 @@ from gsseg_core.raster.cpu import label_pairs
 from gsseg_core.raster.cpu.blending import open_rays
 from gsseg_core.raster.cpu.lifting import Lifted
 from gsseg_core.raster.cpu.splat import WIDTH, aim, blend_block
-from gsseg_core.raster.cpu.tile_observation import TileObservation
+from gsseg_core.raster.cpu.tile_operator import TileObservation
 from gsseg_core.raster.cpu.tiling import TILE
 from gsseg_core.raster.observation import VoteShares
 from gsseg_core.raster.view_operator import ViewOperator
