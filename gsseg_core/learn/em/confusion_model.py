@@ -11,27 +11,13 @@ from gsseg_core.data.label_evidence import LabelEvidence
 
 @dataclass
 class ErrorModel:
-    """Probability of each label of one view's mask given the true class.
+    """Probability of each label of one view's mask given the true class."""
 
-    Attributes
-    ----------
-    evidence : LabelEvidence
-        Of the L labels that occur in the view's mask, in a vocabulary of W words.
-    confusion : (K, W) float32
-        Confusion matrix R_v: rows are true classes, columns the words seen; rows sum to 1.
-    pseudo_counts : (T,) float64
-        a_v, px added to the count of the correct word of each class that has one.
-    outliers : float
-        Share of pixels labelled by chance.
-    num_pixels : int
-        Pixels with a label that is informative.
-    """
-
-    evidence: LabelEvidence
-    confusion: np.ndarray
-    pseudo_counts: np.ndarray
-    outliers: float
-    num_pixels: int
+    evidence: LabelEvidence  # of the L labels that occur in the view's mask, in a vocabulary of W words
+    confusion: np.ndarray  # (K, W) float32: R_v; rows are true classes, columns the words seen; rows sum to 1
+    pseudo_counts: np.ndarray  # (T,) float64: a_v, px added to the count of the correct word of each class that has one
+    outliers: float  # share of pixels labelled by chance
+    num_pixels: int  # with a label that is informative
 
     @classmethod
     def without_errors(cls, evidence: LabelEvidence, num_classes: int, outliers: float, num_pixels: int) -> ErrorModel:
