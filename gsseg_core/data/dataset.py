@@ -15,8 +15,7 @@ from gsseg_core.data.class_names import BACKGROUND_NAME, class_name, read_classe
 from gsseg_core.data.mask_files import SUPERVISES, mask_files, read_supervises
 from gsseg_core.data.view import View
 from gsseg_core.errors import ClassesFileError, SettingsError, SplitFileError
-from gsseg_core.files.confined_files import require_folder_below
-from gsseg_core.files.input_files import READABLE_IMAGES, is_there
+from gsseg_core.files.input_files import READABLE_IMAGES, is_there, require_folder_below
 from gsseg_core.files.json_files import read_object
 from gsseg_core.text import clipped, quoted
 

@@ -22,7 +22,7 @@ from functools import cached_property
 import numba as nb
 import numpy as np
 
-from gsseg_core.csr_rows import CSRRows, starts
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_images import UNKNOWN
 
 _ROUNDS = 50
@@ -154,11 +154,11 @@ def resolved_votes(votes: CSRRows, possible: np.ndarray) -> CSRRows:  # int64; (
     """
     if votes.data.min(initial=0) >= 0:
         return votes
-    ids = np.flatnonzero(possible)
-    indptr = starts(_count_resolved(votes, ids))
-    out = CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], np.int64))
-    _write_resolved(votes, ids, out)
-    return out
+    rows = len(votes.indptr) - 1
+    capacity = len(votes.data) + rows  # A row may gain one entry.
+    out = CSRRows(votes.indptr + np.arange(rows + 1), np.empty(capacity, np.uint32), np.zeros(capacity, np.int64))
+    _resolve(votes, np.flatnonzero(possible), out)
+    return out.nonzero()
 
 
 def impute_probabilities(
@@ -267,18 +267,7 @@ def resolve_row(
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _count_resolved(rows: CSRRows, ids: np.ndarray) -> np.ndarray:
-    """Count the entries that each row has once it is resolved, (N,) int64."""
-    indptr, classes, votes = rows
-    counts = np.empty(indptr.shape[0] - 1, np.int64)
-    for i in nb.prange(counts.shape[0]):
-        row = slice(indptr[i], indptr[i + 1])
-        counts[i] = (votes[row] > 0).sum() + (_only_class_left(classes[row], votes[row], ids)[0] >= 0)
-    return counts
-
-
-@nb.njit(parallel=True, nogil=True, cache=True)
-def _write_resolved(rows: CSRRows, ids: np.ndarray, kept: CSRRows) -> None:
+def _resolve(rows: CSRRows, ids: np.ndarray, kept: CSRRows) -> None:
     indptr, classes, votes = rows
     kept_indptr, kept_classes, kept_votes = kept
     for i in nb.prange(indptr.shape[0] - 1):

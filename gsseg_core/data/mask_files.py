@@ -15,8 +15,7 @@ import numpy.typing as npt
 
 from gsseg_core.data.soft_masks import SeenLabels, check_forms, combine_detections, quantise
 from gsseg_core.errors import MaskFormatError, MaskSizeError, SupervisesFileError, UnknownLabelError
-from gsseg_core.files.confined_files import require_folder_below
-from gsseg_core.files.input_files import check_pixels, is_there, open_image
+from gsseg_core.files.input_files import check_pixels, is_there, open_image, require_folder_below
 from gsseg_core.files.json_files import read_object
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.npz_files import NpzArrays, open_arrays

@@ -1,4 +1,4 @@
-"""Opening what users hand in: regular files only, and images by their header first."""
+"""Opening what users hand in: regular files only, below a folder if asked for, and images by their header first."""
 
 from __future__ import annotations
 
@@ -17,10 +17,12 @@ from pathlib import Path
 
 from PIL import Image, UnidentifiedImageError
 
-from gsseg_core.errors import GssegError
-from gsseg_core.files.confined_files import OPENED, require_below
+from gsseg_core.errors import GssegError, PathNotAllowedError
 from gsseg_core.files.limits import LIMITS
 from gsseg_core.text import clipped
+
+OPENED = "/proc/self/fd"
+"""Where Linux names what a descriptor stands for: to open it there opens that, and not what a path has become since."""
 
 READABLE_IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 """Suffixes of images that `open_image` reads."""
@@ -76,6 +78,19 @@ def _open_below(path: str | os.PathLike[str], within: Path, flags: int) -> int:
         return os.open(f"{OPENED}/{found}", flags)
     finally:
         os.close(found)
+
+
+def require_below(place: str, path: str | os.PathLike[str], within: Path) -> None:
+    """Raise `PathNotAllowedError`, on `path`, unless the place that it leads to is below a folder."""
+    root = os.path.realpath(within)
+    if place != root and not place.startswith(root.rstrip("/") + "/"):
+        raise PathNotAllowedError(f"{path}: leads out of {within}; expected what lies below it, links followed")
+
+
+def require_folder_below(path: Path, within: Path | None) -> None:
+    """Refuse, as `require_below`, to list a folder; what it lists is still to be opened with `open_input`."""
+    if within is not None:
+        require_below(os.path.realpath(path), path, within)
 
 
 def is_there(path: Path, error: type[GssegError]) -> bool:

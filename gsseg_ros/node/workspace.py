@@ -246,7 +246,7 @@ class Workspace:
         """Resolve a path of a request, absolute or relative to data_root.
 
         Between this and the opening any part of it may become a link to elsewhere: open it as
-        `gsseg_core.files.confined_files` does.
+        `open_input` and `pinned_folder` do.
 
         Raises
         ------

@@ -12,9 +12,8 @@ from PIL import Image
 from small_scenes import write_dataset
 
 from gsseg_core.data.dataset import Dataset
-from gsseg_core.errors import CameraFileError, PathNotAllowedError, WriteError
+from gsseg_core.errors import CameraFileError, PathNotAllowedError
 from gsseg_core.files import input_files
-from gsseg_core.files.confined_files import pinned_folder
 from gsseg_core.files.input_files import open_input
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -104,24 +103,3 @@ def test_a_link_that_is_swapped_after_the_check_does_not_lead_out(root: Path, mo
     monkeypatch.setattr(input_files, "require_below", check_and_swap)
     with open_input(path, root) as file:
         assert file.read() == b"mine"
-
-
-def test_a_folder_that_is_swapped_while_it_is_written_to_does_not_lead_out(root: Path) -> None:
-    folder, outside = root / "new" / "folder", root.parent / "elsewhere"
-    outside.mkdir()
-    with pinned_folder(folder, root) as pinned:
-        folder.rename(root / "moved")
-        folder.symlink_to(outside)
-        (pinned / "file").write_text("written")
-    assert (root / "moved" / "file").read_text() == "written"
-    assert not list(outside.iterdir())
-    with pytest.raises(WriteError, match=f"{folder}: cannot be written"), pinned_folder(folder, root):
-        pass
-
-
-def test_errors_name_the_folder_as_it_was_asked_for(root: Path) -> None:
-    with pytest.raises(WriteError) as caught, pinned_folder(root / "new", root) as pinned:
-        raise WriteError(f"{pinned / 'file'}: cannot be written (No space left on device)")
-    assert str(caught.value) == f"{root}/new/file: cannot be written (No space left on device)"
-    with pytest.raises(PathNotAllowedError, match="does not lie below"), pinned_folder(root.parent, root):
-        pass

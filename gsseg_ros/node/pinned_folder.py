@@ -1,4 +1,4 @@
-"""Files that must lie below one folder, whatever links say and whoever moves them meanwhile (Linux).
+"""Folders to write into that must lie below one folder, whoever moves them meanwhile (Linux).
 
 A path is only a question: between the look at it and the opening, any part of it can become a link to somewhere else.
 Here what was looked at is what is opened.
@@ -12,28 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gsseg_core.errors import GssegError, PathNotAllowedError, WriteError
-
-OPENED = "/proc/self/fd"
-"""Where the kernel names what a descriptor stands for; to open it there opens that, and no path."""
-
-
-def require_below(place: str, path: str | os.PathLike[str], within: Path) -> None:
-    """Refuse a place, without links, that is not below a folder; `path` is what the message names.
-
-    Raises
-    ------
-    PathNotAllowedError
-        It is elsewhere.
-    """
-    root = os.path.realpath(within)
-    if place != root and not place.startswith(root.rstrip("/") + "/"):
-        raise PathNotAllowedError(f"{path}: leads out of {within}; expected what lies below it, links followed")
-
-
-def require_folder_below(path: Path, within: Path | None) -> None:
-    """Refuse, as `require_below`, to list a folder; what it lists is still to be opened with `open_input`."""
-    if within is not None:
-        require_below(os.path.realpath(path), path, within)
+from gsseg_core.files.input_files import OPENED
 
 
 @contextlib.contextmanager
