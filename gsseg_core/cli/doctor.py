@@ -162,10 +162,8 @@ def _kernels(say: Callable[[str], object]) -> Iterator[Finding]:
         fix = "install the packages marked !! above"
         yield Finding("kernels", "run", f"{type(error).__name__}: {error}", "!!", fix)
         return
-    seconds, compiled = (
-        time.perf_counter() - start,
-        "from the cache" if add_votes.stats.cache_hits else "compiled just now",
-    )
+    seconds = time.perf_counter() - start
+    compiled = "from the cache" if add_votes.stats.cache_hits else "compiled just now"
     yield Finding("kernels", "run", f"segmented {SIDE**2:,} Gaussians in {seconds:.1f} s, {compiled}")
     if kernel_cache.FOLDER:
         yield Finding("kernels", "cache", add_votes.stats.cache_path or kernel_cache.FOLDER)

@@ -37,7 +37,9 @@ from gsseg_core.files.run_manifest import FileRecord, Manifest, RunRecord
 
 RUN_FILE, COMMIT_FILE = ".gsseg-run.json", ".gsseg-commit.json"
 
-_STAGING = re.compile(r"\.gsseg-[0-9]{8}T[0-9]{6}Z-[0-9a-f]{8}")
+STAGING = re.compile(r"\.gsseg-[0-9]{8}T[0-9]{6}Z-[0-9a-f]{8}")
+"""Names of folders in which runs are staged."""
+
 _PATIENCE = 60.0  # seconds to wait for others who move files
 _PROBE = 1 << 16  # bytes that must fit on the disk before work begins
 
@@ -89,27 +91,6 @@ def settle(folder: str | os.PathLike[str]) -> None:
             _finish(folder)
 
 
-def require_own_folder(out: Path, kind: str) -> None:
-    """Refuse a folder that holds anything but holds no results of this kind.
-
-    Raises
-    ------
-    PathTakenError, WriteError
-        It is such a folder, or cannot be looked into.
-    """
-    try:
-        _refuse_no_folder(out)
-        there = sorted(path.name for path in out.iterdir()) if out.is_dir() else []
-    except OSError as error:  # Also where a name is too long.
-        raise _unwritable(out, error) from error
-    foreign = [name for name in there if name != RUN_FILE and not _STAGING.fullmatch(name)]
-    if foreign and not Manifest.read(out / RUN_FILE).files(kind):
-        raise PathTakenError(
-            f"{out}: holds {foreign[0][:60]!r}, and no results of gsseg {kind}; expected a folder that is new, "
-            "empty, or holds such results"
-        )
-
-
 class StagedRun:
     """A run that is being written; made by `staged_run`.
 
@@ -133,7 +114,8 @@ class StagedRun:
     def begin(self) -> None:
         """Make the folder, finish or remove what dead runs left in it, and see that something can be written there."""
         try:
-            _refuse_no_folder(self.out)
+            if os.path.lexists(self.out) and not self.out.is_dir():
+                raise PathTakenError(f"{self.out}: is not a folder; expected one, or nothing")
             self._made = [path for path in (self.out, *self.out.parents) if not path.exists()]
             self.out.mkdir(parents=True, exist_ok=True)
             with _locked(self.out):
@@ -205,7 +187,7 @@ def _finish(out: Path) -> None:
     if not os.path.lexists(out / COMMIT_FILE):
         return
     manifest = Manifest.read(out / COMMIT_FILE)
-    if not _STAGING.fullmatch(manifest.staging):
+    if not STAGING.fullmatch(manifest.staging):
         raise WriteError(f"{out / COMMIT_FILE}: is damaged; expected it as gsseg wrote it, or nothing")
     staging, before, run_id = out / manifest.staging, manifest.before, manifest.staging.removeprefix(".gsseg-")
     try:
@@ -251,11 +233,6 @@ def _move_aside(path: Path, run_id: str) -> None:
     while os.path.lexists(aside := path.with_name(f"{path.stem[:60]}.edited-{run_id}{number}{path.suffix[:20]}")):
         number = f"-{secrets.token_hex(2)}"
     os.rename(path, aside)
-
-
-def _refuse_no_folder(out: Path) -> None:
-    if os.path.lexists(out) and not out.is_dir():
-        raise PathTakenError(f"{out}: is not a folder; expected one, or nothing")
 
 
 def _refuse_stranger(out: Path, place: str, own: Mapping[str, FileRecord], kind: str) -> None:
@@ -312,7 +289,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 def _remove_dead(out: Path) -> None:
     """Remove what was staged by runs whose processes have ended; `out` is locked."""
-    for path in [path for path in out.iterdir() if _STAGING.fullmatch(path.name) and _is_folder(path)]:
+    for path in [path for path in out.iterdir() if STAGING.fullmatch(path.name) and _is_folder(path)]:
         with contextlib.suppress(OSError):
             lock = _open_folder(path)
             if try_lock(lock):

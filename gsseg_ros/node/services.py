@@ -20,13 +20,13 @@ from gsseg_core.errors import GssegError
 from gsseg_core.export.class_plys import write_classes
 from gsseg_core.export.summary import RunReport
 from gsseg_core.files.json_files import write_json
-from gsseg_core.files.run_folder import require_own_folder, staged_run
+from gsseg_core.files.run_folder import staged_run
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.text import one_line
 from gsseg_ros.errors import InvalidRequestError, error_code
 from gsseg_ros.node.jobs import Turns
+from gsseg_ros.node.output_folders import pinned_folder, require_own_folder
 from gsseg_ros.node.outputs import Outputs
-from gsseg_ros.node.pinned_folder import pinned_folder
 from gsseg_ros.node.reports import Selection, empty_report, finish, report_message, stage_timings
 from gsseg_ros.node.viewpoints import Lookup, draw, viewpoint
 from gsseg_ros.node.workspace import Run, Workspace, checked_confidence, chosen_classes

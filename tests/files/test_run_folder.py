@@ -17,7 +17,7 @@ from test_atomic import small_files_only
 
 from gsseg_core.errors import PathTakenError, SettingsError, WriteError
 from gsseg_core.files import run_folder
-from gsseg_core.files.run_folder import COMMIT_FILE, RUN_FILE, require_own_folder, settle, staged_run
+from gsseg_core.files.run_folder import COMMIT_FILE, RUN_FILE, settle, staged_run
 
 FIRST = ["a.npz", "classes/1_cup.ply", "classes/2_box.ply", "old/gone.png", "report.json"]
 SECOND = ["a.npz", "classes/1_cup.ply", "classes/3_ball.ply", "new/here.png", "report.json"]
@@ -219,17 +219,6 @@ def test_a_place_that_is_taken_is_refused_by_name_before_the_work(
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted({"elsewhere", place})
 
 
-def test_a_folder_for_exports_only_must_be_new_empty_or_an_export(tmp_path: Path) -> None:
-    for _ in range(2):
-        require_own_folder(tmp_path / "new", "segment")
-        write(tmp_path / "new", FIRST)
-    (tmp_path / "data").mkdir()
-    (tmp_path / "data" / "scene.ply").write_text("mine")
-    with pytest.raises(PathTakenError, match=r"data: holds 'scene\.ply', and no results of gsseg segment"):
-        require_own_folder(tmp_path / "data", "segment")
-    assert contents(tmp_path / "data") == {"scene.ply": "mine"} and hidden(tmp_path / "data") == []
-
-
 def test_of_two_runs_at_once_the_last_to_end_wins_whole(tmp_path: Path) -> None:
     ids, errors = [], []
 
@@ -277,8 +266,3 @@ def test_a_lock_that_is_never_released_is_one_clear_error(tmp_path: Path, monkey
     with run_folder._locked(tmp_path), pytest.raises(WriteError, match="another process of gsseg"):
         write(tmp_path, FIRST)
     assert time.monotonic() - started < 30
-
-
-def test_a_folder_whose_name_is_too_long_for_the_disk_is_one_clear_error(tmp_path: Path) -> None:
-    with pytest.raises(WriteError, match="name too long"):
-        require_own_folder(tmp_path / ("x" * 300), "segment")

@@ -1,7 +1,7 @@
-"""Folders to write into that must lie below one folder, whoever moves them meanwhile (Linux).
+"""Folders that the node writes into: they lie below its root, and hold nothing but exports (Linux).
 
 A path is only a question: between the look at it and the opening, any part of it can become a link to somewhere else.
-Here what was looked at is what is opened.
+A pinned folder is what was looked at.
 """
 
 from __future__ import annotations
@@ -11,8 +11,10 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from gsseg_core.errors import GssegError, PathNotAllowedError, WriteError
+from gsseg_core.errors import GssegError, PathNotAllowedError, PathTakenError, WriteError
 from gsseg_core.files.input_files import OPENED
+from gsseg_core.files.run_folder import RUN_FILE, STAGING
+from gsseg_core.files.run_manifest import Manifest
 
 
 @contextlib.contextmanager
@@ -48,3 +50,27 @@ def pinned_folder(folder: Path, within: Path) -> Iterator[Path]:
             yield pinned
         except GssegError as error:
             raise type(error)(str(error).replace(str(pinned), str(folder))) from error
+
+
+def require_own_folder(out: Path, kind: str) -> None:
+    """Refuse a folder that holds anything but holds no results of this kind.
+
+    Raises
+    ------
+    PathTakenError, WriteError
+        It is such a folder, or cannot be looked into.
+    """
+    try:
+        there = sorted(os.listdir(out))
+    except FileNotFoundError:
+        return
+    except NotADirectoryError as error:
+        raise PathTakenError(f"{out}: is not a folder; expected one, or nothing") from error
+    except OSError as error:  # Also where a name is too long.
+        raise WriteError(f"{out}: cannot be written ({error.strerror or error}); expected a folder") from error
+    foreign = [name for name in there if name != RUN_FILE and not STAGING.fullmatch(name)]
+    if foreign and not Manifest.read(out / RUN_FILE).files(kind):
+        raise PathTakenError(
+            f"{out}: holds {foreign[0][:60]!r}, and no results of gsseg {kind}; expected a folder that is new, "
+            "empty, or holds such results"
+        )

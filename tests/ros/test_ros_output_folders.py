@@ -1,0 +1,55 @@
+"""Folders that the node writes into lie below its root, whoever moves them meanwhile, and hold exports only."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gsseg_core.errors import PathNotAllowedError, PathTakenError, WriteError
+from gsseg_core.files.run_folder import staged_run
+from gsseg_ros.node.output_folders import pinned_folder, require_own_folder
+
+
+def test_a_folder_that_is_swapped_while_it_is_written_to_does_not_lead_out(tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    root.mkdir()
+    folder, outside = root / "new" / "folder", tmp_path / "elsewhere"
+    outside.mkdir()
+    with pinned_folder(folder, root) as pinned:
+        folder.rename(root / "moved")
+        folder.symlink_to(outside)
+        (pinned / "file").write_text("written")
+    assert (root / "moved" / "file").read_text() == "written"
+    assert not list(outside.iterdir())
+    with pytest.raises(WriteError, match=f"{folder}: cannot be written"), pinned_folder(folder, root):
+        pass
+
+
+def test_errors_name_the_folder_as_it_was_asked_for(tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    root.mkdir()
+    with pytest.raises(WriteError) as caught, pinned_folder(root / "new", root) as pinned:
+        raise WriteError(f"{pinned / 'file'}: cannot be written (No space left on device)")
+    assert str(caught.value) == f"{root}/new/file: cannot be written (No space left on device)"
+    with pytest.raises(PathNotAllowedError, match="does not lie below"), pinned_folder(tmp_path, root):
+        pass
+
+
+def test_a_folder_for_exports_only_must_be_new_empty_or_an_export(tmp_path: Path) -> None:
+    for _ in range(2):
+        require_own_folder(tmp_path / "new", "segment")
+        with staged_run(tmp_path / "new", "segment") as run:
+            (run.folder / "report.json").write_text(run.id)
+    (tmp_path / "data").mkdir()
+    require_own_folder(tmp_path / "data", "segment")
+    (tmp_path / "data" / "scene.ply").write_text("mine")
+    with pytest.raises(PathTakenError, match=r"data: holds 'scene\.ply', and no results of gsseg segment"):
+        require_own_folder(tmp_path / "data", "segment")
+    with pytest.raises(PathTakenError, match="is not a folder"):
+        require_own_folder(tmp_path / "data" / "scene.ply", "segment")
+
+
+def test_a_folder_whose_name_is_too_long_for_the_disk_is_one_clear_error(tmp_path: Path) -> None:
+    with pytest.raises(WriteError, match="name too long"):
+        require_own_folder(tmp_path / ("x" * 300), "segment")
