@@ -15,7 +15,7 @@ from gsseg_core.data.class_names import BACKGROUND_NAME, class_name, read_classe
 from gsseg_core.data.mask_files import SUPERVISES, mask_files, read_supervises
 from gsseg_core.data.view import View
 from gsseg_core.errors import ClassesFileError, SettingsError, SplitFileError
-from gsseg_core.files.input_files import READABLE_IMAGES, is_there, require_folder_below
+from gsseg_core.files.input_files import READABLE_IMAGES, is_there, list_folder
 from gsseg_core.files.json_files import read_object
 from gsseg_core.text import clipped, quoted
 
@@ -63,7 +63,8 @@ class Dataset:
         masks = mask_files(self.root / labels, stems, self._within)
         supervises = self.root / labels / SUPERVISES
         supervised = read_supervises(supervises, masks, stems, self._declared, self._within)
-        images = _images_by_stem(self.root / "images", self._within)
+        photos = list_folder(self.root / "images", self._within)
+        images = {path.stem: path for path in photos if path.suffix.lower() in READABLE_IMAGES}
         self._views = {
             name: View(camera, masks.get(name), images.get(name), self._declared, supervised.get(name), self._within)
             for name, camera in zip(stems, self.cameras, strict=True)
@@ -111,13 +112,6 @@ class Dataset:
         other.__dict__["class_names"] = names
         other._views = {stem: replace(view, class_names=declared, numbering=ids) for stem, view in self._views.items()}
         return other
-
-
-def _images_by_stem(folder: Path, within: Path | None) -> dict[str, Path]:
-    if not folder.is_dir():
-        return {}
-    require_folder_below(folder, within)
-    return {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() in READABLE_IMAGES}
 
 
 def _read_split(path: Path, views: Collection[str], within: Path | None = None) -> dict[str, list[str]]:

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.data.soft_masks import SeenLabels, check_forms, combine_detections, quantise
-from gsseg_core.errors import MaskFormatError, MaskSizeError, SupervisesFileError, UnknownLabelError
-from gsseg_core.files.input_files import check_pixels, is_there, open_image, require_folder_below
+from gsseg_core.errors import MaskFormatError, SupervisesFileError, UnknownLabelError
+from gsseg_core.files.input_files import check_pixels, is_there, list_folder, open_image
 from gsseg_core.files.json_files import read_object
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.npz_files import NpzArrays, open_arrays
@@ -38,12 +38,9 @@ def mask_files(folder: Path, stems: Iterable[str], within: Path | None = None) -
     PathNotAllowedError
         The folder lies outside `within`.
     """
-    if not folder.is_dir():
-        return {}
-    require_folder_below(folder, within)
     found: dict[str, Path] = {}
     wanted = set(stems)
-    for path in sorted(folder.iterdir()):
+    for path in list_folder(folder, within):
         is_folder = path.is_dir()
         stem = path.name if is_folder else path.stem
         if stem not in wanted or not (is_folder or path.suffix.lower() in (".png", ".npz")):
@@ -147,10 +144,9 @@ def _check_claims(path: Path, arrays: NpzArrays, class_names: Mapping[int, str] 
 
 
 def _read_detections(folder: Path, camera: Camera | None, within: Path | None) -> SeenLabels:
-    require_folder_below(folder, within)
     detections: dict[int, npt.NDArray[np.generic]] = {}
     unknown = None
-    for path in sorted(folder.iterdir()):
+    for path in list_folder(folder, within):
         if path.suffix.lower() not in _DETECTIONS:
             continue
         if path.stem == _UNKNOWN:
@@ -161,9 +157,6 @@ def _read_detections(folder: Path, camera: Camera | None, within: Path | None) -
         if int(path.stem) in detections:
             raise MaskFormatError(f"{folder}: has two images of class {path.stem}; expected one")
         detections[int(path.stem)] = _read_image(path, camera, within)
-    shapes = {array.shape for array in detections.values()}
-    if unknown is not None and len(shapes) == 1 and unknown.shape not in shapes:
-        raise MaskSizeError(f"{folder}: unknown has shape {unknown.shape}; expected {shapes.pop()}, as the others")
     return combine_detections(detections, unknown=unknown, source=str(folder))
 
 

@@ -87,10 +87,13 @@ def require_below(place: str, path: str | os.PathLike[str], within: Path) -> Non
         raise PathNotAllowedError(f"{path}: leads out of {within}; expected what lies below it, links followed")
 
 
-def require_folder_below(path: Path, within: Path | None) -> None:
-    """Refuse, as `require_below`, to list a folder; what it lists is still to be opened with `open_input`."""
+def list_folder(folder: Path, within: Path | None) -> list[Path]:
+    """List, sorted, what is in a folder that `require_below` allows, none if there is no folder; for `open_input`."""
+    if not folder.is_dir():
+        return []
     if within is not None:
-        require_below(os.path.realpath(path), path, within)
+        require_below(os.path.realpath(folder), folder, within)
+    return sorted(folder.iterdir())
 
 
 def is_there(path: Path, error: type[GssegError]) -> bool:

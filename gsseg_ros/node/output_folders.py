@@ -60,12 +60,12 @@ def require_own_folder(out: Path, kind: str) -> None:
     PathTakenError, WriteError
         It is such a folder, or cannot be looked into.
     """
+    if os.path.lexists(out) and not os.path.isdir(out):
+        raise PathTakenError(f"{out}: is not a folder; expected one, or nothing")
     try:
         there = sorted(os.listdir(out))
     except FileNotFoundError:
         return
-    except NotADirectoryError as error:
-        raise PathTakenError(f"{out}: is not a folder; expected one, or nothing") from error
     except OSError as error:  # Also where a name is too long.
         raise WriteError(f"{out}: cannot be written ({error.strerror or error}); expected a folder") from error
     foreign = [name for name in there if name != RUN_FILE and not STAGING.fullmatch(name)]
