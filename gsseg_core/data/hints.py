@@ -113,8 +113,9 @@ def _masks(folder: Path, stems: Collection[str]) -> list[Path]:
     """List masks of the given stems, of every kind; none where the first label image is a photo."""
     with suppress(GssegError, OSError):
         found = list(mask_files(folder, stems).values())
-        for image in [path for path in found if path.suffix.lower() == ".png"][:1]:
-            mask_header(image)
+        images = [path for path in found if path.suffix.lower() == ".png"]
+        if images:
+            mask_header(images[0])
         return [path for path in found if path.is_file() or _has_detections(path)]
     return []
 

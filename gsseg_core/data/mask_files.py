@@ -92,10 +92,7 @@ def read_supervises(
 
 
 def read_soft_mask(
-    path: Path,
-    class_names: Mapping[int, str] | None = None,
-    camera: Camera | None = None,
-    within: Path | None = None,
+    path: Path, class_names: Mapping[int, str] | None = None, camera: Camera | None = None, within: Path | None = None
 ) -> SeenLabels:
     """Read probabilities (.npz) or a folder of detections.
 
