@@ -14,21 +14,11 @@ _NONE = np.uint32(2**32 - 1)
 
 
 class CSRRows(NamedTuple):
-    """A sparse (N, K) array in compressed rows, as SciPy's `csr_array`, with kernels that use all cores.
+    """A sparse (N, K) array in compressed rows, as SciPy's `csr_array`, with kernels that use all cores."""
 
-    Attributes
-    ----------
-    indptr : (N + 1,) int64
-        Entries of row i are indptr[i] to indptr[i + 1].
-    indices : (Z,) uint32
-        Column of each entry, ascending in a row.
-    data : (Z,)
-        The entries. Arrays of one pattern share `indptr` and `indices`.
-    """
-
-    indptr: np.ndarray
-    indices: np.ndarray
-    data: np.ndarray
+    indptr: np.ndarray  # (N + 1,) int64: entries of row i are indptr[i] to indptr[i + 1]
+    indices: np.ndarray  # (Z,) uint32: column of each entry, ascending in a row
+    data: np.ndarray  # (Z,): the entries; arrays of one pattern share `indptr` and `indices`
 
     @classmethod
     def from_dense(cls, array: np.ndarray) -> CSRRows:  # (N, K)

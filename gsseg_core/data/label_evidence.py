@@ -30,21 +30,15 @@ _ROUNDS = 50
 
 @dataclass(frozen=True, eq=False)
 class LabelEvidence:
-    """Evidence of each label of one mask on the classes.
+    """Evidence of each label of one mask on the classes, which stand in ascending order.
 
-    Attributes
-    ----------
-    classes : (C,) int32
-        Classes that some label names, ascending.
-    mass : (L, C) float32
-        Mass of each class under each label; rows sum to at most 1. None where label l is class l, for certain.
-    supervised : (S,) int32
-        Classes that were looked for, ascending; all that have a mass are among them. None for all classes.
+    Rows of `mass` sum to at most 1; it is None where label l is class l, for certain. All classes that have a mass are
+    among those that were looked for, `supervised`, None for all.
     """
 
-    classes: np.ndarray
-    mass: np.ndarray | None = None
-    supervised: np.ndarray | None = None
+    classes: np.ndarray  # (C,) int32: those that some label names
+    mass: np.ndarray | None = None  # (L, C) float32, of each class under each label
+    supervised: np.ndarray | None = None  # (S,) int32
 
     @cached_property
     def rest(self) -> np.ndarray:

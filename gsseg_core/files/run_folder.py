@@ -92,16 +92,9 @@ def settle(folder: str | os.PathLike[str]) -> None:
 
 
 class StagedRun:
-    """A run that is being written; made by `staged_run`.
+    """A run that is being written into `folder`, under the relative paths that its files will have in `out`.
 
-    Attributes
-    ----------
-    id : str
-        Time (UTC) and eight random hex digits; every file of the run carries it, for whoever finds it elsewhere.
-    out : pathlib.Path
-        Where its files will be.
-    folder : pathlib.Path
-        Where they are to be written, under the same relative paths.
+    Every file of the run carries its `id`, time (UTC) and eight random hex digits, for whoever finds it elsewhere.
     """
 
     def __init__(self, out: Path, kind: str) -> None:

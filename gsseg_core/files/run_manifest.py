@@ -47,18 +47,11 @@ class RunRecord:
 class Manifest:
     """Runs of a folder of results, and what it takes to finish the newest; empty where there is no manifest.
 
-    Attributes
-    ----------
-    runs : dict of str to RunRecord
-        The last run of each kind.
-    staging : str
-        Folder in which the newest of them was written; empty if there is none.
-    before : dict of str to FileRecord
-        Files of the run that it takes the place of: as long as they are the same, they are replaced or removed.
+    The newest takes the place of a run whose files are `before`: those that are still the same are replaced or removed.
     """
 
-    runs: dict[str, RunRecord] = field(default_factory=dict)
-    staging: str = ""
+    runs: dict[str, RunRecord] = field(default_factory=dict)  # the last of each kind
+    staging: str = ""  # the folder in which the newest of them was written
     before: dict[str, FileRecord] = field(default_factory=dict)
 
     @classmethod
