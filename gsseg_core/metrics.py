@@ -49,19 +49,12 @@ class Evaluation:
         self._band = np.zeros((3, 0), np.int64)  # the same, of boundary bands
 
     def add(self, truth: np.ndarray, prediction: np.ndarray, name: str = "view") -> None:  # both (H, W)
-        """Add one view.
-
-        Parameters
-        ----------
-        truth, prediction : array (H, W) of int
-            Label maps of one size, `UNKNOWN` where there is no label.
-        name : str
-            What to call the view in an error message.
+        """Add label maps of one view, integers that are `UNKNOWN` where there is no label.
 
         Raises
         ------
         MaskSizeError
-            The two are not label maps of the same size.
+            The two are not label maps of the same size; the message calls the view `name`.
         """
         if truth.shape != prediction.shape or truth.ndim != 2:
             raise MaskSizeError(

@@ -48,14 +48,8 @@ _PROBE = 1 << 16  # bytes that must fit on the disk before work begins
 def staged_run(out: str | os.PathLike[str], kind: str, *, places: Iterable[str] = ()) -> Iterator[StagedRun]:
     """Give a run whose files, at the end of the body, become the result of their kind in `out`: all or none.
 
-    Parameters
-    ----------
-    out : path
-        The folder, made if it is not there.
-    kind : str
-        What kind of results; those of other kinds in the same folder stay.
-    places : iterable of str
-        Files that the run will write, as far as they are known: they are claimed at once.
+    The folder is made if it is not there; results of other kinds in it stay. `places`, files that the run will write as
+    far as they are known, are claimed at once.
 
     Raises
     ------
