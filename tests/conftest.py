@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import gc
 import io
 import os
+import pickle
 import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
+from unittest import mock
 
 import browser
 import processes
@@ -52,6 +55,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         processes.put_first(items)
 
 
+def pytest_collection_finish() -> None:
+    """Take what has been imported for all tests as there to stay; Python would look through it again and again."""
+    gc.freeze()
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     """Hold the tests that are left where those that start processes are left out to starting none."""
@@ -72,8 +80,17 @@ def real_data() -> Path:
 
 @pytest.fixture(scope="session")
 def demo_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What `gsseg demo` wrote, and in said.txt what it printed: made once for all workers, to be read only."""
+    """What `gsseg demo` wrote, to be read only: made once for all workers.
+
+    What it printed is in said.txt, the `DemoScene` that it built in built.pickle.
+    """
     from gsseg_core.cli.main import main
+    from gsseg_core.demo import run, table_scene
+
+    def build_and_keep(folder: Path, seed: int) -> table_scene.DemoScene:
+        built = table_scene.build_demo(folder, seed)
+        (out / "built.pickle").write_bytes(pickle.dumps(built))
+        return built
 
     own = tmp_path_factory.getbasetemp()
     top = own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
@@ -81,7 +98,8 @@ def demo_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with (top / "demo_run.lock").open("w") as lock, contextlib.redirect_stdout(io.StringIO()) as said:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (out / "said.txt").exists():
-            assert main(["demo", "--out", str(out), "--quiet"]) == 0
+            with mock.patch.object(run, "build_demo", build_and_keep):
+                assert main(["demo", "--out", str(out), "--quiet"]) == 0
             (out / "said.txt").write_text(said.getvalue())
     return out
 

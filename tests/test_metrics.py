@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy import ndimage
-from sklearn.metrics import confusion_matrix, jaccard_score, recall_score
 
 from gsseg_core.data.label_images import UNKNOWN, write_mask
 from gsseg_core.errors import MaskFormatError, MaskSizeError, NoUsableViewsError
@@ -54,6 +53,8 @@ def slow_boundary_iou(views: list[tuple[np.ndarray, np.ndarray]], label: int) ->
 
 @pytest.mark.parametrize("seed", range(5))
 def test_figures_are_those_of_scikit_learn(seed: int) -> None:
+    from sklearn import metrics  # Here, since it takes long, and all workers collect all tests.
+
     views = make_views(seed)
     rng = np.random.default_rng(seed + 100)
     for truth, _ in views:
@@ -63,12 +64,12 @@ def test_figures_are_those_of_scikit_learn(seed: int) -> None:
     truth = np.concatenate([t[t != UNKNOWN] for t, _ in views])
     prediction = np.concatenate([p[t != UNKNOWN] for t, p in views])
     labels = np.arange(evaluation.num_classes)
-    iou = jaccard_score(truth, prediction, labels=labels, average=None)
-    accuracy = recall_score(truth, prediction, labels=labels, average=None)
-    np.testing.assert_array_equal(evaluation.confusion, confusion_matrix(truth, prediction, labels=labels))
+    iou = metrics.jaccard_score(truth, prediction, labels=labels, average=None)
+    accuracy = metrics.recall_score(truth, prediction, labels=labels, average=None)
+    np.testing.assert_array_equal(evaluation.confusion, metrics.confusion_matrix(truth, prediction, labels=labels))
     np.testing.assert_allclose(evaluation.iou, iou)
     np.testing.assert_allclose(evaluation.accuracy, accuracy)
-    assert evaluation.mean_iou == pytest.approx(jaccard_score(truth, prediction, average="macro"))
+    assert evaluation.mean_iou == pytest.approx(metrics.jaccard_score(truth, prediction, average="macro"))
     assert evaluation.mean_accuracy == pytest.approx(accuracy.mean())
 
 

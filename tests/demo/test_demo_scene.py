@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -16,8 +18,9 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> DemoScene:
-    return build_demo(tmp_path_factory.mktemp("demo"))
+def demo(demo_run: Path) -> DemoScene:
+    built: DemoScene = pickle.loads((demo_run / "built.pickle").read_bytes())
+    return built
 
 
 def test_the_folder_is_a_dataset_with_train_and_test_views(demo: DemoScene) -> None:
@@ -73,19 +76,24 @@ def test_train_masks_have_errors_and_test_masks_stay_hidden(demo: DemoScene) -> 
     assert 0.15 < np.mean(wrong) < 0.45
 
 
-def test_the_same_seed_gives_the_same_scene(demo: DemoScene, demo_run: Path) -> None:
-    assert GaussianScene.load(demo_run / "scene/scene.ply").digest == demo.scene.digest
-    for name in (f"labels/{view}.png" for view in demo.train):
-        assert (demo_run / "scene" / name).read_bytes() == (demo.root / name).read_bytes()
+@pytest.fixture(scope="module")
+def small_demos(tmp_path_factory: pytest.TempPathFactory) -> list[DemoScene]:
+    """Demos of seeds 0, 0 and 1 with few views and few Gaussians."""
+    sizes = {"NUM_VIEWS": 4, "_SPACING": {"background": 0.3, "table": 0.04}, "_OBJECT_SPACING": 0.016}
+    with mock.patch.multiple(table_scene, **sizes):
+        return [build_demo(tmp_path_factory.mktemp("demo"), seed) for seed in (0, 0, 1)]
 
 
-def test_another_seed_gives_other_gaussians_and_masks_of_the_same_solids(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(table_scene, "NUM_VIEWS", 4)
-    monkeypatch.setattr(table_scene, "_SPACING", {"background": 0.3, "table": 0.04})
-    monkeypatch.setattr(table_scene, "_OBJECT_SPACING", 0.016)
-    one, other = (build_demo(tmp_path / str(seed), seed) for seed in (0, 1))
+def test_the_same_seed_gives_the_same_files(small_demos: list[DemoScene]) -> None:
+    first, again, _ = (
+        {path.relative_to(demo.root): path.read_bytes() for path in demo.root.glob("**/[!.]*.*")}
+        for demo in small_demos
+    )
+    assert len(first) == 5 + 3 + 4 and first == again
+
+
+def test_another_seed_gives_other_gaussians_and_wrong_masks_but_the_same_solids(small_demos: list[DemoScene]) -> None:
+    one, _, other = small_demos
     assert one.scene.digest != other.scene.digest
     for name in one.train:
         for folder, same in (("labels", False), ("labels_true", True)):
