@@ -23,14 +23,9 @@ from gsseg_core.raster.observation import Observation
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
-VOTE_UNIT = 2.0**-24
-"""Votes are counted in whole multiples of this many px, so that adding and taking back are exact."""
-
-UNITS = 1 / VOTE_UNIT
-"""Units per px."""
-
-MEMORY_BUDGET = 2 << 30
-"""Bytes of prepared views to keep between steps, unless asked otherwise."""
+VOTE_UNIT = 2.0**-24  # votes are counted in whole multiples of this many px, so that adding and taking back are exact
+UNITS = 1 / VOTE_UNIT  # units per px
+MEMORY_BUDGET = 2 << 30  # bytes of prepared views to keep between steps, unless asked otherwise
 
 NO_MASK, SEES_NOTHING, ALL_UNKNOWN = "no mask", "sees no Gaussian", "all pixels unknown"
 

@@ -35,8 +35,7 @@ FORMAT = "gsseg-state-1"
 
 _MOST_VIEWS = 2**31 - 1
 _MOST_VOTES = 2.0**62
-_VIEW_VOTES = 2.0**24 * LIMITS.max_pixels
-"""Votes of one view for one Gaussian, at most, in units of `VOTE_UNIT`."""
+_VIEW_VOTES = 2.0**24 * LIMITS.max_pixels  # votes of one view for one Gaussian, at most, in units of `VOTE_UNIT`
 
 
 @dataclass(frozen=True, eq=False)

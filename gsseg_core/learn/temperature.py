@@ -25,20 +25,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-LOWEST, HIGHEST = 0.2, 5.0
-"""Temperatures that are tried."""
-
-VIEWS = 16
-"""Views whose masks the temperature is fitted to, at most."""
-
-PIXELS = 2048
-"""Pixels of each view that the temperature is fitted to, on a grid, at most about."""
+LOWEST, HIGHEST = 0.2, 5.0  # temperatures that are tried
+VIEWS = 16  # views whose masks the temperature is fitted to, at most
+PIXELS = 2048  # pixels of each view that the temperature is fitted to, on a grid, at most about
 
 STEPS = 5
 RIGHT = 0.3
-OUTLIERS = 1e-3
-"""Share of pixels that carry any label of the view by chance."""
-
+OUTLIERS = 1e-3  # share of pixels that carry any label of the view by chance
 _PRECISION = 0.02  # of the logarithm of the temperature
 _TINY = 1e-12
 

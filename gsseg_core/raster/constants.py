@@ -2,29 +2,17 @@
 
 from __future__ import annotations
 
-NEAR = 0.01
-"""Centres nearer than this to the camera plane are not drawn, in scene units."""
-
-DILATION = 0.3
-"""Added to both variances on the image, in px^2 (the low-pass filter of 3DGS trainers)."""
-
-ALPHA_MIN = 1.0 / 255.0
-"""Alphas and opacities below this count as zero."""
-
-ALPHA_MAX = 0.99
-"""Largest alpha."""
-
-T_MIN = 1e-4
-"""A ray ends when its transmittance falls below this."""
-
-TINY = 1e-30
-"""Floor of a pixel's likelihood."""
+NEAR = 0.01  # centres nearer than this to the camera plane are not drawn, in scene units
+DILATION = 0.3  # added to both variances on the image, in px^2 (the low-pass filter of 3DGS trainers)
+ALPHA_MIN = 1.0 / 255.0  # alphas and opacities below this count as zero
+ALPHA_MAX = 0.99  # largest alpha
+T_MIN = 1e-4  # a ray ends when its transmittance falls below this
+TINY = 1e-30  # floor of a pixel's likelihood
 
 CHANNELS = 32
 """Channels that one pass of an adjoint sums at once: bounds its memory, and fits the shared memory of every GPU."""
 
-AHEAD = 12
-"""Entries between the one that is worked on and the one that is fetched from memory."""
+AHEAD = 12  # entries between the one that is worked on and the one that is fetched from memory
 
 CHUNKS = 16
 """Parts into which Gaussians are cut, to be worked on beside each other; fixed, so that threads change nothing."""

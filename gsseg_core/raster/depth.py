@@ -10,12 +10,8 @@ from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
-COVERED = 0.5
-"""Accumulated alpha above which a pixel belongs to a silhouette."""
-
-BEHIND = 1.02
-"""What is deeper than the surface of the scene by more than this factor is hidden."""
-
+COVERED = 0.5  # accumulated alpha above which a pixel belongs to a silhouette
+BEHIND = 1.02  # what is deeper than the surface of the scene by more than this factor is hidden
 _EMPTY = 1e-3  # accumulated alpha below which a ray meets nothing
 
 

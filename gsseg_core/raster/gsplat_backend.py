@@ -29,8 +29,7 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 
-TILE = 16
-"""Side of the tiles that gsplat is asked for, in px."""
+TILE = 16  # side of the tiles that gsplat is asked for, in px
 
 
 @functools.cache

@@ -10,9 +10,7 @@ import numpy as np
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 
-LEAF = 16
-"""Most points in a leaf of the tree."""
-
+LEAF = 16  # most points in a leaf of the tree
 SUBTREE = 8  # levels of a subtree that one thread builds alone: about 4000 points
 
 

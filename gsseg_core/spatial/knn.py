@@ -21,9 +21,7 @@ DEPTH = 64  # nodes that can wait at once; a descent leaves at most one behind a
 FAR = np.float32(np.inf)
 NO_SKIP = np.zeros(0, np.int32)
 
-DIGITS = 24
-"""Distances are summed in steps of 2^-DIGITS of the k-th one, or finer: the precision of a float32."""
-
+DIGITS = 24  # distances are summed in steps of 2^-DIGITS of the k-th one, or finer: the precision of a float32
 SLACK = np.float32(1.00001)  # covers float32 rounding in a bound
 LEAST = np.finfo(np.float32).tiny  # a bound that even points in one place are below
 

@@ -21,8 +21,7 @@ from gsseg_core.simd import at_most, first_bit, load_row
 from gsseg_core.spatial.kd_tree import Tree, leaf_range, scaled, tree_of
 from gsseg_core.spatial.knn import NO_SKIP, find_leaves, measure, nearest, scratch_for
 
-NEIGHBOURS = 12
-"""Neighbours of a Gaussian in its graph, unless others are asked for."""
+NEIGHBOURS = 12  # neighbours of a Gaussian in its graph, unless others are asked for
 
 
 @dataclass(frozen=True, eq=False)

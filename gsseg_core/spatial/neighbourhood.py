@@ -21,22 +21,10 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 from gsseg_core.simd import at_most, first_bit, load_row
+from gsseg_core.spatial import knn
 from gsseg_core.spatial.kd_tree import LEAF, Tree, leaf_range, scaled, tree_of
-from gsseg_core.spatial.knn import (
-    CHUNK,
-    NO_SKIP,
-    LeafCandidates,
-    end_of_group,
-    find_leaves,
-    measure,
-    middle_of,
-    nearest,
-    scratch_for,
-)
 
-CODE_UNIT = 2.0**-24
-"""Codes are summed in steps of this, which is the precision of a float32 near 1."""
-
+CODE_UNIT = 2.0**-24  # codes are summed in steps of this, which is the precision of a float32 near 1
 ROWS_AT_ONCE = 1 << 16  # points whose mean codes are written out at once
 MIXED = np.int32(-(2**31))  # stands for the label of a node whose points have several
 NOBODY = MIXED + 1  # the label of no point
@@ -44,24 +32,12 @@ NOBODY = MIXED + 1  # the label of no point
 
 @dataclass(frozen=True, eq=False)
 class Neighbours:
-    """How far the k nearest others of points are.
+    """How far the k nearest others of points are."""
 
-    Attributes
-    ----------
-    k : int
-        Number of neighbours; N - 1 if there are not as many.
-    tree : Tree
-        The points, all arrays here being in its order.
-    radii : (N,) float32
-        Squared distance to the k-th nearest other, in units of the scaled points; NaN where nobody has asked for it.
-    distances : (N,) float64
-        Mean distance to the k nearest others, in the same units; NaN likewise.
-    """
-
-    k: int
-    tree: Tree
-    radii: np.ndarray
-    distances: np.ndarray
+    k: int  # number of neighbours; N - 1 if there are not as many
+    tree: Tree  # the points, all arrays here being in its order
+    radii: np.ndarray  # (N,) float32: squared distance to the k-th nearest other, NaN where nobody has asked for it
+    distances: np.ndarray  # (N,) float64: mean distance to the k nearest others, both in units of the scaled points
     _looking: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     @classmethod
@@ -79,7 +55,7 @@ class Neighbours:
             missing = np.isnan(self.radii)
             places = np.flatnonzero(missing if wanted is None else missing & wanted).astype(np.int32)
             if len(places):
-                self.radii[places], self.distances[places] = nearest(self.tree, places, self.k)
+                self.radii[places], self.distances[places] = knn.nearest(self.tree, places, self.k)
         return self
 
     def mean_codes(
@@ -136,7 +112,7 @@ class Neighbours:
             mixed = np.flatnonzero(np.isnan(found[members])).astype(np.int32)
             # Where other classes are among the neighbours, more of its own are looked for, farther away.
             if len(members) > 1 and len(mixed):
-                found[members[mixed]] = nearest(tree.part(members), mixed, min(self.k, len(members) - 1))[1]
+                found[members[mixed]] = knn.nearest(tree.part(members), mixed, min(self.k, len(members) - 1))[1]
         out = np.empty(len(labels))
         out[tree.order] = found
         return out
@@ -165,22 +141,22 @@ def average(
     """
     m, leaves, n = len(places), len(tree.blocks), len(tree.order)
     out = np.zeros((m, num_classes), np.float32)
-    for chunk in nb.prange((m + CHUNK - 1) // CHUNK):
+    for chunk in nb.prange((m + knn.CHUNK - 1) // knn.CHUNK):
         sums = np.empty((2, num_classes), np.int64)  # inside the radius, and on it
         counts = np.empty((2, 2), np.int64)  # the same, and of these the ones that count
-        box, candidates = np.empty(6, np.float32), scratch_for(128)
-        begin = chunk * CHUNK
-        while begin < min((chunk + 1) * CHUNK, m):
-            end = end_of_group(tree, places, begin)
-            middle_of(tree.points, places, begin, end, box)
+        box, candidates = np.empty(6, np.float32), knn.scratch_for(128)
+        begin = chunk * knn.CHUNK
+        while begin < min((chunk + 1) * knn.CHUNK, m):
+            end = knn.end_of_group(tree, places, begin)
+            knn.middle_of(tree.points, places, begin, end, box)
             reach = np.float32(0)
             for q in range(begin, end):
                 reach = max(reach, radii[places[q]])
-            candidates, found = find_leaves(tree.boxes, box, reach, NO_SKIP, 0, candidates)
+            candidates, found = knn.find_leaves(tree.boxes, box, reach, knn.NO_SKIP, 0, candidates)
             for q in range(begin, end):
                 own = places[q]
                 sums[:], counts[:] = 0, 0
-                for h in range(measure(tree, own, radii[own], found, candidates)):
+                for h in range(knn.measure(tree, own, radii[own], found, candidates)):
                     start = leaf_range(candidates.leaves[candidates.reached[h]], leaves, n)[0]
                     within = at_most(load_row(candidates.near, h), radii[own])
                     while within:
@@ -211,7 +187,7 @@ def pure_distances(tree: Tree, labels: np.ndarray, radii: np.ndarray, distances:
     leaves, n = len(tree.blocks), len(labels)
     out, of_node = np.full(n, np.nan), _labels_of_nodes(labels, leaves)
     for chunk in nb.prange((leaves + LEAF - 1) // LEAF):
-        candidates = scratch_for(128)
+        candidates = knn.scratch_for(128)
         for leaf in range(chunk * LEAF, min((chunk + 1) * LEAF, leaves)):
             first, last = leaf_range(leaf, leaves, n)
             widest, label = np.float32(-1), of_node[leaves + leaf]
@@ -222,10 +198,10 @@ def pure_distances(tree: Tree, labels: np.ndarray, radii: np.ndarray, distances:
             # A node of the leaf's own label has nothing to say; a leaf of several labels has none.
             skipped = label if label != MIXED else NOBODY
             box = tree.boxes[leaves + leaf]
-            candidates, found = find_leaves(tree.boxes, box, widest, of_node, skipped, candidates)
+            candidates, found = knn.find_leaves(tree.boxes, box, widest, of_node, skipped, candidates)
             for q in range(first, last):
                 if labels[q] > 0:
-                    reached = measure(tree, q, radii[q], found, candidates)
+                    reached = knn.measure(tree, q, radii[q], found, candidates)
                     if _is_pure(labels, labels[q], radii[q], reached, leaves, candidates):
                         out[q] = distances[q]
     return out
@@ -233,7 +209,7 @@ def pure_distances(tree: Tree, labels: np.ndarray, radii: np.ndarray, distances:
 
 @nb.njit
 def _is_pure(
-    labels: np.ndarray, label: int, radius: float, reached: int, leaves: int, candidates: LeafCandidates
+    labels: np.ndarray, label: int, radius: float, reached: int, leaves: int, candidates: knn.LeafCandidates
 ) -> bool:
     """Whether all points measured and within the radius have a label."""
     for h in range(reached):

@@ -17,11 +17,8 @@ from gsseg_core.errors import SchedulerError, SettingsError
 if TYPE_CHECKING:
     from distributed import Client
 
-PATIENCE = 10.0
-"""Seconds to wait for a scheduler to answer, and for a worker when there is none."""
-
-UNREACHABLE = (OSError, TimeoutError, asyncio.TimeoutError)
-"""What Dask raises when nobody answers."""
+PATIENCE = 10.0  # seconds to wait for a scheduler to answer, and for a worker when there is none
+UNREACHABLE = (OSError, TimeoutError, asyncio.TimeoutError)  # what Dask raises when nobody answers
 
 
 @contextmanager

@@ -33,9 +33,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-ATTEMPTS = 5
-"""How often a sum is begun anew where Dask cannot make good by itself what was lost."""
-
+ATTEMPTS = 5  # how often a sum is begun anew where Dask cannot make good by itself what was lost
 _POLL = 0.01  # s
 
 Report = Callable[[int], None]

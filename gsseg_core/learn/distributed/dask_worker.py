@@ -30,8 +30,7 @@ from gsseg_core.scene.gaussian_scene import DC, GaussianScene
 Part = tuple[Any, dict[str, Any]]
 """A sum over some views, of int64, or None, and by view what else came out."""
 
-ONLY_VOTES = EMSettings(errors=False)
-"""What is wrong with a mask does not matter to votes."""
+ONLY_VOTES = EMSettings(errors=False)  # what is wrong with a mask does not matter to votes
 
 _BUSY = threading.Lock()
 

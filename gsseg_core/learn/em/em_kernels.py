@@ -13,8 +13,7 @@ from numba.core import types
 from gsseg_core.data.label_evidence import vote_units
 from gsseg_core.simd import intrinsic
 
-BLOCKS = 16
-"""Counts are summed in this many parts, then together, so that they do not depend on the number of threads."""
+BLOCKS = 16  # counts are summed in this many parts, then together, so that they do not depend on the number of threads
 
 GRADIENT_UNIT = 2.0**-24
 """Gradients are sums of whole multiples of this, in px, so they depend neither on the order of views nor on where."""

@@ -5,11 +5,8 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-DIGIT_BITS = 11
-"""Three digits make up a key; counts of one fit the fastest cache."""
-
-PARTS = 4
-"""Parts that are counted and moved beside each other; fixed, so that threads change nothing."""
+DIGIT_BITS = 11  # three digits make up a key; counts of one fit the fastest cache
+PARTS = 4  # parts that are counted and moved beside each other; fixed, so that threads change nothing
 
 
 def sort_by_depth(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

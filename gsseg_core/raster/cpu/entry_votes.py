@@ -12,8 +12,7 @@ from gsseg_core.raster.cpu.lifting import Lifted
 from gsseg_core.raster.cpu.tiling import Tiles
 from gsseg_core.simd import prefetch
 
-WAITING = 64
-"""Votes that are put together before they are counted: where they go has come into the cache by then."""
+WAITING = 64  # votes that are put together before they are counted: where they go has come into the cache by then
 
 
 def add_entry_votes(

@@ -2,7 +2,7 @@
 
 A *pair* is a Gaussian with one of the labels under which a view sees it. There are few: most Gaussians lie inside
 one label. Everything that learning asks of a view is one number per pair, and `share` makes these numbers, from the
-entries and blocks that `lift` found to have a weight. It projects nothing, sorts nothing, and meets no Gaussian that
+entries and blocks that `lifting` found to have a weight. It projects nothing, sorts nothing, and meets no Gaussian that
 something else hides.
 """
 
@@ -11,24 +11,12 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
+from gsseg_core import simd
 from gsseg_core.raster.constants import AHEAD, CHUNKS, TINY
 from gsseg_core.raster.cpu.blending import open_rays, stride_of, tile_of_turn
 from gsseg_core.raster.cpu.lifting import Labels
 from gsseg_core.raster.cpu.splat import WIDTH, aim, blend_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
-from gsseg_core.simd import (
-    FAST,
-    add_product,
-    add_product_where,
-    add_scaled,
-    add_scaled_where,
-    first_bit,
-    load_row,
-    nothing,
-    prefetch,
-    store_row,
-    sum_row,
-)
 
 _TINY = np.float32(TINY)
 
@@ -36,8 +24,7 @@ _TINY = np.float32(TINY)
 _CHUNK = 27  # the bits above these say which chunk a number belongs to
 _NUMBER = (1 << _CHUNK) - 1
 
-PARTS = 4
-"""Parts of the image whose sums are added up beside each other."""
+PARTS = 4  # parts of the image whose sums are added up beside each other
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
@@ -83,10 +70,10 @@ def number_pairs(
         for g in range(first, (chunk + 1) * count // CHUNKS):
             begin, is_seen = n, False
             for i in range(tiles.gaussian_start[g], tiles.gaussian_start[g + 1]):
-                prefetch(kept, tiles.gaussian_entries[min(i + 2 * AHEAD, last)])
+                simd.prefetch(kept, tiles.gaussian_entries[min(i + 2 * AHEAD, last)])
                 later = tiles.gaussian_entries[min(i + AHEAD, last)]
                 of_tile = facts[kept[later, 1]]
-                prefetch(sums, of_tile[1] + (later - of_tile[0]) * of_tile[5])
+                simd.prefetch(sums, of_tile[1] + (later - of_tile[0]) * of_tile[5])
                 e = tiles.gaussian_entries[i]
                 target = kept[e, 0]
                 if target < 0:
@@ -134,7 +121,7 @@ def take(table: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     return out
 
 
-@nb.njit(parallel=True, nogil=True, cache=True, fastmath=FAST, error_model="numpy")
+@nb.njit(parallel=True, nogil=True, cache=True, fastmath=simd.FAST, error_model="numpy")
 def share(
     tiles: Tiles, labels: Labels, blocks: np.ndarray,  # (E,) of each entry
     records: np.ndarray,  # (T,) blocks of all the tile's entries
@@ -170,7 +157,7 @@ def share(
     return logs, left_over, sums
 
 
-@nb.njit(fastmath=FAST, error_model="numpy")
+@nb.njit(fastmath=simd.FAST, error_model="numpy")
 def _blend_likelihood(
     left: float, top: float, table: np.ndarray,  # (M, 8)
     entries: np.ndarray, blocks: np.ndarray, label_count: int,  # (E_t,), (E_t,) of this tile
@@ -181,26 +168,26 @@ def _blend_likelihood(
     lines = np.empty((2, TILE), np.float32)
     n = 0
     for e in range(entries.shape[0]):
-        prefetch(table, entries[min(e + AHEAD, entries.shape[0] - 1)])
+        simd.prefetch(table, entries[min(e + AHEAD, entries.shape[0] - 1)])
         g = entries[e]
         aim(table, g, left, top, lines)
         only = likelihood[pair[e * label_count]] if label_count == 1 else np.float32(0.0)
         todo = np.int64(blocks[e])
         while todo:
-            b = first_bit(todo)
+            b = simd.first_bit(todo)
             todo &= todo - 1
             weight, _ = blend_block(rays, b, lines, table[g, WIDTH])
-            store_row(weights, n, weight)
+            simd.store_row(weights, n, weight)
             n += 1
-            total = load_row(value, b)
+            total = simd.load_row(value, b)
             if label_count == 1:
-                total = add_scaled(total, weight, only)
+                total = simd.add_scaled(total, weight, only)
             else:
                 for span in range(spans[b], spans[b + 1]):
                     # Where there is no pair, the weights are zero.
                     s = max(pair[e * label_count + labels.slots[span]], 0)
-                    total = add_scaled_where(total, weight, likelihood[s], np.int64(labels.lanes[span]))
-            store_row(value, b, total)
+                    total = simd.add_scaled_where(total, weight, likelihood[s], np.int64(labels.lanes[span]))
+            simd.store_row(value, b, total)
 
 
 @nb.njit(error_model="numpy")
@@ -234,7 +221,7 @@ def invert(
     return total
 
 
-@nb.njit(fastmath=FAST)
+@nb.njit(fastmath=simd.FAST)
 def sum_shares(
     blocks: np.ndarray, label_count: int, spans: np.ndarray, labels: Labels,  # (E_t,), (17,)
     inverse: np.ndarray, weights: np.ndarray, sums: np.ndarray,  # (16, 16), (R, 16), (E_t * label_count,) out
@@ -244,24 +231,25 @@ def sum_shares(
     n = 0
     for e in range(blocks.shape[0]):
         # Lane by lane, as long as the label stays the same: most blocks have one label, and most entries too.
-        current, lanewise = np.int64(-1), nothing()
+        current, lanewise = np.int64(-1), simd.nothing()
         todo = np.int64(blocks[e])
         while todo:
-            b = first_bit(todo)
+            b = simd.first_bit(todo)
             todo &= todo - 1
-            weight = load_row(weights, n)
+            weight = simd.load_row(weights, n)
             n += 1
             if label_count == 1:
-                current, lanewise = np.int64(0), add_product(lanewise, weight, load_row(inverse, b))
+                current, lanewise = np.int64(0), simd.add_product(lanewise, weight, simd.load_row(inverse, b))
                 continue
             for span in range(spans[b], spans[b + 1]):
                 if labels.slots[span] != current:
                     if current >= 0:
-                        sums[e * label_count + current] += sum_row(lanewise)
-                    current, lanewise = np.int64(labels.slots[span]), nothing()
-                lanewise = add_product_where(lanewise, weight, load_row(inverse, b), np.int64(labels.lanes[span]))
+                        sums[e * label_count + current] += simd.sum_row(lanewise)
+                    current, lanewise = np.int64(labels.slots[span]), simd.nothing()
+                here = np.int64(labels.lanes[span])
+                lanewise = simd.add_product_where(lanewise, weight, simd.load_row(inverse, b), here)
         if current >= 0:
-            sums[e * label_count + current] += sum_row(lanewise)
+            sums[e * label_count + current] += simd.sum_row(lanewise)
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)

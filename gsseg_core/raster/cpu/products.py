@@ -24,8 +24,7 @@ from gsseg_core.raster.cpu.splat import OPEN, WIDTH, blend_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
 from gsseg_core.simd import FAST, add_scaled, dot, first_bit, load_row, prefetch, store_row
 
-FEW = 4
-"""Channels up to which `render_few` is the faster one: colours, depths."""
+FEW = 4  # channels up to which `render_few` is the faster one: colours, depths
 
 
 @nb.njit(inline="always")

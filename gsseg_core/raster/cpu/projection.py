@@ -28,25 +28,21 @@ from gsseg_core.simd import prefetch
 FRUSTUM_MARGIN = 0.3
 """The linearisation point is kept within the image widened by this fraction of half its width, as trainers do."""
 
-REACH_MAX = 1e6
-"""A reach is cut off here, in px: far beyond any image, and safely an integer."""
+REACH_MAX = 1e6  # a reach is cut off here, in px: far beyond any image, and safely an integer
 
 HALF_LOG2E = 0.5 / np.log(2.0)
 
-LARGEST_REACH = np.sqrt(2.0 * np.log(255.0))
-"""Standard deviations at which a Gaussian of opacity 1 falls to 1/255."""
+LARGEST_REACH = np.sqrt(2.0 * np.log(255.0))  # standard deviations at which a Gaussian of opacity 1 falls to 1/255
 
 ROOT = np.sqrt(DILATION)
 
-BATCH = 128
-"""Gaussians that are looked at together before those among them that may be visible are projected."""
+BATCH = 128  # Gaussians that are looked at together before those among them that may be visible are projected
 
 # Where numbers of the Gaussians of a batch lie: so many times BATCH.
 MEAN, QUAT, SCALES, OPACITY, OUT, DEPTH = 0, 3, 7, 10, 11, 19
 NUMBERS = 20
 
-AHEAD = 32
-"""How many rows ahead memory is asked for."""
+AHEAD = 32  # how many rows ahead memory is asked for
 
 
 class Projected(NamedTuple):

@@ -16,13 +16,11 @@ from gsseg_core.simd import LANES
 TILE = LANES
 """Side of a tile in px. One row of a tile is one vector register of sixteen float32."""
 
-TYPICAL = 4
-"""Tiles that a Gaussian touches, at first; where they touch more on average, they are listed once more."""
+TYPICAL = 4  # tiles that a Gaussian touches, at first; where they touch more on average, they are listed once more
 
 _LEAST = np.float32(LOG_ALPHA_MIN)
 
-BATCH = 256
-"""Gaussians that are looked at together."""
+BATCH = 256  # Gaussians that are looked at together
 
 
 class Tiles(NamedTuple):
