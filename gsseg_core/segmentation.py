@@ -78,7 +78,7 @@ class Segmentation:
     def from_codes(
         cls,
         scene: GaussianScene,
-        codes: np.ndarray,  # (N, K)
+        codes: np.ndarray,
         class_names: Mapping[int, str],
         settings: RefineSettings | None = None,
     ) -> Segmentation:
@@ -101,13 +101,9 @@ class Segmentation:
 
     @classmethod
     def unfiltered(
-        cls,
-        scene: GaussianScene,
-        codes: np.ndarray,  # (N, K)
-        class_names: Mapping[int, str],
-        settings: RefineSettings,
+        cls, scene: GaussianScene, codes: np.ndarray, class_names: Mapping[int, str], settings: RefineSettings
     ) -> Segmentation:
-        """Label learnt codes, after KNN clustering unless that is switched off, and leave the filter to the caller."""
+        """Label learnt codes (N, K), after KNN clustering unless that is off, and leave the filter to the caller."""
         names = {k: class_name(class_names, k) for k in range(codes.shape[1])}
         probabilities, clustered = codes, np.zeros(len(codes), bool)
         if settings.cluster:
@@ -119,8 +115,8 @@ class Segmentation:
 
     def filtered(self, scene: GaussianScene, settings: RefineSettings) -> Segmentation:
         """Take the outliers out of each object: the paper's statistical filter."""
-        k, classes = settings.k, self.probabilities.shape[1]
-        out = statistical_filter(scene.means, self.labels, k, settings.filter_sigmas, classes, neighbours_of(scene, k))
+        neighbours, classes = neighbours_of(scene, settings.k), self.probabilities.shape[1]
+        out = statistical_filter(scene.means, self.labels, settings.k, settings.filter_sigmas, classes, neighbours)
         return self._without(out)
 
     def calibrated(self, temperature: float) -> Segmentation:
@@ -193,10 +189,8 @@ class Segmentation:
         What the views show are the label maps that the segmentation itself renders, not the masks: they are learnt from
         all masks together, so that errors of single masks carve nothing away.
         """
-        silhouettes = []
-        for camera in cameras:
-            operator = make_operator(scene, camera, device)
-            silhouettes.append(Silhouette.of(scene, operator, self.render(operator).labels))
+        operators = (make_operator(scene, camera, device) for camera in cameras)
+        silhouettes = [Silhouette.of(scene, operator, self.render(operator).labels) for operator in operators]
         return self._without(carve(scene, self.labels, silhouettes))
 
     def blend(self, operator: ViewOperator) -> np.ndarray:
@@ -204,20 +198,17 @@ class Segmentation:
 
         `gsseg_core.learn.temperature.tempered` at `temperature` makes probabilities of them.
         """
-        image, left_over = operator.blend(self._blended)
-        if self._shows_background:
+        codes, shows_background = self._blended
+        image, left_over = operator.blend(codes)
+        if shows_background:
             image[..., 0] += left_over
         return image
 
     @cached_property
-    def _blended(self) -> np.ndarray:
+    def _blended(self) -> tuple[np.ndarray, bool]:
         codes = tempered(self.probabilities, 1 / self.temperature).copy()
         codes[self.clustered] = np.where(self.learnt.any(axis=1, keepdims=True), self.learnt, codes[self.clustered])
-        return codes
-
-    @cached_property
-    def _shows_background(self) -> bool:
-        return bool(self._blended[:, 0].any())
+        return codes, bool(codes[:, 0].any())
 
     def save(self, path: str | os.PathLike[str], run: str | None = None) -> None:
         """Write labels, probabilities, confidence, class ids and names as one npz, atomically.

@@ -22,41 +22,21 @@ from gsseg_core.data.view import View, spread
 from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.learn.temperature import VIEWS, Sample, sample_pixels
 
-CONFUSIONS = 3
-"""Most confusions that the report of a view names."""
-
 
 @dataclass(frozen=True, eq=False)
 class ViewCheck:
     """Comparison of a view's mask with what the other views predict.
 
-    Attributes
-    ----------
-    name : str
-        Of the view.
-    num_pixels : int
-        Pixels with a label.
-    classes : (L,) int32
-        Labels that occur in the mask, ascending; of a partial one, `UNKNOWN` (-1) at last for "none of these".
-    counts : (K, L) int64
-        Of the pixels with a label of which there is a prediction: how many by class predicted (row) and by
-        label (column).
-    predicted : PackedLabels, optional
-        What the other views predict, (H, W), for pictures.
-    evidence : LabelEvidence, optional
-        Of a soft or partial mask; `classes` are its vocabulary.
-    rejected : float
-        Share of the pixels with a label from which nothing was learnt, since they lie in rejected regions; see
-        `gsseg_core.learn.em.rejected_regions`.
+    In `counts` are the pixels with a label of which there is a prediction, by class predicted (row) and label (column).
     """
 
     name: str
-    num_pixels: int
-    classes: np.ndarray
-    counts: np.ndarray
-    predicted: PackedLabels | None = None
-    evidence: LabelEvidence | None = None
-    rejected: float = 0.0
+    num_pixels: int  # with a label
+    classes: np.ndarray  # (L,) int32: labels in the mask, ascending; in a partial one, "none of these" (-1) at last
+    counts: np.ndarray  # (K, L) int64
+    predicted: PackedLabels | None = None  # (H, W): what the other views predict, for pictures
+    evidence: LabelEvidence | None = None  # of a soft or partial mask; `classes` are its vocabulary
+    rejected: float = 0.0  # `Learner.rejected_share`
 
     @property
     def checked(self) -> int:
@@ -68,21 +48,12 @@ class ViewCheck:
         """Share of the checked pixels whose label is the one predicted, in [0, 1]; NaN where there is none."""
         return float(self.counts[self._right].sum() / self.checked) if self.checked else math.nan
 
-    @property
-    def agreement(self) -> np.ndarray:
-        """Share of the pixels predicted as each class that carry its label, (K,); NaN where none is predicted."""
-        right = np.zeros(len(self.counts))
-        right[self._right[0]] = self.counts[self._right]
-        shown = self.counts.sum(axis=1)
-        share: np.ndarray = np.divide(right, shown, out=np.full(len(shown), np.nan), where=shown > 0)
-        return share
-
     def prediction(self) -> np.ndarray:
         """Unpack what the other views predict, (H, W) int32."""
         assert self.predicted is not None, f"check of {self.name} came without its prediction"
         return self.predicted.unpack()
 
-    def confusions(self, count: int = CONFUSIONS) -> list[tuple[int, int, float]]:
+    def confusions(self, count: int = 3) -> list[tuple[int, int, float]]:
         """List what was most often taken for something else: class predicted, label seen, share of checked pixels."""
         wrong = self.counts.copy()
         wrong[self._right] = 0
@@ -116,24 +87,6 @@ class MaskChecker:
         self._samples: dict[str, Sample] = {}
         learner.prepare_predictions(progress)
 
-    def predict(self, view: View) -> np.ndarray:
-        """Predict a view's labels without its mask.
-
-        Returns
-        -------
-        (H, W) int32
-            `UNKNOWN` (-1) where most of the ray ends on Gaussians that only this view has seen.
-        """
-        return _strongest(self.learner.predict_without(view))
-
-    def check(self, view: View) -> ViewCheck:
-        """Compare a view's mask with its prediction."""
-        image = self.learner.predict_without(view)
-        if view.name in self._sampled:
-            self._samples[view.name] = sample_pixels(image, view.read_labels())
-        check = compare_mask(view, _strongest(image), self.learner.num_classes)
-        return replace(check, rejected=self.learner.rejected_share(view))
-
     def sample(self, view: View) -> Sample:
         """Take pixels of a view's mask with their predicted probabilities, to fit the temperature to."""
         if view.name not in self._samples:
@@ -141,43 +94,30 @@ class MaskChecker:
         return self._samples[view.name]
 
     def check_all(self, progress: Progress = silent) -> list[ViewCheck]:
-        """Compare all masks with their predictions, in the order of the views."""
-        checks, views = [], self.learner.views
-        for done, view in enumerate(views.values()):
-            progress("check views", done, len(views))
-            checks.append(self.check(view))
-        progress("check views", len(views), len(views))
+        """Compare all masks with their predictions, in the order of the views.
+
+        A prediction is unknown where most of a ray ends on Gaussians that only this view has seen.
+        """
+        checks, learner = [], self.learner
+        for done, view in enumerate(learner.views.values()):
+            progress("check views", done, len(learner.views))
+            image = learner.predict_without(view)
+            if view.name in self._sampled:
+                self._samples[view.name] = sample_pixels(image, view.read_labels())
+            predicted = np.where(image.sum(axis=2) > 0.5, image.argmax(axis=2), UNKNOWN).astype(np.int32)
+            check = compare_mask(view, predicted, learner.num_classes)
+            checks.append(replace(check, rejected=learner.rejected_share(view)))
+        progress("check views", len(learner.views), len(learner.views))
         return checks
 
 
 def check_views(learner: Learner, progress: Progress = silent) -> list[ViewCheck]:
-    """Compare each view's mask with what the other views predict; see `worst_views` and `reliability_report`.
-
-    Parameters
-    ----------
-    learner : Learner
-        After `fit`; one of which `checks_masks` holds.
-    progress : callable, optional
-        Told of every view.
-
-    Returns
-    -------
-    list of ViewCheck
-        In the order of the views.
-    """
+    """Compare each view's mask with what the other views predict, in the order of the views; see `MaskChecker`."""
     return MaskChecker(learner, progress).check_all(progress)
 
 
 def worst_views(checks: Iterable[ViewCheck], count: int | None = None) -> list[ViewCheck]:
-    """Sort views by reliability, the worst first; those that nothing is known of come last.
-
-    Parameters
-    ----------
-    checks : iterable of ViewCheck
-        Of `check_views`.
-    count : int, optional
-        So many at most; all by default.
-    """
+    """Sort views by reliability, the worst first; those that nothing is known of come last. All, or so many at most."""
     return sorted(checks, key=lambda check: (not check.checked, check.reliability))[:count]
 
 
@@ -188,10 +128,13 @@ def reliability_report(checks: Iterable[ViewCheck], class_names: Mapping[int, st
     -------
     list of dict
         `name`; `reliability` in [0, 1], None where there is no prediction; `num_pixels` with a label; `unheard`,
-        the share of them from which nothing was learnt;
-        `confusions`, largest first: `true`, the class that the others predict, `seen` as, and the `share` of the
-        view's checked pixels.
+        the share of them from which nothing was learnt; `confusions`, largest first: `true`, the class that the others
+        predict, `seen` as, and the `share` of the view's checked pixels.
     """
+
+    def name(label: int) -> str:
+        return class_name(class_names, label) if label >= 0 else "none of these"
+
     return [
         {
             "name": check.name,
@@ -199,26 +142,14 @@ def reliability_report(checks: Iterable[ViewCheck], class_names: Mapping[int, st
             "num_pixels": check.num_pixels,
             "unheard": round(check.rejected, 4),
             "confusions": [
-                {"true": _name(class_names, k), "seen": _name(class_names, y), "share": round(share, 4)}
-                for k, y, share in check.confusions()
+                {"true": name(k), "seen": name(y), "share": round(share, 4)} for k, y, share in check.confusions()
             ],
         }
         for check in worst_views(checks)
     ]
 
 
-def _strongest(
-    image: np.ndarray,  # (H, W, K)
-) -> np.ndarray:
-    labels: np.ndarray = np.where(image.sum(axis=2) > 0.5, image.argmax(axis=2), UNKNOWN).astype(np.int32)
-    return labels
-
-
-def compare_mask(
-    view: View,
-    predicted: np.ndarray,  # (H, W) int32
-    num_classes: int,
-) -> ViewCheck:
+def compare_mask(view: View, predicted: np.ndarray, num_classes: int) -> ViewCheck:  # (H, W) int32
     """Compare a view's mask with any prediction of its labels, `UNKNOWN` (-1) where there is none."""
     seen = view.read_seen()
     labels, evidence = seen.named(), seen.evidence
@@ -231,7 +162,3 @@ def compare_mask(
     cells = predicted[both] * np.int64(len(classes)) + words[both]
     counts = np.bincount(cells, minlength=num_classes * len(classes)).reshape(num_classes, len(classes))
     return ViewCheck(view.name, int(known.sum()), classes, counts, PackedLabels(predicted), evidence)
-
-
-def _name(class_names: Mapping[int, str], label: int) -> str:
-    return class_name(class_names, label) if label >= 0 else "none of these"

@@ -24,8 +24,9 @@ Nothing depends on the order of views or ids, nor on how many there are.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
@@ -33,45 +34,27 @@ from scipy import sparse
 from gsseg_core.errors import SettingsError
 from gsseg_core.objects.lifted_segments import Lifted, Profiles, sums
 
+_PAIRS = 1 << 15
+"""So many pairs at a time, to keep memory small."""
+
+_LEVEL = 0.75
+"""Pairs that agree nearly as well as the best one merge at once, before anything is compared anew."""
+
 
 @dataclass(frozen=True)
 class AssociationSettings:
-    """Settings of `associate`.
+    """Settings of `associate`."""
 
-    Attributes
-    ----------
-    kept : float
-        Share of a segment's weight that is kept, in its heaviest Gaussians, in (0, 1].
-    agreement : float
-        Clusters merge above this mean agreement of the views that see both, in (0, 1).
-    doubt : float
-        Views that disagree, added to every pair: pairs that many views confirm merge first.
-    evidence : float
-        Views, in full sight of both clusters, that it takes at least to merge two.
-    full_sight : float
-        Share of a cluster, as far as any view sees it, that a view must see to count in full.
-    plenty : float
-        Px of a cluster that a view must see to count in full, however large the cluster is.
-    full_sight_px : float
-        What a view sees of a cluster counts by x / (x + this), x in px.
-    least_share : float
-        Smaller shares O_ab / V_av are soft edges, not overlap.
-    unseen : float
-        A segment of which the other views have seen less than this share stays what it is.
-    rounds : int
-        Rounds of moves at most.
-    """
-
-    kept: float = 0.8
-    agreement: float = 0.5
-    doubt: float = 0.3
-    evidence: float = 0.3
-    full_sight: float = 0.5
-    plenty: float = 2000.0
-    full_sight_px: float = 10.0
-    least_share: float = 0.05
-    unseen: float = 0.3
-    rounds: int = 10
+    kept: float = 0.8  # share of a segment's weight that is kept, in its heaviest Gaussians, in (0, 1]
+    agreement: float = 0.5  # clusters merge above this mean agreement of the views that see both, in (0, 1)
+    doubt: float = 0.3  # views that disagree, added to every pair: pairs that many views confirm merge first
+    evidence: float = 0.3  # views, in full sight of both clusters, that it takes at least to merge two
+    full_sight: float = 0.5  # share of a cluster, as far as any view sees it, that a view must see to count in full
+    plenty: float = 2000.0  # px of a cluster that a view must see to count in full, however large the cluster is
+    full_sight_px: float = 10.0  # what a view sees of a cluster counts by x / (x + this), x in px
+    least_share: float = 0.05  # smaller shares O_ab / V_av are soft edges, not overlap
+    unseen: float = 0.3  # a segment of which the other views have seen less than this share stays what it is
+    rounds: int = 10  # of moves, at most
 
     def __post_init__(self) -> None:
         """Validate."""
@@ -79,8 +62,9 @@ class AssociationSettings:
             raise SettingsError(
                 f"association: kept is {self.kept}, agreement {self.agreement}; expected a share in (0, 1]"
             )
-        if min(self.doubt, self.evidence, self.full_sight_px, self.least_share, self.unseen, self.rounds) < 0:
-            raise SettingsError("association: a setting is negative; expected 0 or more")
+        for name in ("doubt", "evidence", "full_sight_px", "least_share", "unseen", "rounds"):
+            if getattr(self, name) < 0:
+                raise SettingsError(f"association: {name} is {getattr(self, name)}; expected 0 or more")
         if min(self.full_sight, self.plenty) <= 0:
             raise SettingsError(
                 f"association: full_sight is {self.full_sight}, plenty {self.plenty}; expected more than 0"
@@ -109,8 +93,7 @@ def associate(views: Mapping[str, Lifted], settings: AssociationSettings | None 
     if not names:
         return {}
     stack = _Stack([views[name] for name in names])
-    objects = _move(stack, _merge(stack, settings), settings)
-    objects = _by_size(objects, stack)
+    objects = _by_size(_move(stack, _merge(stack, settings), settings), stack)
     return dict(zip(names, np.split(objects, stack.starts[1:-1]), strict=True))
 
 
@@ -118,32 +101,26 @@ class _Stack:
     """Segments of all views, stacked as the rows of one sparse matrix."""
 
     def __init__(self, views: list[Lifted]) -> None:
-        self.views = views
         self.starts = np.concatenate([[0], np.cumsum([len(view) for view in views])])
         self.view = np.repeat(np.arange(len(views)), np.diff(self.starts))
         self.background = np.concatenate([view.ids for view in views]) == 0
         self.size = np.concatenate([sums(view.weights, 1) for view in views])
-        # Gaussians that nobody sees take no part.
-        self.present, where = np.unique(np.concatenate([view.gaussians for view in views]), return_inverse=True)
-        self.where = np.split(where, np.cumsum([len(view.gaussians) for view in views])[:-1])
-
-    def rows(self, view: int) -> slice:
-        return slice(int(self.starts[view]), int(self.starts[view + 1]))
+        # Gaussians that nobody sees take no part; those that are left are numbered anew.
+        present, where = np.unique(np.concatenate([view.gaussians for view in views]), return_inverse=True)
+        numbers = np.split(where, np.cumsum([len(view.gaussians) for view in views])[:-1])
+        self.views = [replace(view, gaussians=ids) for view, ids in zip(views, numbers, strict=True)]
+        self.num_gaussians = len(present)
 
     def overlaps(self) -> tuple[sparse.csr_matrix, np.ndarray]:
         """O (n, n), and V (n, views)."""
         scaled, seen = [], []
-        for view, where in zip(self.views, self.where, strict=True):
-            root = np.sqrt(sums(view.weights, 0)).astype(np.float32)
-            weights = view.weights
-            scaled.append(_rows(weights.data / root[weights.indices], where[weights.indices], weights.indptr, self))
-            seen.append(_rows(root, where, np.array([0, len(root)]), self))
+        for view in self.views:
+            weights, root = view.weights, np.sqrt(sums(view.weights, 0)).astype(np.float32)
+            entries = weights.data / root[weights.indices], view.gaussians[weights.indices], weights.indptr
+            scaled.append(sparse.csr_matrix(entries, shape=(len(view), self.num_gaussians)))
+            seen.append(sparse.csr_matrix((root, view.gaussians, [0, len(root)]), shape=(1, self.num_gaussians)))
         stacked = sparse.vstack(scaled, format="csr")
         return (stacked @ stacked.T).tocsr(), (stacked @ sparse.vstack(seen, format="csr").T).toarray()
-
-
-def _rows(data: np.ndarray, columns: np.ndarray, starts: np.ndarray, stack: _Stack) -> sparse.csr_matrix:
-    return sparse.csr_matrix((data, columns, starts), shape=(len(starts) - 1, len(stack.present)))
 
 
 def _merge(stack: _Stack, settings: AssociationSettings) -> np.ndarray:
@@ -152,13 +129,9 @@ def _merge(stack: _Stack, settings: AssociationSettings) -> np.ndarray:
     nodes = np.flatnonzero(~stack.background)
     cluster = np.arange(len(nodes))
     hidden = np.zeros_like(seen)
-    if stack.background.any():
-        columns = np.flatnonzero(stack.background)
-        hidden[:, stack.view[columns]] = overlap[:, columns].toarray()
-        overlap = overlap.tocsc(copy=True)
-        overlap.data[np.repeat(stack.background, np.diff(overlap.indptr))] = 0
-        overlap = overlap.tocsr()
-        overlap.eliminate_zeros()
+    hidden[:, stack.view[stack.background]] = overlap[:, stack.background].toarray()
+    overlap.data[stack.background[overlap.indices]] = 0
+    overlap.eliminate_zeros()
     overlap, seen, hidden = overlap[nodes], seen[nodes], hidden[nodes]
     while len(seen) > 1:
         pairs = _agreements(*_votes(overlap, seen, hidden, stack.view, settings), settings)
@@ -175,15 +148,12 @@ def _merge(stack: _Stack, settings: AssociationSettings) -> np.ndarray:
 
 
 def _votes(
-    overlap: sparse.csr_matrix,  # (C, n)
-    seen: np.ndarray,  # (C, views)
-    hidden: np.ndarray,  # (C, views) of that, what is background there
-    view: np.ndarray,  # (n,)
-    settings: AssociationSettings,
+    overlap: sparse.csr_matrix, seen: np.ndarray, hidden: np.ndarray, view: np.ndarray, settings: AssociationSettings
 ) -> tuple[sparse.csr_matrix, np.ndarray]:
     """Share of each cluster that each segment has, (C, n), and what each view counts for it, (C, views), in the former.
 
-    Who calls a cluster background says nothing of which object it is.
+    From what they have in common, (C, n), what each view sees of a cluster, and how much of that is background there,
+    (C, views) both. Who calls a cluster background says nothing of which object it is.
     """
     foreground = np.maximum(seen - hidden, 0)
     full = np.minimum(settings.full_sight * seen.max(axis=1, keepdims=True), settings.plenty)
@@ -197,11 +167,9 @@ def _votes(
 
 
 def _agreements(
-    votes: sparse.csr_matrix,  # (C, n)
-    counts: np.ndarray,  # (C, views)
-    settings: AssociationSettings,
+    votes: sparse.csr_matrix, counts: np.ndarray, settings: AssociationSettings
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs of clusters, first < second, and the views' mean agreement on them."""
+    """Pairs of clusters, first < second, and the views' mean agreement on them; takes what `_votes` returns."""
     both = sparse.triu(votes @ votes.T, 1).tocoo()
     evidence = np.empty(both.nnz)
     for k in range(0, both.nnz, _PAIRS):
@@ -211,20 +179,7 @@ def _agreements(
     return both.row, both.col, score
 
 
-_PAIRS = 1 << 15
-"""So many pairs at a time, to keep memory small."""
-
-_LEVEL = 0.75
-"""Pairs that agree nearly as well as the best one merge at once, before anything is compared anew."""
-
-
-def _match(
-    first: np.ndarray,
-    second: np.ndarray,
-    score: np.ndarray,
-    num: int,
-    least: float,
-) -> np.ndarray | None:
+def _match(first: np.ndarray, second: np.ndarray, score: np.ndarray, num: int, least: float) -> np.ndarray | None:
     """Pair off clusters, best pairs first, each at most once; return whom each one becomes, None if nobody pairs."""
     good = score > least
     if not good.any():
@@ -242,15 +197,14 @@ def _match(
 
 def _move(stack: _Stack, objects: np.ndarray, settings: AssociationSettings) -> np.ndarray:
     """Give every segment to the object that explains it best by what the other views say."""
+    parts = [slice(*bounds) for bounds in itertools.pairwise(stack.starts.tolist())]
     for _ in range(settings.rounds):
-        before = objects
-        profiles = Profiles.empty(len(stack.present))
-        for v, (view, where) in enumerate(zip(stack.views, stack.where, strict=True)):
-            profiles.add(where, view.weights, before[stack.rows(v)])
-        objects = before.copy()
-        for v, (view, where) in enumerate(zip(stack.views, stack.where, strict=True)):
-            rows = stack.rows(v)
-            best, seen = profiles.explain(where, view.weights, before[rows])
+        before, objects = objects, objects.copy()
+        profiles = Profiles.empty(stack.num_gaussians)
+        for view, rows in zip(stack.views, parts, strict=True):
+            profiles.add(view, before[rows])
+        for view, rows in zip(stack.views, parts, strict=True):
+            best, seen = profiles.explain(view, before[rows])
             moves = ~stack.background[rows] & (seen >= settings.unseen)
             objects[rows] = np.where(moves, best, before[rows])
         if (objects == before).all():
@@ -264,5 +218,4 @@ def _by_size(objects: np.ndarray, stack: _Stack) -> np.ndarray:
     present = np.unique(objects[objects > 0])
     number = np.zeros(len(size), np.int32)
     number[present[np.argsort(-size[present], kind="stable")]] = np.arange(1, len(present) + 1)
-    numbered: np.ndarray = number[objects]
-    return numbered
+    return np.asarray(number[objects])

@@ -13,21 +13,11 @@ from gsseg_core.raster.observation import Observation
 
 @dataclass(frozen=True, eq=False)
 class Lifted:
-    """The segments of one view, lifted to the Gaussians, heaviest segment first.
+    """The segments of one view, lifted to the Gaussians, heaviest segment first."""
 
-    Attributes
-    ----------
-    ids : (L,) int32
-        Id of each segment in the mask; 0 is the background. Ids that lie on no Gaussian are left out.
-    gaussians : (M,) int32
-        Gaussians that the segments are on, ascending.
-    weights : (L, M) csr_matrix of float32
-        w_a, in px.
-    """
-
-    ids: np.ndarray
-    gaussians: np.ndarray
-    weights: sparse.csr_matrix
+    ids: np.ndarray  # (L,) int32: of each segment in the mask; 0 is the background; those on no Gaussian are left out
+    gaussians: np.ndarray  # (M,) int32: those that the segments are on, ascending
+    weights: sparse.csr_matrix  # (L, M) float32: w_a, in px
 
     @classmethod
     def of(cls, observation: Observation, kept: float = 0.8) -> Lifted:
@@ -66,22 +56,13 @@ class Profiles:
         """Start without any segment."""
         return cls(sparse.csr_matrix((num_gaussians, 1)))
 
-    def add(
-        self,
-        gaussians: np.ndarray,  # (M,)
-        weights: sparse.csr_matrix,  # (L, M)
-        objects: np.ndarray,  # (L,)
-    ) -> None:
-        """Add the segments of a view."""
-        part = _by_object(weights, objects, int(objects.max(initial=0)) + 1).tocoo()
-        self._more.append(
-            sparse.coo_matrix((part.data, (gaussians[part.row], part.col)), shape=(len(self), part.shape[1]))
-        )
+    def add(self, segments: Lifted, objects: np.ndarray) -> None:  # (L,)
+        """Add the segments of a view to their objects."""
+        part = _by_object(segments, objects, int(objects.max(initial=0)) + 1).tocoo()
+        at = segments.gaussians[part.row], part.col
+        self._more.append(sparse.coo_matrix((part.data, at), shape=(len(self), part.shape[1])))
 
-    def renumbered(
-        self,
-        objects: np.ndarray,  # (K,)
-    ) -> Profiles:
+    def renumbered(self, objects: np.ndarray) -> Profiles:  # (K,)
         """Give the objects other numbers; those that get the same one become one."""
         old = self.weights.tocoo()
         shape = (len(self), int(objects.max(initial=0)) + 1)
@@ -100,25 +81,18 @@ class Profiles:
         """The sum, (N, K) csr_matrix of float64."""
         if self._more:
             parts = [self._sum.tocoo(), *self._more]
-            row, col, data = (
-                np.concatenate([getattr(part, name) for part in parts]) for name in ("row", "col", "data")
-            )
+            row, col, data = (np.concatenate([getattr(p, name) for p in parts]) for name in ("row", "col", "data"))
             shape = (len(self), int(max(part.shape[1] for part in parts)))
             self._sum, self._more = sparse.coo_matrix((data, (row, col)), shape=shape).tocsr(), []
         return self._sum
 
-    def common(
-        self,
-        gaussians: np.ndarray,  # (M,)
-        weights: sparse.csr_matrix,  # (L, M)
-        objects: np.ndarray | None = None,  # (L,)
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def common(self, segments: Lifted, objects: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Tell how much of each segment of a view lies on each object.
 
         Parameters
         ----------
-        gaussians, weights
-            As in `Lifted`.
+        segments : Lifted
+            L segments.
         objects : (L,), optional
             What these segments have been added as; then only what the other views say counts.
 
@@ -129,24 +103,17 @@ class Profiles:
         known : (L,) float64
             What lies on Gaussians of which anything is known, in px.
         """
-        profile = self.weights[gaussians]
+        profile = self.weights[segments.gaussians]
         if objects is not None:
-            profile = (profile - _by_object(weights, objects, profile.shape[1])).tocsr()
+            profile = (profile - _by_object(segments, objects, profile.shape[1])).tocsr()
             # Where this view was the only one, rounding is left.
             profile.data[profile.data < 1e-6] = 0
         total = sums(profile, 1)
         profile.data /= np.repeat(np.where(total > 0, total, 1), np.diff(profile.indptr))
-        return (weights @ profile).toarray(), weights @ (total > 0).astype(np.float64)
+        return (segments.weights @ profile).toarray(), segments.weights @ (total > 0).astype(np.float64)
 
-    def explain(
-        self,
-        gaussians: np.ndarray,  # (M,)
-        weights: sparse.csr_matrix,  # (L, M)
-        objects: np.ndarray | None = None,  # (L,)
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Find the object of the largest IoU with each segment of a view.
-
-        Parameters are those of `common`.
+    def explain(self, segments: Lifted, objects: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Find the object of the largest IoU with each segment of a view; takes what `common` takes.
 
         Returns
         -------
@@ -155,16 +122,16 @@ class Profiles:
         seen : (L,) float64
             Share of each segment that lies on Gaussians of which anything is known.
         """
-        common, known = self.common(gaussians, weights, objects)
+        common, known = self.common(segments, objects)
         overlap = np.nan_to_num(iou(common, known[:, None], common.sum(axis=0)))
-        whole = sums(weights, 1)
+        whole = sums(segments.weights, 1)
         return overlap.argmax(axis=1), np.divide(known, whole, out=np.zeros_like(known), where=whole > 0)
 
 
-def _by_object(weights: sparse.csr_matrix, objects: np.ndarray, num: int) -> sparse.csr_matrix:
-    """Sum segments (L, M) by object, (M, num)."""
+def _by_object(segments: Lifted, objects: np.ndarray, num: int) -> sparse.csr_matrix:
+    """Sum the weights of segments by object, (M, num)."""
     groups = sparse.csr_matrix((np.ones(len(objects)), objects, np.arange(len(objects) + 1)), shape=(len(objects), num))
-    return (weights.T @ groups).tocsr()
+    return (segments.weights.T @ groups).tocsr()
 
 
 def sums(matrix: sparse.csr_matrix, axis: int) -> np.ndarray:

@@ -27,37 +27,19 @@ IDS = ("global", PER_VIEW)
 
 @dataclass(frozen=True)
 class Alignment:
-    """Objects that the ids of one view stand for, and ids that fit none.
+    """Objects that the ids of one view stand for, and ids that fit none."""
 
-    Attributes
-    ----------
-    objects : dict of int to int
-        Object by id; 0 is the background in both.
-    merged : int
-        Ids that cover two objects or more, so that they can be right for one only.
-    split : int
-        Ids beyond the first of an object that this view has cut up.
-    """
-
-    objects: dict[int, int]
-    merged: int
-    split: int
+    objects: dict[int, int]  # by id; 0 is the background in both
+    merged: int  # ids that cover two objects or more, so that they can be right for one only
+    split: int  # ids beyond the first of an object that this view has cut up
 
 
 @dataclass(frozen=True, eq=False)
 class Repair:
-    """Views and objects that `ObjectTable.solve` gave another number.
+    """Views and objects that `ObjectTable.solve` gave another number."""
 
-    Attributes
-    ----------
-    changed : list of str
-        Views whose ids now mean something else than before.
-    successors : (K,) int64
-        Successor of each earlier object: the number that most of its weight has now.
-    """
-
-    changed: list[str]
-    successors: np.ndarray
+    changed: list[str]  # views whose ids now mean something else than before
+    successors: np.ndarray  # (K,) int64: of each earlier object, the number that most of its weight has now
 
 
 class ObjectTable:
@@ -71,7 +53,6 @@ class ObjectTable:
     ----------
     scene : GaussianScene
         N Gaussians.
-    settings : AssociationSettings, optional
     device : str
         Where views are rendered.
 
@@ -81,10 +62,8 @@ class ObjectTable:
         The views as they came, by name.
     """
 
-    def __init__(
-        self, scene: GaussianScene, settings: AssociationSettings | None = None, *, device: str = "cpu"
-    ) -> None:
-        self.scene, self.settings, self.device = scene, settings or AssociationSettings(), device
+    def __init__(self, scene: GaussianScene, *, device: str = "cpu") -> None:
+        self.scene, self.settings, self.device = scene, AssociationSettings(), device
         self.views: dict[str, View] = {}
         self._lifted: dict[str, Lifted] = {}
         self._objects: dict[str, np.ndarray] = {}
@@ -140,7 +119,7 @@ class ObjectTable:
         if not self.add(view):
             return _without_labels(view)
         lifted = self._lifted[view.name]
-        best, seen = self._profiles.explain(lifted.gaussians, lifted.weights)
+        best, seen = self._profiles.explain(lifted)
         new = (lifted.ids > 0) & (seen < self.settings.unseen)
         best[lifted.ids == 0] = 0
         best[new] = self._largest + 1 + np.arange(np.count_nonzero(new))
@@ -181,8 +160,7 @@ class ObjectTable:
 
     def forget(self, name: str) -> None:
         """Drop a view; its evidence still counts for `match`, but no longer for `solve`."""
-        lifted = self._lifted.pop(name)
-        self._forgotten.add(lifted.gaussians, lifted.weights, self._objects.pop(name))
+        self._forgotten.add(self._lifted.pop(name), self._objects.pop(name))
         del self.views[name]
 
     def solve(self, progress: Progress = silent) -> Repair:
@@ -221,7 +199,7 @@ class ObjectTable:
         """Tell which object each id of a view stands for, and how many ids do not fit."""
         lifted, objects = self._lifted[name], self._objects[name]
         shown = objects[objects > 0]
-        parts, _ = self._profiles.common(lifted.gaussians, lifted.weights)
+        parts, _ = self._profiles.common(lifted)
         parts[:, 0], parts[lifted.ids == 0] = 0, 0
         size = parts.sum(axis=0)
         # Most of an object, as far as this view shows it, lies under an id: more than one, and the id has merged them.
@@ -255,14 +233,14 @@ class ObjectTable:
         return Lifted.of(observation, self.settings.kept) if len(observation.ids) else None
 
     def _give(self, name: str, objects: np.ndarray) -> None:
-        lifted, self._objects[name] = self._lifted[name], objects.astype(np.int32)
+        self._objects[name] = objects.astype(np.int32)
         self._largest = max(self._largest, int(objects.max(initial=0)))
-        self._profiles.add(lifted.gaussians, lifted.weights, objects)
+        self._profiles.add(self._lifted[name], objects)
 
     def _fill(self) -> None:
         self._profiles = self._forgotten.copy()
         for name, objects in self._objects.items():
-            self._profiles.add(self._lifted[name].gaussians, self._lifted[name].weights, objects)
+            self._profiles.add(self._lifted[name], objects)
 
     def _renumbered(self, solved: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Give solved objects the numbers that most of their weight had before; also return the successors."""

@@ -6,7 +6,7 @@ changed. Results are bit-identical whatever the order of the Gaussians and the n
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,26 +15,17 @@ from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.spatial.neighbourhood import Neighbours
 
 
-@dataclass(frozen=True, eq=False)
-class Clustered:
-    """What `cluster` returns.
+class Clustered(NamedTuple):
+    """What `cluster` returns."""
 
-    Attributes
-    ----------
-    probabilities : (N, K) float32
-        A new array; rows that did not change are those that went in.
-    changed : (N,) bool
-        Which Gaussians took the mean code of their neighbours.
-    """
-
-    probabilities: np.ndarray
-    changed: np.ndarray
+    probabilities: np.ndarray  # (N, K) float32: a new array; rows that did not change are those that went in
+    changed: np.ndarray  # (N,) bool: which Gaussians took the mean code of their neighbours
 
 
 def cluster(
-    means: np.ndarray,  # (N, 3)
-    probabilities: np.ndarray,  # (N, K)
-    observed: np.ndarray,  # (N,)
+    means: np.ndarray,
+    probabilities: np.ndarray,
+    observed: np.ndarray,
     k: int = RefineSettings.k,
     beta: float = RefineSettings.beta,
     neighbours: Neighbours | None = None,
@@ -61,10 +52,6 @@ def cluster(
     neighbours : Neighbours, optional
         Those of `means` for this k, if they are known already.
 
-    Returns
-    -------
-    Clustered
-
     Examples
     --------
     >>> import numpy as np
@@ -86,8 +73,8 @@ def cluster(
 
 
 def statistical_filter(
-    means: np.ndarray,  # (N, 3)
-    labels: np.ndarray,  # (N,)
+    means: np.ndarray,
+    labels: np.ndarray,
     k: int = RefineSettings.k,
     sigmas: float = RefineSettings.filter_sigmas,
     num_classes: int | None = None,

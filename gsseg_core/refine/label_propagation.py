@@ -38,26 +38,11 @@ NEVER = 2**31 - 1
 
 @dataclass(frozen=True)
 class GraphSettings:
-    """How codes spread along the graph.
+    """How codes spread along the graph; a value outside its range raises `SettingsError`."""
 
-    Attributes
-    ----------
-    k : int
-        Neighbours of a Gaussian; of those tied for the last place as many more count.
-    strength : float
-        Evidence in px that weighs as much as all neighbours together; 0 leaves all codes as they are.
-    steps : int
-        Steps at most, and so how many neighbours away a code can come from.
-
-    Raises
-    ------
-    SettingsError
-        A value outside its range.
-    """
-
-    k: int = NEIGHBOURS
-    strength: float = 1.0
-    steps: int = 100
+    k: int = NEIGHBOURS  # neighbours of a Gaussian; of those tied for the last place as many more count
+    strength: float = 1.0  # evidence in px that weighs as much as all neighbours together; 0 leaves codes as they are
+    steps: int = 100  # at most, and so how many neighbours away a code can come from
 
     def __post_init__(self) -> None:
         """Validate."""
@@ -67,40 +52,21 @@ class GraphSettings:
             raise SettingsError(f"graph: strength is {self.strength} px; expected 0 or more, finite")
 
 
-def is_scarce(
-    evidence: np.ndarray,  # (N,)
-    settings: GraphSettings | None = None,
-) -> bool:
+def is_scarce(evidence: np.ndarray) -> bool:  # (N,) px
     """Tell whether evidence is scarce in enough of a scene for the graph to matter.
 
     Of what is seen often it changes nothing, yet takes as long to build; docs/few_views.md has figures of both cases.
     """
-    strength = (settings or GraphSettings()).strength
-    return len(evidence) > 0 and float((evidence < strength).mean()) > SCARCE
+    return len(evidence) > 0 and float((evidence < GraphSettings.strength).mean()) > SCARCE
 
 
-def spread_if_scarce(
-    scene: GaussianScene,
-    codes: np.ndarray,  # (N, K)
-    evidence: np.ndarray,  # (N,)
-) -> np.ndarray:
-    """Spread codes along the graph of a scene where evidence is scarce; else return the very same array.
-
-    Parameters
-    ----------
-    scene : GaussianScene
-        N Gaussians.
-    codes, evidence
-        As `propagate` takes them.
-    """
+def spread_if_scarce(scene: GaussianScene, codes: np.ndarray, evidence: np.ndarray) -> np.ndarray:  # (N, K), (N,) px
+    """Spread codes as `propagate` does, on the graph of a scene; the very same array where evidence is not scarce."""
     return propagate(graph_of(scene), codes, evidence) if is_scarce(evidence) else codes
 
 
 def propagate(
-    graph: Graph,
-    codes: np.ndarray,  # (N, K)
-    evidence: np.ndarray,  # (N,)
-    settings: GraphSettings | None = None,
+    graph: Graph, codes: np.ndarray, evidence: np.ndarray, settings: GraphSettings | None = None
 ) -> np.ndarray:
     """Spread codes along the graph, held by their evidence.
 
@@ -114,10 +80,9 @@ def propagate(
     codes : (N, K) float32
         Rows on the simplex, or of zeros where nothing is known.
     evidence : (N,)
-        Weight of the labelled pixels that each one's code stands on, in px; what it is where the code is zeros does not
-        matter.
+        Weight of the labelled pixels that each one's code stands on, in px; not read where the code is zeros.
     settings : GraphSettings, optional
-        Of these, k was used in building the graph and is not read.
+        All but k, with which the graph was built.
 
     Returns
     -------
@@ -164,14 +129,9 @@ def propagate(
 
 
 def _spread(
-    graph: Graph,
-    learnt: np.ndarray,  # (N, C), by place
-    weight: np.ndarray,  # (N,) evidence as a multiple of the strength
-    moving: np.ndarray,  # (M,) places
-    reached: np.ndarray,  # (N,) int32
-    steps: int,
+    graph: Graph, learnt: np.ndarray, weight: np.ndarray, moving: np.ndarray, reached: np.ndarray, steps: int
 ) -> np.ndarray:
-    """Step until the codes of some classes settle."""
+    """Step until the codes of some classes settle; `_step` has the shapes."""
     old, new = learnt.copy(), learnt.copy()
     was, now = np.zeros((2, len(learnt)), np.uint8)
     last = int(reached[reached < NEVER].max(initial=0))  # until then zeros are where nothing has come yet
@@ -185,20 +145,17 @@ def _spread(
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def _step(
-    indptr: np.ndarray,  # (N + 1,)
-    indices: np.ndarray,  # (E,)
-    weights: np.ndarray,  # (E,)
-    learnt: np.ndarray,  # (N, C)
-    weight: np.ndarray,  # (N,)
-    moving: np.ndarray,  # (M,)
-    reached: np.ndarray,  # (N,) int32: the step after which a code is known
-    step: int,
-    was: np.ndarray,  # (N,) uint8: what changed in the step before
-    now: np.ndarray,  # (N,) uint8 out, at the places that move: what changes in this one
-    old: np.ndarray,  # (N, C)
-    new: np.ndarray,  # (N, C) out, at the places that move
-) -> None:
-    """Compute the codes that move, from those before, wherever something around them has changed."""
+    indptr: np.ndarray, indices: np.ndarray, weights: np.ndarray, learnt: np.ndarray, weight: np.ndarray,
+    moving: np.ndarray, reached: np.ndarray, step: int, was: np.ndarray, now: np.ndarray, old: np.ndarray,
+    new: np.ndarray,
+) -> None:  # fmt: skip
+    """Compute the codes that move, from those before, wherever something around them has changed.
+
+    Codes are by place, (N, C): as `learnt`, `old`, before this step, and `new`, after it. The evidence, `weight`, (N,),
+    is a multiple of the strength; `reached`, (N,) int32, is the step after which a code is known; `was` and `now`, (N,)
+    uint8, are what changed in the step before and what changes in this one. Only `new` and `now` are written, at the
+    places that move, (M,).
+    """
     count = learnt.shape[1]
     for chunk in nb.prange((moving.shape[0] + CHUNK - 1) // CHUNK):
         sums = np.empty(count, np.float32)
@@ -233,11 +190,7 @@ def _step(
 @nb.njit(nogil=True, cache=True)
 def _steps_to_reach(indptr: np.ndarray, indices: np.ndarray, known: np.ndarray, steps: int) -> np.ndarray:
     """Tell after how many steps the code of each place is known, (N,) int32, or NEVER."""
-    n = known.shape[0]
-    reached = np.full(n, np.int32(NEVER))
-    for i in range(n):
-        if known[i]:
-            reached[i] = 0
+    reached = np.where(known, np.int32(0), np.int32(NEVER))
     waiting = np.flatnonzero(~known)
     for step in range(1, steps + 1):
         left = 0

@@ -54,8 +54,6 @@ class RefineSettings:
         if not 0 <= self.filter_sigmas < float("inf"):
             raise SettingsError(f"refinement: found filter_sigmas = {self.filter_sigmas}; expected 0 or more, finite")
         if self.carve_views != int(self.carve_views) or self.carve_views < 1:
-            raise SettingsError(
-                f"refinement: found carve_views = {self.carve_views}; expected a whole number from 1 up"
-            )
+            raise SettingsError(f"refinement: found carve_views = {self.carve_views}; expected a whole number above 0")
         if self.carve and self.filter:
             raise SettingsError("refinement: found both carve and filter; expected one of them")

@@ -21,7 +21,7 @@ Gaussian is all there is, it stays although it sticks out. One that never sticks
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,31 +41,15 @@ KEPT = 0.5
 _LEAST = np.float32(0.01)  # of a share, so that a Gaussian may come back
 
 
-@dataclass(frozen=True, eq=False)
-class Silhouette:
-    """What a view shows, to cut objects by.
-
-    Attributes
-    ----------
-    camera : Camera
-        Where from.
-    labels : (H, W) int32
-        Class of each pixel, negative where unknown.
-    depth : (H, W) float32
-        Depth of the scene's surface, scene units; infinite where there is none.
-    """
+class Silhouette(NamedTuple):
+    """What a view shows, to cut objects by."""
 
     camera: Camera
-    labels: np.ndarray
-    depth: np.ndarray
+    labels: np.ndarray  # (H, W) int32: class of each pixel, negative where unknown
+    depth: np.ndarray  # (H, W) float32: of the scene's surface, scene units; infinite where there is none
 
     @classmethod
-    def of(
-        cls,
-        scene: GaussianScene,
-        operator: ViewOperator,
-        labels: np.ndarray,  # (H, W) int32
-    ) -> Silhouette:
+    def of(cls, scene: GaussianScene, operator: ViewOperator, labels: np.ndarray) -> Silhouette:  # (H, W) int32
         """Put a label map and the depth of the scene together.
 
         Raises
@@ -81,28 +65,16 @@ class Silhouette:
         return cls(camera, labels.astype(np.int32), surface(scene, operator).depth)
 
 
-@dataclass(frozen=True, eq=False)
-class KeptShares:
-    """Share of each Gaussian that its object keeps, and the reasons for it.
+class KeptShares(NamedTuple):
+    """Share of each Gaussian that its object keeps, and the reasons for it at the last step, in px: (N,) float64."""
 
-    Attributes
-    ----------
-    kept : (N,) float64
-        Share of each Gaussian that its object keeps, 0.01 to 1; 1 where it has no object or no view says anything.
-    stay, go : (N,) float64
-        Reasons for either at the last step, in px; both 0 where there is none to go.
-    """
-
-    kept: np.ndarray
-    stay: np.ndarray
+    kept: np.ndarray  # 0.01 to 1; 1 where it has no object or no view says anything
+    stay: np.ndarray  # 0 where there is no reason to go
     go: np.ndarray
 
 
 def kept_shares(
-    scene: GaussianScene,
-    labels: np.ndarray,  # (N,) int
-    silhouettes: Iterable[Silhouette],
-    steps: int = STEPS,
+    scene: GaussianScene, labels: np.ndarray, silhouettes: Iterable[Silhouette], steps: int = STEPS
 ) -> KeptShares:
     """Find how much of each Gaussian its object should keep.
 
@@ -116,22 +88,18 @@ def kept_shares(
         Views.
     steps : int
         How often to go through them, at least 1.
-
-    Returns
-    -------
-    KeptShares
     """
     labels = np.ascontiguousarray(labels, np.int32)
-    views = [(silhouette, *_aimed(scene, silhouette.camera)) for silhouette in silhouettes]
-    kept = np.ones(len(scene))
-    stay, go, asked = np.zeros(len(scene)), np.zeros(len(scene)), labels > 0
+    views = []
+    for shown in silhouettes:
+        operator = make_operator(scene, shown.camera)  # on the CPU, which alone tells the terms of a silhouette
+        views.append((shown, operator, depths(scene, shown.camera)[operator.ids]))
+    kept, asked = np.ones(len(scene)), labels > 0
     for _ in range(steps):
-        stay, go = np.zeros(len(scene)), np.zeros(len(scene))
+        stay, go = np.zeros((2, len(scene)))
         for shown, operator, depth in views:
-            ids = operator.ids
-            terms = operator.silhouette_terms(
-                labels[ids], kept[ids], asked[ids], depth, shown.labels, shown.depth * np.float32(BEHIND)
-            )
+            ids, behind = operator.ids, shown.depth * np.float32(BEHIND)
+            terms = operator.silhouette_terms(labels[ids], kept[ids], asked[ids], depth, shown.labels, behind)
             stay[ids] += terms.stay
             go[ids] += terms.go
         # Reasons to go do not depend on the shares: who has none is not asked again.
@@ -140,22 +108,9 @@ def kept_shares(
     return KeptShares(kept, np.where(asked, stay, 0), go)
 
 
-def _aimed(scene: GaussianScene, camera: Camera) -> tuple[ViewOperator, np.ndarray]:
-    """Operator of a view on the CPU, which alone tells the terms of a silhouette, and the depths of its `ids`."""
-    operator = make_operator(scene, camera)
-    return operator, depths(scene, camera)[operator.ids]
+def carve(scene: GaussianScene, labels: np.ndarray, silhouettes: Iterable[Silhouette]) -> np.ndarray:
+    """Find the Gaussians that stick out of their objects, (N,) bool; takes what `kept_shares` takes.
 
-
-def carve(
-    scene: GaussianScene,
-    labels: np.ndarray,  # (N,) int
-    silhouettes: Iterable[Silhouette],
-    steps: int = STEPS,
-) -> np.ndarray:
-    """Find the Gaussians that stick out of their objects, (N,) bool.
-
-    Parameters are those of `kept_shares`. Results depend neither on the order of the Gaussians nor on the number of
-    threads.
+    Results depend neither on the order of the Gaussians nor on the number of threads.
     """
-    out: np.ndarray = kept_shares(scene, labels, silhouettes, steps).kept < KEPT
-    return out
+    return np.asarray(kept_shares(scene, labels, silhouettes).kept < KEPT)

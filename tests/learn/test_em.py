@@ -27,7 +27,7 @@ from threadpoolctl import threadpool_limits
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
-from gsseg_core.learn.em.em_kernels import GRADIENT_UNIT, accumulate, m_step, predicted_gain
+from gsseg_core.learn.em.em_kernels import GRADIENT_UNIT, ViewPairs, accumulate, m_step, predicted_gain
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings, codes_without
 from gsseg_core.learn.em.rejected_regions import SMALLEST
 from gsseg_core.learn.vote_learner import VoteLearner
@@ -216,8 +216,8 @@ def test_no_step_gains_more_than_its_slope_promises() -> None:
     slopes, gained = [], []
     for _ in range(6):
         before = codes.data.astype(np.float64)
-        slopes.append(predicted_gain(codes.indptr, codes.data, gradient, prior.astype(np.float32)))
-        m_step(codes.indptr, codes.data, gradient, prior.astype(np.float32))
+        slopes.append(predicted_gain(codes, gradient, prior.astype(np.float32)))
+        m_step(codes, gradient, prior.astype(np.float32))
         gradient = gradient * GRADIENT_UNIT + prior / before
         np.testing.assert_allclose(slopes[-1], gradient @ (codes.data - before), rtol=1e-3)
         gradient, after = look()
@@ -294,7 +294,7 @@ def test_codes_without_a_view_are_a_step_with_the_gains_of_all_the_others() -> N
         observation = learner.observation(name)
         others, _ = learner._e_step(codes, {other: models[other] for other in models if other != name}, lambda: None)
         expected = codes.with_data(codes.data.copy())
-        m_step(expected.indptr, expected.data, others, prior)
+        m_step(expected, others, prior)
         seen = expected.positions(observation.ids[observation.order])
         found = codes_without(observation, models[name], codes, gradient, prior)
         np.testing.assert_array_equal(found.indptr, seen.indptr)
@@ -303,15 +303,15 @@ def test_codes_without_a_view_are_a_step_with_the_gains_of_all_the_others() -> N
 
 
 def test_what_was_all_but_ruled_out_does_not_overflow_the_sums() -> None:
-    rows, classes = np.array([0, 2]), np.array([0, 1], np.int32)
-    codes, gradient = np.full(2, 0.5, np.float32), np.zeros(2, np.int64)
-    one, start, label = np.zeros(1, np.int32), np.array([0, 1]), np.zeros(1, np.int32)
+    codes = CSRRows(np.array([0, 2]), np.array([0, 1], np.uint32), np.full(2, 0.5, np.float32))
+    gradient, one = np.zeros(2, np.int64), np.zeros(1, np.int32)
+    pairs = ViewPairs(one, one, start=np.array([0, 1]), labels=one)
     share, likelihood = np.array([1e30], np.float32), np.array([[1.0, 1e-30]], np.float32)
     for _ in range(255):
-        accumulate(rows, classes, gradient, one, one, start, label, likelihood, share)
+        accumulate(codes.with_data(gradient), pairs, likelihood, share)
     np.testing.assert_allclose(gradient * GRADIENT_UNIT, [255 * 2.0**27, 255.0], rtol=1e-6)
-    m_step(rows, codes, gradient, np.zeros_like(codes))
-    np.testing.assert_allclose(codes, [1.0, 0.0], atol=1e-6)
+    m_step(codes, gradient, np.zeros(2, np.float32))
+    np.testing.assert_allclose(codes.data, [1.0, 0.0], atol=1e-6)
 
 
 def test_the_number_of_threads_does_not_matter_not_even_to_the_last_bit() -> None:

@@ -58,29 +58,19 @@ STRONGEST = 2.0
 _LIGHT: PerScene[np.ndarray] = PerScene()
 
 
-def scene_edges(
-    operator: ViewOperator,
-    scene: GaussianScene,
-) -> np.ndarray:
+def scene_edges(operator: ViewOperator, scene: GaussianScene) -> np.ndarray:
     """Strength of the edges of colour and depth of a view, (H, W) float32, at least 0; see above for units."""
     camera, light = operator.camera, _LIGHT.of(scene, lambda: scene.colors().mean(axis=1))
     if light.min() == light.max():
         return np.zeros((camera.height, camera.width), np.float32)
     channels = np.empty((len(scene), 2), np.float32)
     _luminance_and_inverse_depth(scene.means, light, camera.world_to_camera[2].astype(np.float32), channels)
-    image, left_over = operator.blend(channels)
-    light_edges, depth_edges = np.empty(image.shape[:2], np.float32), np.empty(image.shape[:2], np.float32)
-    _differences(image, left_over, light_edges, depth_edges)
+    light_edges, depth_edges = _differences(*operator.blend(channels))
     edges: np.ndarray = _in_units(light_edges) + _in_units(depth_edges)
     return edges
 
 
-def align_boundaries(
-    labels: np.ndarray,  # (H, W) int32
-    edges: np.ndarray,  # (H, W) float32
-    farthest: int,
-    telling: float = TELLING,
-) -> np.ndarray:
+def align_boundaries(labels: np.ndarray, edges: np.ndarray, farthest: int, telling: float = TELLING) -> np.ndarray:
     """Align the boundaries of a mask with edges of the scene.
 
     Parameters
@@ -121,13 +111,8 @@ def _in_units(edges: np.ndarray) -> np.ndarray:
     return np.minimum(edges / unit, np.float32(STRONGEST)) if unit > 0 else np.zeros_like(edges)
 
 
-def _shifts(
-    touching: np.ndarray,  # (P, 2) regions
-    log_likelihood: np.ndarray,  # (P, 4 S - 1)
-    count: int,
-    farthest: int,
-) -> np.ndarray:
-    """Find by how much each region was drawn too wide, (R,) int64, in px."""
+def _shifts(touching: np.ndarray, log_likelihood: np.ndarray, count: int, farthest: int) -> np.ndarray:
+    """Find by how much each region was drawn too wide, (R,) int64, in px; `_mean_field_round` has the shapes."""
     prior = np.full(2 * farthest + 1, 0.25 / farthest)
     prior[farthest] = 0.5
     posterior, touches = np.tile(prior, (count, 1)), np.zeros(count, bool)
@@ -144,11 +129,11 @@ def _shifts(
     return found
 
 
-def _edge_log_likelihood(
-    lengths: np.ndarray,  # (P, 4 S) pixels in each ring, from the farthest inside the second to that inside the first
-    strengths: np.ndarray,  # (P, 4 S) sum of their edges
-) -> np.ndarray:
-    """Log-likelihood of boundaries moved by -(2 S - 1) to 2 S - 1 px, (P, 4 S - 1), in nats."""
+def _edge_log_likelihood(lengths: np.ndarray, strengths: np.ndarray) -> np.ndarray:
+    """Log-likelihood of boundaries moved by -(2 S - 1) to 2 S - 1 px, (P, 4 S - 1), in nats.
+
+    Lengths and strengths, (P, 4 S), are those of `_boundary_strengths`.
+    """
     there = np.minimum(lengths[:, 1:], lengths[:, :-1]) >= SHORTEST
     mean = (strengths[:, 1:] + strengths[:, :-1]) / np.maximum(lengths[:, 1:] + lengths[:, :-1], 1)
     middle = lengths.shape[1] // 2
@@ -159,14 +144,15 @@ def _edge_log_likelihood(
 
 @nb.njit(nogil=True, cache=True)
 def _mean_field_round(
-    pairs: np.ndarray,  # (P, 2) regions
-    log_likelihood: np.ndarray,  # (P, 4 S - 1)
-    begin: np.ndarray,  # (R + 1,) where the ends of each region begin
-    ends: np.ndarray,  # (2 P,)
-    log_prior: np.ndarray,  # (2 S + 1,)
-    posterior: np.ndarray,  # (R, 2 S + 1) changed in place: probability of each shift
-) -> None:
-    """Update the posterior of each region in turn, given those of the regions that it touches."""
+    pairs: np.ndarray, log_likelihood: np.ndarray, begin: np.ndarray, ends: np.ndarray, log_prior: np.ndarray,
+    posterior: np.ndarray,
+) -> None:  # fmt: skip
+    """Update the posterior of each region in turn, given those of the regions that it touches.
+
+    With the log-likelihood of each move of the boundary of each pair of regions, (P, 2), that touch, (P, 4 S - 1); the
+    ends of the pairs, (2 P,), and where those of each region begin, (R + 1,); the log of the prior of each shift,
+    (2 S + 1,); and the posterior, (R, 2 S + 1), changed in place.
+    """
     num_shifts, middle = log_prior.shape[0], log_likelihood.shape[1] // 2
     for region in range(posterior.shape[0]):
         field = log_prior.copy()
@@ -181,12 +167,8 @@ def _mean_field_round(
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _luminance_and_inverse_depth(
-    means: np.ndarray,  # (N, 3) float32
-    light: np.ndarray,  # (N,)
-    ahead: np.ndarray,  # (4,) third row of world to camera
-    channels: np.ndarray,  # (N, 2) out: luminance, inverse depth
-) -> None:
+def _luminance_and_inverse_depth(means: np.ndarray, light: np.ndarray, ahead: np.ndarray, channels: np.ndarray) -> None:
+    """Write luminance and inverse depth of each Gaussian into channels (N, 2); ahead is the row of depths, (4,)."""
     for i in nb.prange(means.shape[0]):
         depth = means[i, 0] * ahead[0] + means[i, 1] * ahead[1] + means[i, 2] * ahead[2] + ahead[3]
         channels[i, 0] = light[i]
@@ -194,13 +176,13 @@ def _luminance_and_inverse_depth(
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _differences(
-    image: np.ndarray,  # (H, W, 2) luminance, inverse depth; divided in place by what is seen
-    left_over: np.ndarray,  # (H, W) of each ray
-    light_edges: np.ndarray,  # (H, W) out: length of the gradient of the one
-    depth_edges: np.ndarray,  # (H, W) out: second differences of the other
-) -> None:
-    height, width = light_edges.shape
+def _differences(image: np.ndarray, left_over: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Length of the gradient of luminance, and second differences of inverse depth, (H, W) float32 each.
+
+    The image (H, W, 2) holds the two; it is divided in place by what of each ray is not left over, (H, W).
+    """
+    height, width = left_over.shape
+    light_edges, depth_edges = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
     for y in nb.prange(height):
         for x in range(width):
             # Means over what is seen; where that is little, the background is dark and far away.
@@ -217,13 +199,11 @@ def _differences(
             across = image[y, left, 1] + image[y, right, 1] - here if left < x < right else np.float32(0)
             along = image[up, x, 1] + image[down, x, 1] - here if up < y < down else np.float32(0)
             depth_edges[y, x] = abs(across) + abs(along)
+    return light_edges, depth_edges
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _nearest_regions(
-    region: np.ndarray,  # (H, W) int32
-    farthest: int,
-) -> tuple[np.ndarray, np.ndarray]:
+def _nearest_regions(region: np.ndarray, farthest: int) -> tuple[np.ndarray, np.ndarray]:  # (H, W) int32
     """Find for each pixel the nearest other region, by spreading from boundary pixels, band by band.
 
     Returns
@@ -275,17 +255,13 @@ def _borders(region: np.ndarray) -> np.ndarray:
 
 @nb.njit
 def _spread_region(
-    region: np.ndarray,  # (H, W)
-    y: int,
-    begin: int,
-    end: int,
-    farthest: int,
-    first: int,
-    last: int,
-    other: np.ndarray,  # (H, W) changed in place
-    away: np.ndarray,  # (last - first, W) changed in place: squared distance to it
-) -> None:
-    """Offer a stretch of a row as the nearest region to the pixels around it, in the rows from first to last."""
+    region: np.ndarray, y: int, begin: int, end: int, farthest: int, first: int, last: int, other: np.ndarray,
+    away: np.ndarray,
+) -> None:  # fmt: skip
+    """Offer a stretch of row y as the nearest region to the pixels around it, in the rows from first to last.
+
+    Changed in place are `other`, (H, W), and `away`, (last - first, W): the squared distance to it.
+    """
     own = region[y, begin]
     for v in range(max(y - farthest, first), min(y + farthest + 1, last)):
         across = int(np.sqrt(farthest**2 - (v - y) ** 2))
@@ -302,14 +278,9 @@ def _spread_region(
 
 @nb.njit(nogil=True, cache=True)
 def _boundary_strengths(
-    region: np.ndarray,  # (H, W)
-    other: np.ndarray,  # (H, W)
-    ring: np.ndarray,  # (H, W)
-    edges: np.ndarray,  # (H, W)
-    count: int,  # regions
-    farthest: int,
+    region: np.ndarray, other: np.ndarray, ring: np.ndarray, edges: np.ndarray, count: int, farthest: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Enumerate pairs of regions that touch, and sum up edges by pair and ring.
+    """Enumerate pairs of regions that touch, of `count` in all, and sum up edges by pair and ring; images are (H, W).
 
     Returns
     -------
@@ -341,11 +312,7 @@ def _boundary_strengths(
 
 
 @nb.njit
-def _sort_by_lower_region(
-    of_pixel: np.ndarray,  # (H W,) region
-    of_other: np.ndarray,  # (H W,) the one near by, -1 for none
-    count: int,  # regions
-) -> tuple[np.ndarray, np.ndarray]:
+def _sort_by_lower_region(of_pixel: np.ndarray, of_other: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Sort the pixels near another region by the lower number of the two: where each begins, and the pixels."""
     begin = np.zeros(count + 1, np.int64)
     for p in range(of_pixel.shape[0]):
@@ -363,15 +330,10 @@ def _sort_by_lower_region(
 
 @nb.njit(nogil=True, cache=True)
 def _move(
-    region: np.ndarray,  # (H, W)
-    other: np.ndarray,  # (H, W)
-    ring: np.ndarray,  # (H, W)
-    pair: np.ndarray,  # (H W,)
-    pairs: np.ndarray,  # (P, 2)
-    moved: np.ndarray,  # (P,) px, into the first region of each pair
-    label: np.ndarray,  # (R,) of each region
-    labels: np.ndarray,  # (H, W) changed in place
-) -> None:
+    region: np.ndarray, other: np.ndarray, ring: np.ndarray, pair: np.ndarray, pairs: np.ndarray, moved: np.ndarray,
+    label: np.ndarray, labels: np.ndarray,
+) -> None:  # fmt: skip
+    """Move the boundary of each pair by so many px, (P,), into its first region, in labels (H, W); label is (R,)."""
     height, width = region.shape
     for y in range(height):
         for x in range(width):

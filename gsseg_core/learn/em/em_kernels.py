@@ -1,16 +1,22 @@
-"""Kernels of EM and of votes, over the (Gaussian, label) pairs of one view."""
+"""Kernels of EM, over the (Gaussian, label) pairs of one view.
+
+Class probabilities, `codes`, are N rows of Z entries in all, `CSRRows` of float32; each entry has a `gradient`, (Z,)
+int64 in units of `GRADIENT_UNIT`, and a `prior`, (Z,) float32 in px. The `likelihood` of each label given the class is
+(L, K) float32. `shares`, (P,) float32, are those of the pairs in one vote per labelled pixel.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
 from llvmlite import ir
 from numba.core import types
 
-from gsseg_core.data.label_evidence import vote_units
+from gsseg_core.csr_rows import CSRRows
+from gsseg_core.raster.observation import Observation
 from gsseg_core.simd import intrinsic
 
 BLOCKS = 16  # counts are summed in this many parts, then together, so that they do not depend on the number of threads
@@ -29,6 +35,27 @@ _ROUND = 1.5 * 2.0**28
 _ROUND_BITS = int(np.float64(_ROUND).view(np.int64))
 
 
+class ViewPairs(NamedTuple):
+    """The (Gaussian, label) pairs of a view as kernels take them; `Observation` says what the arrays are.
+
+    Attributes
+    ----------
+    order, ids : (M,) int32
+    start : (M + 1,) int64
+    labels : (P,) int32
+    """
+
+    order: np.ndarray
+    ids: np.ndarray
+    start: np.ndarray
+    labels: np.ndarray
+
+    @classmethod
+    def of(cls, observation: Observation) -> ViewPairs:
+        """Take the pairs of an observation."""
+        return cls(observation.order, observation.ids, observation.start, observation.labels)
+
+
 @intrinsic
 def rounded_to_units(_: Any, __: Any) -> Any:
     """Round px, float32 of at least 0, to int64 in units of GRADIENT_UNIT, by instructions that vector units have."""
@@ -43,17 +70,15 @@ def rounded_to_units(_: Any, __: Any) -> Any:
 
 
 @nb.njit(parallel=True, nogil=True, cache=True, fastmath={"contract", "reassoc"})
-def pair_likelihood(
-    indptr: np.ndarray, classes: np.ndarray, codes: np.ndarray,  # (N + 1,), (Z,) uint32, (Z,) float32, as `CSRRows`
-    order: np.ndarray, ids: np.ndarray,  # (M,) int32: in which to go through the Gaussians; (M,) int32
-    start: np.ndarray, labels: np.ndarray, likelihood: np.ndarray,  # (M + 1,), (P,) int32, (L, K) float32
-) -> np.ndarray:  # fmt: skip
+def pair_likelihood(codes: CSRRows, pairs: ViewPairs, likelihood: np.ndarray) -> np.ndarray:
     """Likelihood of the label of each (Gaussian, label) pair, codes[i] . likelihood[y]: (P,) float32."""
+    indptr, classes, data = codes
+    order, ids, start, labels = pairs
     out = np.empty(labels.shape[0], np.float32)
     for i in nb.prange(order.shape[0]):
         m = order[i]
         row = slice(indptr[ids[m]], indptr[ids[m] + 1])
-        code, which = codes[row], classes[row]
+        code, which = data[row], classes[row]
         for s in range(start[m], start[m + 1]):
             by_class, total = likelihood[labels[s]], np.float32(0.0)
             for z in range(code.shape[0]):
@@ -63,18 +88,14 @@ def pair_likelihood(
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def accumulate(
-    indptr: np.ndarray, classes: np.ndarray,  # (N + 1,), (Z,), with the next as `CSRRows`
-    gradient: np.ndarray,  # (Z,) int64, in units of GRADIENT_UNIT, added to
-    order: np.ndarray, ids: np.ndarray,  # (M,) int32: in which to go through the Gaussians; (M,) int32, distinct
-    start: np.ndarray, labels: np.ndarray,  # (M + 1,), (P,) int32
-    likelihood: np.ndarray, shares: np.ndarray,  # (L, K) float32, (P,) float32
-) -> None:  # fmt: skip
+def accumulate(gradient: CSRRows, pairs: ViewPairs, likelihood: np.ndarray, shares: np.ndarray) -> None:
     """Add one view's term to the gradient: sum over a Gaussian's pairs of share times likelihood of the label."""
+    indptr, classes, data = gradient
+    order, ids, start, labels = pairs
     for i in nb.prange(order.shape[0]):
         m = order[i]
         row = slice(indptr[ids[m]], indptr[ids[m] + 1])
-        entries, which = gradient[row], classes[row]
+        entries, which = data[row], classes[row]
         for s in range(start[m], start[m + 1]):
             by_class, share = likelihood[labels[s]], shares[s]
             for z in range(entries.shape[0]):
@@ -82,39 +103,35 @@ def accumulate(
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def m_step(
-    indptr: np.ndarray, codes: np.ndarray,  # (N + 1,), (Z,) float32, changed in place
-    gradient: np.ndarray, prior: np.ndarray,  # (Z,) int64, in units of GRADIENT_UNIT; (Z,) float32, px
-) -> None:  # fmt: skip
+def m_step(codes: CSRRows, gradient: np.ndarray, prior: np.ndarray) -> None:
     """M-step: set the codes to normalise(codes * gradient + prior), in place; rows of zeros stay zero."""
+    indptr, _, data = codes
     for i in nb.prange(indptr.shape[0] - 1):
         total = np.float32(0.0)
         for z in range(indptr[i], indptr[i + 1]):
-            codes[z] = codes[z] * (np.float32(gradient[z]) * _GRADIENT_UNIT) + prior[z]
-            total += codes[z]
+            data[z] = data[z] * (np.float32(gradient[z]) * _GRADIENT_UNIT) + prior[z]
+            total += data[z]
         if total > 0:
             for z in range(indptr[i], indptr[i + 1]):
-                codes[z] /= total
+                data[z] /= total
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def predicted_gain(
-    indptr: np.ndarray, codes: np.ndarray,  # (N + 1,), (Z,) float32
-    gradient: np.ndarray, prior: np.ndarray,  # (Z,) int64, in units of GRADIENT_UNIT; (Z,) float32, px
-) -> float:  # fmt: skip
+def predicted_gain(codes: CSRRows, gradient: np.ndarray, prior: np.ndarray) -> float:
     """Slope of J along the step that `m_step` takes, in nats, at least 0: an upper bound of what it gains.
 
     With p = codes * gradient + prior, the gradient of J is p / codes, and the step leads to p / sum(p).
     """
+    indptr, _, data = codes
     blocks = np.zeros(BLOCKS)
     for block in nb.prange(BLOCKS):
         for i in range(block * (indptr.shape[0] - 1) // BLOCKS, (block + 1) * (indptr.shape[0] - 1) // BLOCKS):
             total, there = 0.0, 0.0
             for z in range(indptr[i], indptr[i + 1]):
-                if codes[z] > 0:
-                    p = np.float64(codes[z]) * gradient[z] * GRADIENT_UNIT + prior[z]
+                if data[z] > 0:
+                    p = np.float64(data[z]) * gradient[z] * GRADIENT_UNIT + prior[z]
                     total += p
-                    there += p * p / codes[z]
+                    there += p * p / data[z]
             if total > 0:
                 blocks[block] += there / total - total
     return float(blocks.sum())
@@ -122,15 +139,16 @@ def predicted_gain(
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def m_step_without_view(
-    indptr: np.ndarray, classes: np.ndarray, codes: np.ndarray,  # (N + 1,), (Z,), (Z,) float32, as `CSRRows`
-    gradient: np.ndarray, prior: np.ndarray,  # (Z,) int64, in units of GRADIENT_UNIT; (Z,) float32, px
-    order: np.ndarray, ids: np.ndarray,  # (M,) int32: in which to go through the Gaussians; (M,) int32
-    start: np.ndarray, labels: np.ndarray,  # (M + 1,), (P,) int32
-    likelihood: np.ndarray, shares: np.ndarray,  # (L, K) float32, (P,) float32
-    out_indptr: np.ndarray, out_classes: np.ndarray,  # (M + 1,); (Z',) out; with the next as `CSRRows`, in that order
-    out: np.ndarray,  # (Z',) float32 out
+    codes: CSRRows, gradient: np.ndarray, prior: np.ndarray, pairs: ViewPairs, likelihood: np.ndarray,
+    shares: np.ndarray, stepped: CSRRows,
 ) -> None:  # fmt: skip
-    """M-step of the Gaussians that a view sees, with the gradient less what `accumulate` added for this view."""
+    """M-step of the M Gaussians that a view sees, with the gradient less what `accumulate` added for this view.
+
+    Written are the classes and the entries of `stepped`, M rows in the order of `pairs.order`.
+    """
+    indptr, classes, data = codes
+    order, ids, start, labels = pairs
+    out_indptr, out_classes, out = stepped
     for i in nb.prange(order.shape[0]):
         m = order[i]
         first, total = indptr[ids[m]], np.float32(0.0)
@@ -140,7 +158,7 @@ def m_step_without_view(
             for s in range(start[m], start[m + 1]):
                 remaining -= rounded_to_units(shares[s] * likelihood[labels[s], k])
             out_classes[z] = k
-            out[z] = codes[first + j] * (np.float32(remaining) * _GRADIENT_UNIT) + prior[first + j]
+            out[z] = data[first + j] * (np.float32(remaining) * _GRADIENT_UNIT) + prior[first + j]
             total += out[z]
         if total > 0:
             for z in range(out_indptr[i], out_indptr[i + 1]):
@@ -149,12 +167,11 @@ def m_step_without_view(
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def confusion_counts(
-    indptr: np.ndarray, classes: np.ndarray, codes: np.ndarray,  # (M + 1,), (Z,), (Z,) float32, as `CSRRows`
-    order: np.ndarray, start: np.ndarray,  # (M,) int32: whose rows these are; (M + 1,)
-    labels: np.ndarray, shares: np.ndarray,  # (P,) int32, (P,) float32
-    num_classes: int, num_labels: int,
-) -> np.ndarray:  # fmt: skip
-    """Sum over the pairs of codes[i] times share, by class and label, (K, L) float64."""
+    codes: CSRRows, pairs: ViewPairs, shares: np.ndarray, num_classes: int, num_labels: int
+) -> np.ndarray:
+    """Sum over the pairs of codes[i] times share, by class and label, (K, L) float64; row i is of `pairs.order[i]`."""
+    indptr, classes, data = codes
+    order, _, start, labels = pairs
     parts = np.zeros((BLOCKS, num_classes, num_labels))
     for block in nb.prange(BLOCKS):
         part = parts[block]
@@ -162,20 +179,17 @@ def confusion_counts(
             m = order[i]
             for s in range(start[m], start[m + 1]):
                 for z in range(indptr[i], indptr[i + 1]):
-                    part[classes[z], labels[s]] += shares[s] * codes[z]
+                    part[classes[z], labels[s]] += shares[s] * data[z]
     counts: np.ndarray = parts.sum(axis=0)
     return counts
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def normalise_votes(
-    votes: np.ndarray, possible: np.ndarray,  # (N, K) int64; (K,) bool: ids that are classes
-    codes: np.ndarray,  # (N, K) float32 out
-) -> int:  # fmt: skip
-    """Divide the votes for classes by their sum; rows of zeros stay zero.
+def normalise_votes(votes: np.ndarray, possible: np.ndarray, codes: np.ndarray) -> int:
+    """Divide the votes (N, K) int64 for classes by their sum, into codes (N, K) float32; rows of zeros stay zero.
 
-    Votes below 0 are against a class. Where there are only such, the one class without any is certain; where several
-    have none, the row is left zero. Returns how many rows these are.
+    Votes below 0 are against a class. Where there are only such, the one class without any is certain; where several of
+    the `possible`, (K,) bool, have none, the row is left zero. Returns how many rows these are.
     """
     unsure = 0
     for i in nb.prange(votes.shape[0]):
@@ -193,32 +207,3 @@ def normalise_votes(
             else:
                 unsure += 1
     return unsure
-
-
-@nb.njit(nogil=True, cache=True)
-def subtract_row(
-    classes: np.ndarray, total: np.ndarray,  # (n,) of one Gaussian; (n,) int64, taken from
-    labels: np.ndarray,  # (s,) label of each of its pairs
-    vote_indptr: np.ndarray, vote_classes: np.ndarray, vote: np.ndarray,  # votes of a pixel of each label: L `CSRRows`
-    votes: np.ndarray, units: float,  # (s,) float32; per vote, a power of 2
-) -> None:  # fmt: skip
-    """Subtract one view's votes for one Gaussian, rounded as when they were added."""
-    for s in range(labels.shape[0]):
-        for j in range(vote_indptr[labels[s]], vote_indptr[labels[s] + 1]):
-            for z in range(classes.shape[0]):
-                if classes[z] == vote_classes[j]:
-                    total[z] -= vote_units(votes[s], vote[j], units)
-
-
-@nb.njit(parallel=True, nogil=True, cache=True)
-def subtract_votes(
-    first: np.ndarray, last: np.ndarray,  # (M,) where the row of each Gaussian begins; (M,) one past its end
-    classes: np.ndarray, total: np.ndarray,  # (Z,), (Z,) int64, taken from
-    order: np.ndarray, start: np.ndarray, labels: np.ndarray,  # (M,) int32: whose rows these are; (M + 1,), (P,) int32
-    vote_indptr: np.ndarray, vote_classes: np.ndarray, vote: np.ndarray,  # as in `subtract_row`
-    votes: np.ndarray, units: float,  # (P,) float32; per vote, a power of 2
-) -> None:  # fmt: skip
-    """Subtract one view's votes from those of all, row by row."""
-    for i in nb.prange(order.shape[0]):
-        row, seen = slice(first[i], last[i]), slice(start[order[i]], start[order[i] + 1])
-        subtract_row(classes[row], total[row], labels[seen], vote_indptr, vote_classes, vote, votes[seen], units)

@@ -32,18 +32,12 @@ from gsseg_core.data.label_evidence import resolved_votes
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
+from gsseg_core.learn.em import em_kernels as kernels
 from gsseg_core.learn.em.boundary_alignment import align_boundaries, scene_edges
 from gsseg_core.learn.em.confusion_model import ErrorModel
-from gsseg_core.learn.em.em_kernels import (
-    accumulate,
-    confusion_counts,
-    m_step,
-    m_step_without_view,
-    pair_likelihood,
-    predicted_gain,
-)
-from gsseg_core.learn.em.leave_one_out import leave_one_out_counts
-from gsseg_core.learn.em.rejected_regions import find_rejected, split_regions, subtract_labels
+from gsseg_core.learn.em.em_kernels import ViewPairs
+from gsseg_core.learn.em.leave_one_out import leave_one_out_counts, subtract_votes
+from gsseg_core.learn.em.rejected_regions import find_rejected, split_regions
 from gsseg_core.learn.learner import MEMORY_BUDGET, VOTE_UNIT, Learner, Progress, silent
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.observation import Observation
@@ -53,6 +47,9 @@ from gsseg_core.spatial.neighbourhood import neighbours_of
 
 REFIT_FACTOR = 8
 """Error models are re-estimated once a step gains less than this many times the tolerance."""
+
+Tick = Callable[[], None]
+"""Called for each view, so that whoever listens can stop the work at once."""
 
 
 @dataclass(frozen=True)
@@ -109,10 +106,9 @@ class EMSettings:
             raise SettingsError(f"em: least_agreement is {self.least_agreement}; expected a share in [0, 1]")
         if self.majority < 1:
             raise SettingsError(f"em: majority is {self.majority}; expected at least 1")
-        if min(self.tolerance, self.error_prior, self.prior_weight, self.refits, self.edge_px) < 0:
-            raise SettingsError(
-                "em: tolerance, error_prior, prior_weight, refits or edge_px is negative; expected 0 or more"
-            )
+        for name in ("tolerance", "error_prior", "prior_weight", "refits", "edge_px"):
+            if getattr(self, name) < 0:
+                raise SettingsError(f"em: {name} is {getattr(self, name)}; expected 0 or more")
 
     @property
     def rejects_regions(self) -> bool:
@@ -131,10 +127,6 @@ class EMLearner(Learner):
         After `fit`: J per labelled pixel before each step, in nats; it never falls until error models are re-estimated.
     rounds_ : list of int
         After `fit`: steps with each set of error models.
-    n_iter_ : int
-        After `fit`: steps in all.
-    lower_bound_ : float
-        After `fit`: the last entry of `history_`.
     converged_ : bool
         After `fit`: whether the last step gained less than the tolerance.
     """
@@ -162,12 +154,12 @@ class EMLearner(Learner):
 
     @property
     def n_iter_(self) -> int:
-        """Steps of `fit`."""
+        """Steps of `fit` in all."""
         return len(self.history_)
 
     @property
     def lower_bound_(self) -> float:
-        """J per labelled pixel, in nats, as of the last step."""
+        """J per labelled pixel, in nats, before the last step: the last entry of `history_`."""
         return self.history_[-1] if self.history_ else float("nan")
 
     @property
@@ -191,8 +183,8 @@ class EMLearner(Learner):
         # The votes are the first step; with the prior added, J is finite from the start. What is zero now is zero after
         # every step, so the pattern of the probabilities stays.
         codes = resolved.with_data(resolved.data.astype(np.float32) * np.float32(VOTE_UNIT) + prior.data).normalised()
-        history: list[float] = []
-        self.history_ = history
+        counted = prior.data > 0
+        self.history_ = history = list[float]()
         models = self._initial_error_models(votes, rejected, tick)
         pixels = sum(model.num_pixels for model in models.values())
         self.rounds_ = rounds = [0]
@@ -200,15 +192,16 @@ class EMLearner(Learner):
             tick = partial(progress, "em", len(history), settings.max_steps)
             gradient, log_likelihoods = self._e_step(codes, models, tick)
             log_likelihood = sum(log_likelihoods[name] for name in self.views)
-            history.append((_log_prior(codes.data, prior.data) + log_likelihood) / pixels)
+            log_prior = (prior.data[counted] * np.log(codes.data[counted])).sum(dtype=np.float64)
+            history.append((float(log_prior) + log_likelihood) / pixels)
             rounds[-1] += 1
             last_round = len(rounds) > settings.refits or not settings.errors
             tolerance = settings.tolerance * (1 if last_round else REFIT_FACTOR) * pixels
-            small = predicted_gain(codes.indptr, codes.data, gradient, prior.data) < tolerance
+            small = kernels.predicted_gain(codes, gradient, prior.data) < tolerance
             if small and not last_round:
                 self._refit_error_models(codes, gradient, prior.data, models, tick)
                 rounds.append(0)
-            m_step(codes.indptr, codes.data, gradient, prior.data)
+            kernels.m_step(codes, gradient, prior.data)
             self.converged_ = small and last_round
             if self.converged_:
                 break
@@ -220,10 +213,11 @@ class EMLearner(Learner):
     def prepare_predictions(self, progress: Progress = silent) -> None:
         """Run the E-step at the fitted probabilities, from which `predict_without` takes one view's part away."""
         codes, total, done = CSRRows.from_dense(self.codes_), len(self.views), itertools.count()
-        gradient, _ = self._e_step(
-            codes, self.error_models_, lambda: progress("sum up views", min(next(done), total - 1), total)
-        )
-        self._leave_one_out = codes, gradient
+
+        def tick() -> None:
+            progress("sum up views", min(next(done), total - 1), total)
+
+        self._leave_one_out = codes, self._e_step(codes, self.error_models_, tick)[0]
         progress("sum up views", total, total)
 
     def predict_without(self, view: View) -> np.ndarray:
@@ -259,12 +253,9 @@ class EMLearner(Learner):
         return split_regions(seen) if settings.rejects_regions else seen
 
     def _reject_regions(
-        self,
-        votes: CSRRows,  # int64
-        tick: Callable[[], None],
-        names: Iterable[str] | None = None,
+        self, votes: CSRRows, tick: Tick, names: Iterable[str] | None = None
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Find the labels of each view, or of some, that the other views contradict.
+        """Find the labels of each view, or of some, that the other views contradict, by the votes of all, int64.
 
         Returns
         -------
@@ -279,39 +270,37 @@ class EMLearner(Learner):
             labels = find_rejected(votes, observation, self._possible(), self.settings.least_agreement)
             if labels.any():
                 rejected[name] = labels
-                subtract_labels(labels, votes, observation, remaining)
+                rejected_votes = observation.evidence.without(~labels).votes
+                total, pairs = votes.with_data(remaining), ViewPairs.of(observation)
+                subtract_votes(total, pairs, observation.votes(), rejected_votes)
         return -remaining, rejected
 
     def _initial_error_models(
         self,
-        votes: CSRRows,  # int64
-        rejected: Mapping[str, np.ndarray],  # (L,) bool
-        tick: Callable[[], None],
+        votes: CSRRows,
+        rejected: Mapping[str, np.ndarray],
+        tick: Tick,
         names: Iterable[str] | None = None,
     ) -> dict[str, ErrorModel]:
-        """Estimate an error model for each view, or for some, from the votes of all other views."""
-        models = {}
+        """Estimate an error model for each view, or for some, from the votes of all other views.
+
+        The votes, int64, are without those of labels that are `rejected`: (L,) bool, of views that have any.
+        """
+        models, settings = {}, self.settings
         for name, observation in self._observations(names):
             tick()
-            models[name] = self._initial_error_model(votes, observation, rejected.get(name))
+            evidence, outliers = observation.evidence, settings.outliers
+            if not settings.errors:
+                models[name] = ErrorModel.without_errors(evidence, self.num_classes, outliers, observation.num_pixels)
+                continue
+            if name in rejected:
+                evidence = evidence.without(rejected[name])
+            pixels = int(observation.areas[evidence.informative].sum())
+            counts = leave_one_out_counts(votes, observation, self._possible(), evidence, settings.majority)
+            models[name] = ErrorModel.from_counts(evidence, counts, settings.error_prior, outliers, pixels)
         return models
 
-    def _initial_error_model(self, votes: CSRRows, observation: Observation, rejected: np.ndarray | None) -> ErrorModel:
-        settings, evidence = self.settings, observation.evidence
-        if not settings.errors:
-            return ErrorModel.without_errors(evidence, self.num_classes, settings.outliers, observation.num_pixels)
-        if rejected is not None:
-            evidence = evidence.without(rejected)
-        pixels = int(observation.areas[evidence.informative].sum())
-        counts = leave_one_out_counts(votes, observation, self._possible(), evidence, settings.majority)
-        return ErrorModel.from_counts(evidence, counts, settings.error_prior, settings.outliers, pixels)
-
-    def _e_step(
-        self,
-        codes: CSRRows,
-        models: dict[str, ErrorModel],
-        tick: Callable[[], None],
-    ) -> tuple[np.ndarray, dict[str, float]]:
+    def _e_step(self, codes: CSRRows, models: dict[str, ErrorModel], tick: Tick) -> tuple[np.ndarray, dict[str, float]]:
         """Sum over the views of these models the gradient of the log-likelihood.
 
         Returns
@@ -323,33 +312,28 @@ class EMLearner(Learner):
         """
         gradient, log_likelihoods = np.zeros(len(codes.data), np.int64), {}
         for name, observation in self._observations(models):
-            tick()  # after each view, so that whoever listens can stop the work at once
-            (likelihood, used), pairs = models[name].by_label, _pairs(observation)
-            shares = observation.shares(pair_likelihood(*codes, *pairs, likelihood), likelihood[:, 0])
+            tick()
+            (likelihood, used), pairs = models[name].by_label, ViewPairs.of(observation)
+            shares = observation.shares(kernels.pair_likelihood(codes, pairs, likelihood), likelihood[:, 0])
             log_likelihoods[name] = shares.log_likelihood
-            accumulate(codes.indptr, codes.indices, gradient, *pairs, used, shares.pairs)
+            kernels.accumulate(codes.with_data(gradient), pairs, used, shares.pairs)
         return gradient, log_likelihoods
 
     def _refit_error_models(
-        self,
-        codes: CSRRows,
-        gradient: np.ndarray,  # (Z,) int64, of all views at these codes and models
-        prior: np.ndarray,  # (Z,) px
-        models: dict[str, ErrorModel],
-        tick: Callable[[], None],
+        self, codes: CSRRows, gradient: np.ndarray, prior: np.ndarray, models: dict[str, ErrorModel], tick: Tick
     ) -> dict[str, ErrorModel]:
-        """Re-estimate each view's error model, in place, from the step without this view."""
+        """Re-estimate each view's error model, in place, from the step without this view; see `codes_without`."""
         for name, observation in self._observations(models):
             tick()
-            model, order = models[name], observation.order
+            model, pairs = models[name], ViewPairs.of(observation)
             without = codes_without(observation, model, codes, gradient, prior)
             # Rows of `without` are in the order of the scene, so a Gaussian's row is its place in that order.
-            place = np.empty(len(order), np.int32)
-            place[order] = np.arange(len(order), dtype=np.int32)
-            pairs = observation.start, observation.labels
+            place = np.empty_like(pairs.order)
+            place[pairs.order] = np.arange(len(place), dtype=np.int32)
             likelihood, _ = model.by_label
-            shares = observation.shares(pair_likelihood(*without, order, place, *pairs, likelihood), likelihood[:, 0])
-            counts = confusion_counts(*without, order, *pairs, shares.pairs, self.num_classes, len(observation.classes))
+            said = kernels.pair_likelihood(without, pairs._replace(ids=place), likelihood)
+            shares = observation.shares(said, likelihood[:, 0])
+            counts = kernels.confusion_counts(without, pairs, shares.pairs, self.num_classes, len(likelihood))
             counts[0] += shares.rest
             model.m_step(model.expected_counts(counts))
         return models
@@ -365,29 +349,15 @@ class EMLearner(Learner):
 
 
 def codes_without(
-    observation: Observation,
-    model: ErrorModel,
-    codes: CSRRows,
-    gradient: np.ndarray,  # (Z,) int64, of all views at these codes and models
-    prior: np.ndarray,  # (Z,) float32, px
+    observation: Observation, model: ErrorModel, codes: CSRRows, gradient: np.ndarray, prior: np.ndarray
 ) -> CSRRows:
-    """Take an M-step without one view: probabilities of the M Gaussians that it sees, in the order of the scene."""
-    (likelihood, used), pairs = model.by_label, _pairs(observation)
-    shares = observation.shares(pair_likelihood(*codes, *pairs, likelihood), likelihood[:, 0])
-    indptr = starts(np.diff(codes.indptr)[observation.ids[observation.order]])
-    without = CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], np.float32))
-    m_step_without_view(*codes, gradient, prior, *pairs, used, shares.pairs, *without)
-    return without
+    """Take an M-step without one view: probabilities of the M Gaussians that it sees, in the order of the scene.
 
-
-def _pairs(observation: Observation) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the (Gaussian, label) pairs of a view as the kernels take them."""
-    return observation.order, observation.ids, observation.start, observation.labels
-
-
-def _log_prior(
-    codes: np.ndarray,  # (Z,)
-    prior: np.ndarray,  # (Z,) px
-) -> float:
-    counted = prior > 0
-    return float((prior[counted] * np.log(codes[counted])).sum(dtype=np.float64))
+    The gradient is that of all views at these codes and models; see `gsseg_core.learn.em.em_kernels` for the arrays.
+    """
+    (likelihood, used), pairs = model.by_label, ViewPairs.of(observation)
+    shares = observation.shares(kernels.pair_likelihood(codes, pairs, likelihood), likelihood[:, 0])
+    indptr = starts(np.diff(codes.indptr)[pairs.ids[pairs.order]])
+    stepped = CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], np.float32))
+    kernels.m_step_without_view(codes, gradient, prior, pairs, used, shares.pairs, stepped)
+    return stepped

@@ -6,8 +6,8 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.data.label_evidence import LabelEvidence, resolve_row
-from gsseg_core.learn.em.em_kernels import BLOCKS, subtract_row
+from gsseg_core.data.label_evidence import LabelEvidence, resolve_row, vote_units
+from gsseg_core.learn.em.em_kernels import BLOCKS, ViewPairs
 from gsseg_core.learn.learner import UNITS
 from gsseg_core.raster.observation import Observation
 
@@ -25,10 +25,35 @@ def leave_one_out_counts(
     Probabilities are raised to a power, and normalised, before they are counted: above 1, majorities stand out. A
     Gaussian counts at most `most` times the pixels that the other views saw of it.
     """
-    return _count(
-        *votes, observation.order, observation.ids, observation.start, observation.labels, observation.votes(),
-        *evidence.votes, np.flatnonzero(possible), power, most, len(possible), len(observation.classes),
-    )  # fmt: skip
+    pairs, own, classes = ViewPairs.of(observation), observation.votes(), np.flatnonzero(possible)
+    return _count(votes, pairs, own, evidence.votes, classes, len(possible), power, most)
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def subtract_votes(total: CSRRows, pairs: ViewPairs, own: np.ndarray, label_votes: CSRRows) -> None:
+    """Subtract one view's votes from those of all, N rows of int64, in place.
+
+    Of the view are `Observation.votes`, (P,) float32, and `LabelEvidence.votes`, L rows of float64.
+    """
+    indptr, classes, data = total
+    order, ids, start, labels = pairs
+    for i in nb.prange(order.shape[0]):
+        m = order[i]
+        row, seen = slice(indptr[ids[m]], indptr[ids[m] + 1]), slice(start[m], start[m + 1])
+        _subtract_row(classes[row], data[row], labels[seen], own[seen], label_votes)
+
+
+@nb.njit(nogil=True, cache=True)
+def _subtract_row(
+    classes: np.ndarray, total: np.ndarray, labels: np.ndarray, own: np.ndarray, label_votes: CSRRows
+) -> None:
+    """Subtract one view's votes from the row of one Gaussian, rounded as when they were added."""
+    indptr, vote_classes, votes = label_votes
+    for s in range(labels.shape[0]):
+        for j in range(indptr[labels[s]], indptr[labels[s] + 1]):
+            for z in range(classes.shape[0]):
+                if classes[z] == vote_classes[j]:
+                    total[z] -= vote_units(own[s], votes[j], UNITS)
 
 
 @nb.njit(nogil=True, cache=True)
@@ -46,15 +71,16 @@ def _raised(x: np.float32, power: float) -> np.float32:
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def _count(
-    indptr: np.ndarray, classes: np.ndarray, votes: np.ndarray,  # (N + 1,), (Z,), (Z,) int64: of all views, `CSRRows`
-    order: np.ndarray, ids: np.ndarray,  # (M,) in which to go through the Gaussians; (M,)
-    start: np.ndarray, labels: np.ndarray, own: np.ndarray,  # (M + 1,), (P,), (P,) float32, px
-    vote_indptr: np.ndarray, vote_classes: np.ndarray, vote: np.ndarray,  # as in `subtract_row`
-    possible: np.ndarray, power: float, most: float,  # ids that are classes, ascending
-    num_classes: int, num_labels: int,
+    votes: CSRRows, pairs: ViewPairs, own: np.ndarray, label_votes: CSRRows, possible: np.ndarray, num_classes: int,
+    power: float, most: float,
 ) -> np.ndarray:  # fmt: skip
-    """Count as `leave_one_out_counts` does, row by row, so that the votes of the other views are never stored."""
-    parts = np.zeros((BLOCKS, num_classes, num_labels))
+    """Count as `leave_one_out_counts` does, row by row, so that the votes of the other views are never stored.
+
+    Here `possible` are the ids that are classes, ascending; other arrays are those of `subtract_votes`.
+    """
+    indptr, classes, data = votes
+    order, ids, start, labels = pairs
+    parts = np.zeros((BLOCKS, num_classes, label_votes.indptr.shape[0] - 1))
     for block in nb.prange(BLOCKS):
         part = parts[block]
         which, remaining = np.empty(num_classes + 1, np.uint32), np.empty(num_classes + 1, np.int64)
@@ -64,10 +90,9 @@ def _count(
             m = order[i]
             first, count = indptr[ids[m]], indptr[ids[m] + 1] - indptr[ids[m]]
             for z in range(count):
-                which[z], remaining[z] = classes[first + z], votes[first + z]
-            pairs = slice(start[m], start[m + 1])
-            row = which[:count], remaining[:count]
-            subtract_row(row[0], row[1], labels[pairs], vote_indptr, vote_classes, vote, own[pairs], UNITS)
+                which[z], remaining[z] = classes[first + z], data[first + z]
+            seen = slice(start[m], start[m + 1])
+            _subtract_row(which[:count], remaining[:count], labels[seen], own[seen], label_votes)
             least = np.int64(0)
             for z in range(count):
                 least = min(least, remaining[z])
@@ -80,13 +105,13 @@ def _count(
                 largest = max(largest, remaining[z])
             if total == 0:
                 continue
-            raised, seen = np.float32(0), np.float64(0)
+            raised, pixels = np.float32(0), np.float64(0)
             for z in range(count):  # As shares of the largest, of which some power is never lost to rounding.
                 codes[z] = _raised(np.float32(remaining[z]) / np.float32(largest), power)
                 raised += codes[z]
             for s in range(start[m], start[m + 1]):
-                seen += own[s]
-            share = np.float32(min(1.0, most * total / max(seen * UNITS, 1.0))) / raised
+                pixels += own[s]
+            share = np.float32(min(1.0, most * total / max(pixels * UNITS, 1.0))) / raised
             for s in range(start[m], start[m + 1]):
                 for z in range(count):
                     part[which[z], labels[s]] += own[s] * share * codes[z]

@@ -15,9 +15,7 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import SeenLabels
-from gsseg_core.learn.em.em_kernels import subtract_votes
 from gsseg_core.learn.em.leave_one_out import leave_one_out_counts
-from gsseg_core.learn.learner import UNITS
 from gsseg_core.raster.observation import Observation
 
 SMALLEST = 64
@@ -48,42 +46,14 @@ def split_regions(seen: SeenLabels) -> SeenLabels:
     return SeenLabels(labels, LabelEvidence(classes.astype(np.int32), mass))
 
 
-def connected_pixels(
-    labels: np.ndarray,  # (H, W) int32
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Label the 4-connected components of pixels of one label, in the order of their first pixels.
-
-    Returns
-    -------
-    connected : (H, W) int32
-        `UNKNOWN` (-1) where the label is negative.
-    first : (R,) int64
-        First pixel of each component, counted row by row.
-    area : (R,) int64
-        Pixels of each component.
-    """
-    connected = np.empty(labels.shape, np.int32)
-    first, area = _connect(np.ascontiguousarray(labels), connected)
-    return connected, first, area
-
-
-def find_rejected(
-    votes: CSRRows,  # int64, of all views
-    observation: Observation,
-    possible: np.ndarray,  # (K,) bool: ids that are classes
-    least: float,
-) -> np.ndarray:
+def find_rejected(votes: CSRRows, observation: Observation, possible: np.ndarray, least: float) -> np.ndarray:
     """Find the labels of a view that the votes of all other views contradict, (L,) bool; none of uncertain evidence.
 
-    A Gaussian that this view saw better than all others together counts by what they saw of it, no more: what shows
+    They are those under which less than the share `least`, by weight, is of their class by the votes of the others. A
+    Gaussian that this view saw better than all others together counts by what they saw of it, no more: what shows
     through a gap in another view is little evidence. A region of which they saw too little is kept.
 
-    Parameters
-    ----------
-    votes, observation, possible
-        As for `leave_one_out_counts`.
-    least : float
-        Least share of what lies under a label, by weight, that is of its class by the votes of the others.
+    The other parameters are those of `leave_one_out_counts`.
     """
     evidence = observation.evidence
     if not evidence.is_certain:
@@ -96,38 +66,24 @@ def find_rejected(
     return rejected
 
 
-def subtract_labels(
-    chosen: np.ndarray,  # (L,) bool
-    votes: CSRRows,  # int64, of all views
-    observation: Observation,
-    total: np.ndarray,  # (Z,) int64, changed in place
-) -> None:
-    """Subtract a view's votes with some of its labels from a total of the same pattern as the votes."""
-    order, label_votes = observation.order, observation.evidence.without(~chosen).votes
-    ids = observation.ids[order]
-    rows = votes.indptr[ids], votes.indptr[ids + 1], votes.indices
-    pairs = order, observation.start, observation.labels
-    subtract_votes(*rows, total, *pairs, *label_votes, observation.votes(), UNITS)
-
-
 @nb.njit(nogil=True, cache=True)
-def _root(parent: np.ndarray, i: int) -> int:
-    while parent[i] != i:
-        parent[i] = parent[parent[i]]
-        i = parent[i]
-    return i
+def connected_pixels(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # (H, W) int32
+    """Label the 4-connected components of pixels of one label, in the order of their first pixels.
 
+    Runs of equal pixels are joined to those of the row above.
 
-@nb.njit(nogil=True, cache=True)
-def _connect(
-    labels: np.ndarray,  # (H, W)
-    connected: np.ndarray,  # (H, W) int32 out
-) -> tuple[np.ndarray, np.ndarray]:
-    """Write the numbers, return first pixels and areas. Runs of equal pixels are joined to those of the row above."""
-    height, width = labels.shape
-    parent = np.empty(height * width, np.int32)  # of runs; there are at most as many as pixels
-    begin = np.empty(height * width, np.int32)
-    runs = 0
+    Returns
+    -------
+    connected : (H, W) int32
+        `UNKNOWN` (-1) where the label is negative.
+    first : (R,) int64
+        First pixel of each component, counted row by row.
+    area : (R,) int64
+        Pixels of each component.
+    """
+    (height, width), connected = labels.shape, np.empty(labels.shape, np.int32)
+    # Of runs; there are at most as many as pixels.
+    parent, begin, runs = np.empty(labels.size, np.int32), np.empty(labels.size, np.int32), 0
     for y in range(height):
         for x in range(width):
             if labels[y, x] < 0:
@@ -142,8 +98,7 @@ def _connect(
             if y > 0 and labels[y, x] == labels[y - 1, x] and not (joined and labels[y - 1, x - 1] == labels[y, x]):
                 one, two = _root(parent, run), _root(parent, connected[y - 1, x])
                 parent[max(one, two)] = min(one, two)
-    count = 0
-    number, first = np.empty(runs, np.int32), np.empty(runs, np.int64)
+    number, first, count = np.empty(runs, np.int32), np.empty(runs, np.int64), 0
     for run in range(runs):
         root = _root(parent, run)
         if root == run:
@@ -151,10 +106,17 @@ def _connect(
             count += 1
         else:
             number[run] = number[root]
-    area = np.zeros(count, np.int64)
-    for y in range(height):
-        for x in range(width):
-            if connected[y, x] >= 0:
-                connected[y, x] = number[connected[y, x]]
-                area[connected[y, x]] += 1
-    return first[:count].copy(), area
+    area, pixels = np.zeros(count, np.int64), connected.ravel()
+    for p in range(pixels.shape[0]):
+        if pixels[p] >= 0:
+            pixels[p] = number[pixels[p]]
+            area[pixels[p]] += 1
+    return connected, first[:count].copy(), area
+
+
+@nb.njit(nogil=True, cache=True)
+def _root(parent: np.ndarray, i: int) -> int:
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i
