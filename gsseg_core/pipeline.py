@@ -45,8 +45,7 @@ from gsseg_core.segmentation import Segmentation
 if TYPE_CHECKING:
     from distributed import Client
 
-PICTURED_VIEWS = 12
-"""Views that `segment` draws, spread evenly over the dataset."""
+PICTURED_VIEWS = 12  # views that `segment` draws, spread evenly over the dataset
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,11 +34,8 @@ from scipy import sparse
 from gsseg_core.errors import SettingsError
 from gsseg_core.objects.lifted_segments import Lifted, Profiles, sums
 
-_PAIRS = 1 << 15
-"""So many pairs at a time, to keep memory small."""
-
-_LEVEL = 0.75
-"""Pairs that agree nearly as well as the best one merge at once, before anything is compared anew."""
+_PAIRS = 1 << 15  # so many pairs at a time, to keep memory small
+_LEVEL = 0.75  # pairs that agree nearly as well as the best one merge at once, before anything is compared anew
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 from gsseg_core.errors import SettingsError
 
-MAX_K = 1 << 20
-"""Most neighbours: sums over more would overflow."""
+MAX_K = 1 << 20  # most neighbours: sums over more would overflow
 
 
 @dataclass(frozen=True)

@@ -32,12 +32,8 @@ from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
-STEPS = 5
-"""Steps of the shares: the labels hardly change after these."""
-
-KEPT = 0.5
-"""Least share with which a Gaussian stays with its object."""
-
+STEPS = 5  # steps of the shares: the labels hardly change after these
+KEPT = 0.5  # least share with which a Gaussian stays with its object
 _LEAST = np.float32(0.01)  # of a share, so that a Gaussian may come back
 
 

@@ -31,14 +31,12 @@ from gsseg_core.scene.scene_cache import PerScene
 SHARPNESS = 3.0
 """Log-likelihood of edges of one unit in the mean, in nats, where `LENGTH` pixels lie along the boundary."""
 
-LENGTH = 30.0
-"""In px, of both sides."""
+LENGTH = 30.0  # in px, of both sides
 
 LONGEST = 400
 """More pixels than these weigh no more: that a region is too wide by the same all around holds only roughly."""
 
-SHORTEST = 3
-"""Boundaries of fewer px on either side are not moved."""
+SHORTEST = 3  # boundaries of fewer px on either side are not moved
 
 VANISHED = -20.0
 """Log-likelihood, in nats, of a boundary so far inside a region that hardly anything of it would be left."""
@@ -46,14 +44,9 @@ VANISHED = -20.0
 TELLING = 1.75
 """Nothing is moved unless edges within S px of the boundaries are this many times as strong as in the whole view."""
 
-BAND = 64
-"""Rows of the image that are gone through at once."""
-
-ROUNDS = 6
-"""Of the mean field, each with a better prior."""
-
-STRONGEST = 2.0
-"""Edges count at most so much, in units of the view's 95th percentile."""
+BAND = 64  # rows of the image that are gone through at once
+ROUNDS = 6  # of the mean field, each with a better prior
+STRONGEST = 2.0  # edges count at most so much, in units of the view's 95th percentile
 
 _LIGHT: PerScene[np.ndarray] = PerScene()
 

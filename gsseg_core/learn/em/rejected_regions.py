@@ -18,14 +18,12 @@ from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.learn.em.leave_one_out import leave_one_out_counts
 from gsseg_core.raster.observation import Observation
 
-SMALLEST = 64
-"""Regions of fewer px are not split: all of one label are tested as one."""
+SMALLEST = 64  # regions of fewer px are not split: all of one label are tested as one
 
 COVERED = 0.25
 """Share of a region, by weight, that the other views must have seen as well as this one for it to be rejected."""
 
-MOST = 500
-"""Regions of a mask that are split at most, the largest; what is left of each label is tested as one."""
+MOST = 500  # regions of a mask that are split at most, the largest; what is left of each label is tested as one
 
 
 def split_regions(seen: SeenLabels) -> SeenLabels:
@@ -58,7 +56,7 @@ def find_rejected(votes: CSRRows, observation: Observation, possible: np.ndarray
     evidence = observation.evidence
     if not evidence.is_certain:
         return np.zeros(len(observation.classes), bool)
-    counts = leave_one_out_counts(votes, observation, possible, evidence, most=1)
+    counts = leave_one_out_counts(votes, observation, possible, evidence, most=1.0)
     label = np.arange(len(evidence.informative))
     covered = counts.sum(axis=0)
     enough = covered >= COVERED * np.bincount(observation.labels, weights=observation.votes(), minlength=len(label))
