@@ -29,6 +29,8 @@ from typing import TYPE_CHECKING
 from forked import Ended, in_child, run_command, skip_warm_up  # first: it says how numba runs
 from report import table
 
+from gsseg_core.text import printable
+
 if TYPE_CHECKING:
     from fuzz_inputs import Kind
 
@@ -185,7 +187,7 @@ def judge(ended: Ended) -> str:
         return "refused with more than one line"
     if len(lines[0]) > LONGEST_LINE:
         return "refused with a line of more than 1000 characters"
-    return "refused" if lines[0].isprintable() else "refused with control characters"
+    return "refused" if lines[0] == printable(lines[0]) else "refused with control characters"
 
 
 def _without_paths(line: str) -> str:

@@ -26,6 +26,8 @@ from sensor_msgs.msg import Image
 from small_scenes import balls_on_a_table, clean_views, write_dataset
 from whole_outputs import hash_of
 
+from gsseg_core.text import printable
+
 BATCH = 100
 """Inputs after which the node is asked what it knows."""
 DEAD = "the node ended"
@@ -245,7 +247,7 @@ def _request(kind: str, node: FuzzedNode, rng: random.Random) -> str:
         return "done"
     if answer.error_code == type(answer).UNKNOWN:
         return f"answered UNKNOWN: {answer.error_msg[:60]}"
-    if len(answer.error_msg) > LONGEST_LINE or not answer.error_msg.isprintable():
+    if len(answer.error_msg) > LONGEST_LINE or answer.error_msg != printable(answer.error_msg):
         return "refused with a line that is long or not printable"
     return "refused"
 

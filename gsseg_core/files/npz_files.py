@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import sys
 import tokenize
 import zipfile
 from collections.abc import Iterator
@@ -24,6 +25,7 @@ from gsseg_core.text import clipped, quoted
 SHARES_TOLERANCE = 0.01
 """Probabilities of a row may sum to so much more or less than 1."""
 
+_COLDEST = 1e-3  # lowest temperature of probabilities; the highest is one over it
 _SUFFIX = ".npy"
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
@@ -94,7 +96,10 @@ class NpzArrays:
         header = self.header(name)
         if header.dtype.kind != "U" or header.shape != () or header.dtype.itemsize > 4 * LIMITS.max_json_bytes:
             raise ValueError(f"array {name!r} is {header}; expected one text")
-        return str(self.read(name))
+        text = self.read(name)
+        if text.reshape(1).view(text.dtype.byteorder + "u4").max(initial=0) > sys.maxunicode:
+            raise ValueError(f"array {name!r} holds what is no character")
+        return str(text)
 
 
 def _read_header(member: Any, name: str) -> Header:
@@ -124,8 +129,8 @@ def whole_number(value: object, what: str, least: int, most: int) -> int:
 def temperature_of(header: dict[str, Any]) -> float:
     """Read the temperature of probabilities from a JSON header; 1 where there is none, as in files of old."""
     value = header.get("temperature", 1.0)
-    if type(value) not in (int, float) or not 0 < value < math.inf:
-        raise UnfitError(f"temperature is {quoted(value)}; expected a finite number above 0")
+    if type(value) not in (int, float) or not _COLDEST <= value <= 1 / _COLDEST:
+        raise UnfitError(f"temperature is {quoted(value)}; expected a number from {_COLDEST:g} to {1 / _COLDEST:g}")
     return float(value)
 
 

@@ -126,6 +126,7 @@ def test_arrays_of_another_type_shape_or_content_are_refused_by_name(
         ({"temperature": 0}, "temperature is 0"), ({"temperature": float("inf")}, "temperature is inf"),
         ({"temperature": float("nan")}, "temperature is nan"), ({"temperature": "hot"}, "temperature is 'hot'"),
         ({"temperature": -1.0}, "temperature is -1.0"), ({"temperature": True}, "temperature is True"),
+        ({"temperature": 1e-300}, "temperature is 1e-300"),
         ({"class_names": ["a"]}, "class_names are ['a']"), ({"class_names": {"0": 1}}, "class_names are"),
         ({"class_names": {"1": "a", "2": "b", "3": "c", "4": "d"}}, "class_names lack 0"),
         ({"class_names": {"0": "a", "70000": "b"}}, "70000"), ({"class_names": {"x": "a"}}, "'x'"),
@@ -136,6 +137,15 @@ def test_arrays_of_another_type_shape_or_content_are_refused_by_name(
 def test_headers_that_make_no_sense_are_refused(saved: Path, header: dict[str, Any], part: str) -> None:
     rewritten(saved, header)
     assert_refused_in_little_memory(lambda: Segmentation.load(saved, SCENE), StateFileError, str(saved), part)
+
+
+def test_a_header_of_what_are_no_characters_is_refused(saved: Path) -> None:
+    with np.load(saved) as file:
+        content = dict(file)
+    words = content["header"].reshape(1).view(np.uint32).copy()
+    words[-3] = 0xFFFFFFFF
+    np.savez(saved, **{**content, "header": words.view(f"<U{len(words)}").reshape(())})
+    assert_refused_in_little_memory(lambda: Segmentation.load(saved, SCENE), StateFileError, str(saved), "no character")
 
 
 @pytest.mark.parametrize(
