@@ -27,7 +27,7 @@ from gsseg_ros.node.workspace import Run, Workspace
 FEEDBACK_PERIOD = 0.1
 """Seconds between two messages of feedback, at least; a new stage is always told."""
 
-MAX_STEPS = 100_000
+MAX_STEPS = 1_000_000
 """Steps at most that a goal may ask for: so many over any number of views can be counted in feedback."""
 
 

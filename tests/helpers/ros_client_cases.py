@@ -23,7 +23,7 @@ from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
 from gsseg_ros.client import SegmentationClient, SegmentationError
 
-FOREVER: dict[str, Any] = {"learner": "gradient", "max_steps": 10_000_000}
+FOREVER: dict[str, Any] = {"learner": "gradient", "max_steps": 1_000_000}
 """A goal that does not come to its end while a test waits."""
 
 

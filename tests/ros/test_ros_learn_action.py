@@ -185,7 +185,7 @@ def test_max_steps_ends_it_early(robot: Robot, scene: GaussianScene, learner: st
 def endless(learner: str) -> dict[str, Any]:
     """A goal that goes on until it is canceled."""
     needs(learner)
-    return {"learner": "gradient", "max_steps": 10_000_000} if learner == "gradient" else {"dataset_path": "long"}
+    return {"learner": "gradient", "max_steps": 1_000_000} if learner == "gradient" else {"dataset_path": "long"}
 
 
 def halfway(robot: Robot, goal: Goal, stage: str, done: int) -> None:
@@ -201,7 +201,7 @@ def halfway(robot: Robot, goal: Goal, stage: str, done: int) -> None:
         ({"dataset_path": "long"}, "observe", 500),
         ({"dataset_path": "long", "learner": "votes"}, "observe", 100),
         ({"dataset_path": "long", "num_views": 500}, "em", 0),
-        ({"learner": "gradient", "max_steps": 10_000_000}, "gradient", 100),
+        ({"learner": "gradient", "max_steps": 1_000_000}, "gradient", 100),
     ],
 )
 def test_cancel_ends_it_at_once_and_keeps_the_codes_from_before(
