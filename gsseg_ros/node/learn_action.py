@@ -28,7 +28,7 @@ FEEDBACK_PERIOD = 0.1
 """Seconds between two messages of feedback, at least; a new stage is always told."""
 
 MAX_STEPS = 1_000_000
-"""Steps at most that a goal may ask for: so many over any number of views can be counted in feedback."""
+"""Steps at most that a goal may ask for: so many over four thousand views can be counted in its feedback."""
 
 
 class LearnAction:
