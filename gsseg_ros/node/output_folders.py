@@ -13,7 +13,7 @@ from pathlib import Path
 
 from gsseg_core.errors import GssegError, PathNotAllowedError, PathTakenError, WriteError
 from gsseg_core.files.input_files import OPENED
-from gsseg_core.files.run_folder import RUN_FILE, STAGING
+from gsseg_core.files.run_folder import COMMIT_FILE, RUN_FILE, STAGING, StagedRun, staged_run
 from gsseg_core.files.run_manifest import Manifest
 
 
@@ -68,9 +68,26 @@ def require_own_folder(out: Path, kind: str) -> None:
         return
     except OSError as error:  # Also where a name is too long.
         raise WriteError(f"{out}: cannot be written ({error.strerror or error}); expected a folder") from error
-    foreign = [name for name in there if name != RUN_FILE and not STAGING.fullmatch(name)]
-    if foreign and not Manifest.read(out / RUN_FILE).files(kind):
+    # A first run that was killed while its files were moved into their places is not in the manifest yet.
+    manifests = (RUN_FILE, COMMIT_FILE)
+    foreign = [name for name in there if name not in manifests and not STAGING.fullmatch(name)]
+    if foreign and not any(Manifest.read(out / name).files(kind) for name in manifests):
         raise PathTakenError(
             f"{out}: holds {foreign[0][:60]!r}, and no results of gsseg {kind}; expected a folder that is new, "
             "empty, or holds such results"
         )
+
+
+@contextlib.contextmanager
+def staged_export(folder: Path, within: Path) -> Iterator[StagedRun]:
+    """Give a run whose files become the export in a folder below `within`, which must hold nothing but exports.
+
+    Raises
+    ------
+    PathNotAllowedError, PathTakenError, WriteError
+        As `pinned_folder`, `require_own_folder` and `gsseg_core.files.run_folder.staged_run` do.
+    """
+    with pinned_folder(folder, within) as pinned:
+        require_own_folder(pinned, "segment")
+        with staged_run(pinned, "segment") as run:
+            yield run

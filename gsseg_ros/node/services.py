@@ -20,12 +20,11 @@ from gsseg_core.errors import GssegError
 from gsseg_core.export.class_plys import write_classes
 from gsseg_core.export.summary import RunReport
 from gsseg_core.files.json_files import write_json
-from gsseg_core.files.run_folder import staged_run
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.text import one_line
 from gsseg_ros.errors import InvalidRequestError, error_code
 from gsseg_ros.node.jobs import Turns
-from gsseg_ros.node.output_folders import pinned_folder, require_own_folder
+from gsseg_ros.node.output_folders import pinned_folder, require_own_folder, staged_export
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.reports import Selection, empty_report, finish, report_message, stage_timings
 from gsseg_ros.node.viewpoints import Lookup, draw, viewpoint
@@ -233,17 +232,13 @@ class Services:
     def export(self, request: Export.Request, response: Export.Response) -> None:
         """Write the files that the command line writes."""
         directory, settings = self.workspace.path(request.directory, EXPORT_FOLDER), self.workspace.settings
-        require_own_folder(directory, "segment")
+        require_own_folder(directory, "segment")  # Before the work, and again below.
         with self.workspace.run("export") as run:
             selection, refine = self._select(request, run)
             self.workspace.number(run)
             session = selection.session
             result = selection.result.selected(selection.chosen, selection.min_confidence)
-            with (
-                run.watch.stage("write"),
-                pinned_folder(directory, self.workspace.root) as folder,
-                staged_run(folder, "segment") as staged,
-            ):
+            with run.watch.stage("write"), staged_export(directory, self.workspace.root) as staged:
                 result.save(staged.folder / "segmentation.npz", staged.id)
                 plys = write_classes(session.scene, result, staged.folder / "classes", staged.id)
                 names = {k: str(path.relative_to(staged.folder)) for k, path in plys.items()}

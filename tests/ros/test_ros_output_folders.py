@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from pathlib import Path
 
 import pytest
 
 from gsseg_core.errors import PathNotAllowedError, PathTakenError, WriteError
 from gsseg_core.files.run_folder import staged_run
-from gsseg_ros.node.output_folders import pinned_folder, require_own_folder
+from gsseg_ros.node.output_folders import pinned_folder, require_own_folder, staged_export
 
 
 def test_a_folder_that_is_swapped_while_it_is_written_to_does_not_lead_out(tmp_path: Path) -> None:
@@ -48,6 +50,40 @@ def test_a_folder_for_exports_only_must_be_new_empty_or_an_export(tmp_path: Path
         require_own_folder(tmp_path / "data", "segment")
     with pytest.raises(PathTakenError, match="is not a folder"):
         require_own_folder(tmp_path / "data" / "scene.ply", "segment")
+
+
+def test_a_folder_that_somebody_fills_while_an_export_is_computed_is_refused(tmp_path: Path) -> None:
+    require_own_folder(tmp_path / "new", "segment")
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new" / "thesis.tex").write_text("mine")
+    with (
+        pytest.raises(PathTakenError, match=f"{tmp_path}/new: holds 'thesis.tex'"),
+        staged_export(tmp_path / "new", tmp_path),
+    ):
+        pytest.fail("nothing is to be written")
+    assert os.listdir(tmp_path / "new") == ["thesis.tex"]
+
+
+def test_a_first_export_that_was_killed_within_its_move_is_finished_by_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, killed, replace = tmp_path / "new", tmp_path / "as it was killed", os.replace
+
+    def replace_and_look(source: Path, target: Path) -> None:
+        monkeypatch.undo()
+        replace(source, target)
+        shutil.copytree(folder, killed)
+
+    with staged_export(folder, tmp_path) as run:
+        (run.folder / "labels.npz").write_text("first")
+        (run.folder / "report.json").write_text("first")
+        monkeypatch.setattr(os, "replace", replace_and_look)
+    assert not (killed / ".gsseg-run.json").exists() and (killed / "labels.npz").exists()
+    require_own_folder(killed, "segment")
+    with staged_export(killed, tmp_path) as run:
+        (run.folder / "report.json").write_text("second")
+    assert {path.name for path in killed.iterdir()} == {".gsseg-run.json", "report.json"}
+    assert (killed / "report.json").read_text() == "second"
 
 
 def test_a_folder_whose_name_is_too_long_for_the_disk_is_one_clear_error(tmp_path: Path) -> None:
