@@ -112,9 +112,11 @@ class StagedRun:
                 self._lock = _open_folder(self._staging)
                 try_lock(self._lock)
             self.folder.mkdir()
-            probe = self._staging / "probe"
-            probe.write_bytes(bytes(_PROBE))
-            probe.unlink()
+            with open(self._staging / "probe", "wb") as probe:
+                probe.write(bytes(_PROBE))
+                probe.flush()
+                os.fsync(probe.fileno())  # Some disks say only now that they are full.
+            os.unlink(self._staging / "probe")
         except OSError as error:
             raise _unwritable(self.out, error) from error
 

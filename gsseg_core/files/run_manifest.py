@@ -64,7 +64,7 @@ class Manifest:
             runs = {
                 str(kind): RunRecord(str(run["run"]), _files(run["files"])) for kind, run in content["runs"].items()
             }
-            return cls(runs, str(content["staging"]), _files(content["before"]))
+            return cls(runs, str(content["staging"]), _files(content.get("before", {})))
         except (FileNotFoundError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
             return cls()
 

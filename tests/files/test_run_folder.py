@@ -128,6 +128,15 @@ def test_a_run_that_fails_leaves_everything_as_it_was(tmp_path: Path) -> None:
     assert not (tmp_path / "no").exists()
 
 
+def test_results_under_a_manifest_that_says_nothing_of_the_run_before_are_replaced(tmp_path: Path) -> None:
+    write(tmp_path, FIRST)
+    manifest = json.loads((tmp_path / RUN_FILE).read_text())
+    del manifest["before"]
+    (tmp_path / RUN_FILE).write_text(json.dumps({**manifest, "replaced": {}, "edited": []}))
+    last = write(tmp_path, SECOND)
+    assert contents(tmp_path) == dict.fromkeys(SECOND, last)
+
+
 def test_an_interrupt_within_the_move_leaves_the_new_run_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out, replace = tmp_path / "out", os.replace
     write(out, FIRST)
