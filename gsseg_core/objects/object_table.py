@@ -53,6 +53,7 @@ class ObjectTable:
     ----------
     scene : GaussianScene
         N Gaussians.
+    settings : AssociationSettings, optional
     device : str
         Where views are rendered.
 
@@ -62,8 +63,10 @@ class ObjectTable:
         The views as they came, by name.
     """
 
-    def __init__(self, scene: GaussianScene, *, device: str = "cpu") -> None:
-        self.scene, self.settings, self.device = scene, AssociationSettings(), device
+    def __init__(
+        self, scene: GaussianScene, settings: AssociationSettings | None = None, *, device: str = "cpu"
+    ) -> None:
+        self.scene, self.settings, self.device = scene, settings or AssociationSettings(), device
         self.views: dict[str, View] = {}
         self._lifted: dict[str, Lifted] = {}
         self._objects: dict[str, np.ndarray] = {}
