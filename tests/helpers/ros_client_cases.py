@@ -14,14 +14,14 @@ from typing import Any
 
 import pytest
 from patience import PATIENCE
-from ros_helpers import Process, Ros
+from ros_helpers import Process, Ros, wait_until
 from small_scenes import NAMES, write_dataset
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
-from gsseg_ros.client import SegmentationClient, SegmentationError
+from gsseg_ros.client import NodeUnavailableError, SegmentationClient, SegmentationError
 
 FOREVER: dict[str, Any] = {"learner": "gradient", "max_steps": 1_000_000}
 """A goal that does not come to its end while a test waits."""
@@ -102,7 +102,7 @@ def learning_forever(client: SegmentationClient) -> Background:
     """A `learn` that is under way."""
     began = threading.Event()
     running = Background(lambda: client.learn("data", **FOREVER, on_feedback=lambda *_: began.set()))
-    assert began.wait(30), running.error
+    assert began.wait(PATIENCE), running.error
     return running
 
 
@@ -110,3 +110,14 @@ def failure(call: Callable[[], Any]) -> SegmentationError:
     with pytest.raises(SegmentationError) as caught:
         call()
     return caught.value
+
+
+def says_in_the_end(call: Callable[[], Any], what: str) -> None:
+    """Repeat a call, which must fail, until its error says something: what it knows of the node comes in time."""
+
+    def says() -> bool:
+        with pytest.raises(NodeUnavailableError) as caught:
+            call()
+        return what in str(caught.value)
+
+    wait_until(says, f"an error that says {what!r}")

@@ -123,10 +123,11 @@ class Robot:
         """Wait until the node is active and its inputs are connected."""
         assert self.process is not None
         self.process.wait_for("active: listening", timeout=PATIENCE)  # Compiles its kernels after an installation.
-        self.ros.wait_until(
-            lambda: all(self.publishers[topic].get_subscription_count() for topic in ("mask", "camera_info")),
-            "the node's subscriptions",
-        )
+        self.ros.wait_until(lambda: all(map(self._heard, ("mask", "camera_info"))), "the node's subscriptions")
+        self.ros.wait_until(lambda: any(map(self._heard, ("pose", "odometry"))), "the node's subscription to poses")
+
+    def _heard(self, topic: str) -> bool:
+        return self.publishers[topic].get_subscription_count() > 0
 
     def change(self, transition: str) -> bool:
         """Ask for a lifecycle transition, such as "configure"; returns whether it succeeded."""

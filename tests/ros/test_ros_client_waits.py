@@ -20,6 +20,7 @@ from ros_client_cases import (  # noqa: F401
     learning_forever,
     learnt_fixture,
     place_fixture,
+    says_in_the_end,
     shared_fixture,
     start_node,
 )
@@ -113,8 +114,7 @@ def test_a_script_that_forgets_to_close_ends_cleanly(place: Place) -> None:
 
 def test_an_absent_node_is_an_error_that_says_what_to_check(ros: Ros) -> None:
     with SegmentationClient("robot1/gsseg", domain_id=ros.domain, find_timeout=1.0) as client:
-        # So that the two have found each other.
-        ros.wait_until(lambda: "gsseg_client" in ros.node.get_node_names(), "the client")
+        says_in_the_end(lambda: client.wait_until_active(0.5), "nodes seen: /test")
         for call, what in (
             (client.segment, "service /robot1/gsseg/segment"),
             (client.learn, "action /robot1/gsseg/learn"),
@@ -134,8 +134,7 @@ def test_a_node_that_is_not_active_is_waited_for_and_its_state_named(ros: Ros, t
     node = start_node(ros, tmp_path, autostart=False)
     node.wait_for("waiting to be configured")
     with SegmentationClient(domain_id=ros.domain) as client:
-        with pytest.raises(NodeUnavailableError, match="/gsseg is unconfigured after 1 s; expected active"):
-            client.wait_until_active(1.0)
+        says_in_the_end(lambda: client.wait_until_active(1.0), "/gsseg is unconfigured after 1 s; expected active")
         assert failure(client.segment).name == failure(client.learn).name == "NOT_ACTIVE"
 
 
@@ -153,6 +152,7 @@ def test_a_node_that_hangs_is_not_waited_for_for_ever(ros: Ros, tmp_path: Path) 
     node = start_node(ros, tmp_path)
     with SegmentationClient(domain_id=ros.domain) as client:
         client.wait_until_active()
+        assert failure(client.segment).name == "NO_CODES"
         node.send(signal.SIGSTOP)
         with pytest.raises(NodeUnavailableError, match="/gsseg did not answer in time during /gsseg/segment"):
             client.segment(timeout=0.5)
