@@ -157,7 +157,7 @@ def measure_curve(bench: Bench, counts: Sequence[int], draws: int) -> Curve:
 def score_codes(bench: Bench, codes: np.ndarray) -> float:
     """Mean IoU of label maps of the scored views, after KNN."""
     # Rendered label maps do not depend on the filter.
-    result = Segmentation.from_codes(bench.scene, codes, {}, RefineSettings(filter=False))
+    result = Segmentation.from_codes(bench.scene, codes, {}, RefineSettings())
     evaluation = Evaluation()
     for operator, truth in bench.scored:
         evaluation.add(truth, result.render(operator).labels)

@@ -83,7 +83,7 @@ def score(bench: Bench, views: Sequence[View]) -> list[str]:
     temperature, evidence = calibrate(learner).temperature, learner.evidence()
     iou, ece = [], []
     for tried in (codes, propagate(graph_of(bench.scene), codes, evidence)):
-        result = Segmentation.from_codes(bench.scene, tried, {}, RefineSettings(filter=False)).calibrated(temperature)
+        result = Segmentation.from_codes(bench.scene, tried, {}, RefineSettings()).calibrated(temperature)
         evaluation, diagram = Evaluation(), ReliabilityDiagram()
         for operator, truth in bench.scored:
             found, known = result.render(operator), truth >= 0

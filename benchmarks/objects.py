@@ -2,8 +2,8 @@
 
 Usage: python benchmarks/objects.py [--held-out] [--data FOLDER] [--out docs/clean_objects.md]
 
-FOLDER holds `replica_apartment/` (default: the environment variable GSSEG_DATA, else ../shared/data); without it, only
-the demo scene is measured. `--held-out` scores every seventh train view, held out from learning, in place of the test
+FOLDER holds the scenes (default: the environment variable GSSEG_DATA, else ../shared/data); those that are absent are
+left out. `--held-out` scores every seventh train view, held out from learning, in place of the test
 views, and writes to `results_out/`: so settings were chosen. Pictures of the real scene go to `results_out/` too.
 """
 
@@ -30,16 +30,17 @@ from gsseg_core.export.view_pictures import background_image
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.depth import surface
-from gsseg_core.refine.settings import RefineSettings
-from gsseg_core.refine.silhouette_carving import KEPT, Silhouette, kept_shares
+from gsseg_core.refine.settings import PAPER, UNREFINED, RefineSettings
+from gsseg_core.refine.silhouette_carving import Silhouette, kept_shares, sticking_out
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
-PAPER = {
-    "no refinement": RefineSettings(cluster=False, filter=False),
-    "KNN": RefineSettings(filter=False),
-    "KNN + filter (paper)": RefineSettings(),
+WITHOUT_VIEWS = {
+    "no refinement": UNREFINED,
+    "KNN": RefineSettings(),
+    "KNN + filter (paper)": PAPER,
 }
+SCENES = ("replica_apartment", "shelf", "kitchen_table", "workbench")
 CARVED, SPLIT = "KNN + carving", "KNN + straddlers split + carving"
 CEILINGS = {"KNN": "KNN + chosen by the truth", SPLIT: "KNN + straddlers split + chosen by the truth"}
 HELD_OUT = slice(3, None, 7)
@@ -51,7 +52,7 @@ Parts = dict[str, tuple[GaussianScene, np.ndarray]]
 def main() -> int:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default=DATA, type=Path, help="folder that holds replica_apartment/")
+    parser.add_argument("--data", default=DATA, type=Path, help="folder that holds the scenes")
     parser.add_argument("--out", type=Path, help="document to write")
     parser.add_argument("--held-out", action="store_true", help="score train views that were held out from learning")
     options = parser.parse_args()
@@ -64,13 +65,14 @@ def main() -> int:
         rows += measure(
             "demo", demo.scene, Path(folder), masks, "labels_true", options.held_out, out.parent / "pictures"
         )
-    real = options.data / "replica_apartment"
-    if real.is_dir():
-        masks = {"true": "labels", "wrong": "labels_noisy"}
-        scene = GaussianScene.load(real / "scene.ply")
-        rows += measure("apartment", scene, real, masks, "labels", options.held_out, aside)
-    else:
-        print(f"{real}: not there; measuring the demo scene only")
+    masks = {"true": "labels", "wrong": "labels_noisy"}
+    for name in SCENES:
+        root = options.data / name
+        if root.is_dir():
+            scene = GaussianScene.load(root / "scene.ply")
+            rows += measure(name, scene, root, masks, "labels", options.held_out, aside)
+        else:
+            print(f"{root}: not there, and so not measured")
     header = [
         "scene",
         "masks",
@@ -117,18 +119,19 @@ def refined(
 ) -> tuple[Parts, np.ndarray]:
     """Make every kind of refinement from the same codes; and the labels of the halves before they were carved."""
     parts: Parts = {}
-    for way, settings in PAPER.items():
+    for way, settings in WITHOUT_VIEWS.items():
         parts[way] = scene, Segmentation.from_codes(scene, codes, names, settings).labels
-    clustered = Segmentation.from_codes(scene, codes, names, PAPER["KNN"])
+    clustered = Segmentation.from_codes(scene, codes, names, WITHOUT_VIEWS["KNN"])
     silhouettes = []
     for view in spread(train, RefineSettings.carve_views):
         operator = make_operator(scene, view.camera)
         silhouettes.append(Silhouette.of(scene, operator, clustered.render(operator).labels))
     found = kept_shares(scene, clustered.labels, silhouettes)
-    parts[CARVED] = scene, np.where(found.kept < KEPT, -2, clustered.labels)
+    parts[CARVED] = scene, np.where(sticking_out(found.kept, clustered.labels), -2, clustered.labels)
     halves, parents = split(scene, straddlers(found))
     labels = clustered.labels[parents]
-    parts[SPLIT] = halves, np.where(kept_shares(halves, labels, silhouettes).kept < KEPT, -2, labels)
+    kept = kept_shares(halves, labels, silhouettes).kept
+    parts[SPLIT] = halves, np.where(sticking_out(kept, labels), -2, labels)
     return parts, labels
 
 
@@ -173,8 +176,8 @@ TEXT = """# Objects cut out of the scene
 
 Made by `python benchmarks/objects.py`, which measures everything here again. Machine: {machine}.
 
-Learnt by `em` from the train views, with true masks and with wrong ones (the demo's own, and the apartment's
-`labels_noisy`); scored in the {views} against the true masks. Settings were chosen on train views that were held out
+Learnt by `em` from the train views, with true masks and with wrong ones (the demo's own, and `labels_noisy`
+of the others); scored in the {views} against the true masks. Settings were chosen on train views that were held out
 from learning, as `--held-out` does it.
 
 {table}
@@ -199,12 +202,12 @@ The labels of most Gaussians are right, but an object cut out is larger than in 
 which others hid a part, show in full, and so do those just under a neighbour's surface.
 
 - **KNN** gives unobserved Gaussians to what is around them.
-- **The paper's filter** removes whatever is farther from its fellows than mu + sigma. Where Gaussians are large and
-  sparse this takes away good ones.
-- **Carving** (`gsseg segment --carve`, `gsseg_core.refine.silhouette_carving`) drops the Gaussians that stick out of
-  the silhouettes in 24 train views, unless the object would have holes without them. The silhouettes are those of the
-  label maps that the segmentation itself renders, so errors of single masks carve nothing away; no retraining. What no
-  view reaches stays. It replaces the filter. Where objects touch, it may take a little of the object itself: see the
+- **The paper's filter** (`--refine paper`, and what the node publishes) removes whatever is farther from its fellows
+  than mu + sigma. Where Gaussians are large and sparse this takes away good ones.
+- **Carving** (the default, `gsseg_core.refine.silhouette_carving`) drops the Gaussians that stick out of the
+  silhouettes in 24 train views, unless the object would have holes without them. The silhouettes are those of the label
+  maps that the segmentation itself renders, so errors of single masks carve nothing away; no retraining. What no view
+  reaches stays, and no object goes as a whole. Where objects touch, it may take a little of the object itself: see the
   foot of the can.
 - **Splitting straddlers** (`benchmarks/straddlers.py`) puts two halves in place of each Gaussian that both fills its
   object and sticks out, and has each carved by itself. It changes the Gaussians of the scene, so it is no part of

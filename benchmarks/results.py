@@ -34,15 +34,15 @@ from gsseg_core.learn.registry import make_learner
 from gsseg_core.metrics import Evaluation, evaluate_folders
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.knn_filter import cluster, statistical_filter
-from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.refine.settings import PAPER, UNREFINED, RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
 MASKS = {"labels": "true masks", "labels_noisy": "wrong masks"}
 STAGES = {
-    "no refinement": RefineSettings(cluster=False, filter=False),
-    "KNN": RefineSettings(filter=False),
-    "KNN + filter": RefineSettings(),
+    "no refinement": UNREFINED,
+    "KNN": RefineSettings(),
+    "KNN + filter": PAPER,
 }
 RUNS = 3
 

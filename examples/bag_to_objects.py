@@ -102,6 +102,7 @@ def main() -> None:
         result = Segmentation.from_codes(
             scene, learner.fit().codes_, {label: names.get(label, f"class_{label:02d}") for label in labels}
         )
+        result = result.carved(scene, [view.camera for view in views])  # cut to the silhouettes
         files = export_classes(scene, result, options.out)
     except (GssegError, AnyReaderError) as error:
         sys.exit(f"bag_to_objects: {error}")

@@ -26,6 +26,7 @@ try:
         learner.observe(view)
     learner.fit()
     result = Segmentation.from_codes(scene, learner.codes_, data.class_names)
+    result = result.carved(scene, [view.camera for view in data.views("train")])  # cut to the silhouettes
     files = export_classes(scene, result, options.out)
 except GssegError as error:
     sys.exit(f"segment_from_python: {error}")

@@ -117,7 +117,7 @@ def segment(
     views : int, optional
         Learn from this many train views, spread evenly; from all by default.
     refine : RefineSettings, optional
-        The paper's by default.
+        KNN clustering and carving by default.
     graph : bool
         Where views are few, let class probabilities spread to Gaussians that few or no pixels saw, before
         refinement; see `gsseg_core.refine.label_propagation`.
@@ -167,8 +167,8 @@ def segment(
             del probabilities
         if settings.refine.carve:
             with watch.stage("carve"):
-                cameras = [view.camera for view in spread(inputs.train, settings.refine.carve_views)]
-                result = result.carved(inputs.scene, cameras, device)
+                cameras = [view.camera for view in inputs.train]
+                result = result.carved(inputs.scene, cameras, device, settings.refine.carve_views)
         report = _write(run, inputs, assessment, result, settings, watch).as_dict()
         write_json(run.folder / "report.json", report)
     return report

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,6 +13,7 @@ import numpy as np
 
 from gsseg_core.csr_rows import largest
 from gsseg_core.data.class_names import class_name
+from gsseg_core.data.view import spread
 from gsseg_core.files.npz_files import UnfitError, check_shares, class_names_of, open_npz, temperature_of, write_npz
 from gsseg_core.files.run_folder import settle
 from gsseg_core.learn.temperature import tempered
@@ -82,7 +83,7 @@ class Segmentation:
         class_names: Mapping[int, str],
         settings: RefineSettings | None = None,
     ) -> Segmentation:
-        """Refine learnt codes, as the paper does, and label every Gaussian by its largest entry.
+        """Refine learnt codes by their neighbours, and label every Gaussian by its largest entry.
 
         Parameters
         ----------
@@ -93,7 +94,7 @@ class Segmentation:
         class_names : mapping from id to name
             Classes without a name get one like "class_07".
         settings : RefineSettings, optional
-            Either step can be switched off there.
+            Without the filter by default. What needs views is left to `carved`.
         """
         settings = settings or RefineSettings()
         result = cls.unfiltered(scene, codes, class_names, settings)
@@ -183,13 +184,17 @@ class Segmentation:
         image = self.blend(operator)
         return LabelMap(self.class_ids[image.argmax(axis=2)], tempered(image, self.temperature).max(axis=2))
 
-    def carved(self, scene: GaussianScene, cameras: Iterable[Camera], device: str = "cpu") -> Segmentation:
+    def carved(
+        self, scene: GaussianScene, cameras: Sequence[Camera], device: str = "cpu", num_views: int | None = None
+    ) -> Segmentation:
         """Take out of each object what sticks out of its silhouettes in some views; these Gaussians become `REMOVED`.
 
         What the views show are the label maps that the segmentation itself renders, not the masks: they are learnt from
-        all masks together, so that errors of single masks carve nothing away.
+        all masks together, so that errors of single masks carve nothing away. So many of the views have their say,
+        spread evenly; `RefineSettings.carve_views` by default.
         """
-        operators = (make_operator(scene, camera, device) for camera in cameras)
+        chosen = spread(cameras, num_views or RefineSettings.carve_views)
+        operators = (make_operator(scene, camera, device) for camera in chosen)
         silhouettes = [Silhouette.of(scene, operator, self.render(operator).labels) for operator in operators]
         return self._without(carve(scene, self.labels, silhouettes))
 

@@ -98,7 +98,7 @@ def segment_summary(report: Mapping[str, Any], out: str) -> str:
 
 {used}
 {counted(report["scene"]["gaussians"], "Gaussian")}: {gaussians["labelled"]:,} labelled \
-({gaussians["from_neighbours"]:,} of them by their neighbours), {gaussians["removed"]:,} removed by the filter, \
+({gaussians["from_neighbours"]:,} of them by their neighbours), {gaussians["removed"]:,} taken out of their object, \
 {gaussians["unobserved"]:,} unobserved
 
 {seconds_table(report["seconds"])}

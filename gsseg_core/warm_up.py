@@ -13,6 +13,7 @@ from gsseg_core.data.view import View
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.refine.settings import PAPER
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
@@ -68,7 +69,8 @@ def _segment_something(device: str) -> None:
     passing.fit()
     learner = EMLearner(scene, 2, EMSettings(max_steps=2), device=device)
     learner.observe(view)
-    result = Segmentation.from_codes(scene, learner.fit().codes_, {0: "left", 1: "right"})
+    codes, names = learner.fit().codes_, {0: "left", 1: "right"}
+    result = Segmentation.from_codes(scene, codes, names, PAPER).carved(scene, [camera])
     learner.predict_without(view)
     operator = make_operator(scene, camera, device)
     result.render(operator)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,18 +14,17 @@ from gsseg_core import segmentation
 from gsseg_core.errors import StateFileError, StateMismatchError, WriteError
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.refine.settings import PAPER, UNREFINED, RefineSettings
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 
 SCENE, TRUTH = balls_on_a_table()
 CODES = np.eye(NUM_CLASSES, dtype=np.float32)[TRUTH]
-RAW = RefineSettings(cluster=False, filter=False)
 
 
 def test_labels_are_the_largest_probability_and_minus_one_where_nothing_is_known() -> None:
     codes = CODES.copy()
     codes[[3, 500]] = 0
-    result = Segmentation.from_codes(SCENE, codes, NAMES, RAW)
+    result = Segmentation.from_codes(SCENE, codes, NAMES, UNREFINED)
     expected = TRUTH.copy()
     expected[[3, 500]] = UNOBSERVED
     np.testing.assert_array_equal(result.labels, expected)
@@ -37,7 +37,7 @@ def test_labels_are_the_largest_probability_and_minus_one_where_nothing_is_known
 def test_the_filter_marks_far_gaussians_of_an_object_as_removed_and_keeps_their_probabilities() -> None:
     codes = CODES.copy()
     codes[-1] = np.eye(NUM_CLASSES)[1]
-    result = Segmentation.from_codes(SCENE, codes, NAMES, RefineSettings(cluster=False, k=10))
+    result = Segmentation.from_codes(SCENE, codes, NAMES, replace(PAPER, cluster=False, k=10))
     assert result.labels[-1] == REMOVED == -2
     assert result.probabilities[-1, 1] == 1
     assert result.counts().sum() == (result.labels >= 0).sum() < len(SCENE)
@@ -47,7 +47,7 @@ def test_the_filter_marks_far_gaussians_of_an_object_as_removed_and_keeps_their_
 def test_neighbours_fill_in_what_was_unobserved_and_rows_sum_to_one() -> None:
     codes = CODES.copy()
     codes[TRUTH == 2] *= np.arange(60)[:, None] % 2
-    result = Segmentation.from_codes(SCENE, codes, NAMES, RefineSettings(k=5, filter=False))
+    result = Segmentation.from_codes(SCENE, codes, NAMES, RefineSettings(k=5))
     np.testing.assert_array_equal(result.clustered, ~codes.any(axis=1))
     np.testing.assert_allclose(result.probabilities.sum(axis=1), 1, atol=1e-5)
     assert (result.labels[TRUTH == 2] == 2).mean() > 0.8
@@ -61,13 +61,13 @@ def test_nothing_observed_at_all_is_all_unobserved() -> None:
 
 
 def test_classes_without_a_name_get_one() -> None:
-    assert Segmentation.from_codes(SCENE, CODES, {1: "cup"}, RAW).class_names == {
+    assert Segmentation.from_codes(SCENE, CODES, {1: "cup"}, UNREFINED).class_names == {
         0: "class_00", 1: "cup", 2: "class_02", 3: "class_03",
     }  # fmt: skip
 
 
 def test_label_maps_of_true_codes_are_the_true_masks() -> None:
-    result = Segmentation.from_codes(SCENE, CODES, NAMES, RAW)
+    result = Segmentation.from_codes(SCENE, CODES, NAMES, UNREFINED)
     for view in clean_views(2):
         labels = result.render(make_operator(SCENE, view.camera)).labels
         assert labels.dtype == np.int32

@@ -43,13 +43,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     k, beta = RefineSettings.k, RefineSettings.beta
     add("--k", type=int, default=k, help="neighbours in KNN and filter (default: %(default)s)")
     add("--beta", type=float, default=beta, help="confidence below which KNN decides (default: %(default)s)")
+    ways = "after KNN: cut objects to their silhouettes in the views, or filter outliers (default: %(default)s)"
+    add("--refine", choices=("carve", "paper"), default="carve", help=ways)
     for name, effect in {
         "--no-graph": "few views: leave what they hardly saw to KNN, without spreading codes",
         "--no-knn": "leave uncertain and unobserved Gaussians as they are",
-        "--no-filter": "keep Gaussians that lie far from the rest of their object",
-        "--carve": "cut objects to their silhouettes in the views, in place of the filter",
+        "--no-filter": "neither cut objects nor filter them",
     }.items():
         add(name, action="store_true", help=effect)
+    # What is the default now had to be asked for.
+    add("--carve", dest="refine", action="store_const", const="carve", help=argparse.SUPPRESS)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -57,9 +60,9 @@ def run(options: argparse.Namespace) -> int:
     # The rasteriser's kernels load with the pipeline; `gsseg --help` need not wait for them.
     from gsseg_core import pipeline
 
-    is_filtered = not (options.no_filter or options.carve)
+    outer = None if options.no_filter else options.refine
     refine = RefineSettings(
-        k=options.k, beta=options.beta, cluster=not options.no_knn, filter=is_filtered, carve=options.carve
+        k=options.k, beta=options.beta, cluster=not options.no_knn, filter=outer == "paper", carve=outer == "carve"
     )
     load_kernels(options.quiet, options.device)
     with progress_bars(options.quiet) as progress:

@@ -232,8 +232,8 @@ class View:
             raise UnknownLabelError(f"{source}: mask holds the labels {str(unknown)[1:-1][:60]}; expected {expected}")
 
 
-def spread(views: Sequence[View], count: int | None) -> list[View]:
-    """Choose some views, spread evenly over all of them; all if there are no more, or `count` is None.
+def spread(views: Sequence[Any], count: int | None) -> list[Any]:
+    """Choose some views, or cameras, spread evenly over all of them; all if there are no more, or `count` is None.
 
     Raises
     ------

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -21,14 +21,14 @@ from gsseg_core.errors import (
     StateFileError,
     UnknownLabelError,
 )
-from gsseg_core.learn.calibrate import calibrate
-from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.learner_state import Learnt, State
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.learn.vote_learner import VoteLearner
+from gsseg_core.live.fitting import Report, fitted
 from gsseg_core.live.results import SCENE_CHANGED, Outcome, Rejection
 from gsseg_core.progress import Stopwatch
 from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.spatial.neighbourhood import neighbours_of
@@ -38,9 +38,6 @@ VOTES_LIMIT = 2 << 30
 
 LIVE = "votes"
 """Name of the learner that fuses views as they arrive."""
-
-Report = Callable[[str, int, int, float], None]
-"""Told of stage, done, total, and the loss (nats per labelled pixel; NaN at first)."""
 
 
 class LiveSession:
@@ -76,6 +73,7 @@ class LiveSession:
 
     _learnt: Learnt | None
     _segmented: tuple[object, Segmentation] | None
+    _cameras: list[Camera]  # of the dataset that was learnt from
 
     def __init__(
         self,
@@ -215,7 +213,8 @@ class LiveSession:
         if dataset is not None:
             views, num_classes = dataset.views("train"), self._num_classes_with(dataset, num_classes)
         made = make_learner(learner, self.scene, num_classes, max_steps=max_steps, device=self.device)
-        outcome = _fitted(learner, made, spread(views, num_views), report, watch or Stopwatch())
+        views = spread(views, num_views)
+        outcome = fitted(learner, made, views, report, watch or Stopwatch())
         with self._lock:
             if era is not self._era:
                 raise NoUsableViewsError("all views were forgotten while they were learnt from; nothing was learnt")
@@ -223,6 +222,7 @@ class LiveSession:
                 self._names.update(dataset.class_names)
             self._live.grow(num_classes)
             self._learnt = outcome.learnt
+            self._cameras = [] if dataset is None else [view.camera for view in views]
             self._version += 1
         return outcome
 
@@ -273,6 +273,8 @@ class LiveSession:
             temperature = 1.0 if self._learnt is None else self._learnt.temperature
             if known is not None and known[0] == key:
                 return known[1]
+            # Those of a dataset's views and of those that are kept; a state without either has nothing carved.
+            cameras = [*self._cameras, *(view.camera for view in self._live.views.values())]
             with watch.stage("codes"):
                 codes = self.codes()
         with watch.stage("knn"):
@@ -280,6 +282,9 @@ class LiveSession:
         if settings.filter:
             with watch.stage("filter"):
                 result = result.filtered(self.scene, settings)
+        if settings.carve:
+            with watch.stage("carve"):
+                result = result.carved(self.scene, cameras, self.device, settings.carve_views)
         result = result.calibrated(temperature)
         self._segmented = (key, result)
         return result
@@ -358,6 +363,7 @@ class LiveSession:
         # Views are rendered again by `learn`; to keep them prepared would take far more memory than their masks.
         self._live = VoteLearner(self.scene, num_classes, device=self.device, memory_budget=0)
         self._learnt, self._segmented, self.num_fused = None, None, 0
+        self._cameras = []
         self._version += 1
         self.retire()
 
@@ -377,19 +383,3 @@ class LiveSession:
     def _drop_old_views(self) -> None:
         while len(self._live.views) > self.max_views:
             self._live.forget(next(iter(self._live.views)))
-
-
-def _fitted(name: str, learner: Learner, views: list[View], report: Report, watch: Stopwatch) -> Outcome:
-    """Have a learner observe views, fit and be calibrated."""
-
-    def progress(stage: str, done: int, total: int) -> None:
-        report(stage, done, total, learner.loss)
-
-    with watch.stage("observe"):
-        learner.observe_all(views, progress)
-    with watch.stage("learn"):
-        learner.fit(progress)
-    with watch.stage("calibrate"):
-        temperature = calibrate(learner, progress=progress).temperature
-    learnt = Learnt(name, learner.codes_, len(learner.views), temperature)
-    return Outcome(learnt, len(learner.history_), learner.converged_, learner.loss, dict(learner.rejected))

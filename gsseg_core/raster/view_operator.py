@@ -29,13 +29,6 @@ class Blended(NamedTuple):
     transmittance: np.ndarray  # (H, W) float32: what is left of each ray after the last Gaussian, in [0, 1]
 
 
-class SilhouetteTerms(NamedTuple):
-    """What each object alone in a view would lose and gain by each Gaussian, in px; T_k is its transmittance."""
-
-    stay: np.ndarray  # (M,) float64: sum of alpha T_k / (1 - T_k) over the pixels that show the Gaussian's own object
-    go: np.ndarray  # (M,) float64: sum of alpha over those that show another one, where it does not hide the Gaussian
-
-
 class ViewOperator(ABC):
     """The weight matrix W (pixels x Gaussians) of one view of one scene, and its transpose.
 
@@ -176,26 +169,53 @@ class ViewOperator(ABC):
     def footprints(self) -> np.ndarray:
         """Sum of the alphas of each of `ids` over an endless image, opacity * 2 pi sqrt(|S|): (M,), in px."""
 
-    def silhouette_terms(
-        self, labels: np.ndarray, kept: np.ndarray, asked: np.ndarray, depths: np.ndarray, shown: np.ndarray,
-        hidden_from: np.ndarray,
-    ) -> SilhouetteTerms:  # fmt: skip
-        """Weigh what speaks for each Gaussian in its object, and what against it, were each object alone in the view.
+    def reasons_to_go(
+        self, labels: np.ndarray, depths: np.ndarray, shown: np.ndarray, hidden_from: np.ndarray
+    ) -> np.ndarray:
+        """Weigh what speaks against each Gaussian in its object, were the object alone in the view.
 
         Parameters
         ----------
         labels : (M,) int32
             Object of each of `ids`; 0 and below are none.
-        kept : (M,)
-            Share of each Gaussian that its object keeps, by which its alphas are multiplied.
-        asked : (M,) bool
-            Whose terms are wanted; those of all others are 0.
         depths : (M,) float32
             Depth of each Gaussian, in scene units.
         shown : (H, W) int32
             Object that the view shows in each pixel, negative where unknown.
         hidden_from : (H, W) float32
             Depth from which on the pixel hides a Gaussian.
+
+        Returns
+        -------
+        (M,) float64
+            Sum of alpha, in px, over the pixels that show another object and do not hide the Gaussian.
+
+        Raises
+        ------
+        SettingsError
+            The rasteriser cannot tell; the one of the CPU can.
+        """
+        raise SettingsError(f"view '{self.camera.name}': silhouettes are weighed on the device cpu only")
+
+    def reasons_to_stay(
+        self, labels: np.ndarray, kept: np.ndarray, asked: np.ndarray, shown: np.ndarray
+    ) -> np.ndarray:  # fmt: skip
+        """Weigh what speaks for each Gaussian in its object k, were the object alone in the view.
+
+        Parameters
+        ----------
+        labels, shown
+            As `reasons_to_go` takes them.
+        kept : (M,)
+            Share of each Gaussian that its object keeps, by which its alphas are multiplied.
+        asked : (M,) bool
+            Whose reasons are wanted; those of all others are 0.
+
+        Returns
+        -------
+        (M,) float64
+            Sum of alpha T_k / (1 - T_k), in px, over the pixels that show the Gaussian's own object, whose
+            transmittance is T_k; as good as 0 where the object lets no light through.
 
         Raises
         ------

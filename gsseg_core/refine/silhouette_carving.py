@@ -33,7 +33,7 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 STEPS = 5  # steps of the shares: the labels hardly change after these
-KEPT = 0.5  # least share with which a Gaussian stays with its object
+KEPT = 0.5  # least share with which a Gaussian stays with its object, of the largest share in that object
 _LEAST = np.float32(0.01)  # of a share, so that a Gaussian may come back
 
 
@@ -90,16 +90,16 @@ def kept_shares(
     for shown in silhouettes:
         operator = make_operator(scene, shown.camera)  # on the CPU, which alone tells the terms of a silhouette
         views.append((shown, operator, depths(scene, shown.camera)[operator.ids]))
-    kept, asked = np.ones(len(scene)), labels > 0
+    go, kept = np.zeros(len(scene)), np.ones(len(scene))
+    for shown, operator, depth in views:
+        behind = shown.depth * np.float32(BEHIND)
+        go[operator.ids] += operator.reasons_to_go(labels[operator.ids], depth, shown.labels, behind)
+    asked = go > 0
     for _ in range(steps):
-        stay, go = np.zeros((2, len(scene)))
-        for shown, operator, depth in views:
-            ids, behind = operator.ids, shown.depth * np.float32(BEHIND)
-            terms = operator.silhouette_terms(labels[ids], kept[ids], asked[ids], depth, shown.labels, behind)
-            stay[ids] += terms.stay
-            go[ids] += terms.go
-        # Reasons to go do not depend on the shares: who has none is not asked again.
-        asked = go > 0
+        stay = np.zeros(len(scene))
+        for shown, operator, _ in views:
+            ids = operator.ids
+            stay[ids] += operator.reasons_to_stay(labels[ids], kept[ids], asked[ids], shown.labels)
         kept = np.where(asked, np.clip(kept * stay / np.maximum(go, 1e-30), _LEAST, 1.0), kept)
     return KeptShares(kept, np.where(asked, stay, 0), go)
 
@@ -109,4 +109,12 @@ def carve(scene: GaussianScene, labels: np.ndarray, silhouettes: Iterable[Silhou
 
     Results depend neither on the order of the Gaussians nor on the number of threads.
     """
-    return np.asarray(kept_shares(scene, labels, silhouettes).kept < KEPT)
+    return sticking_out(kept_shares(scene, labels, silhouettes).kept, labels)
+
+
+def sticking_out(kept: np.ndarray, labels: np.ndarray) -> np.ndarray:  # (N,), (N,) int32
+    """Tell by the shares that are kept which Gaussians leave their object, (N,) bool; never all of an object's."""
+    most = np.zeros(int(labels.max(initial=0)) + 1)
+    own = labels > 0
+    np.maximum.at(most, labels[own], kept[own])
+    return np.asarray(own & (kept < KEPT * most[np.maximum(labels, 0)]))

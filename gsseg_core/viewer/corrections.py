@@ -135,7 +135,7 @@ class Corrections:
         mixed /= mixed.sum(axis=1, keepdims=True)
         probabilities[touched] = mixed
         labels = before.labels.copy()
-        # A Gaussian that the filter took out of its object stays out, unless it goes to another one.
+        # A Gaussian that refinement took out of its object stays out, unless it goes to another one.
         best = mixed.argmax(axis=1).astype(np.int32)
         filtered = (labels[touched] == REMOVED) & (best == before.probabilities[touched].argmax(axis=1))
         labels[touched] = np.where(filtered, REMOVED, best)

@@ -21,7 +21,7 @@ from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 TRUE_COLOURS, BY_CLASS, BY_CONFIDENCE, BY_RELIABILITY = "true colours", "class", "confidence", "view reliability"
 MODES = (TRUE_COLOURS, BY_CLASS, BY_CONFIDENCE, BY_RELIABILITY)
 
-NO_CLASS = {UNOBSERVED: "(unobserved)", REMOVED: "(removed by the filter)"}
+NO_CLASS = {UNOBSERVED: "(unobserved)", REMOVED: "(taken out by refinement)"}
 """What the list of classes calls the labels that are no class."""
 
 NOTHING_KNOWN = (120, 120, 120)

@@ -267,7 +267,8 @@ class SegmentationClient:
         min_confidence : float
             Leave out Gaussians less sure than this, 0 to 1.
         refine, filter : bool
-            Whether codes are refined by their neighbours, and whether outliers are then removed.
+            Whether codes are refined by their neighbours, and whether outliers are then removed; `export` cuts objects
+            to their silhouettes instead.
         viewpoint : Viewpoint, optional
             Where to draw a label image from, too.
         timeout : float

@@ -17,10 +17,11 @@ from gsseg_core.data.dataset import Dataset
 from gsseg_core.learn.registry import LEARNERS
 from gsseg_core.live.results import Outcome
 from gsseg_core.live.session import LiveSession
+from gsseg_core.refine.settings import UNREFINED
 from gsseg_ros.errors import CanceledError, InvalidRequestError, NotActiveError, error_code
 from gsseg_ros.node.jobs import Job
 from gsseg_ros.node.outputs import Outputs
-from gsseg_ros.node.reports import RAW, Selection, finish, report_message
+from gsseg_ros.node.reports import Selection, finish, report_message
 from gsseg_ros.node.services import explain
 from gsseg_ros.node.workspace import Run, Workspace
 
@@ -104,7 +105,7 @@ class LearnAction:
 
     def _report(self, session: LiveSession, outcome: Outcome, run: Run) -> SegmentationReport:
         settings = self._workspace.settings
-        raw = session.segmentation(RAW, run.watch)
+        raw = session.segmentation(UNREFINED, run.watch)
         selection = Selection(session, raw, sorted(raw.class_names), 0.0, settings.scene_to_map)
         with run.watch.stage("boxes"):
             header = Header(stamp=run.stamp, frame_id=settings.map_frame)
@@ -112,7 +113,7 @@ class LearnAction:
         with outputs.turn(run.revision, lambda: self._workspace.holds(run)) as newest:
             if newest:
                 outputs.publish_objects(objects)
-        report = report_message(run, selection, RAW, settings.map_frame)
+        report = report_message(run, selection, UNREFINED, settings.map_frame)
         if outcome.rejected:
             reasons = sorted(set(outcome.rejected.values()))
             report.rejection_reasons = [reason.replace(" ", "_") for reason in reasons]

@@ -19,12 +19,13 @@ from std_msgs.msg import Header
 from gsseg_core.errors import GssegError
 from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.refine.settings import UNREFINED
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.color_images import color_from_image
 from gsseg_ros.conversions import camera_from_messages, rgb_image
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.pairing import Paired
-from gsseg_ros.node.reports import RAW, Selection
+from gsseg_ros.node.reports import Selection
 from gsseg_ros.node.size_limits import require_size
 from gsseg_ros.node.workspace import Workspace
 
@@ -188,7 +189,7 @@ class LiveOutputs:
             if kept == key or (kept[0] is key[0] and time.monotonic() - since < CODES_PERIOD):
                 return result
         learnt = session.learnt
-        result = Segmentation.unfiltered(session.scene, session.codes(), session.class_names, RAW)
+        result = Segmentation.unfiltered(session.scene, session.codes(), session.class_names, UNREFINED)
         result = result.calibrated(1.0 if learnt is None else learnt.temperature)
         self._segmentation = (key, time.monotonic(), result)
         return result

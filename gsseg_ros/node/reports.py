@@ -23,7 +23,6 @@ from gsseg_ros.frames import Similarity
 from gsseg_ros.node.workspace import Run
 from gsseg_ros.object_messages import object_message, point_message
 
-RAW = RefineSettings(cluster=False, filter=False)
 """Settings without any refinement."""
 
 
@@ -156,7 +155,7 @@ def report_message(
         rejection_counts=[count for _, count in rejected],
         k=settings.k if settings.cluster else 0,
         beta=settings.beta,
-        filtered=settings.filter,
+        filtered=settings.filter or settings.carve,
         min_confidence=selection.min_confidence,
         classes=[selection.class_summary(k, (topics or {}).get(k, "")) for k in selection.chosen],
     )

@@ -87,13 +87,18 @@ def describe(error: Exception) -> str:
 
 
 def refinement(request: Any, workspace: Workspace) -> RefineSettings:
-    """Refinement as a request asks for it, with the node's k and beta."""
-    settings = workspace.settings
+    """Refinement as a request asks for it, with the node's k and beta.
+
+    Files are made to be kept, and worth the seconds that carving takes; what is asked for while the robot moves is not.
+    """
+    settings, carve = workspace.settings, isinstance(request, Export.Request)
+    outer = not (request.skip_refinement or request.skip_filter)
     return RefineSettings(
         k=settings.k,
         beta=settings.beta,
         cluster=not request.skip_refinement,
-        filter=not (request.skip_refinement or request.skip_filter),
+        filter=outer and not carve,
+        carve=outer and carve,
     )
 
 

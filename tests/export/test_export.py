@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,18 +17,18 @@ from gsseg_core.export.class_plys import class_file_name, export_classes
 from gsseg_core.export.view_pictures import draw_views, view_file_name, write_pictures
 from gsseg_core.files.json_files import write_json
 from gsseg_core.files.run_folder import RUN_FILE
-from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.refine.settings import PAPER, RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
 SCENE, TRUTH = balls_on_a_table()
 CODES = np.eye(NUM_CLASSES, dtype=np.float32)[TRUTH]
-RESULT = Segmentation.from_codes(SCENE, CODES, NAMES, RefineSettings(cluster=False, k=10))
+RESULT = Segmentation.from_codes(SCENE, CODES, NAMES, replace(PAPER, cluster=False, k=10))
 
 
 def only(label: int) -> Segmentation:
     codes = np.eye(NUM_CLASSES, dtype=np.float32)[np.full(len(SCENE), label)]
-    return Segmentation.from_codes(SCENE, codes, NAMES, RefineSettings(filter=False))
+    return Segmentation.from_codes(SCENE, codes, NAMES, RefineSettings())
 
 
 def contents(folder: Path) -> dict[str, bytes]:

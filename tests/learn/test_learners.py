@@ -15,7 +15,7 @@ from gsseg_core.learn.gradient_learner import GradientLearner
 from gsseg_core.learn.learner import VOTE_UNIT, Learner
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.refine.settings import UNREFINED, RefineSettings
 from gsseg_core.segmentation import UNOBSERVED, Segmentation
 
 LEARNERS = [VoteLearner, EMLearner, GradientLearner]
@@ -43,9 +43,9 @@ def test_every_learner_recovers_the_objects_from_clean_masks(kind: type[Learner]
 def test_what_no_view_sees_is_unobserved_until_its_neighbours_fill_it_in(kind: type[Learner]) -> None:
     learner = taught(kind(SCENE, NUM_CLASSES), VIEWS).fit()
     assert not learner.observed_[-OUT_OF_SIGHT:].any() and not learner.codes_[-OUT_OF_SIGHT:].any()
-    raw = Segmentation.from_codes(SCENE, learner.codes_, NAMES, RefineSettings(cluster=False, filter=False))
+    raw = Segmentation.from_codes(SCENE, learner.codes_, NAMES, UNREFINED)
     np.testing.assert_array_equal(raw.labels == UNOBSERVED, ~learner.observed_)
-    filled = Segmentation.from_codes(SCENE, learner.codes_, NAMES, RefineSettings(filter=False))
+    filled = Segmentation.from_codes(SCENE, learner.codes_, NAMES, RefineSettings())
     assert (filled.labels >= 0).all() and filled.clustered[-OUT_OF_SIGHT:].all()
 
 

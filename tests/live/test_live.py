@@ -27,7 +27,7 @@ from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live import session as live
 from gsseg_core.live.session import LiveSession
-from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.refine.settings import UNREFINED
 
 SCENE, TRUTH = balls_on_a_table()
 VIEWS = clean_views(6)
@@ -233,7 +233,7 @@ def test_a_segmentation_is_kept_until_codes_or_settings_change() -> None:
     session = fed(LiveSession(SCENE, NAMES), VIEWS[:3])
     first = session.segmentation()
     assert session.segmentation() is first
-    other = session.segmentation(RefineSettings(cluster=False, filter=False))
+    other = session.segmentation(UNREFINED)
     assert other is not first and not other.clustered.any()
     before = session.segmentation()
     fed(session, VIEWS[3:4])

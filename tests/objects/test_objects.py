@@ -34,7 +34,7 @@ from gsseg_core.export.class_plys import export_classes
 from gsseg_core.objects.removal import without_objects
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.depth import BEHIND, depths, surface
-from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.refine.settings import UNREFINED, RefineSettings
 from gsseg_core.refine.silhouette_carving import Silhouette, carve, kept_shares
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -42,7 +42,6 @@ from gsseg_core.segmentation import REMOVED, Segmentation
 
 SCENE, TRUTH = balls_on_a_table()
 LABELS = TRUTH.astype(np.int32)
-UNREFINED = RefineSettings(cluster=False, filter=False)
 
 
 def silhouettes(scene: GaussianScene = SCENE, cameras: list[Camera] | None = None) -> list[Silhouette]:
@@ -305,7 +304,7 @@ def test_gsseg_segment_carves_when_asked_to(tmp_path: Path) -> None:
     assert '"carve": true' in report and '"filter": false' in report
 
 
-@pytest.mark.parametrize("wrong", [{"carve_views": 0}, {"carve_views": 1.5}, {"carve": True}])
+@pytest.mark.parametrize("wrong", [{"carve_views": 0}, {"carve_views": 1.5}, {"carve": True, "filter": True}])
 def test_settings_of_carving_out_of_range_are_refused_by_name(wrong: dict[str, float]) -> None:
     with pytest.raises(SettingsError, match=r"refinement: found .*carve.*; expected"):
         RefineSettings(**wrong)

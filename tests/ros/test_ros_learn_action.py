@@ -19,9 +19,9 @@ from gsseg_core.data.view import View, spread
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.live.session import LiveSession
-from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.refine.settings import UNREFINED
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.segmentation import Segmentation
+from gsseg_core.segmentation import REMOVED, Segmentation
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
@@ -77,14 +77,18 @@ def codes(robot: Robot) -> np.ndarray:
 
 
 def expected(scene: GaussianScene, views: list[View], learner: str = "em", **settings: Any) -> Segmentation:
-    """What the core's own learner comes to."""
+    """What the core's own learner comes to, before objects are cut to their silhouettes."""
     fitted = taught(make_learner(learner, scene, len(CLASSES), **settings), views).fit()
     result = Segmentation.from_codes(scene, fitted.codes_, dict(enumerate(CLASSES)))
     return result.calibrated(calibrate(fitted).temperature)
 
 
+def learnt_by(robot: Robot, **fields: Any) -> Segmentation:
+    return robot.exported(Path(robot.get("data_root")) / "out" / "learnt", **fields)
+
+
 def assert_learnt(robot: Robot, wanted: Segmentation) -> None:
-    assert_same(robot.exported(Path(robot.get("data_root")) / "out" / "learnt"), wanted)
+    assert_same(learnt_by(robot, skip_filter=True), wanted)
 
 
 @pytest.mark.parametrize("learner", LEARNERS)
@@ -92,7 +96,7 @@ def test_the_result_equals_that_of_the_core_on_the_same_views(robot: Robot, scen
     needs(learner)
     status, result = robot.learn(learner=learner)
     assert (status, result.error_code, result.error_msg) == (GoalStatus.STATUS_SUCCEEDED, Learn.Result.NONE, "")
-    found = robot.exported(Path(robot.get("data_root")) / "out" / "learnt")
+    found = learnt_by(robot, skip_filter=True)
     wanted = expected(scene, wrong_views(), learner)
     # A pose that went through a quaternion differs in the last digit, and Adam's first steps divide by tiny gradients.
     assert (found.labels == wanted.labels).mean() >= (0.99 if learner == "gradient" else 1)
@@ -115,7 +119,7 @@ def test_the_learner_is_em_unless_another_one_is_asked_for(robot: Robot, scene: 
 def test_the_result_reports_the_learnt_codes_before_refinement(robot: Robot, scene: GaussianScene) -> None:
     report = robot.learn()[1].report
     fitted = taught(make_learner("em", scene, len(CLASSES)), wrong_views()).fit()
-    raw = RefineSettings(cluster=False, filter=False)
+    raw = UNREFINED
     wanted = Segmentation.from_codes(scene, fitted.codes_, dict(enumerate(CLASSES)), raw)
     assert [summary.num_gaussians for summary in report.classes] == wanted.counts().tolist()
     assert [summary.name for summary in report.classes] == CLASSES
@@ -249,7 +253,9 @@ def test_while_it_learns_a_second_goal_is_busy_and_everything_else_is_answered(r
     assert (status, result.error_code) == (GoalStatus.STATUS_CANCELED, Learn.Result.CANCELED)
 
 
-def test_views_that_come_while_it_learns_are_not_lost(robot: Robot, scene: GaussianScene) -> None:
+def test_views_that_come_while_it_learns_are_not_lost_and_exports_are_cut_to_their_silhouettes(
+    robot: Robot, scene: GaussianScene
+) -> None:
     goal = robot.begin(dataset_path="long", num_views=300)
     robot.drive(clean_views(2))
     assert robot.outcome(goal)[0] == GoalStatus.STATUS_SUCCEEDED
@@ -259,7 +265,8 @@ def test_views_that_come_while_it_learns_are_not_lost(robot: Robot, scene: Gauss
     for view in renamed([*wrong_views(), *clean_views(2)]):
         session.fuse(view)
     session.learn()
-    assert_learnt(robot, session.segmentation())
+    assert_same(learnt_by(robot), session.segmentation())
+    assert (learnt_by(robot).labels == REMOVED).any()
 
 
 def test_a_goal_that_was_canceled_before_is_not_confused_with_the_next(robot: Robot) -> None:

@@ -14,7 +14,7 @@ from small_scenes import clean_views, look_at
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
-from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.refine.settings import UNREFINED
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.frames import Similarity
@@ -26,8 +26,6 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
 from gsseg_ros.conversions import arrays_from_cloud, mask_image, pose_from_matrix, stamp_message
-
-RAW = RefineSettings(cluster=False, filter=False)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +46,7 @@ def learnt(robot: Robot, name: str) -> Segmentation:
 
 
 def expected(scene: GaussianScene, views: list[View]) -> Segmentation:
-    return core_session(scene, views).segmentation(RAW)
+    return core_session(scene, views).segmentation(UNREFINED)
 
 
 def padded(image: Any, gap: int) -> Any:

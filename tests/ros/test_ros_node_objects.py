@@ -14,7 +14,7 @@ from small_scenes import clean_views
 
 from gsseg_core.export.pictures import palette
 from gsseg_core.objects.oriented_boxes import object_boxes
-from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.refine.settings import PAPER, UNREFINED
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.frames import Similarity
@@ -28,8 +28,6 @@ from gsseg_ros.conversions import pose_from_matrix
 from gsseg_ros.frames import rigid
 from gsseg_ros.node.live_outputs import OBJECTS_PERIOD
 from gsseg_ros.object_messages import box_from_object
-
-RAW = RefineSettings(cluster=False, filter=False)
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +64,7 @@ def assert_objects(found: list[Object], scene: GaussianScene, result: Segmentati
 def test_the_objects_of_a_run_are_answered_and_latched_with_their_boxes(robot: Robot, scene: GaussianScene) -> None:
     response = robot.done("segment")
     session = core_session(scene, clean_views(6))
-    assert_objects(response.objects, scene, session.segmentation(), Similarity(np.eye(3), np.zeros(3), 1.0))
+    assert_objects(response.objects, scene, session.segmentation(PAPER), Similarity(np.eye(3), np.zeros(3), 1.0))
     (latched,) = robot.latched((ObjectArray, "objects"))
     assert (latched.header, latched.revision) == (response.report.header, response.report.revision)
     assert latched.objects == response.objects
@@ -106,7 +104,7 @@ def test_learning_publishes_the_objects_of_its_run(robot: Robot, scene: Gaussian
     assert (latched.header, latched.revision) == (result.report.header, result.report.revision)
     session = core_session(scene, clean_views(6))
     session.learn()
-    assert [thing.id for thing in latched.objects] == list(object_boxes(scene, session.segmentation(RAW)))
+    assert [thing.id for thing in latched.objects] == list(object_boxes(scene, session.segmentation(UNREFINED)))
 
 
 def test_the_objects_of_a_run_stay_until_another_view_comes(robot: Robot) -> None:
@@ -140,7 +138,7 @@ def test_objects_come_by_themselves_while_views_come_and_somebody_listens(robot:
     robot.drive(clean_views(1))
     robot.ros.wait_until(lambda: len(heard) > count, "objects of all views")
     assert {array.revision for array in heard[1:]} == {0}
-    result = core_session(scene, [*clean_views(6), clean_views(1)[0]]).segmentation(RAW)
+    result = core_session(scene, [*clean_views(6), clean_views(1)[0]]).segmentation(UNREFINED)
     assert [thing.id for thing in heard[-1].objects] == list(object_boxes(scene, result))
 
 
@@ -158,4 +156,4 @@ def test_boxes_are_in_the_map_where_the_scene_has_another_frame_and_scale(
     views = clean_views(6)
     robot.drive(views, place)
     robot.ros.wait_until(lambda: robot.ask("segment").report.num_views == 6, "six views")
-    assert_objects(robot.done("segment").objects, scene, core_session(scene, views).segmentation(), place)
+    assert_objects(robot.done("segment").objects, scene, core_session(scene, views).segmentation(PAPER), place)

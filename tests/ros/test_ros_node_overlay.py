@@ -20,7 +20,7 @@ from gsseg_core.errors import MaskFormatError
 from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.live.session import LiveSession
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.refine.settings import UNREFINED
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -36,8 +36,6 @@ from gsseg_ros.frames import Similarity
 from gsseg_ros.node import live_outputs
 from gsseg_ros.node.live_outputs import LiveOutputs
 from gsseg_ros.node.pairing import Paired
-
-RAW = RefineSettings(cluster=False, filter=False)
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +92,7 @@ def photo_of(sent: dict[str, Any], encoding: str = "rgb8") -> tuple[Image, np.nd
 
 def labels_of(scene: GaussianScene, views: list[View], camera: Camera) -> np.ndarray:
     """What a camera sees once some views are fused."""
-    return core_session(scene, views).segmentation(RAW).render(make_operator(scene, camera)).labels
+    return core_session(scene, views).segmentation(UNREFINED).render(make_operator(scene, camera)).labels
 
 
 def close_to(found: np.ndarray, expected: np.ndarray) -> bool:

@@ -15,6 +15,7 @@ from small_scenes import NAMES, clean_views
 from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.export.view_pictures import background_image
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.refine.settings import PAPER
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
 
@@ -40,7 +41,7 @@ def robot(running: Robot) -> Robot:
 
 
 def refined(scene: GaussianScene) -> Segmentation:
-    return core_session(scene, clean_views(6)).segmentation()
+    return core_session(scene, clean_views(6)).segmentation(PAPER)
 
 
 def test_a_request_left_at_its_defaults_means_all_classes_refined_without_a_threshold(

@@ -25,6 +25,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
 from gsseg_core.live.session import LiveSession
+from gsseg_core.refine.settings import PAPER
 from gsseg_ros.frames import Similarity
 from gsseg_ros.node import outputs as outputs_module
 from gsseg_ros.node.outputs import Outputs
@@ -46,7 +47,7 @@ def selection(*chosen: int) -> Selection:
     session = LiveSession(balls_on_a_table()[0], NAMES)
     for view in clean_views(2):
         session.fuse(view)
-    return Selection(session, session.segmentation(), chosen, 0.0, Similarity(np.eye(3), np.zeros(3), 1.0))
+    return Selection(session, session.segmentation(PAPER), chosen, 0.0, Similarity(np.eye(3), np.zeros(3), 1.0))
 
 
 class Publisher:

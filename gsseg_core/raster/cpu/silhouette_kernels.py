@@ -5,100 +5,167 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
+from gsseg_core.raster.constants import T_MIN
 from gsseg_core.raster.cpu.blending import corner_of, in_block, open_rays, stride_of, tile_of_turn
-from gsseg_core.raster.cpu.splat import WIDTH, aim, blend_block
+from gsseg_core.raster.cpu.splat import WIDTH, aim, alpha_of
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
-from gsseg_core.simd import first_bit, store_row
+from gsseg_core.simd import add_product, add_scaled, first_bit, load_row, nothing, store_row, sum_row
 
 _ROUNDING = np.float32(1e-3)  # of 1 - T, below which a pixel is as good as empty
+_UNKNOWN, _MIXED = np.int32(-1), np.int32(-2)  # in place of the one label that a block or a tile shows
+
+_FAST = {"contract", "reassoc", "nnan", "nsz"}
 
 
-@nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath={"contract", "reassoc", "nnan", "nsz"})
-def silhouette_terms(
-    tiles: Tiles, labels: np.ndarray, num_labels: int,  # (M,) int32; those above 0 are objects
-    kept: np.ndarray, asked: np.ndarray, depths: np.ndarray,  # (M,), (M,) bool, (M,)
+@nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath=_FAST)
+def reasons_to_go(
+    tiles: Tiles, labels: np.ndarray, depths: np.ndarray,  # (M,) int32, (M,); labels above 0 are objects
     shown: np.ndarray, hidden_from: np.ndarray,  # (H, W), (H, W)
-    stay: np.ndarray, go: np.ndarray,  # (E,) out, each
+    go: np.ndarray,  # (E,) out, zeros
 ) -> None:  # fmt: skip
-    """Sum by entry the reasons of its Gaussian to stay with its object, and to go; see `SilhouetteTerms`."""
+    """Sum by entry its Gaussian's alphas over the pixels that show another label, where they do not hide it."""
     table, start, entries = tiles.table, tiles.start, tiles.entries
     stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
         tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
-        # Only labels of those who are asked matter here.
+        fresh, lines = np.empty((TILE, TILE), np.float32), np.empty((2, TILE), np.float32)
+        left, top, inside = open_rays(tiles, tile, fresh)
+        seen, limit = np.full((TILE, TILE), _UNKNOWN, np.int32), np.zeros((TILE, TILE), np.float32)
+        _cut(shown, hidden_from, *corner_of(tiles, tile), seen, limit)
+        only, farthest = np.empty(TILE, np.int32), np.empty(TILE, np.float32)
+        tile_only, tile_farthest = _summed_up(seen, limit, only, farthest)
+        if tile_only == _UNKNOWN:
+            continue
+        alpha = np.empty((1, TILE), np.float32)
+        for e in range(start[tile], start[tile + 1]):
+            g = entries[e]
+            label, z = labels[g], depths[g]
+            if label <= 0 or label == tile_only or z > tile_farthest:
+                continue
+            reached, total = aim(table, g, left, top, lines) & inside, np.float32(0)
+            while reached:
+                b = first_bit(reached)
+                reached &= reached - 1
+                if only[b] == label or only[b] == _UNKNOWN or z > farthest[b]:
+                    continue
+                store_row(alpha, 0, alpha_of(b, lines, table[g, WIDTH]))
+                for i in range(TILE):
+                    outside = seen[b, i] != label and seen[b, i] >= 0 and z <= limit[b, i]
+                    total += alpha[0, i] if outside else np.float32(0)
+            go[e] = total
+
+
+@nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath=_FAST)
+def reasons_to_stay(
+    tiles: Tiles, labels: np.ndarray, num_labels: int,  # (M,) int32; those above 0 are objects
+    kept: np.ndarray, asked: np.ndarray, shown: np.ndarray,  # (M,) float32, (M,) bool, (H, W)
+    stay: np.ndarray,  # (E,) out, zeros
+) -> None:  # fmt: skip
+    """Sum by entry its Gaussian's alpha T_k / (1 - T_k) over the pixels that show its object k, for those asked for."""
+    table, start, entries = tiles.table, tiles.start, tiles.entries
+    stride = stride_of(tiles.rows)
+    for turn in nb.prange(tiles.rows * tiles.columns):
+        tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
+        # Only objects that the tile shows, and of which somebody is asked for.
         slots, count = np.full(num_labels, -1, np.int64), 0
         for e in range(start[tile], start[tile + 1]):
             label = labels[entries[e]]
-            if asked[entries[e]] and slots[label] < 0:
+            if asked[entries[e]] and label > 0 and slots[label] < 0:
                 slots[label] = count
                 count += 1
         if not count:
             continue
         fresh, lines = np.empty((TILE, TILE), np.float32), np.empty((2, TILE), np.float32)
         left, top, inside = open_rays(tiles, tile, fresh)
-        limit = _cut(hidden_from, *corner_of(tiles, tile))
-        through = np.ones((count, TILE, TILE), np.float32)  # T_k
-        alpha = np.empty((1, TILE), np.float32)
+        shows = _blocks_of(shown, *corner_of(tiles, tile), slots, count)
+        through = np.ones((count * TILE, TILE), np.float32)  # T_k, block by block
+        live = shows.copy()  # blocks in which the object does not cover all yet
         for e in range(start[tile], start[tile + 1]):
             g = entries[e]
-            if labels[g] > 0 and slots[labels[g]] >= 0:
-                reached, own = aim(table, g, left, top, lines) & inside, through[slots[labels[g]]]
+            slot = slots[labels[g]] if labels[g] > 0 else -1
+            if slot < 0 or not live[slot]:
+                continue
+            reached = aim(table, g, left, top, lines) & inside & live[slot]
+            while reached:
+                b = first_bit(reached)
+                reached &= reached - 1
+                before = load_row(through, slot * TILE + b)
+                share = add_scaled(nothing(), alpha_of(b, lines, table[g, WIDTH]), -kept[g])
+                after = add_product(before, before, share)
+                store_row(through, slot * TILE + b, after)
+                if sum_row(after) < T_MIN:
+                    live[slot] &= ~(1 << b)
+        need = np.zeros_like(through)
+        _weigh(shown, *corner_of(tiles, tile), slots, through, need)
+        for e in range(start[tile], start[tile + 1]):
+            g = entries[e]
+            if asked[g] and labels[g] > 0 and live[slots[labels[g]]]:
+                slot, total = slots[labels[g]], nothing()
+                reached = aim(table, g, left, top, lines) & inside & live[slot]
                 while reached:
                     b = first_bit(reached)
                     reached &= reached - 1
-                    _alphas(lines, b, table[g, WIDTH], fresh, alpha)
-                    for i in range(TILE):
-                        own[b, i] *= np.float32(1) - kept[g] * alpha[0, i]
-        need, excess = np.zeros_like(through), np.zeros_like(through)
-        for label in range(1, num_labels):
-            if slots[label] >= 0:
-                slot = slots[label]
-                _weigh(shown, label, *corner_of(tiles, tile), through[slot], need[slot], excess[slot])
-        for e in range(start[tile], start[tile + 1]):
-            g = entries[e]
-            if asked[g]:
-                reached, slot = aim(table, g, left, top, lines) & inside, slots[labels[g]]
-                more, less, z = np.float32(0), np.float32(0), depths[g]
-                while reached:
-                    b = first_bit(reached)
-                    reached &= reached - 1
-                    _alphas(lines, b, table[g, WIDTH], fresh, alpha)
-                    for i in range(TILE):
-                        more += alpha[0, i] * need[slot, b, i]
-                        less += alpha[0, i] * (excess[slot, b, i] if z <= limit[b, i] else np.float32(0))
-                stay[e], go[e] = more, less
+                    total = add_product(total, alpha_of(b, lines, table[g, WIDTH]), load_row(need, slot * TILE + b))
+                stay[e] = sum_row(total)
 
 
 @nb.njit
-def _cut(image: np.ndarray, left: int, top: int) -> np.ndarray:
-    """One tile of an image (H, W), by block, (16, 16) float32; 0 outside of it."""
-    out = np.zeros((TILE, TILE), np.float32)
-    for r in range(min(TILE, image.shape[0] - top)):
-        for c in range(min(TILE, image.shape[1] - left)):
-            out[in_block(r, c)] = image[top + r, left + c]
-    return out
+def _cut(
+    shown: np.ndarray, hidden_from: np.ndarray, left: int, top: int,  # (H, W), (H, W)
+    seen: np.ndarray, limit: np.ndarray,  # (16, 16) out, each: by block, what lies outside of the image as it was
+) -> None:  # fmt: skip
+    for r in range(min(TILE, shown.shape[0] - top)):
+        for c in range(min(TILE, shown.shape[1] - left)):
+            seen[in_block(r, c)], limit[in_block(r, c)] = shown[top + r, left + c], hidden_from[top + r, left + c]
+
+
+@nb.njit
+def _summed_up(
+    seen: np.ndarray, limit: np.ndarray, only: np.ndarray, farthest: np.ndarray,  # (16, 16) each; (16,) out, each
+) -> tuple[np.int32, np.float32]:  # fmt: skip
+    """Of each block, and of the tile: the only label that it shows, and the depth behind which all is hidden."""
+    tile_only, tile_farthest = _UNKNOWN, np.float32(0)
+    for b in range(TILE):
+        found, depth = _UNKNOWN, np.float32(0)
+        for i in range(TILE):
+            if seen[b, i] >= 0:
+                found = _joined(found, seen[b, i])
+                depth = max(depth, limit[b, i])
+        only[b], farthest[b] = found, depth
+        if found != _UNKNOWN:
+            tile_only = _joined(tile_only, found)
+            tile_farthest = max(tile_farthest, depth)
+    return tile_only, tile_farthest
 
 
 @nb.njit(inline="always")
-def _alphas(
-    lines: np.ndarray, b: int, wide: float,  # (2, 16) from `aim`
-    fresh: np.ndarray, alpha: np.ndarray,  # (16, 16) scratch, (1, 16) out
-) -> None:  # fmt: skip
-    """Alpha of a Gaussian in block b: `blend_block` makes it of rays that nothing has met yet."""
-    fresh[b, :] = 1
-    weight, _ = blend_block(fresh, b, lines, wide)
-    store_row(alpha, 0, weight)
+def _joined(known: np.int32, label: np.int32) -> np.int32:
+    if known == _UNKNOWN:
+        return label
+    return known if known == label else _MIXED
+
+
+@nb.njit
+def _blocks_of(shown: np.ndarray, left: int, top: int, slots: np.ndarray, count: int) -> np.ndarray:
+    """Blocks of a tile that show each label, as bits, (count,) int64."""
+    blocks = np.zeros(count, np.int64)
+    for r in range(min(TILE, shown.shape[0] - top)):
+        for c in range(min(TILE, shown.shape[1] - left)):
+            label = shown[top + r, left + c]
+            if 0 < label < len(slots) and slots[label] >= 0:
+                blocks[slots[label]] |= 1 << in_block(r, c)[0]
+    return blocks
 
 
 @nb.njit(fastmath={"contract", "nnan", "nsz"}, error_model="numpy")
 def _weigh(
-    shown: np.ndarray, label: int, left: int, top: int, through: np.ndarray,  # (H, W); (16, 16) T_k
-    need: np.ndarray, excess: np.ndarray,  # (16, 16) out: T_k / (1 - T_k) where the label is shown; 1 where another is
+    shown: np.ndarray, left: int, top: int, slots: np.ndarray,  # (H, W)
+    through: np.ndarray, need: np.ndarray,  # (16 S, 16) T_k; out, T_k / (1 - T_k) where label k is shown
 ) -> None:  # fmt: skip
     for r in range(min(TILE, shown.shape[0] - top)):
         for c in range(min(TILE, shown.shape[1] - left)):
-            b, i = in_block(r, c)
-            if shown[top + r, left + c] == label:
-                need[b, i] = through[b, i] / (np.float32(1) - through[b, i] + _ROUNDING)
-            elif shown[top + r, left + c] >= 0:
-                excess[b, i] = 1
+            label = shown[top + r, left + c]
+            if 0 < label < len(slots) and slots[label] >= 0:
+                b, i = in_block(r, c)
+                n = slots[label] * TILE + b
+                need[n, i] = through[n, i] / (np.float32(1) - through[n, i] + _ROUNDING)

@@ -54,6 +54,16 @@ class _Splat(Builder):
         four = self.llvm.load(address, align=4, typ=_FOUR)
         return self.llvm.shuffle_vector(four, ir.Constant(_FOUR, ir.Undefined), _EACH_FOUR_TIMES)
 
+    def alpha(self, first: int) -> tuple[Any, Any]:
+        """Alpha in a block, and log2 of it before it is clipped; arguments from `first` on: block, lines and width."""
+        offset = self.llvm.fsub(self.columns_of(first), self.four_of(first + 1, 0, self.arguments[first]))
+        peak, wide = (
+            self.four_of(first + 1, 1, self.arguments[first]),
+            self.spread(self.llvm.fneg(self.arguments[first + 2])),
+        )
+        power = self.fma(wide, self.llvm.fmul(offset, offset), peak)
+        return self.least(self.exp2(power), constant(ALPHA_MAX)), power
+
     def columns_of(self, position: int) -> Any:
         """Columns in the tile of the pixels of a block, which is argument `position`."""
         block = self.arguments[position]
@@ -114,11 +124,7 @@ def blend_block(typing: Any, rays: Any, b: Any, lines: Any, wide: Any) -> tuple[
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         row = _Splat(context, builder, signature, arguments)
-        offset = builder.fsub(row.columns_of(1), row.four_of(2, 0, arguments[1]))
-        peak = row.four_of(2, 1, arguments[1])
-        power = row.fma(row.spread(builder.fneg(arguments[3])), builder.fmul(offset, offset), peak)
-        alpha = row.exp2(power)
-        alpha = builder.select(builder.fcmp_ordered("<", alpha, constant(ALPHA_MAX)), alpha, constant(ALPHA_MAX))
+        alpha, power = row.alpha(1)
         address = row.row(0)
         before = row.load(address)
         hit = builder.and_(
@@ -134,3 +140,14 @@ def blend_block(typing: Any, rays: Any, b: Any, lines: Any, wide: Any) -> tuple[
 
     both: Any = types.Tuple((row_type, types.int64))  # type: ignore[no-untyped-call]
     return both(rays, b, lines, types.float32), generate
+
+
+@intrinsic
+def alpha_of(typing: Any, b: Any, lines: Any, wide: Any) -> tuple[Any, Callable[..., Any]]:
+    """Alpha of one Gaussian in block b, as `blend_block` has it, whatever lies in front."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        alpha, power = _Splat(context, builder, signature, arguments).alpha(0)
+        return builder.select(builder.fcmp_ordered(">=", power, constant(LOG_ALPHA_MIN)), alpha, constant(0.0))
+
+    return row_type(b, lines, types.float32), generate

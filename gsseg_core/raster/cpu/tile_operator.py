@@ -9,15 +9,14 @@ import numpy as np
 from gsseg_core.csr_rows import CSRRows, starts
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.raster.constants import CHANNELS, CHUNKS
-from gsseg_core.raster.cpu import label_pairs, products
+from gsseg_core.raster.cpu import label_pairs, products, silhouette_kernels
 from gsseg_core.raster.cpu.entry_votes import add_entry_votes
 from gsseg_core.raster.cpu.lifting import Lifted
 from gsseg_core.raster.cpu.projection import project
-from gsseg_core.raster.cpu.silhouette_kernels import silhouette_terms
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_OPACITY, WIDTH
 from gsseg_core.raster.cpu.tiling import TILE, Tiles, assign
 from gsseg_core.raster.observation import Observation, VoteShares
-from gsseg_core.raster.view_operator import Blended, SilhouetteTerms, ViewOperator
+from gsseg_core.raster.view_operator import Blended, ViewOperator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -45,15 +44,21 @@ class TileOperator(ViewOperator):
         areas: np.ndarray = np.exp2(table[:, LOG_OPACITY]) * area
         return areas
 
-    def silhouette_terms(
-        self, labels: np.ndarray, kept: np.ndarray, asked: np.ndarray, depths: np.ndarray, shown: np.ndarray,
-        hidden_from: np.ndarray,
-    ) -> SilhouetteTerms:  # fmt: skip
-        """Weigh what speaks for each Gaussian in its object, and what against it, entry by entry."""
-        tiles, count = self._tiles, int(labels.max(initial=0)) + 1
-        stay, go = np.zeros((2, len(tiles.entries)), np.float32)
-        silhouette_terms(tiles, labels, count, kept.astype(np.float32), asked, depths, shown, hidden_from, stay, go)
-        return SilhouetteTerms(*(np.bincount(tiles.entries, part, len(self.ids)) for part in (stay, go)))
+    def reasons_to_go(
+        self, labels: np.ndarray, depths: np.ndarray, shown: np.ndarray, hidden_from: np.ndarray
+    ) -> np.ndarray:
+        """Weigh what speaks against each Gaussian in its object, entry by entry."""
+        go = np.zeros(len(self._tiles.entries), np.float32)
+        silhouette_kernels.reasons_to_go(self._tiles, labels, depths, shown, hidden_from, go)
+        return np.bincount(self._tiles.entries, go, len(self.ids))
+
+    def reasons_to_stay(
+        self, labels: np.ndarray, kept: np.ndarray, asked: np.ndarray, shown: np.ndarray
+    ) -> np.ndarray:  # fmt: skip
+        """Weigh what speaks for each Gaussian in its object, entry by entry."""
+        stay, count = np.zeros(len(self._tiles.entries), np.float32), int(labels.max(initial=0)) + 1
+        silhouette_kernels.reasons_to_stay(self._tiles, labels, count, kept.astype(np.float32), asked, shown, stay)
+        return np.bincount(self._tiles.entries, stay, len(self.ids))
 
     def _without(self, hidden: np.ndarray) -> TileOperator:
         other, table = copy.copy(self), self._tiles.table.copy()
