@@ -181,18 +181,23 @@ def _finish(out: Path) -> None:
     staging, before, run_id = out / manifest.staging, manifest.before, manifest.staging.removeprefix(".gsseg-")
     try:
         places = {place for run in manifest.runs.values() for place in run.files}
-        for place in sorted(places):
-            if not os.path.lexists(staging / "new" / place):
-                continue  # It was moved already, or is of another kind.
-            for folder in reversed(Path(place).parents[:-1]):
-                if os.path.lexists(out / folder) and not _is_folder(out / folder):
-                    _move_aside(out / folder, run_id)
+        # Others were moved already, or are of another kind.
+        new = sorted(place for place in places if os.path.lexists(staging / "new" / place))
+        gone = before.keys() - places
+        for folder in {folder for place in new for folder in reversed(Path(place).parents[:-1])}:
+            if os.path.lexists(out / folder) and not _is_folder(out / folder):
+                _move_aside(out / folder, run_id)
+        for place in new:
             (out / place).parent.mkdir(parents=True, exist_ok=True)
-            if os.path.lexists(out / place) and not _is_unchanged(out, place, before.get(place)):
+        # All that takes time comes before the first move: until the last one, the files are of two runs.
+        unchanged = {place for place in (*new, *gone) if _is_unchanged(out, place, before.get(place))}
+        for place in new:
+            if place not in unchanged and os.path.lexists(out / place):
                 _move_aside(out / place, run_id)
+        for place in new:
             os.replace(staging / "new" / place, out / place)
-        for place in before.keys() - places:
-            if _is_unchanged(out, place, before[place]):
+        for place in gone:
+            if place in unchanged:
                 (out / place).unlink()
                 with contextlib.suppress(OSError):
                     for folder in Path(place).parents[:-1]:

@@ -13,9 +13,12 @@ cluster are those of the cluster.
 1. **Views vote on pairs.** View v says that clusters C and D are one object with the probability that a point of each
    gets the same id there, A_v = sum_b O_Cb O_Db / (V_Cv V_Dv). What counts is the mean over the views that see both,
    so an object that some views split, or two that some views merge, are outvoted by the other views.
-2. **Clusters merge**, the most agreed pairs first, while the agreement is above one half; what has merged is compared
-   anew, with the evidence of all its segments together.
-3. **Segments move** to the object that explains them best by what the other views say, until none does. That gives
+2. **Clusters merge**, the most agreed pairs first; what has merged is compared anew, with the evidence of all its
+   segments together.
+3. **The views tell where to stop.** Segmenters split objects far more often than they merge two, but how often they
+   merge differs. It shows in the clusters that most views hold together: of those that touch, the least agreed pairs
+   are different objects, so their agreement is how often neighbours are merged. Merging goes on to a level above it.
+4. **Segments move** to the object that explains them best by what the other views say, until none does. That gives
    leftovers, one half of something, say, to the whole, and clutter to the background; objects left without a segment
    are gone.
 
@@ -25,8 +28,10 @@ Nothing depends on the order of views or ids, nor on how many there are.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -35,7 +40,13 @@ from gsseg_core.errors import SettingsError
 from gsseg_core.objects.lifted_segments import Lifted, Profiles, sums
 
 _PAIRS = 1 << 15  # so many pairs at a time, to keep memory small
-_LEVEL = 0.75  # pairs that agree nearly as well as the best one merge at once, before anything is compared anew
+_BEST = 0.75  # pairs that agree nearly as well as the best one merge at once, before anything is compared anew
+_MOST = 0.6  # agreement above which clusters are one object whatever the segmenter does
+# The level is _LEAST + _SLOPE sqrt(how often views merge neighbours), at most _MOST; both were fitted to made-up masks.
+_LEAST, _SLOPE = 0.2, 1.75
+_DIFFERENT = 0.1  # share of the pairs of clusters that touch of which it is sure that they are different objects
+_TOUCHING = 5  # views in which clusters touch, for that
+_FEWEST = 10  # such pairs, of which fewer tell nothing; then the level is one half
 
 
 @dataclass(frozen=True)
@@ -43,7 +54,7 @@ class AssociationSettings:
     """Settings of `associate`."""
 
     kept: float = 0.8  # share of a segment's weight that is kept, in its heaviest Gaussians, in (0, 1]
-    agreement: float = 0.5  # clusters merge above this mean agreement of the views that see both, in (0, 1)
+    agreement: float | None = None  # clusters merge above it, in (0, 1); by default, what the views tell
     doubt: float = 0.3  # views that disagree, added to every pair: pairs that many views confirm merge first
     evidence: float = 0.3  # views, in full sight of both clusters, that it takes at least to merge two
     full_sight: float = 0.5  # share of a cluster, as far as any view sees it, that a view must see to count in full
@@ -55,10 +66,10 @@ class AssociationSettings:
 
     def __post_init__(self) -> None:
         """Validate."""
-        if not 0 < self.kept <= 1 or not 0 < self.agreement < 1:
-            raise SettingsError(
-                f"association: kept is {self.kept}, agreement {self.agreement}; expected a share in (0, 1]"
-            )
+        if not 0 < self.kept <= 1:
+            raise SettingsError(f"association: kept is {self.kept}; expected a share in (0, 1]")
+        if self.agreement is not None and not 0 < self.agreement < 1:
+            raise SettingsError(f"association: agreement is {self.agreement}; expected a share in (0, 1), or None")
         for name in ("doubt", "evidence", "full_sight_px", "least_share", "unseen", "rounds"):
             if getattr(self, name) < 0:
                 raise SettingsError(f"association: {name} is {getattr(self, name)}; expected 0 or more")
@@ -124,20 +135,26 @@ def _merge(stack: _Stack, settings: AssociationSettings) -> np.ndarray:
     """Cluster the segments; all of the background are cluster 0, the others are numbered from 1."""
     overlap, seen = stack.overlaps()
     nodes = np.flatnonzero(~stack.background)
+    touching = _same_view(overlap, stack.view)[nodes][:, nodes]
     cluster = np.arange(len(nodes))
     hidden = np.zeros_like(seen)
     hidden[:, stack.view[stack.background]] = overlap[:, stack.background].toarray()
     overlap.data[stack.background[overlap.indices]] = 0
     overlap.eliminate_zeros()
     overlap, seen, hidden = overlap[nodes], seen[nodes], hidden[nodes]
+    level, is_told = (_MOST, False) if settings.agreement is None else (settings.agreement, True)
     while len(seen) > 1:
         pairs = _agreements(*_votes(overlap, seen, hidden, stack.view, settings), settings)
-        target = _match(*pairs, len(seen), settings.agreement)
-        if target is None:
+        target = _match(pairs, len(seen), level)
+        if target is None and is_told:
             break
+        if target is None:
+            level, is_told = _told_level(pairs, touching), True
+            continue
         merged = np.unique(target, return_inverse=True)[1]
         groups = sparse.csr_matrix((np.ones(len(merged), np.float32), (merged, np.arange(len(merged)))))
         overlap, seen, hidden = (groups @ overlap).tocsr(), groups @ seen, groups @ hidden
+        touching = groups @ touching @ groups.T
         cluster = merged[cluster]
     clusters = np.zeros(len(stack.view), np.int64)
     clusters[nodes] = cluster + 1
@@ -163,26 +180,53 @@ def _votes(
     return sparse.csr_matrix((share * counts[row, view[col]], (row, col)), shape=overlap.shape), counts
 
 
-def _agreements(
-    votes: sparse.csr_matrix, counts: np.ndarray, settings: AssociationSettings
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs of clusters, first < second, and the views' mean agreement on them; takes what `_votes` returns."""
+class _Pairs(NamedTuple):
+    """Pairs of clusters that some view calls the same, (P,) each."""
+
+    first: np.ndarray
+    second: np.ndarray  # larger than the first
+    score: np.ndarray  # mean agreement of the views; 0 where too few see both
+    evidence: np.ndarray  # views that see both, each as far as it does
+
+
+def _agreements(votes: sparse.csr_matrix, counts: np.ndarray, settings: AssociationSettings) -> _Pairs:
+    """Compare clusters; takes what `_votes` returns."""
     both = sparse.triu(votes @ votes.T, 1).tocoo()
     evidence = np.empty(both.nnz)
     for k in range(0, both.nnz, _PAIRS):
         part = slice(k, k + _PAIRS)
         evidence[part] = np.einsum("pv,pv->p", counts[both.row[part]], counts[both.col[part]])
     score = np.where(evidence >= settings.evidence, both.data / (evidence + settings.doubt), 0)
-    return both.row, both.col, score
+    return _Pairs(both.row, both.col, score, evidence)
 
 
-def _match(first: np.ndarray, second: np.ndarray, score: np.ndarray, num: int, least: float) -> np.ndarray | None:
+def _same_view(overlap: sparse.csr_matrix, view: np.ndarray) -> sparse.csr_matrix:
+    """Pairs of segments of one view that share a Gaussian, and so touch, (n, n) of ones."""
+    entries = overlap.tocoo()
+    same = view[entries.row] == view[entries.col]
+    ones = np.ones(int(same.sum()), np.float32)
+    return sparse.csr_matrix((ones, (entries.row[same], entries.col[same])), shape=overlap.shape)
+
+
+def _told_level(pairs: _Pairs, touching: sparse.csr_matrix) -> float:  # (C, C) how often clusters touch
+    """Agreement above which clusters are one object, by how often the views merge two that are not."""
+    known = np.flatnonzero(pairs.evidence > _TOUCHING)
+    if len(known) >= _FEWEST:
+        touch = np.asarray(touching[pairs.first[known], pairs.second[known]]).ravel() >= _TOUCHING
+        known = known[touch]
+    if len(known) < _FEWEST:
+        return 0.5
+    merged = float(np.quantile(pairs.score[known], _DIFFERENT))
+    return min(_LEAST + _SLOPE * math.sqrt(merged), _MOST)
+
+
+def _match(pairs: _Pairs, num: int, least: float) -> np.ndarray | None:
     """Pair off clusters, best pairs first, each at most once; return whom each one becomes, None if nobody pairs."""
-    good = score > least
+    good = pairs.score > least
     if not good.any():
         return None
-    good &= score >= _LEVEL * score.max()
-    first, second, score = first[good], second[good], score[good]
+    good &= pairs.score >= _BEST * pairs.score.max()
+    first, second, score = pairs.first[good], pairs.second[good], pairs.score[good]
     target, free = np.arange(num), np.ones(num, bool)
     for k in np.lexsort([second, first, -score]):
         a, b = first[k], second[k]
