@@ -144,12 +144,13 @@ def _merge(stack: _Stack, settings: AssociationSettings) -> np.ndarray:
     overlap, seen, hidden = overlap[nodes], seen[nodes], hidden[nodes]
     level, is_told = (_MOST, False) if settings.agreement is None else (settings.agreement, True)
     while len(seen) > 1:
-        pairs = _agreements(*_votes(overlap, seen, hidden, stack.view, settings), settings)
+        votes, counts = _votes(overlap, seen, hidden, stack.view, settings)
+        pairs = _agreements(votes, counts, settings)
         target = _match(pairs, len(seen), level)
         if target is None and is_told:
             break
         if target is None:
-            level, is_told = _told_level(pairs, touching), True
+            level, is_told = _told_level(votes, counts, touching, settings), True
             continue
         merged = np.unique(target, return_inverse=True)[1]
         groups = sparse.csr_matrix((np.ones(len(merged), np.float32), (merged, np.arange(len(merged)))))
@@ -186,7 +187,6 @@ class _Pairs(NamedTuple):
     first: np.ndarray
     second: np.ndarray  # larger than the first
     score: np.ndarray  # mean agreement of the views; 0 where too few see both
-    evidence: np.ndarray  # views that see both, each as far as it does
 
 
 def _agreements(votes: sparse.csr_matrix, counts: np.ndarray, settings: AssociationSettings) -> _Pairs:
@@ -197,7 +197,7 @@ def _agreements(votes: sparse.csr_matrix, counts: np.ndarray, settings: Associat
         part = slice(k, k + _PAIRS)
         evidence[part] = np.einsum("pv,pv->p", counts[both.row[part]], counts[both.col[part]])
     score = np.where(evidence >= settings.evidence, both.data / (evidence + settings.doubt), 0)
-    return _Pairs(both.row, both.col, score, evidence)
+    return _Pairs(both.row, both.col, score)
 
 
 def _same_view(overlap: sparse.csr_matrix, view: np.ndarray) -> sparse.csr_matrix:
@@ -208,16 +208,22 @@ def _same_view(overlap: sparse.csr_matrix, view: np.ndarray) -> sparse.csr_matri
     return sparse.csr_matrix((ones, (entries.row[same], entries.col[same])), shape=overlap.shape)
 
 
-def _told_level(pairs: _Pairs, touching: sparse.csr_matrix) -> float:  # (C, C) how often clusters touch
-    """Agreement above which clusters are one object, by how often the views merge two that are not."""
-    known = np.flatnonzero(pairs.evidence > _TOUCHING)
-    if len(known) >= _FEWEST:
-        touch = np.asarray(touching[pairs.first[known], pairs.second[known]]).ravel() >= _TOUCHING
-        known = known[touch]
-    if len(known) < _FEWEST:
+def _told_level(
+    votes: sparse.csr_matrix, counts: np.ndarray, touching: sparse.csr_matrix, settings: AssociationSettings
+) -> float:
+    """Agreement above which clusters are one object, by how often the views merge two that are not.
+
+    Takes what `_votes` returns, and in how many views clusters touch, (C, C).
+    """
+    pairs = sparse.triu(touching, 1).tocoo()
+    often = pairs.data >= _TOUCHING
+    first, second = pairs.row[often], pairs.col[often]
+    evidence = np.einsum("pv,pv->p", counts[first], counts[second])
+    agreed = np.asarray(votes[first].multiply(votes[second]).sum(axis=1)).ravel()
+    score = (agreed / (evidence + settings.doubt))[evidence > _TOUCHING]
+    if len(score) < _FEWEST:
         return 0.5
-    merged = float(np.quantile(pairs.score[known], _DIFFERENT))
-    return min(_LEAST + _SLOPE * math.sqrt(merged), _MOST)
+    return min(_LEAST + _SLOPE * math.sqrt(np.quantile(score, _DIFFERENT)), _MOST)
 
 
 def _match(pairs: _Pairs, num: int, least: float) -> np.ndarray | None:

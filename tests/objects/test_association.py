@@ -155,6 +155,39 @@ def test_there_can_be_more_than_255_objects() -> None:
     assert agreement(table, [View.from_arrays(c, true_labels(scene, truth, c)) for c in cameras]) > 0.99
 
 
+def row_of_objects(rng: np.random.Generator, split: float, merged: float) -> Lifted:
+    """A view of 16 objects, 20 Gaussians each, of which each reaches over to the next; as a generator masks them.
+
+    It cuts an object in two somewhere, and gives two neighbours one id, each with a probability.
+    """
+    owner = np.repeat(np.arange(16), 20)
+    cut = np.where(rng.random(16) < split, rng.integers(3, 18, 16), 20)
+    ids = np.arange(16)
+    for k in range(15):
+        if rng.random() < merged:
+            ids[k + 1] = ids[k]
+    segment = np.unique(2 * ids[owner] + (np.arange(320) % 20 >= cut[owner]), return_inverse=True)[1]
+    weights = np.zeros((segment.max() + 1, 320), np.float32)
+    weights[segment, np.arange(320)] = 10 + rng.random(320)
+    last = np.arange(19, 319, 20)
+    weights[segment[last + 1], last] += 4
+    return Lifted(np.arange(1, len(weights) + 1), np.arange(320), sparse.csr_matrix(weights))
+
+
+@pytest.mark.parametrize(("split", "merged"), [(0.0, 0.0), (0.8, 0.0), (0.0, 0.25), (0.5, 0.1)])
+def test_views_tell_how_often_they_merge_neighbours_and_so_the_objects_are_whole(split: float, merged: float) -> None:
+    rng = np.random.default_rng(0)
+    views = {f"v{i:02}": row_of_objects(rng, split, merged) for i in range(40)}
+    objects = associate(views)
+    votes = sum(
+        sparse.csr_matrix((np.ones(len(ids)), (ids, np.arange(len(ids)))), shape=(400, len(ids))) @ views[name].weights
+        for name, ids in objects.items()
+    )
+    score = Contingency()
+    score.add(np.repeat(np.arange(16), 20), np.asarray(votes.argmax(axis=0)).ravel())
+    assert score.ari > 0.97
+
+
 def test_no_view_one_view_and_views_without_evidence_are_no_special_case() -> None:
     assert associate({}) == {} and find_objects(SCENE, []).class_names == {0: "background"}
     one = find_objects(SCENE, [shuffled(VIEWS[0])])
