@@ -24,8 +24,8 @@ os.environ.update(THREADS)
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/helpers"))  # Small scenes and the robot are there.
 
-HEADROOM = 4 << 30
-"""Bytes of address space that a child may take beyond its parent's: a bomb must not take the machine with it."""
+MOST_MEMORY = 2 << 30
+"""Bytes that a child may have in memory: a bomb must not take the machine with it."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def skip_warm_up() -> None:
 def _do(job: Callable[[], int | None], paths: tuple[Path, Path]) -> int:
     for number, path in zip((1, 2), paths, strict=True):
         os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
-    resource.setrlimit(resource.RLIMIT_AS, (_status("VmSize") + HEADROOM,) * 2)
+    resource.setrlimit(resource.RLIMIT_AS, (_status("VmSize") + MOST_MEMORY - _status("VmRSS"),) * 2)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     try:
         code = job() or 0

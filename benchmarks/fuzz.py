@@ -26,7 +26,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from forked import Ended, in_child, run_command, skip_warm_up  # first: it says how numba runs
+from forked import MOST_MEMORY, Ended, in_child, run_command, skip_warm_up  # first: it says how numba runs
 from report import table
 
 from gsseg_core.text import printable
@@ -42,7 +42,6 @@ NODE_KINDS = (
     "mask", "camera_info", "pose", "odometry", "image", "segment", "render_view", "load_scene", "save_state",
     "load_state", "export", "learn",
 )  # fmt: skip
-MOST_MEMORY = 2 << 30
 LONGEST_LINE = 1000
 COLUMNS = ("done", "refused")
 _NO_MEMORY = re.compile(r"MemoryError|[Uu]nable to allocate|[Cc]annot allocate memory|bad_alloc")
