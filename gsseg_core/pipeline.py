@@ -31,6 +31,7 @@ from gsseg_core.learn.calibrate import Calibration, calibrate
 from gsseg_core.learn.learner import MEMORY_BUDGET, NO_MASK, Learner
 from gsseg_core.learn.mask_reliability import MaskChecker, ViewCheck, compare_mask, reliability_report
 from gsseg_core.learn.registry import make_learner
+from gsseg_core.objects.association import AssociationSettings
 from gsseg_core.objects.object_table import PER_VIEW, ObjectTable, find_objects
 from gsseg_core.progress import Progress, Stopwatch, silent
 from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, spread_if_scarce
@@ -98,6 +99,7 @@ def segment(
     seed: int = 0,
     scheduler: str | None = None,
     ids: str = "global",
+    granularity: float | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Learn from the train views of a dataset, refine, and write everything into `out`.
@@ -127,6 +129,9 @@ def segment(
         Address of a Dask scheduler whose workers learn; everything else is done here.
     ids : str
         One of `IDS`: whether an id means the same in every view, or the objects are to be found.
+    granularity : float, optional
+        Of these objects, between 0 and 1: ids of views are one object where the views agree by more than this on that;
+        by default, the views tell. See docs/ids.md.
 
     Returns
     -------
@@ -140,7 +145,7 @@ def segment(
     """
     settings = RunSettings(
         learner, labels, views, device, memory_budget, seed, scheduler, ids,
-        refine or RefineSettings(), GraphSettings() if graph else None,
+        refine or RefineSettings(), GraphSettings() if graph else None, granularity,
     )  # fmt: skip
     watch = Stopwatch()
     with staged_run(out, "segment", places=segment_places({}, [])) as run:
@@ -151,7 +156,7 @@ def segment(
                 inputs = _load(scene_path, data, settings)
             if ids == PER_VIEW:
                 with watch.stage("associate"):
-                    inputs = _associate(inputs, device, progress)
+                    inputs = _associate(inputs, settings, progress)
             run.claim(segment_places(inputs.class_names, inputs.pictured))
             fitted = _learn(inputs, settings, client, watch, progress)
             assessment = _assess(fitted, inputs.class_names, watch, progress)
@@ -194,9 +199,10 @@ def _load(scene_path: str | os.PathLike[str], data: str | os.PathLike[str], sett
     return Inputs(scene, dataset.root, train, pictured, {} if class_ids is None else dataset.class_names, class_ids)
 
 
-def _associate(inputs: Inputs, device: str, progress: Progress) -> Inputs:
+def _associate(inputs: Inputs, settings: RunSettings, progress: Progress) -> Inputs:
     """Find which ids of the views are the same object, and number the objects."""
-    objects = find_objects(inputs.scene, inputs.train, device=device, progress=progress)
+    association = AssociationSettings(agreement=settings.granularity)
+    objects = find_objects(inputs.scene, inputs.train, association, device=settings.device, progress=progress)
     train = [objects.relabelled(view) for view in inputs.train]
     return replace(inputs, train=train, class_names=objects.class_names, objects=objects)
 

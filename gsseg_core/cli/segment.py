@@ -31,6 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--ids", choices=("global", "per-view"), default="global",
         help="whether an id means the same in every view, or holds in its own view only (default: %(default)s)",
     )  # fmt: skip
+    level = "per-view ids: more makes parts of objects, less puts objects together (default: what the views tell)"
+    parser.add_argument("--granularity", type=float, metavar="G", help=level)
     add = parser.add_argument_group("learning").add_argument
     add("--learner", choices=tuple(LEARNERS), default=DEFAULT, help="default: %(default)s")
     add("--views", type=int, metavar="N", help="learn from N train views, spread evenly (default: all)")
@@ -70,7 +72,7 @@ def run(options: argparse.Namespace) -> int:
             options.scene, options.data, options.out, labels=options.labels, learner=options.learner,
             views=options.views, refine=refine, graph=not options.no_graph, device=options.device,
             memory_budget=options.memory_budget << 20, seed=options.seed, scheduler=options.scheduler,
-            ids=options.ids, progress=progress,
+            ids=options.ids, granularity=options.granularity, progress=progress,
         )  # fmt: skip
     from gsseg_core.text import segment_summary
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn.registry import check_learner
-from gsseg_core.objects.object_table import IDS
+from gsseg_core.objects.object_table import IDS, PER_VIEW
 from gsseg_core.objects.oriented_boxes import object_boxes
 from gsseg_core.refine.label_propagation import GraphSettings
 from gsseg_core.refine.settings import RefineSettings
@@ -29,7 +29,7 @@ class RunSettings:
 
     Attributes
     ----------
-    learner, labels, views, device, memory_budget, seed, scheduler, ids
+    learner, labels, views, device, memory_budget, seed, scheduler, ids, granularity
         As `gsseg_core.pipeline.segment` takes them.
     refine : RefineSettings
         The refinement.
@@ -49,6 +49,7 @@ class RunSettings:
     ids: str
     refine: RefineSettings
     graph: GraphSettings | None
+    granularity: float | None = None
     learner_settings: Any = None
 
     def check(self) -> None:
@@ -56,6 +57,10 @@ class RunSettings:
         check_learner(self.learner, self.scheduler)
         if self.ids not in IDS:
             raise SettingsError(f"ids is {self.ids!r}; expected one of {', '.join(IDS)}")
+        if self.granularity is not None and not 0 < self.granularity < 1:
+            raise SettingsError(f"granularity is {self.granularity}; expected a share between 0 and 1")
+        if self.granularity is not None and self.ids != PER_VIEW:
+            raise SettingsError("granularity is for ids that are a view's own; expected ids per-view")
 
     def as_dict(self) -> dict[str, Any]:
         """Give them as `report.json` does."""

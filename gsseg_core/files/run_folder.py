@@ -194,6 +194,9 @@ def _finish(out: Path) -> None:
         for place in new:
             if place not in unchanged and os.path.lexists(out / place):
                 _move_aside(out / place, run_id)
+        for number, place in enumerate(new):  # To free what a file took is slow, so that is put off, too.
+            with contextlib.suppress(OSError):
+                os.link(out / place, staging / f"old-{number}")
         for place in new:
             os.replace(staging / "new" / place, out / place)
         for place in gone:

@@ -46,7 +46,7 @@ _MOST = 0.6  # agreement above which clusters are one object whatever the segmen
 _LEAST, _SLOPE = 0.2, 1.75
 _DIFFERENT = 0.1  # share of the pairs of clusters that touch of which it is sure that they are different objects
 _TOUCHING = 5  # views in which clusters touch, for that
-_FEWEST = 10  # such pairs, of which fewer tell nothing; then the level is one half
+_FEWEST, _UNTOLD = 10, 0.5  # such pairs, of which fewer tell nothing; the level then
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,14 @@ class AssociationSettings:
             )
 
 
-def associate(views: Mapping[str, Lifted], settings: AssociationSettings | None = None) -> dict[str, np.ndarray]:
+class Association(NamedTuple):
+    """Objects that the segments of some views show."""
+
+    objects: dict[str, np.ndarray]  # by view, (L,) int32: of each segment, like `Lifted.ids`; 0 is the background
+    agreement: float  # above which clusters merged
+
+
+def associate(views: Mapping[str, Lifted], settings: AssociationSettings | None = None) -> Association:
     """Find the objects that the segments of all views show.
 
     Time and memory grow with the number of pairs of segments that share a Gaussian or are neighbours of the same
@@ -93,16 +100,17 @@ def associate(views: Mapping[str, Lifted], settings: AssociationSettings | None 
 
     Returns
     -------
-    dict of str to ndarray (L,) int32
-        Object of each segment, like `Lifted.ids`: 0 for the background, others from 1, the largest first.
+    Association
+        Objects have numbers from 1 on, the largest first.
     """
     settings = settings or AssociationSettings()
     names = sorted(views)
     if not names:
-        return {}
+        return Association({}, settings.agreement or _UNTOLD)
     stack = _Stack([views[name] for name in names])
-    objects = _by_size(_move(stack, _merge(stack, settings), settings), stack)
-    return dict(zip(names, np.split(objects, stack.starts[1:-1]), strict=True))
+    clusters, agreement = _merge(stack, settings)
+    objects = _by_size(_move(stack, clusters, settings), stack)
+    return Association(dict(zip(names, np.split(objects, stack.starts[1:-1]), strict=True)), agreement)
 
 
 class _Stack:
@@ -131,8 +139,11 @@ class _Stack:
         return (stacked @ stacked.T).tocsr(), (stacked @ sparse.vstack(seen, format="csr").T).toarray()
 
 
-def _merge(stack: _Stack, settings: AssociationSettings) -> np.ndarray:
-    """Cluster the segments; all of the background are cluster 0, the others are numbered from 1."""
+def _merge(stack: _Stack, settings: AssociationSettings) -> tuple[np.ndarray, float]:
+    """Cluster the segments, and say down to which agreement.
+
+    All of the background are cluster 0, the others are numbered from 1.
+    """
     overlap, seen = stack.overlaps()
     nodes = np.flatnonzero(~stack.background)
     touching = _same_view(overlap, stack.view)[nodes][:, nodes]
@@ -159,7 +170,7 @@ def _merge(stack: _Stack, settings: AssociationSettings) -> np.ndarray:
         cluster = merged[cluster]
     clusters = np.zeros(len(stack.view), np.int64)
     clusters[nodes] = cluster + 1
-    return clusters
+    return clusters, level if is_told else _UNTOLD
 
 
 def _votes(
@@ -222,7 +233,7 @@ def _told_level(
     agreed = np.asarray(votes[first].multiply(votes[second]).sum(axis=1)).ravel()
     score = (agreed / (evidence + settings.doubt))[evidence > _TOUCHING]
     if len(score) < _FEWEST:
-        return 0.5
+        return _UNTOLD
     return min(_LEAST + _SLOPE * math.sqrt(np.quantile(score, _DIFFERENT)), _MOST)
 
 

@@ -70,7 +70,7 @@ class ObjectTable:
         self.views: dict[str, View] = {}
         self._lifted: dict[str, Lifted] = {}
         self._objects: dict[str, np.ndarray] = {}
-        self._largest = 0
+        self._largest, self._agreement = 0, self.settings.agreement
         self._forgotten = Profiles.empty(len(scene))
         self._profiles = Profiles.empty(len(scene))
 
@@ -172,7 +172,7 @@ class ObjectTable:
         Objects that have a number keep it, by the largest overlap; new ones follow, the largest first.
         """
         progress("associate", 0, 1)
-        solved = associate(self._lifted, self.settings)
+        solved, self._agreement = associate(self._lifted, self.settings)
         before, successors = self._objects, np.arange(self._largest + 1)
         if before:
             solved, successors = self._renumbered(solved)
@@ -218,6 +218,7 @@ class ObjectTable:
         alignments = {name: asdict(self.alignment(name)) for name in sorted(self._objects)}
         return {
             "objects": self.num_objects,
+            "granularity": self._agreement,
             "segments": sum(len(lifted) for lifted in self._lifted.values()),
             "merged": sum(alignment["merged"] for alignment in alignments.values()),
             "split": sum(alignment["split"] for alignment in alignments.values()),
@@ -276,10 +277,15 @@ def object_name(number: int) -> str:
 
 
 def find_objects(
-    scene: GaussianScene, views: Sequence[View], *, device: str = "cpu", progress: Progress = silent
+    scene: GaussianScene,
+    views: Sequence[View],
+    settings: AssociationSettings | None = None,
+    *,
+    device: str = "cpu",
+    progress: Progress = silent,
 ) -> ObjectTable:
     """Find the objects of all views whose masks can be used."""
-    table = ObjectTable(scene, device=device)
+    table = ObjectTable(scene, settings, device=device)
     for done, view in enumerate(views):
         progress("lift", done, len(views))
         table.add(view)

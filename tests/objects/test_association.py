@@ -84,9 +84,9 @@ def test_shuffled_ids_give_the_objects_that_true_ids_give() -> None:
 def test_what_is_found_does_not_depend_on_the_order_of_the_views() -> None:
     views = [shuffled(in_halves(view, 1 + i % 3)) for i, view in enumerate(VIEWS)]
     lifted = {v.name: Lifted.of(make_operator(SCENE, v.camera).observe(v.read_labels())) for v in views}
-    expected = associate(lifted)
+    expected = associate(lifted).objects
     for order in (list(lifted)[::-1], list(np.random.default_rng(0).permutation(list(lifted)))):
-        found = associate({str(name): lifted[str(name)] for name in order})
+        found = associate({str(name): lifted[str(name)] for name in order}).objects
         for name, objects in expected.items():
             np.testing.assert_array_equal(found[name], objects)
 
@@ -178,7 +178,7 @@ def row_of_objects(rng: np.random.Generator, split: float, merged: float) -> Lif
 def test_views_tell_how_often_they_merge_neighbours_and_so_the_objects_are_whole(split: float, merged: float) -> None:
     rng = np.random.default_rng(0)
     views = {f"v{i:02}": row_of_objects(rng, split, merged) for i in range(40)}
-    objects = associate(views)
+    objects = associate(views).objects
     votes = sum(
         sparse.csr_matrix((np.ones(len(ids)), (ids, np.arange(len(ids)))), shape=(400, len(ids))) @ views[name].weights
         for name, ids in objects.items()
@@ -189,7 +189,7 @@ def test_views_tell_how_often_they_merge_neighbours_and_so_the_objects_are_whole
 
 
 def test_no_view_one_view_and_views_without_evidence_are_no_special_case() -> None:
-    assert associate({}) == {} and find_objects(SCENE, []).class_names == {0: "background"}
+    assert associate({}).objects == {} and find_objects(SCENE, []).class_names == {0: "background"}
     one = find_objects(SCENE, [shuffled(VIEWS[0])])
     assert one.num_objects == 3 and agreement(one, VIEWS[:1]) == 1.0
     table = ObjectTable(SCENE)
@@ -375,6 +375,7 @@ def test_the_command_finds_the_objects_and_reports_what_the_ids_meant(tmp_path: 
     report = json.loads((tmp_path / "out/report.json").read_text())
     assert report["ids"]["objects"] == 3 and report["ids"]["split"] == report["ids"]["merged"] == 0
     assert len(report["ids"]["views"]) == 6 and report["settings"]["ids"] == "per-view"
+    assert report["ids"]["granularity"] == 0.5 and report["settings"]["granularity"] is None
     names = sorted(path.name for path in (tmp_path / "out/classes").iterdir())
     assert names == ["0_background.ply", "1_object_001.ply", "2_object_002.ply", "3_object_003.ply"]
     npz = f"{tmp_path}/out/segmentation.npz"
@@ -409,11 +410,11 @@ def test_views_of_a_corner_of_something_large_say_that_what_is_beside_it_is_anot
 
     views = {"afar": lifted([[9e4] * 9 + [150.0]])}
     views |= {f"close {i}": lifted([[0.0] * 8 + [3e3, 0.0], [0.0] * 9 + [300.0]]) for i in range(5)}
-    objects = associate(views)
+    objects = associate(views).objects
     large, small = objects["close 0"]
     assert large != small and objects["afar"].tolist() == [large]
     assert all(objects[name].tolist() == [large, small] for name in views if name != "afar")
-    one = associate(views, AssociationSettings(plenty=np.inf))
+    one = associate(views, AssociationSettings(plenty=np.inf)).objects
     assert len(set(np.concatenate(list(one.values())).tolist())) == 1
 
 
