@@ -17,7 +17,8 @@ cluster are those of the cluster.
    segments together.
 3. **The views tell where to stop.** Segmenters split objects far more often than they merge two, but how often they
    merge differs. It shows in the clusters that most views hold together: of those that touch, the least agreed pairs
-   are different objects, so their agreement is how often neighbours are merged. Merging goes on to a level above it.
+   are different objects, so their agreement is how often neighbours are merged. Merging goes on to a level above it; to
+   one half where hardly a pair is in doubt, since there objects are whole, and small ones must not go to large ones.
 4. **Segments move** to the object that explains them best by what the other views say, until none does. That gives
    leftovers, one half of something, say, to the whole, and clutter to the background; objects left without a segment
    are gone.
@@ -42,11 +43,13 @@ from gsseg_core.objects.lifted_segments import Lifted, Profiles, sums
 _PAIRS = 1 << 15  # so many pairs at a time, to keep memory small
 _BEST = 0.75  # pairs that agree nearly as well as the best one merge at once, before anything is compared anew
 _MOST = 0.6  # agreement above which clusters are one object whatever the segmenter does
-# The level is _LEAST + _SLOPE sqrt(how often views merge neighbours), at most _MOST; both were fitted to made-up masks.
+_WHOLE = 0.5  # the level where segmenters hardly ever split an object, or too little is known
+# Where they do, it is _LEAST + _SLOPE sqrt(how often views merge neighbours), at most _MOST; fitted to made-up masks.
 _LEAST, _SLOPE = 0.2, 1.75
+_SPLIT, _OFTEN = 0.3, 0.15  # agreement of two parts of one object, at least; share of such pairs that means often
 _DIFFERENT = 0.1  # share of the pairs of clusters that touch of which it is sure that they are different objects
 _TOUCHING = 5  # views in which clusters touch, for that
-_FEWEST, _UNTOLD = 10, 0.5  # such pairs, of which fewer tell nothing; the level then
+_FEWEST = 10  # such pairs, of which fewer tell nothing
 
 
 @dataclass(frozen=True)
@@ -106,7 +109,7 @@ def associate(views: Mapping[str, Lifted], settings: AssociationSettings | None 
     settings = settings or AssociationSettings()
     names = sorted(views)
     if not names:
-        return Association({}, settings.agreement or _UNTOLD)
+        return Association({}, settings.agreement or _WHOLE)
     stack = _Stack([views[name] for name in names])
     clusters, agreement = _merge(stack, settings)
     objects = _by_size(_move(stack, clusters, settings), stack)
@@ -170,7 +173,7 @@ def _merge(stack: _Stack, settings: AssociationSettings) -> tuple[np.ndarray, fl
         cluster = merged[cluster]
     clusters = np.zeros(len(stack.view), np.int64)
     clusters[nodes] = cluster + 1
-    return clusters, level if is_told else _UNTOLD
+    return clusters, level if is_told else _WHOLE
 
 
 def _votes(
@@ -233,8 +236,9 @@ def _told_level(
     agreed = np.asarray(votes[first].multiply(votes[second]).sum(axis=1)).ravel()
     score = (agreed / (evidence + settings.doubt))[evidence > _TOUCHING]
     if len(score) < _FEWEST:
-        return _UNTOLD
-    return min(_LEAST + _SLOPE * math.sqrt(np.quantile(score, _DIFFERENT)), _MOST)
+        return _WHOLE
+    told = min(_LEAST + _SLOPE * math.sqrt(np.quantile(score, _DIFFERENT)), _MOST)
+    return _WHOLE + (told - _WHOLE) * min(float(np.mean(score > _SPLIT)) / _OFTEN, 1)
 
 
 def _match(pairs: _Pairs, num: int, least: float) -> np.ndarray | None:
