@@ -169,61 +169,6 @@ class ViewOperator(ABC):
     def footprints(self) -> np.ndarray:
         """Sum of the alphas of each of `ids` over an endless image, opacity * 2 pi sqrt(|S|): (M,), in px."""
 
-    def reasons_to_go(
-        self, labels: np.ndarray, depths: np.ndarray, shown: np.ndarray, hidden_from: np.ndarray
-    ) -> np.ndarray:
-        """Weigh what speaks against each Gaussian in its object, were the object alone in the view.
-
-        Parameters
-        ----------
-        labels : (M,) int32
-            Object of each of `ids`; 0 and below are none.
-        depths : (M,) float32
-            Depth of each Gaussian, in scene units.
-        shown : (H, W) int32
-            Object that the view shows in each pixel, negative where unknown.
-        hidden_from : (H, W) float32
-            Depth from which on the pixel hides a Gaussian.
-
-        Returns
-        -------
-        (M,) float64
-            Sum of alpha, in px, over the pixels that show another object and do not hide the Gaussian.
-
-        Raises
-        ------
-        SettingsError
-            The rasteriser cannot tell; the one of the CPU can.
-        """
-        raise SettingsError(f"view '{self.camera.name}': silhouettes are weighed on the device cpu only")
-
-    def reasons_to_stay(
-        self, labels: np.ndarray, kept: np.ndarray, asked: np.ndarray, shown: np.ndarray
-    ) -> np.ndarray:  # fmt: skip
-        """Weigh what speaks for each Gaussian in its object k, were the object alone in the view.
-
-        Parameters
-        ----------
-        labels, shown
-            As `reasons_to_go` takes them.
-        kept : (M,)
-            Share of each Gaussian that its object keeps, by which its alphas are multiplied.
-        asked : (M,) bool
-            Whose reasons are wanted; those of all others are 0.
-
-        Returns
-        -------
-        (M,) float64
-            Sum of alpha T_k / (1 - T_k), in px, over the pixels that show the Gaussian's own object, whose
-            transmittance is T_k; as good as 0 where the object lets no light through.
-
-        Raises
-        ------
-        SettingsError
-            The rasteriser cannot tell; the one of the CPU can.
-        """
-        raise SettingsError(f"view '{self.camera.name}': silhouettes are weighed on the device cpu only")
-
     def weights(self, row: int | None = None, column: int | None = None) -> Weights:
         """List W, or only the row of W of one pixel: which Gaussians made it, and how much.
 

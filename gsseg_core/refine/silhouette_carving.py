@@ -20,13 +20,13 @@ Gaussian is all there is, it stays although it sticks out. One that never sticks
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 
 from gsseg_core.errors import MaskSizeError
-from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.cpu.tile_operator import TileOperator
 from gsseg_core.raster.depth import BEHIND, depths, surface
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.camera import Camera
@@ -35,6 +35,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 STEPS = 5  # steps of the shares: the labels hardly change after these
 KEPT = 0.5  # least share with which a Gaussian stays with its object, of the largest share in that object
 _LEAST = np.float32(0.01)  # of a share, so that a Gaussian may come back
+_MEMORY = 2 << 30  # bytes of projected views that are kept between the steps; others are projected anew
 
 
 class Silhouette(NamedTuple):
@@ -86,22 +87,36 @@ def kept_shares(
         How often to go through them, at least 1.
     """
     labels = np.ascontiguousarray(labels, np.int32)
-    views = []
-    for shown in silhouettes:
-        operator = make_operator(scene, shown.camera)  # on the CPU, which alone tells the terms of a silhouette
-        views.append((shown, operator, depths(scene, shown.camera)[operator.ids]))
+    views = _Projected(scene, list(silhouettes))
     go, kept = np.zeros(len(scene)), np.ones(len(scene))
-    for shown, operator, depth in views:
-        behind = shown.depth * np.float32(BEHIND)
-        go[operator.ids] += operator.reasons_to_go(labels[operator.ids], depth, shown.labels, behind)
+    for shown, operator in views:
+        ids, behind = operator.ids, shown.depth * np.float32(BEHIND)
+        go[ids] += operator.reasons_to_go(labels[ids], depths(scene, shown.camera)[ids], shown.labels, behind)
     asked = go > 0
     for _ in range(steps):
         stay = np.zeros(len(scene))
-        for shown, operator, _ in views:
+        for shown, operator in views:
             ids = operator.ids
             stay[ids] += operator.reasons_to_stay(labels[ids], kept[ids], asked[ids], shown.labels)
         kept = np.where(asked, np.clip(kept * stay / np.maximum(go, 1e-30), _LEAST, 1.0), kept)
     return KeptShares(kept, np.where(asked, stay, 0), go)
+
+
+class _Projected:
+    """Views with their operators, of which those that do not fit into memory are made again each time."""
+
+    def __init__(self, scene: GaussianScene, shown: list[Silhouette]) -> None:
+        self._scene, self._shown = scene, shown
+        self._kept: dict[int, TileOperator] = {}
+
+    def __iter__(self) -> Iterator[tuple[Silhouette, TileOperator]]:
+        for number, shown in enumerate(self._shown):
+            operator = self._kept.get(number)
+            if operator is None:  # on the CPU, which alone tells the reasons
+                operator = TileOperator(self._scene, shown.camera)
+                if operator.nbytes + sum(kept.nbytes for kept in self._kept.values()) <= _MEMORY:
+                    self._kept[number] = operator
+            yield shown, operator
 
 
 def carve(scene: GaussianScene, labels: np.ndarray, silhouettes: Iterable[Silhouette]) -> np.ndarray:

@@ -20,6 +20,7 @@ from small_scenes import (
     balls_on_a_table,
     clean_views,
     look_at,
+    many_classes,
     ring,
     true_labels,
     write_dataset,
@@ -34,8 +35,9 @@ from gsseg_core.export.class_plys import export_classes
 from gsseg_core.objects.removal import without_objects
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.depth import BEHIND, depths, surface
+from gsseg_core.refine import silhouette_carving
 from gsseg_core.refine.settings import UNREFINED, RefineSettings
-from gsseg_core.refine.silhouette_carving import Silhouette, carve, kept_shares
+from gsseg_core.refine.silhouette_carving import Silhouette, carve, kept_shares, sticking_out
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
@@ -127,6 +129,23 @@ def test_who_knows_the_truth_chooses_at_least_as_well_as_who_carves() -> None:
     carved_away = scores(np.where(carve(scene, labels, silhouettes()), REMOVED, labels)).visible.iou
     assert (scores(best).visible.iou[1:] > without[1:] + 0.05).all()
     assert np.nanmean(scores(best).visible.iou) > np.nanmean(carved_away) - 0.01
+
+
+def test_views_that_do_not_fit_into_memory_are_projected_anew_and_change_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene, labels, _ = with_fringe()
+    out = carve(scene, labels, silhouettes())
+    monkeypatch.setattr(silhouette_carving, "_MEMORY", 0)
+    np.testing.assert_array_equal(carve(scene, labels, silhouettes()), out)
+
+
+def test_an_object_of_one_gaussian_that_sticks_out_stays() -> None:
+    scene, truth = many_classes(9)
+    camera = look_at("above", np.array([0.1, 0.1, 3.5]), 120, 90, 125.0)
+    shown = true_labels(scene, truth, camera)
+    shares = kept_shares(scene, truth, [Silhouette.of(scene, make_operator(scene, camera), shown)])
+    assert (shares.kept[1:] < 0.5).any() and not sticking_out(shares.kept, truth).any()
 
 
 def test_background_and_what_no_view_sees_is_never_carved() -> None:

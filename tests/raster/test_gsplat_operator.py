@@ -172,15 +172,6 @@ def test_a_gaussian_whose_extent_overflows_is_left_out_and_spoils_no_pixel():
     assert np.isfinite(operator.transmittance()).all()
 
 
-def test_silhouettes_are_weighed_on_the_cpu_only():
-    operator = PLAIN.make(*random_view(0))
-    each, image = np.zeros(len(operator.ids)), np.zeros((21, 37))
-    with pytest.raises(SettingsError, match="silhouettes are weighed on the device cpu only"):
-        operator.reasons_to_go(each, each, image, image)
-    with pytest.raises(SettingsError, match="silhouettes are weighed on the device cpu only"):
-        operator.reasons_to_stay(each, each, each, image)
-
-
 # Where it cannot run
 
 

@@ -36,6 +36,11 @@ class TileOperator(ViewOperator):
         self.ids = projected.ids
         self._tiles = assign(projected, camera.width, camera.height)
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes that it holds."""
+        return int(self.ids.nbytes + sum(part.nbytes for part in self._tiles if isinstance(part, np.ndarray)))
+
     def footprints(self) -> np.ndarray:
         """Sum of the alphas of each of `ids` over an endless image, (M,)."""
         # |S| = var(x|y) S_yy, and the table has log2(e) / 2 over each of them.
@@ -47,7 +52,24 @@ class TileOperator(ViewOperator):
     def reasons_to_go(
         self, labels: np.ndarray, depths: np.ndarray, shown: np.ndarray, hidden_from: np.ndarray
     ) -> np.ndarray:
-        """Weigh what speaks against each Gaussian in its object, entry by entry."""
+        """Weigh what speaks against each Gaussian in its object, were the object alone in the view.
+
+        Parameters
+        ----------
+        labels : (M,) int32
+            Object of each of `ids`; 0 and below are none.
+        depths : (M,) float32
+            Depth of each Gaussian, in scene units.
+        shown : (H, W) int32
+            Object that the view shows in each pixel, negative where unknown.
+        hidden_from : (H, W) float32
+            Depth from which on the pixel hides a Gaussian.
+
+        Returns
+        -------
+        (M,) float64
+            Sum of alpha, in px, over the pixels that show another object and do not hide the Gaussian.
+        """
         go = np.zeros(len(self._tiles.entries), np.float32)
         silhouette_kernels.reasons_to_go(self._tiles, labels, depths, shown, hidden_from, go)
         return np.bincount(self._tiles.entries, go, len(self.ids))
@@ -55,7 +77,23 @@ class TileOperator(ViewOperator):
     def reasons_to_stay(
         self, labels: np.ndarray, kept: np.ndarray, asked: np.ndarray, shown: np.ndarray
     ) -> np.ndarray:  # fmt: skip
-        """Weigh what speaks for each Gaussian in its object, entry by entry."""
+        """Weigh what speaks for each Gaussian in its object k, were the object alone in the view.
+
+        Parameters
+        ----------
+        labels, shown
+            As `reasons_to_go` takes them.
+        kept : (M,)
+            Share of each Gaussian that its object keeps, by which its alphas are multiplied.
+        asked : (M,) bool
+            Whose reasons are wanted; those of all others are 0.
+
+        Returns
+        -------
+        (M,) float64
+            Sum of alpha T_k / (1 - T_k), in px, over the pixels that show the object, whose transmittance is T_k; as
+            good as 0 where the object lets no light through.
+        """
         stay, count = np.zeros(len(self._tiles.entries), np.float32), int(labels.max(initial=0)) + 1
         silhouette_kernels.reasons_to_stay(self._tiles, labels, count, kept.astype(np.float32), asked, shown, stay)
         return np.bincount(self._tiles.entries, stay, len(self.ids))
