@@ -26,7 +26,7 @@ MATRIX_CLASSES = 24
 PAIRS = 10
 WORST = 8
 
-_NO_CLASS = ((UNOBSERVED, "seen by no mask", (128, 131, 138)), (REMOVED, "taken out of its object", (214, 64, 159)))
+_NO_CLASS = ((UNOBSERVED, "seen by no mask", (128, 131, 138)), (REMOVED, "taken out", (214, 64, 159)))
 
 Content = Mapping[str, Any]
 

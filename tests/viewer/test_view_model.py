@@ -38,7 +38,7 @@ N, K = len(SCENE), len(NAMES)
 
 
 def model(seed: int = 0) -> ViewModel:
-    """The table, of which the first Gaussians are unobserved, and some others were removed by the filter."""
+    """The table, of which the first Gaussians are unobserved, and some others taken out of their objects."""
     rng = np.random.default_rng(seed)
     probabilities = rng.dirichlet(np.ones(K), N).astype(np.float32) * 0.5
     probabilities[np.arange(N), TRUTH] += 0.5
@@ -105,6 +105,8 @@ def test_the_threshold_for_probability_goes_by_the_shown_classes_and_not_by_labe
 def test_colours_are_of_the_mode() -> None:
     shown = model()
     assert shown.mode == BY_CLASS and {tuple(c) for c in shown.colors()[TRUTH == 3].tolist()} == {shown.color(3)}
+    mixed = shown.labelling.probabilities[10:13] @ np.array([shown.color(k) for k in range(K)])
+    np.testing.assert_array_equal(shown.colors()[10:13], np.rint(mixed))  # taken out: as it is rendered
     shown.mode = TRUE_COLOURS
     assert np.array_equal(shown.colors(), np.rint(SCENE.colors() * 255))
     shown.mode = BY_CONFIDENCE
