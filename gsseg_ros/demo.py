@@ -31,7 +31,7 @@ from gsseg_core.progress import Stopwatch, progress_bars
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.text import percent, seconds_table, table
 from gsseg_ros.child_nodes import ChildNodes
-from gsseg_ros.client import NodeUnavailableError, SegmentationClient, SegmentResult, Viewpoint
+from gsseg_ros.client import Exported, NodeUnavailableError, SegmentationClient, Viewpoint
 
 T = TypeVar("T")
 
@@ -89,7 +89,7 @@ def run_demo(out: Path, nodes: ChildNodes, *, seed: int = 0, rate: float = 10.0,
     return "\n\n".join(
         [
             seconds_table(watch.seconds) + f"\nsegment, in the node: {inside} s",
-            _classes(result, overlap, scores),
+            _classes(exported, overlap, scores),
             f"{learnt.report.num_views} views with missed, swapped and frayed masks came over DDS; {learnt.num_steps} "
             f"steps of EM.\nScored on {scores['views']} others against the truth, rendered by the node: mIoU "
             f"{percent(scores['mean_iou'])}, mAcc {percent(scores['mean_accuracy'])}, boundary IoU "
@@ -157,7 +157,7 @@ def _compare(demo: DemoScene, views: Sequence[View], seen: Sequence[np.ndarray],
     save_png(path, contact_sheet([colors[np.maximum(labels, 0)] for labels in images], captions, len(views)))
 
 
-def _classes(result: SegmentResult, overlap: Sequence[float], scores: dict[str, Any]) -> str:
+def _classes(exported: Exported, overlap: Sequence[float], scores: dict[str, Any]) -> str:
     images = {entry["id"]: entry["iou"] for entry in scores["classes"]}
     rows = [
         [
@@ -167,7 +167,7 @@ def _classes(result: SegmentResult, overlap: Sequence[float], scores: dict[str, 
             percent(overlap[summary.class_id]),
             percent(images.get(summary.class_id)),
         ]
-        for summary in result.report.classes
+        for summary in exported.report.classes
     ]
     return table(["class", "Gaussians", "confidence", "IoU of Gaussians", "IoU in test views"], rows)
 
