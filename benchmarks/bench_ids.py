@@ -28,11 +28,11 @@ import numpy as np
 from matching import Contingency, renamed
 from results import markdown, points
 from scipy import sparse
-from scipy.optimize import linear_sum_assignment
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.learn.em.em_learner import EMLearner
@@ -120,38 +120,25 @@ def parts(data: Path) -> str:
     for folder in sorted(path.parent for path in data.glob("*/labels_parts")):
         scene, truth = GaussianScene.load(folder / "scene.ply"), Dataset(folder)
         views = [replace(view, class_names=None) for view in Dataset(folder, "labels_parts").views("train")]
-        start = time.perf_counter()
-        table = find_objects(scene, views)
-        middle = time.perf_counter()
-        learner = EMLearner(scene, table.num_objects + 1)
-        learner.observe_all([table.relabelled(view) for view in views])
-        learner.fit()
-        end = time.perf_counter()
-        result = Segmentation.from_codes(scene, learner.codes_, {})
-        pairs = [
-            (view.read_labels().ravel(), result.render(make_operator(scene, view.camera)).labels.ravel())
-            for view in truth.views("test")
-        ]
-        ious, found = object_ious(*map(np.concatenate, zip(*pairs, strict=True)))
+        tests = truth.views("test")
+        found, seconds = learnt(scene, views, True, tests)
+        ious, objects = object_ious(labels_of(tests), found)
         lines.append([
-            folder.name, str(len(ious)), str(found), points(float(ious.mean())), points(float(ious.min())),
-            f"{middle - start:.1f}", f"{end - middle:.1f}",
+            folder.name, str(len(ious)), str(objects), points(float(ious.mean())), points(float(ious.min())), *seconds,
         ])  # fmt: skip
         print(*lines[-1], sep=", ", flush=True)
     return markdown(["scene", "objects", "found", "IoU one-to-one", "least", "find, s", "learn, s"], lines)
 
 
-def object_ious(truth: np.ndarray, found: np.ndarray) -> tuple[np.ndarray, int]:
+def object_ious(truth: Masks, found: Masks) -> tuple[np.ndarray, int]:
     """IoU of each true object with its match, best matching of all; and how many found ones show objects at all."""
-    known = truth >= 0
-    counts = np.zeros((int(truth.max()) + 1, int(found.max()) + 1))
-    np.add.at(counts, (truth[known], found[known]), 1)
-    iou = counts / np.maximum(counts.sum(1, keepdims=True) + counts.sum(0) - counts, 1)
-    matched = np.zeros(len(counts))
-    rows, columns = linear_sum_assignment(-iou)
-    matched[rows] = iou[rows, columns]
-    shown = (counts.sum(0) > SHOWN) & (counts.argmax(axis=0) > 0)
-    return matched[1:][counts[1:].any(axis=1)], int(shown.sum())
+    score = Contingency()
+    for name, labels in truth.items():
+        score.add(labels, found[name])
+    size = np.bincount(np.concatenate([labels[truth[name] != UNKNOWN] for name, labels in found.items()]))
+    shown = [k for k, true in score.many_to_one().items() if true > 0 and size[k] > SHOWN]
+    ious = evaluated(truth, found, score.one_to_one()).iou[1:]
+    return ious[~np.isnan(ious)], len(shown)
 
 
 def cases(true: Masks, wrong: Masks | None, truth: Masks, name: str = "true") -> list[Case]:
@@ -174,17 +161,7 @@ def measure(scene: GaussianScene, data: Dataset, rows: list[Case]) -> str:
     for case in rows:
         views = [view for view in data.views("train") if view.name in case.labels]
         views = [View.from_arrays(view.camera, case.labels[view.name]) for view in views]
-        start = time.perf_counter()
-        if case.find:
-            table = find_objects(scene, views)
-            views = [table.relabelled(view) for view in views]
-        middle = time.perf_counter()
-        learner = EMLearner(scene, max(int(view.read_labels().max()) for view in views) + 1)
-        learner.observe_all(views)
-        learner.fit()
-        end = time.perf_counter()
-        result = Segmentation.from_codes(scene, learner.codes_, {})
-        found = {view.name: result.render(make_operator(scene, view.camera)).labels for view in data.views("test")}
+        found, seconds = learnt(scene, views, case.find, data.views("test"))
         score = Contingency()
         for name, labels in case.truth.items():
             score.add(labels, found[name])
@@ -194,18 +171,39 @@ def measure(scene: GaussianScene, data: Dataset, rows: list[Case]) -> str:
             case.masks, case.ids, str(shown), str(true), f"{score.ari:.4f}",
             points(mean_iou(case.truth, found, score.one_to_one())),
             points(mean_iou(case.truth, found, score.many_to_one())),
-            f"{middle - start:.1f}" if case.find else "", f"{end - middle:.1f}",
+            *seconds,
         ])  # fmt: skip
         print(*lines[-1], sep=", ", flush=True)
     return markdown(COLUMNS, lines)
 
 
+def learnt(scene: GaussianScene, views: list[View], find: bool, tests: list[View]) -> tuple[Masks, list[str]]:
+    """Find objects if asked to, and learn them; return label maps of other views, and the seconds of both."""
+    start = time.perf_counter()
+    if find:
+        table = find_objects(scene, views)
+        views = [table.relabelled(view) for view in views]
+    middle = time.perf_counter()
+    learner = EMLearner(scene, max(int(view.read_labels().max()) for view in views) + 1)
+    learner.observe_all(views)
+    learner.fit()
+    end = time.perf_counter()
+    result = Segmentation.from_codes(scene, learner.codes_, {})
+    found = {view.name: result.render(make_operator(scene, view.camera)).labels for view in tests}
+    return found, [f"{middle - start:.1f}" if find else "", f"{end - middle:.1f}"]
+
+
 def mean_iou(truth: Masks, found: Masks, names: dict[int, int]) -> float:
     """Mean IoU over the true ids of the test views, with found ids given true ones."""
+    return float(evaluated(truth, found, names).mean_iou)
+
+
+def evaluated(truth: Masks, found: Masks, names: dict[int, int]) -> Evaluation:
+    """Compare found ids, given true ones, with the truth."""
     evaluation = Evaluation()
     for name, labels in truth.items():
         evaluation.add(labels, renamed(found[name], names), name)
-    return float(evaluation.mean_iou)
+    return evaluation
 
 
 def labels_of(views: list[View]) -> Masks:

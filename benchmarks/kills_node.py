@@ -19,6 +19,7 @@ from small_scenes import balls_on_a_table, clean_views
 from whole_outputs import Fault, faults_of, hash_of, leftovers, listing, read_folder
 
 from gsseg_core.data.view import View
+from gsseg_core.errors import GssegError
 from gsseg_core.segmentation import Segmentation
 
 TURNED = (0, 2, 3, 1)
@@ -150,8 +151,10 @@ class NodeExporting(NodeVictim):
         return super().faults() + faults_of(self.root / "out", self._runs)
 
     def faults_after(self) -> list[Fault]:
-        # As whoever uses it reads it.
-        Segmentation.load(self.root / "out/segmentation.npz", self.scene)
+        try:  # As whoever uses it reads it.
+            Segmentation.load(self.root / "out/segmentation.npz", self.scene)
+        except GssegError as error:
+            return [*self.faults(), ("refused", str(error))]
         return self.faults()
 
     def leftovers(self) -> list[Fault]:

@@ -3,8 +3,8 @@
 Usage: python benchmarks/objects.py [--held-out] [--data FOLDER] [--out docs/clean_objects.md]
 
 FOLDER holds the scenes (default: the environment variable GSSEG_DATA, else ../shared/data); those that are absent are
-left out. `--held-out` scores every seventh train view, held out from learning, in place of the test
-views, and writes to `results_out/`: so settings were chosen. Pictures of the real scene go to `results_out/` too.
+left out. `--held-out` scores every seventh train view, held out from learning, in place of the test views, and writes
+to `results_out/`: so settings were chosen. Pictures of the real scenes go to `results_out/` too.
 """
 
 from __future__ import annotations

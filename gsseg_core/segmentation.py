@@ -185,16 +185,19 @@ class Segmentation:
         return LabelMap(self.class_ids[image.argmax(axis=2)], tempered(image, self.temperature).max(axis=2))
 
     def carved(
-        self, scene: GaussianScene, cameras: Sequence[Camera], device: str = "cpu", num_views: int | None = None
+        self,
+        scene: GaussianScene,
+        cameras: Sequence[Camera],
+        device: str = "cpu",
+        num_views: int = RefineSettings.carve_views,
     ) -> Segmentation:
         """Take out of each object what sticks out of its silhouettes in some views; these Gaussians become `REMOVED`.
 
         What the views show are the label maps that the segmentation itself renders, not the masks: they are learnt from
         all masks together, so that errors of single masks carve nothing away. So many of the views have their say,
-        spread evenly; `RefineSettings.carve_views` by default.
+        spread evenly.
         """
-        chosen = spread(cameras, num_views or RefineSettings.carve_views)
-        operators = (make_operator(scene, camera, device) for camera in chosen)
+        operators = (make_operator(scene, camera, device) for camera in spread(cameras, num_views))
         silhouettes = [Silhouette.of(scene, operator, self.render(operator).labels) for operator in operators]
         return self._without(carve(scene, self.labels, silhouettes))
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,8 @@ from gsseg_core.errors import MaskFormatError, SettingsError, UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.npz_files import Header
 from gsseg_core.scene.camera import Camera
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +234,7 @@ class View:
             raise UnknownLabelError(f"{source}: mask holds the labels {str(unknown)[1:-1][:60]}; expected {expected}")
 
 
-def spread(views: Sequence[Any], count: int | None) -> list[Any]:
+def spread(views: Sequence[T], count: int | None) -> list[T]:
     """Choose some views, or cameras, spread evenly over all of them; all if there are no more, or `count` is None.
 
     Raises

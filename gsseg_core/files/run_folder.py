@@ -184,7 +184,7 @@ def _finish(out: Path) -> None:
         # Others were moved already, or are of another kind.
         new = sorted(place for place in places if os.path.lexists(staging / "new" / place))
         gone = before.keys() - places
-        for folder in {folder for place in new for folder in reversed(Path(place).parents[:-1])}:
+        for folder in sorted({folder for place in new for folder in Path(place).parents[:-1]}):  # the outermost first
             if os.path.lexists(out / folder) and not _is_folder(out / folder):
                 _move_aside(out / folder, run_id)
         for place in new:

@@ -156,24 +156,28 @@ def _merge(stack: _Stack, settings: AssociationSettings) -> tuple[np.ndarray, fl
     overlap.data[stack.background[overlap.indices]] = 0
     overlap.eliminate_zeros()
     overlap, seen, hidden = overlap[nodes], seen[nodes], hidden[nodes]
-    level, is_told = (_MOST, False) if settings.agreement is None else (settings.agreement, True)
+    agreement = settings.agreement
     while len(seen) > 1:
         votes, counts = _votes(overlap, seen, hidden, stack.view, settings)
-        pairs = _agreements(votes, counts, settings)
-        target = _match(pairs, len(seen), level)
-        if target is None and is_told:
+        target = _match(_agreements(votes, counts, settings), len(seen), _MOST if agreement is None else agreement)
+        if target is None and agreement is not None:
             break
         if target is None:
-            level, is_told = _told_level(votes, counts, touching, settings), True
+            groups = _grouping(cluster)
+            agreement = _told_level(votes, counts, groups @ touching @ groups.T, settings)
             continue
         merged = np.unique(target, return_inverse=True)[1]
-        groups = sparse.csr_matrix((np.ones(len(merged), np.float32), (merged, np.arange(len(merged)))))
+        groups = _grouping(merged)
         overlap, seen, hidden = (groups @ overlap).tocsr(), groups @ seen, groups @ hidden
-        touching = groups @ touching @ groups.T
         cluster = merged[cluster]
     clusters = np.zeros(len(stack.view), np.int64)
     clusters[nodes] = cluster + 1
-    return clusters, level if is_told else _WHOLE
+    return clusters, _WHOLE if agreement is None else agreement
+
+
+def _grouping(cluster: np.ndarray) -> sparse.csr_matrix:  # (n,)
+    """Matrix (C, n) of ones that adds up the rows of each cluster."""
+    return sparse.csr_matrix((np.ones(len(cluster), np.float32), (cluster, np.arange(len(cluster)))))
 
 
 def _votes(

@@ -188,10 +188,11 @@ class ViewModel:
         if self.mode == BY_RELIABILITY:
             nothing = np.full(len(self.scene), np.nan, np.float32)
             return ramp(nothing if self.reliability is None else self.reliability)
-        by_class: np.ndarray = self._palette[self.labelling.labels]
+        colors = self._palette
+        by_class: np.ndarray = colors[self.labelling.labels]
         # What refinement took out lies across an edge: in one colour it would be a stain on what it covers.
         out, probabilities = self.labelling.labels == REMOVED, self.labelling.probabilities
-        by_class[out] = np.rint(probabilities[out] @ self._palette[: probabilities.shape[1]])
+        by_class[out] = np.rint(probabilities[out] @ colors[: probabilities.shape[1]])
         return by_class
 
     @property

@@ -23,8 +23,6 @@ from gsseg_ros.frames import Similarity
 from gsseg_ros.node.workspace import Run
 from gsseg_ros.object_messages import object_message, point_message
 
-"""Settings without any refinement."""
-
 
 @dataclass(frozen=True, eq=False)
 class Selection:

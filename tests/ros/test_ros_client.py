@@ -162,7 +162,8 @@ def test_views_are_awaited_and_counted_and_forgotten(place: Place) -> None:
     assert replay.wait() == 0
     assert place.client.segment().report.learner == "votes"
     assert place.client.reset() == 4
-    says_in_the_end(lambda: place.client.wait_for_views(1, timeout=1.5), "has fused 0 of 1 views after 1.5 s; it says")
+    said = "has fused 0 of 1 views after 1.5 s; it says: "
+    says_in_the_end(lambda: place.client.wait_for_views(1, timeout=1.5), said)
 
 
 def test_an_error_of_the_node_has_code_name_and_message(place: Place) -> None:

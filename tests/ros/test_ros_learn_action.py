@@ -119,8 +119,7 @@ def test_the_learner_is_em_unless_another_one_is_asked_for(robot: Robot, scene: 
 def test_the_result_reports_the_learnt_codes_before_refinement(robot: Robot, scene: GaussianScene) -> None:
     report = robot.learn()[1].report
     fitted = taught(make_learner("em", scene, len(CLASSES)), wrong_views()).fit()
-    raw = UNREFINED
-    wanted = Segmentation.from_codes(scene, fitted.codes_, dict(enumerate(CLASSES)), raw)
+    wanted = Segmentation.from_codes(scene, fitted.codes_, dict(enumerate(CLASSES)), UNREFINED)
     assert [summary.num_gaussians for summary in report.classes] == wanted.counts().tolist()
     assert [summary.name for summary in report.classes] == CLASSES
     assert (report.k, report.filtered, report.num_removed) == (0, False, 0)

@@ -31,7 +31,8 @@ def reasons_to_go(
         fresh, lines = np.empty((TILE, TILE), np.float32), np.empty((2, TILE), np.float32)
         left, top, inside = open_rays(tiles, tile, fresh)
         seen, limit = np.full((TILE, TILE), _UNKNOWN, np.int32), np.zeros((TILE, TILE), np.float32)
-        _cut(shown, hidden_from, *corner_of(tiles, tile), seen, limit)
+        _cut(shown, *corner_of(tiles, tile), seen)
+        _cut(hidden_from, *corner_of(tiles, tile), limit)
         only, farthest = np.empty(TILE, np.int32), np.empty(TILE, np.float32)
         tile_only, tile_farthest = _summed_up(seen, limit, only, farthest)
         if tile_only == _UNKNOWN:
@@ -66,7 +67,7 @@ def reasons_to_stay(
     stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
         tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
-        # Only objects that the tile shows, and of which somebody is asked for.
+        # Only objects of which somebody is asked for.
         slots, count = np.full(num_labels, -1, np.int64), 0
         for e in range(start[tile], start[tile + 1]):
             label = labels[entries[e]]
@@ -77,9 +78,10 @@ def reasons_to_stay(
             continue
         fresh, lines = np.empty((TILE, TILE), np.float32), np.empty((2, TILE), np.float32)
         left, top, inside = open_rays(tiles, tile, fresh)
-        shows = _blocks_of(shown, *corner_of(tiles, tile), slots, count)
+        seen = np.full((TILE, TILE), _UNKNOWN, np.int32)
+        _cut(shown, *corner_of(tiles, tile), seen)
         through = np.ones((count * TILE, TILE), np.float32)  # T_k, block by block
-        live = shows.copy()  # blocks in which the object does not cover all yet
+        live = _blocks_of(seen, slots, count)  # those that show the object, until it covers all in them
         for e in range(start[tile], start[tile + 1]):
             g = entries[e]
             slot = slots[labels[g]] if labels[g] > 0 else -1
@@ -96,7 +98,7 @@ def reasons_to_stay(
                 if sum_row(after) < T_MIN:
                     live[slot] &= ~(1 << b)
         need = np.zeros_like(through)
-        _weigh(shown, *corner_of(tiles, tile), slots, through, need)
+        _weigh(seen, slots, through, need)
         for e in range(start[tile], start[tile + 1]):
             g = entries[e]
             if asked[g] and labels[g] > 0 and live[slots[labels[g]]]:
@@ -110,13 +112,11 @@ def reasons_to_stay(
 
 
 @nb.njit
-def _cut(
-    shown: np.ndarray, hidden_from: np.ndarray, left: int, top: int,  # (H, W), (H, W)
-    seen: np.ndarray, limit: np.ndarray,  # (16, 16) out, each: by block, what lies outside of the image as it was
-) -> None:  # fmt: skip
-    for r in range(min(TILE, shown.shape[0] - top)):
-        for c in range(min(TILE, shown.shape[1] - left)):
-            seen[in_block(r, c)], limit[in_block(r, c)] = shown[top + r, left + c], hidden_from[top + r, left + c]
+def _cut(image: np.ndarray, left: int, top: int, out: np.ndarray) -> None:  # (H, W); (16, 16)
+    """One tile of an image, by block; what lies outside of the image stays as it was."""
+    for r in range(min(TILE, image.shape[0] - top)):
+        for c in range(min(TILE, image.shape[1] - left)):
+            out[in_block(r, c)] = image[top + r, left + c]
 
 
 @nb.njit
@@ -146,26 +146,30 @@ def _joined(known: np.int32, label: np.int32) -> np.int32:
 
 
 @nb.njit
-def _blocks_of(shown: np.ndarray, left: int, top: int, slots: np.ndarray, count: int) -> np.ndarray:
+def _slot_of(label: int, slots: np.ndarray) -> int:
+    return slots[label] if 0 < label < len(slots) else -1
+
+
+@nb.njit
+def _blocks_of(seen: np.ndarray, slots: np.ndarray, count: int) -> np.ndarray:  # (16, 16)
     """Blocks of a tile that show each label, as bits, (count,) int64."""
     blocks = np.zeros(count, np.int64)
-    for r in range(min(TILE, shown.shape[0] - top)):
-        for c in range(min(TILE, shown.shape[1] - left)):
-            label = shown[top + r, left + c]
-            if 0 < label < len(slots) and slots[label] >= 0:
-                blocks[slots[label]] |= 1 << in_block(r, c)[0]
+    for b in range(TILE):
+        for i in range(TILE):
+            slot = _slot_of(seen[b, i], slots)
+            if slot >= 0:
+                blocks[slot] |= 1 << b
     return blocks
 
 
 @nb.njit(fastmath={"contract", "nnan", "nsz"}, error_model="numpy")
 def _weigh(
-    shown: np.ndarray, left: int, top: int, slots: np.ndarray,  # (H, W)
+    seen: np.ndarray, slots: np.ndarray,  # (16, 16)
     through: np.ndarray, need: np.ndarray,  # (16 S, 16) T_k; out, T_k / (1 - T_k) where label k is shown
 ) -> None:  # fmt: skip
-    for r in range(min(TILE, shown.shape[0] - top)):
-        for c in range(min(TILE, shown.shape[1] - left)):
-            label = shown[top + r, left + c]
-            if 0 < label < len(slots) and slots[label] >= 0:
-                b, i = in_block(r, c)
-                n = slots[label] * TILE + b
+    for b in range(TILE):
+        for i in range(TILE):
+            slot = _slot_of(seen[b, i], slots)
+            if slot >= 0:
+                n = slot * TILE + b
                 need[n, i] = through[n, i] / (np.float32(1) - through[n, i] + _ROUNDING)

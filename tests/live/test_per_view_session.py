@@ -1,0 +1,127 @@
+"""A live session whose masks have ids of their own: objects are found as views arrive, and repaired."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matching import Contingency
+from per_view_ids import in_halves, shuffled, with_labels
+from small_scenes import (
+    NUM_CLASSES,
+    balls_on_a_table,
+    clean_views,
+    write_dataset,
+)
+
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.view import View
+from gsseg_core.errors import SettingsError, UnknownLabelError
+from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.learn.learner_state import Learnt
+from gsseg_core.live.per_view_session import PerViewSession
+
+SCENE, TRUTH = balls_on_a_table()
+VIEWS = clean_views(8)
+
+
+def test_a_live_session_finds_the_objects_as_views_arrive_and_repairs_them_when_it_learns() -> None:
+    session = PerViewSession(SCENE, max_views=6)
+    for view in [in_halves(VIEWS[0], 1), *VIEWS[1:]]:
+        assert session.fuse(shuffled(view)) is None
+    assert session.class_names[4] == "object_004"
+    codes = session.learn().learnt.codes
+    assert session.num_views == 6 and session.num_fused == 8
+    true = EMLearner(SCENE, NUM_CLASSES)
+    for view in VIEWS[2:]:
+        true.observe(view)
+    score = Contingency()
+    score.add(true.fit().codes_.argmax(axis=1)[:, None], codes.argmax(axis=1)[:, None])
+    assert score.ari == 1.0
+    assert (session.codes().any(axis=0)).sum() == NUM_CLASSES
+    blank = with_labels(VIEWS[0], np.full((48, 64), UNKNOWN))
+    assert session.fuse(blank).reason == "all_pixels_unknown"  # type: ignore[union-attr]
+
+
+def test_a_live_session_goes_on_with_its_objects_after_saving_and_loading(tmp_path: Path) -> None:
+    session = PerViewSession(SCENE)
+    for view in VIEWS[:5]:
+        session.fuse(shuffled(view))
+    session.save(tmp_path / "state.npz")
+    other = PerViewSession(SCENE)
+    other.load(tmp_path / "state.npz")
+    np.testing.assert_array_equal(other.codes(), session.codes())
+    for each in (session, other):
+        each.fuse(shuffled(VIEWS[5]))
+    np.testing.assert_array_equal(other.codes(), session.codes())
+    with pytest.raises(SettingsError, match="from the views received only"):
+        other.learn(dataset=Dataset(write_dataset(tmp_path / "data")))
+
+
+def test_votes_of_views_that_are_gone_follow_their_object() -> None:
+    session = PerViewSession(SCENE, max_views=5)
+    for view in [*VIEWS[:2], in_halves(VIEWS[2], 1), *VIEWS[3:]]:
+        session.fuse(shuffled(view))
+    before = session.codes().any(axis=1)
+    session.repair()
+    assert session.num_views == 5 and list(session._live.views) == [view.name for view in VIEWS[-5:]]
+    np.testing.assert_array_equal(session.codes().any(axis=1), before)
+
+
+def test_a_repair_keeps_the_calibration_of_what_was_learnt() -> None:
+    session = PerViewSession(SCENE)
+    for view in [in_halves(VIEWS[0], 1), *VIEWS[1:]]:
+        session.fuse(shuffled(view))
+    session._learnt = Learnt("em", session.codes(), 5, temperature=1.7)
+    repair = session.repair()
+    assert (repair.successors != np.arange(len(repair.successors))).any(), "something was repaired"
+    assert session.learnt is not None and (session.learnt.temperature, session.learnt.num_views) == (1.7, 5)
+
+
+def test_in_a_live_session_a_view_of_a_name_that_is_kept_takes_its_place() -> None:
+    session = PerViewSession(SCENE)
+    for view in VIEWS[:5]:
+        session.fuse(shuffled(view))
+    before, names = session.codes(), session.class_names
+    for labels, reason in ((np.full((48, 64), UNKNOWN), "all_pixels_unknown"), (None, "no_mask")):
+        view = with_labels(VIEWS[0], labels) if labels is not None else View(VIEWS[0].camera)
+        rejection = session.fuse(view)
+        assert rejection is not None and rejection.reason == reason
+        np.testing.assert_array_equal(session.codes(), before)
+    assert session.fuse(shuffled(VIEWS[0])) is None
+    assert session.num_fused == session.num_views == 5 and session.class_names == names
+    session.repair()
+    assert session.num_fused == session.num_views == 5
+    np.testing.assert_array_equal(session.codes(), before)
+
+
+def test_a_view_of_too_many_objects_is_refused_and_uses_up_no_number() -> None:
+    session = PerViewSession(SCENE, max_classes=4)
+    for view in VIEWS[:3]:
+        assert session.fuse(shuffled(view)) is None
+    before = session.codes()
+    few = PerViewSession(SCENE, max_classes=3)
+    for _ in range(2):
+        rejection = few.fuse(shuffled(VIEWS[0]))
+        assert rejection is not None and rejection.reason == "unknown_label"
+        assert "would show the first of object 3; expected at most 2, as max_classes is 3" in rejection.message
+    assert few.fuse(with_labels(VIEWS[0], np.minimum(VIEWS[0].read_labels(), 1))) is None
+    assert few.class_names == {0: "background", 1: "object_001"}
+    session.repair()
+    np.testing.assert_array_equal(session.codes(), before)
+
+
+def test_a_repair_that_finds_too_many_objects_changes_nothing() -> None:
+    session = PerViewSession(SCENE, max_classes=2)
+    merged = [with_labels(view, np.minimum(view.read_labels(), 1)) for view in VIEWS[:2]]
+    for view in [*merged, *VIEWS[2:]]:
+        assert session.fuse(view) is None, "what was one object at first, a view cannot part by itself"
+    before = session.codes()
+    with pytest.raises(UnknownLabelError, match="expected at most 1, as max_classes is 2"):
+        session.repair()
+    np.testing.assert_array_equal(session.codes(), before)
+    assert session.num_views == session.num_fused == len(VIEWS)
+    session.max_classes = 256
+    assert session.repair().changed, "which has not been done yet"
