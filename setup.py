@@ -58,12 +58,15 @@ setup(
         "distributed": ["dask>=2024.8", "distributed>=2024.8"],
         "dev": [
             "distributed>=2024.8",
+            "gaussforge>=0.6",
+            "gsply>=0.4.6",
             "hypothesis>=6.100",
             "import-linter>=2.5",
             "mkdocs-material>=9.6",
             "mkdocstrings-python>=1.16",
             "mypy>=1.15",
             "playwright>=1.45",
+            "pygltflib>=1.16",
             "pytest>=8",
             "pytest-xdist>=3.6",
             "pyyaml>=6.0",
@@ -72,9 +75,13 @@ setup(
             "scikit-image>=0.25",
             "scikit-learn>=1.5",
             "threadpoolctl>=3.1",
+            "trimesh>=4.0",
+            "usd-core>=26.3",
             "viser>=1.0",
         ],
         "docs": ["mkdocs-material>=9.6", "mkdocstrings-python>=1.16"],
+        # Scenes in other formats than PLY, .splat and GLB.
+        "formats": ["gaussforge>=0.6", "gsply>=0.4.6"],
         "examples": ["rosbags>=0.10", "scikit-image>=0.25"],
         # The view operator on CUDA. Below 1.6, since docs/gpu.md bounds what the rules of this version change. gsplat
         # imports packaging without asking for it.
@@ -86,6 +93,8 @@ setup(
             "ros-jazzy-rmw-fastrtps-cpp==8.4.3",
             "rosbags>=0.10",
         ],
+        # 26.3 is the first with a schema for Gaussians.
+        "usd": ["scikit-image>=0.25", "usd-core>=26.3"],
         "view": ["viser>=1.0"],
         "test": ["pytest"],  # colcon test runs pytest only where an extra of this name asks for it.
     },

@@ -13,7 +13,7 @@ from machine import asked_anew, drop_from_page_cache, once, timed
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View, spread
-from gsseg_core.export.class_plys import export_classes
+from gsseg_core.export.class_files import export_classes
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner import UNITS
 from gsseg_core.learn.vote_learner import VoteLearner

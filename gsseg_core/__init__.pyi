@@ -1,7 +1,7 @@
 from .data.dataset import Dataset as Dataset
 from .data.view import View as View
 from .errors import GssegError as GssegError
-from .export.class_plys import export_classes as export_classes
+from .export.class_files import export_classes as export_classes
 from .learn.em.em_learner import EMLearner as EMLearner
 from .learn.em.em_learner import EMSettings as EMSettings
 from .learn.gradient_learner import GradientLearner as GradientLearner
@@ -15,4 +15,5 @@ from .raster.view_operator import ViewOperator as ViewOperator
 from .refine.settings import RefineSettings as RefineSettings
 from .scene.camera import Camera as Camera
 from .scene.gaussian_scene import GaussianScene as GaussianScene
+from .scene.scene_writers import write_scene as write_scene
 from .segmentation import Segmentation as Segmentation

@@ -14,7 +14,8 @@ from gsseg_core.data.hints import mask_hint
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.data.view import View, spread
 from gsseg_core.errors import NoUsableViewsError
-from gsseg_core.export.class_plys import class_file_name, write_classes
+from gsseg_core.export.class_files import class_places, mesh_file_name, write_classes
+from gsseg_core.export.collision import collision_meshes
 from gsseg_core.export.pictures import save_png
 from gsseg_core.export.summary import RunReport, RunSettings
 from gsseg_core.export.view_pictures import (
@@ -41,6 +42,7 @@ from gsseg_core.report.page import write_report_page
 from gsseg_core.report.pictures import ViewImages
 from gsseg_core.report.sections import PageInputs
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.scene_writers import DEFAULT as DEFAULT_FORMAT
 from gsseg_core.segmentation import Segmentation
 
 if TYPE_CHECKING:
@@ -73,14 +75,14 @@ class Assessment:
     report: Mapping[str, Any]  # `views` in `report.json`
 
 
-def segment_places(class_names: Mapping[int, str], views: Iterable[View]) -> list[str]:
+def segment_places(class_names: Mapping[int, str], views: Iterable[View], settings: RunSettings) -> list[str]:
     """Files that `gsseg segment` writes, as far as they are known before it learns; relative to its folder."""
     pictures = ["contact_sheet.png", "legend.png", "worst_views.png"]
     pictures += [view_file_name(view.name, "overlay_") for view in views]
-    plys = [class_file_name(k, name) for k, name in class_names.items()]
+    classes = class_places(class_names, settings.scene_format, settings.collision)
     return [
         "segmentation.npz", "report.json", "report.html",
-        *(f"classes/{name}" for name in plys), *(f"pictures/{name}" for name in pictures),
+        *(f"classes/{name}" for name in classes), *(f"pictures/{name}" for name in pictures),
     ]  # fmt: skip
 
 
@@ -100,6 +102,8 @@ def segment(
     scheduler: str | None = None,
     ids: str = "global",
     granularity: float | None = None,
+    scene_format: str = DEFAULT_FORMAT,
+    collision: str | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Learn from the train views of a dataset, refine, and write everything into `out`.
@@ -132,6 +136,10 @@ def segment(
     granularity : float, optional
         Of these objects, between 0 and 1: ids of views are one object where the views agree by more than this on that;
         by default, the views tell. See docs/ids.md.
+    scene_format : str
+        Of the files in `classes/`, one of `SCENE_WRITERS`; see docs/formats.md.
+    collision : str, optional
+        Kind of meshes to collide with, one of `gsseg_core.export.collision.KINDS`, for each object; none by default.
 
     Returns
     -------
@@ -145,11 +153,11 @@ def segment(
     """
     settings = RunSettings(
         learner, labels, views, device, memory_budget, seed, scheduler, ids,
-        refine or RefineSettings(), GraphSettings() if graph else None, granularity,
+        refine or RefineSettings(), GraphSettings() if graph else None, granularity, scene_format, collision,
     )  # fmt: skip
     watch = Stopwatch()
-    with staged_run(out, "segment", places=segment_places({}, [])) as run:
-        settings.check()
+    settings.check()
+    with staged_run(out, "segment", places=segment_places({}, [], settings)) as run:
         with ExitStack() as workers:
             with watch.stage("load"):
                 client = _connect(scheduler, workers)
@@ -157,7 +165,7 @@ def segment(
             if ids == PER_VIEW:
                 with watch.stage("associate"):
                     inputs = _associate(inputs, settings, progress)
-            run.claim(segment_places(inputs.class_names, inputs.pictured))
+            run.claim(segment_places(inputs.class_names, inputs.pictured, settings))
             fitted = _learn(inputs, settings, client, watch, progress)
             assessment = _assess(fitted, inputs.class_names, watch, progress)
         probabilities, evidence = fitted.codes_, fitted.evidence()
@@ -255,14 +263,16 @@ def _write(
     named = result if inputs.class_ids is None else result.with_ids(inputs.class_ids)
     with watch.stage("export"):
         named.save(folder / "segmentation.npz", run.id)
-        plys = write_classes(scene, named, folder / "classes", run.id)
+        meshes = collision_meshes(scene, named, settings.collision) if settings.collision else {}
+        files = write_classes(scene, named, folder / "classes", run.id, settings.scene_format, meshes)
     with watch.stage("pictures"):
         images, evidence, pictures = _picture(run, inputs, assessment, result, settings.device)
     report = RunReport.of(
         scene, named, run=run.id, views=assessment.report, settings=settings.as_dict(), seconds=watch.seconds,
         objective=assessment.objective, calibration=assessment.calibration.as_dict(),
         ids=None if inputs.objects is None else inputs.objects.summary(),
-        plys={k: str(path.relative_to(folder)) for k, path in plys.items()},
+        files={k: str(path.relative_to(folder)) for k, path in files.items()},
+        meshes={k: f"classes/{mesh_file_name(k, named.class_names[k])}" for k in meshes},
         pictures=[str(path.relative_to(folder)) for path in pictures],
     )  # fmt: skip
     with watch.stage("report page"):

@@ -15,7 +15,7 @@ from gsseg_core.scene.scene_formats import SCENE_FORMATS
 REPOSITORY = Path(__file__).parents[2]
 
 API = {
-    "Files in, files out": ["GaussianScene", "Dataset", "View", "Camera", "export_classes"],
+    "Files in, files out": ["GaussianScene", "Dataset", "View", "Camera", "export_classes", "write_scene"],
     "Operator": ["make_operator", "ViewOperator"],
     "Learners": ["EMLearner", "EMSettings", "VoteLearner", "GradientLearner", "GradientSettings"],
     "Results": ["Segmentation", "RefineSettings", "Evaluation"],

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import argparse
 
-from gsseg_core.cli.shared import add_scene, load_kernels
+from gsseg_core.cli.shared import add_format, add_scene, load_kernels
 from gsseg_core.cli.terminal import tell
 from gsseg_core.learn.registry import DEFAULT, LEARNERS, distributed_learners
 from gsseg_core.progress import progress_bars
 from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.scene.scene_writers import DEFAULT as DEFAULT_FORMAT
 
 DESCRIPTION = """
 Learns from the masks of the train views which Gaussian belongs to which class, refines that by the neighbours in
-space, and writes OUT/segmentation.npz, one PLY per class, a report and pictures.
+space, and writes OUT/segmentation.npz, one PLY (or another file) per class, a report and pictures.
 """
 EXAMPLES = """
   gsseg segment scene.ply --data DATASET --out out
   gsseg segment scene.ply --data DATASET --out out --labels sam --ids per-view
   gsseg segment scene.ply --data DATASET --out out --learner votes --views 20
+  gsseg segment scene.ply --data DATASET --out out --format usd --collision
 """
 
 
@@ -41,6 +43,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--memory-budget", type=int, default=2048, metavar="MIB", help=budget)
     learners = " and ".join(distributed_learners())
     add("--scheduler", metavar="ADDRESS", help=f"learn on the workers of this Dask scheduler ({learners})")
+    add = parser.add_argument_group("files of the classes").add_argument
+    add_format(add, DEFAULT_FORMAT)
+    mesh = "a mesh of each object to collide with, as .obj and in USD: convex, or watertight (default: none, or hull)"
+    add("--collision", nargs="?", choices=("hull", "surface"), const="hull", help=mesh)
     add = parser.add_argument_group("refinement").add_argument
     k, beta = RefineSettings.k, RefineSettings.beta
     add("--k", type=int, default=k, help="neighbours in KNN and filter (default: %(default)s)")
@@ -72,7 +78,8 @@ def run(options: argparse.Namespace) -> int:
             options.scene, options.data, options.out, labels=options.labels, learner=options.learner,
             views=options.views, refine=refine, graph=not options.no_graph, device=options.device,
             memory_budget=options.memory_budget << 20, seed=options.seed, scheduler=options.scheduler,
-            ids=options.ids, granularity=options.granularity, progress=progress,
+            ids=options.ids, granularity=options.granularity, scene_format=options.format,
+            collision=options.collision, progress=progress,
         )  # fmt: skip
     from gsseg_core.text import segment_summary
 

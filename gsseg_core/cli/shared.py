@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 
 from gsseg_core.cli.terminal import note
 from gsseg_core.errors import SettingsError
 from gsseg_core.raster.backends import devices, rasteriser_of
+from gsseg_core.scene.scene_writers import SCENE_WRITERS
 
 
 def add_scene(parser: argparse.ArgumentParser) -> None:
@@ -26,6 +28,11 @@ def add_device(parser: argparse.ArgumentParser) -> None:
 def add_quiet(parser: argparse.ArgumentParser) -> None:
     """Add `--quiet`."""
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
+
+
+def add_format(add: Callable[..., object], default: str | None, otherwise: str = "%(default)s") -> None:
+    """Add `--format` by the `add_argument` of a parser or group; `otherwise` says what counts where it is left out."""
+    add("--format", choices=tuple(SCENE_WRITERS), default=default, help=f"format to write (default: {otherwise})")
 
 
 def load_kernels(quiet: bool, device: str = "cpu") -> None:

@@ -1,1 +1,1 @@
-"""A segmentation as files for others: PLY files and pictures."""
+"""A segmentation as files for others: scene files, meshes and pictures."""

@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 
 from gsseg_core.errors import SettingsError
+from gsseg_core.export.collision import check_collision
 from gsseg_core.learn.registry import check_learner
 from gsseg_core.objects.object_table import IDS, PER_VIEW
 from gsseg_core.objects.oriented_boxes import object_boxes
 from gsseg_core.refine.label_propagation import GraphSettings
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.scene_writers import DEFAULT, check_format, format_of
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 
 PACKAGES = ("gsseg", "numpy", "scipy", "numba")
@@ -29,7 +31,7 @@ class RunSettings:
 
     Attributes
     ----------
-    learner, labels, views, device, memory_budget, seed, scheduler, ids, granularity
+    learner, labels, views, device, memory_budget, seed, scheduler, ids, granularity, scene_format, collision
         As `gsseg_core.pipeline.segment` takes them.
     refine : RefineSettings
         The refinement.
@@ -50,6 +52,8 @@ class RunSettings:
     refine: RefineSettings
     graph: GraphSettings | None
     granularity: float | None = None
+    scene_format: str = DEFAULT
+    collision: str | None = None
     learner_settings: Any = None
 
     def check(self) -> None:
@@ -61,6 +65,8 @@ class RunSettings:
             raise SettingsError(f"granularity is {self.granularity}; expected a share between 0 and 1")
         if self.granularity is not None and self.ids != PER_VIEW:
             raise SettingsError("granularity is for ids that are a view's own; expected ids per-view")
+        check_format(self.scene_format)
+        check_collision(self.collision)
 
     def as_dict(self) -> dict[str, Any]:
         """Give them as `report.json` does."""
@@ -118,17 +124,21 @@ class RunReport:
         scene: GaussianScene,
         result: Segmentation,
         *,
-        plys: Mapping[int, str],
+        files: Mapping[int, str],
+        meshes: Mapping[int, str] | None = None,
         objective: Sequence[float] = (),
         pictures: Sequence[str] = (),
         **others: Any,
     ) -> RunReport:
-        """Report a segmentation of a scene; `plys` is the file of each class that has one, `others` are fields."""
+        """Report a segmentation of a scene; `others` are fields.
+
+        `files` and `meshes` are the file of each class, and of the mesh to collide with it, where there is one.
+        """
         return cls(
             scene={"path": str(scene.path), "gaussians": len(scene), "digest": scene.digest},
             objective=objective,
             gaussians=gaussian_counts(result),
-            classes=_class_table(scene, result, plys),
+            classes=_class_table(scene, result, files, meshes or {}),
             pictures=pictures,
             versions={"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
             **others,
@@ -150,7 +160,9 @@ def gaussian_counts(result: Segmentation) -> dict[str, int]:
     }
 
 
-def _class_table(scene: GaussianScene, result: Segmentation, plys: Mapping[int, str]) -> list[dict[str, Any]]:
+def _class_table(
+    scene: GaussianScene, result: Segmentation, files: Mapping[int, str], meshes: Mapping[int, str]
+) -> list[dict[str, Any]]:
     counts, boxes, labelled = result.counts(), object_boxes(scene, result), result.labels >= 0
     total = np.bincount(result.labels[labelled], result.confidence[labelled], result.num_classes)
     return [
@@ -159,8 +171,10 @@ def _class_table(scene: GaussianScene, result: Segmentation, plys: Mapping[int, 
             "name": name,
             "gaussians": int(counts[k]),
             "mean_confidence": round(float(total[k] / counts[k]), 4) if counts[k] else None,
-            "ply": plys.get(k),
+            "ply": files[k] if k in files and format_of(files[k]) == DEFAULT else None,
             "box": boxes[k].as_dict() if k in boxes else None,
+            **({"file": files[k]} if k in files and format_of(files[k]) != DEFAULT else {}),
+            **({"collision": meshes[k]} if k in meshes else {}),
         }
         for k, name in result.class_names.items()
     ]

@@ -131,7 +131,7 @@ def oriented_box(means: np.ndarray, covariances: np.ndarray, weights: np.ndarray
     points, shape, weights = (np.asarray(values[::every], np.float64) for values in (means, covariances, weights))
     if not weights.any():
         weights = np.ones(len(points))
-    kept = _without_floaters(points, weights)
+    kept = without_floaters(points, weights)
     points, shape, weights = points[kept], shape[kept], weights[kept]
     share = weights / weights.sum()
     mean = share @ points
@@ -178,7 +178,7 @@ def object_boxes(scene: GaussianScene, result: Segmentation) -> dict[int, Orient
     return {k: class_box(scene, own, confidence[own]) for k, own in members.items() if len(own)}
 
 
-def _without_floaters(points: Array, weights: Array) -> npt.NDArray[np.bool_]:
+def without_floaters(points: Array, weights: Array) -> npt.NDArray[np.bool_]:
     """Tell which points (M, 3) are no farther than `FAR` times 90 % of their weight from the geometric median, (M,)."""
     middle = weights @ points / weights.sum()
     distance = np.linalg.norm(points - middle, axis=1)

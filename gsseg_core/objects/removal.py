@@ -32,14 +32,19 @@ def without_objects(scene: GaussianScene, segmentation: Segmentation, classes: C
     EmptySceneError
         Nothing would be left.
     """
+    return scene.subset(left_without(scene, segmentation, classes))
+
+
+def left_without(scene: GaussianScene, segmentation: Segmentation, classes: Collection[int]) -> np.ndarray:
+    """Tell which Gaussians of a scene `without_objects` leaves, (N,) bool; it raises the same errors."""
     counts = segmentation.counts()
     empty = [k for k in classes if not 0 <= k < len(counts) or not counts[k]]
     if empty or not classes:
         found = f"class {empty[0]}, which has no Gaussians" if empty else "no class"
         present = listed(f"{k} ({clipped(segmentation.class_names[k])})" for k in np.flatnonzero(counts).tolist())
         raise SettingsError(f"{scene.path or 'scene'}: asked to remove {found}; expected some of: {present}")
-    kept = ~np.isin(segmentation.labels, list(classes))
+    kept: np.ndarray = ~np.isin(segmentation.labels, list(classes))
     if not kept.any():
         without = counted(len(classes), "class", "classes")
         raise EmptySceneError(f"{scene.path or 'scene'}: nothing is left without {without}; expected to keep some")
-    return scene.subset(kept)
+    return kept

@@ -18,6 +18,7 @@ from gsseg_core.data.class_names import class_name
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.scene_writers import SCENE_WRITERS
 from gsseg_core.text import counted, html_text, printable
 from gsseg_core.viewer.corrections import box, disc, region
 from gsseg_core.viewer.model import MODES, ClassRow
@@ -71,8 +72,9 @@ class Panel:
         with tabs.add_tab("Correct"):
             self._build_correct()
         with tabs.add_tab("Save"):
-            self._add_download("what is shown, as PLY", "selection.ply", state.selection_ply)
-            self._add_download("the segmentation, as npz", "segmentation.npz", state.segmentation_npz)
+            as_format = gui.add_dropdown("format", tuple(SCENE_WRITERS))
+            self._add_download("what is shown", lambda: state.selection(str(as_format.value)))
+            self._add_download("the segmentation, as npz", state.segmentation_npz)
             self._live = gui.add_html(_paragraph("live: waiting for the first probabilities")) if live else None
 
     # Tabs.
@@ -143,10 +145,12 @@ class Panel:
         self._on(undo.on_click, lambda _: self._undo())
         self._corrected = gui.add_markdown("No corrections yet.")
 
-    def _add_download(self, text: str, name: str, content: Callable[[], bytes]) -> None:
+    def _add_download(self, text: str, made: Callable[[], tuple[str, bytes]]) -> None:
+        """Add a button that has the browser save a file, which is made when it is asked for: its name and content."""
+
         def send(event: Event) -> None:
             if event.client is not None:
-                event.client.send_file_download(name, content(), save_immediately=True)
+                event.client.send_file_download(*made(), save_immediately=True)
 
         self._on(self._gui.add_button(text, icon=viser.Icon.DOWNLOAD).on_click, send)
 

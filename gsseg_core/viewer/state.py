@@ -12,10 +12,12 @@ import numpy as np
 
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
+from gsseg_core.export.class_files import write_selection
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
-from gsseg_core.segmentation import Segmentation
+from gsseg_core.scene.scene_writers import SCENE_WRITERS, check_format
+from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 from gsseg_core.viewer.corrections import Corrections
 from gsseg_core.viewer.model import BY_RELIABILITY, MODES, ClassRow, Labelling, ViewModel, completed
 from gsseg_core.viewer.picking import ViewVotes
@@ -130,24 +132,33 @@ class ViewerState:
             self._learnt = learnt
             self._relabel()
 
-    def selection_ply(self) -> bytes:
-        """Write what is shown as a 3DGS PLY.
+    def selection(self, scene_format: str) -> tuple[str, bytes]:
+        """Write what is shown in a format of `gsseg_core.scene.scene_writers.SCENE_WRITERS`: a file name and its bytes.
 
         Raises
         ------
         EmptySceneError
             Nothing is shown.
+        SettingsError
+            There is no such format, or the library that writes it is not installed.
+        SceneValueError
+            The format cannot hold what is shown.
         """
+        check_format(scene_format)
         with self._lock:
-            shown = self.model.shown()
-        return _as_file(lambda path: self.model.scene.subset(shown).save(path), "selection.ply")
+            shown, (labels, _, names) = self.model.shown(), self.model.labelling
+            scene, ids = self.model.scene, self.model.ids()
+        name = f"selection{SCENE_WRITERS[scene_format].suffixes[0]}"
+        given = np.array([*ids, REMOVED, UNOBSERVED])[labels]  # labels -1 and -2 are its last two
+        known = {ids[k]: text for k, text in names.items()}
+        return name, _as_file(lambda path: write_selection(scene, shown, given, known, path, scene_format), name)
 
-    def segmentation_npz(self) -> bytes:
-        """Write labels and class probabilities, corrections included, as a `segmentation.npz`."""
+    def segmentation_npz(self) -> tuple[str, bytes]:
+        """Write labels and class probabilities, corrections included: the name `segmentation.npz`, and its bytes."""
         labels, probabilities, names = self.model.labelling
         nothing, none = np.zeros(len(labels), bool), np.empty((0, probabilities.shape[1]), np.float32)
         result = Segmentation(labels, completed(probabilities), names, self.model.scene.digest, nothing, none)
-        return _as_file(result.with_ids(self.model.ids()).save, "segmentation.npz")
+        return "segmentation.npz", _as_file(result.with_ids(self.model.ids()).save, "segmentation.npz")
 
     def _relabel(self) -> None:
         self.model.relabel(self.corrections.apply(self._learnt, self.added_names))

@@ -20,6 +20,7 @@ from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.objects.object_table import PER_VIEW
 from gsseg_core.raster.backends import devices, rasteriser_of
 from gsseg_core.refine.settings import MAX_K, RefineSettings
+from gsseg_core.scene.scene_writers import DEFAULT, SCENE_WRITERS, check_format
 from gsseg_ros.frames import Similarity, pose_from_parameters
 
 POSE_SOURCES = ("topic", "odometry", "tf")
@@ -105,6 +106,12 @@ DECLARATIONS = (
     Declaration(
         "beta", RefineSettings.beta, "probability below which KNN clustering decides [0..1]", 0.0, 1.0, at_once=True
     ),
+    Declaration(
+        "export_format",
+        DEFAULT,
+        f"format of the classes that ~/export writes: {', '.join(SCENE_WRITERS)}",
+        at_once=True,
+    ),
     Declaration("device", "cpu", f"where views are rendered: {devices()}"),
     Declaration("autostart", True, "configure and activate at start; false: wait for a lifecycle manager"),
     Declaration("queue_size", 30, "masks waiting to be fused; of more, the oldest are dropped [count]", 1, 1000),
@@ -146,6 +153,7 @@ class Settings:
     max_classes: int
     k: int
     beta: float
+    export_format: str
     device: str
     autostart: bool
     queue_size: int
@@ -161,6 +169,10 @@ class Settings:
             rasteriser_of(self.device)
         except SettingsError as error:
             raise SettingsError(f"parameter {error}") from error
+        try:
+            check_format(self.export_format)
+        except SettingsError as error:
+            raise SettingsError(f"parameter export_{error}") from error
         if self.ids == PER_VIEW and self.class_names:
             raise SettingsError(
                 f"parameter class_names gives {len(self.class_names)} names, but with ids '{PER_VIEW}' the node finds "

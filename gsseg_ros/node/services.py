@@ -17,7 +17,7 @@ from rclpy.lifecycle import LifecycleNode
 from std_msgs.msg import Header
 
 from gsseg_core.errors import GssegError
-from gsseg_core.export.class_plys import write_classes
+from gsseg_core.export.class_files import write_classes
 from gsseg_core.export.summary import RunReport
 from gsseg_core.files.json_files import write_json
 from gsseg_core.refine.settings import RefineSettings
@@ -245,8 +245,10 @@ class Services:
             result = selection.result.selected(selection.chosen, selection.min_confidence)
             with run.watch.stage("write"), staged_export(directory, self.workspace.root) as staged:
                 result.save(staged.folder / "segmentation.npz", staged.id)
-                plys = write_classes(session.scene, result, staged.folder / "classes", staged.id)
-                names = {k: str(path.relative_to(staged.folder)) for k, path in plys.items()}
+                files = write_classes(
+                    session.scene, result, staged.folder / "classes", staged.id, settings.export_format
+                )
+                names = {k: str(path.relative_to(staged.folder)) for k, path in files.items()}
                 report = finish(report_message(run, selection, refine, settings.map_frame), run)
                 content = RunReport.of(
                     session.scene,
@@ -254,12 +256,13 @@ class Services:
                     views={"used": report.num_views, "rejected": dict(Counter(session.rejected) + run.dropped)},
                     settings={"learner": report.learner, "device": settings.device, "refine": asdict(refine)},
                     seconds=run.watch.seconds,
-                    plys=names,
+                    files=names,
                     run=staged.id,
                 )
                 write_json(staged.folder / "report.json", content.as_dict())
         response.report = finish(report, run)
-        response.directory, response.files = str(directory), ["segmentation.npz", *names.values(), "report.json"]
+        unique = dict.fromkeys(names.values())  # One file may hold all classes.
+        response.directory, response.files = str(directory), ["segmentation.npz", *unique, "report.json"]
 
     @answered
     def reset(self, request: Reset.Request, response: Reset.Response) -> None:

@@ -196,6 +196,32 @@ def test_single_files_replace_no_device_and_keep_links(place: Path, capsys: pyte
     assert (place / "link.ply").is_symlink() and len(GaussianScene.load(place / "rest.ply")) > 0
 
 
+def test_segment_writes_the_classes_in_the_format_asked_for_and_meshes_beside_them(place: Path) -> None:
+    assert main([*command(place), "--format", "usd", "--collision"]) == 0
+    meshes = ["1_red_ball.obj", "2_cup_mug.obj", "3_box.obj"]
+    assert sorted(path.name for path in (place / "out/classes").iterdir()) == [*meshes, "objects.usdc"]
+    report = json.loads((place / "out/report.json").read_text())
+    assert report["settings"]["scene_format"] == "usd" and report["settings"]["collision"] == "hull"
+    assert [one.get("collision") for one in report["classes"]] == [None, *(f"classes/{name}" for name in meshes)]
+    assert all(one["ply"] is None and one["file"] == "classes/objects.usdc" for one in report["classes"])
+    assert '<a href="classes/objects.usdc">USDC</a>' in (place / "out/report.html").read_text()
+
+
+def test_a_library_that_is_missing_is_told_before_anything_is_read(
+    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = contents(place)
+    monkeypatch.setitem(sys.modules, "gaussforge", None)
+    monkeypatch.delitem(sys.modules, "gsseg_core.scene.writers.sog", raising=False)
+    monkeypatch.setattr(GaussianScene, "load", lambda *_: pytest.fail("reads"))
+    remove = ["remove", "no.ply", "--segmentation", "no.npz", "--class", "box", "--out", f"{place}/rest.sog"]
+    for asked in ([*command(place), "--format", "sog"], remove):
+        assert main(asked) == 2
+        stderr = capsys.readouterr().err
+        assert "format sog: needs gaussforge, which is not installed; expected: pip install 'gsseg[formats]'" in stderr
+    assert contents(place) == before
+
+
 def test_names_of_views_that_are_too_long_for_a_picture_do_not_end_a_run(place: Path) -> None:
     path = place / "data/cameras.json"
     cameras = json.loads(path.read_text())

@@ -12,8 +12,8 @@ from PIL import Image
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views
 
 from gsseg_core.errors import PathTakenError, WriteError
-from gsseg_core.export import class_plys as export
-from gsseg_core.export.class_plys import class_file_name, export_classes
+from gsseg_core.export import class_files as export
+from gsseg_core.export.class_files import class_file_name, export_classes
 from gsseg_core.export.view_pictures import draw_views, view_file_name, write_pictures
 from gsseg_core.files.json_files import write_json
 from gsseg_core.files.run_folder import RUN_FILE

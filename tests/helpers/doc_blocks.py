@@ -98,6 +98,7 @@ def protocols(desk: Path) -> None:
 FIRST: dict[str, Callable[[Path], None]] = {
     "docs/clean_objects.md": segmented,
     "docs/evaluation.md": protocols,
+    "docs/formats.md": segmented,
     "docs/results.md": apartment,
     "docs/ids.md": on_a_robot,
     "docs/tutorial_robot.md": on_a_robot,

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, ring, taught, write_dataset, wrong_views
 
 from gsseg_core.data.label_images import UNKNOWN
-from gsseg_core.export.class_plys import export_classes
+from gsseg_core.export.class_files import export_classes
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner import Learner

@@ -191,6 +191,6 @@ def test_a_box_as_a_dictionary_is_plain_json(segmented: tuple[GaussianScene, Seg
 
 
 def test_the_report_of_a_run_has_the_boxes_of_its_objects(segmented: tuple[GaussianScene, Segmentation]) -> None:
-    report = RunReport.of(*segmented, views={}, settings={}, seconds={}, plys={}).as_dict()
+    report = RunReport.of(*segmented, views={}, settings={}, seconds={}, files={}).as_dict()
     boxes = {entry["id"]: entry["box"] for entry in report["classes"]}
     assert boxes == {0: None} | {k: box.as_dict() for k, box in object_boxes(*segmented).items()}

@@ -31,7 +31,7 @@ from gsseg_core.cli.main import main
 from gsseg_core.data.class_names import class_ids
 from gsseg_core.data.view import View
 from gsseg_core.errors import EmptySceneError, MaskSizeError, SceneValueError, SettingsError
-from gsseg_core.export.class_plys import export_classes
+from gsseg_core.export.class_files import export_classes
 from gsseg_core.objects.removal import without_objects
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.depth import BEHIND, depths, surface
@@ -313,6 +313,21 @@ def test_gsseg_remove_writes_the_rest_and_refuses_what_is_not_there(
     assert main([*command, "--class", "chair", "--out", f"{tmp_path}/none.ply"]) == 2
     assert "class 'chair' does not exist" in capsys.readouterr().err
     assert not (tmp_path / "none.ply").exists()
+
+
+def test_gsseg_remove_writes_the_format_that_the_suffix_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = write_dataset(tmp_path / "data")
+    segmentation().save(tmp_path / "segmentation.npz")
+    command = ["remove", f"{data}/scene.ply", "--segmentation", f"{tmp_path}/segmentation.npz", "--class", "box"]
+    assert main([*command, "--out", f"{tmp_path}/rest.splat"]) == 0
+    kept = int((TRUTH != 3).sum())
+    assert (tmp_path / "rest.splat").stat().st_size == 32 * kept and f"{kept:,} of" in capsys.readouterr().out
+    assert main([*command, "--out", f"{tmp_path}/rest.bin", "--format", "glb"]) == 0
+    assert (tmp_path / "rest.bin").read_bytes().startswith(b"glTF")
+    assert main([*command, "--out", f"{tmp_path}/rest.spz", "--format", "glb"]) == 2
+    assert "rest.spz: has the suffix of the format spz, but glb is asked for" in capsys.readouterr().err
 
 
 def test_gsseg_segment_carves_when_asked_to(tmp_path: Path) -> None:

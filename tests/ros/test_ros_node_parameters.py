@@ -51,6 +51,9 @@ def test_every_parameter_is_typed_described_and_ranged(robot: Robot) -> None:
     assert wanted.items() <= ranges.items()
 
 
+STEMS = ("0_background", "1_red_ball", "2_cup_mug", "3_box")
+
+
 @pytest.mark.parametrize(
     ("name", "value", "why"),
     [
@@ -64,6 +67,7 @@ def test_every_parameter_is_typed_described_and_ranged(robot: Robot) -> None:
         ("pose_source", "gps", "parameter pose_source is 'gps'; expected topic, odometry, tf"),
         ("device", "tpu", "parameter device is 'tpu'; expected cpu, cuda (the first GPU) or cuda:1 and so on"),
         ("device", "cuda:x", "parameter device is 'cuda:x'"),
+        ("export_format", "obj", "parameter export_format is 'obj'; expected one of ply, compressed-ply, spz"),
         ("ids", "mine", "parameter ids is 'mine'; expected given, per-view"),
         ("ids", "per-view", "parameter class_names gives 4 names, but with ids 'per-view' the node finds the objects"),
         ("map_frame", "", "parameter map_frame is empty; expected the name of a frame"),
@@ -117,10 +121,10 @@ def test_arguments_that_ros_cannot_parse_are_one_error(ros: Ros) -> None:
 
 
 @pytest.mark.parametrize("state", ["inactive", "active"])
-def test_while_it_is_configured_only_k_and_beta_can_be_set(robot: Robot, state: str) -> None:
+def test_while_it_is_configured_only_k_beta_and_the_format_of_exports_can_be_set(robot: Robot, state: str) -> None:
     robot.brought_to(state)
     for declaration in DECLARATIONS:
-        if declaration.name in ("k", "beta"):
+        if declaration.name in ("k", "beta", "export_format"):
             continue
         value = robot.get(declaration.name)
         message = Parameter("", value=value)
@@ -135,7 +139,23 @@ def test_while_it_is_configured_only_k_and_beta_can_be_set(robot: Robot, state: 
         assert result.reason == (
             f"{declaration.name} can change only while the node is unconfigured: deactivate and clean it up first"
         )
-    assert robot.set("k", 50) == robot.set("beta", 0.65) == (True, "")
+    assert robot.set("k", 50) == robot.set("beta", 0.65) == robot.set("export_format", "ply") == (True, "")
+
+
+@pytest.mark.parametrize(
+    ("name", "files"), [("glb", [f"classes/{k}.glb" for k in STEMS]), ("usd", ["classes/objects.usdc"])]
+)
+def test_classes_are_exported_in_the_format_that_is_set(robot: Robot, name: str, files: list[str]) -> None:
+    robot.brought_to("active")
+    robot.fuse(clean_views(4))
+    try:
+        assert robot.set("export_format", name) == (True, "")
+        folder = robot.out(f"as_{name}")
+        exported = robot.done("export", directory=str(folder))
+        assert exported.files == ["segmentation.npz", *files, "report.json"]
+        assert all((folder / file).is_file() for file in exported.files)
+    finally:
+        robot.set("export_format", "ply")
 
 
 def test_k_and_beta_take_effect_at_once(robot: Robot) -> None:

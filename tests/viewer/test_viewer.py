@@ -194,13 +194,25 @@ def test_an_export_is_a_valid_ply_of_what_is_shown(shown: Shown, tmp_path: Path)
     shown.viewer.state.change(lambda model: model.isolate(2))
     shown.tab("Save")
     with shown.page.expect_download(timeout=PATIENCE * 1000) as download:
-        shown.press("what is shown, as PLY")
+        shown.press("what is shown")
     download.value.save_as(tmp_path / "some.ply")
     exported = GaussianScene.load(tmp_path / "some.ply")
     assert exported.vertices.tobytes() == SCENE.subset(TRUTH == 2).vertices.tobytes()
     shown.viewer.state.change(lambda model: model.toggle(2))
-    shown.press("what is shown, as PLY")
+    shown.press("what is shown")
     shown.says("none of its 626 Gaussians is in the subset")
+
+
+def test_an_export_has_the_format_that_is_chosen(shown: Shown, tmp_path: Path) -> None:
+    shown.viewer.state.change(lambda model: model.isolate(2))
+    shown.tab("Save")
+    shown.page.locator("input[role=combobox][value=ply]").click()
+    shown.page.get_by_role("option", name="glb").click()
+    with shown.page.expect_download(timeout=PATIENCE * 1000) as download:
+        shown.press("what is shown")
+    assert download.value.suggested_filename == "selection.glb"
+    download.value.save_as(tmp_path / "selection.glb")
+    assert (tmp_path / "selection.glb").read_bytes().startswith(b"glTF")
 
 
 def test_a_shift_click_corrects_a_label_and_can_be_taken_back(shown: Shown, tmp_path: Path) -> None:

@@ -1,0 +1,167 @@
+"""One file for each object of a segmentation, or one for all of them, in any format that scenes are written in."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from gsseg_core.export.collision import check_collision, collision_meshes
+from gsseg_core.files.run_folder import staged_run
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.ply import write_vertices
+from gsseg_core.scene.scene_writers import DEFAULT, SCENE_WRITERS, SceneObject, check_format, write_objects, write_scene
+from gsseg_core.scene.triangle_mesh import TriangleMesh
+from gsseg_core.segmentation import Segmentation
+
+TOGETHER = "objects"
+"""Stem of the file in which a format keeps the objects of all classes."""
+
+
+def export_classes(
+    scene: GaussianScene,
+    segmentation: Segmentation,
+    folder: str | os.PathLike[str],
+    scene_format: str = DEFAULT,
+    collision: str | None = None,
+) -> dict[int, Path]:
+    """Write `<id>_<name>.ply` for every class that has Gaussians; valid 3DGS PLYs with all properties kept.
+
+    Two properties are added: `label` (int), the class, and `confidence` (float), that of the segmentation.
+
+    Another format has another suffix, and keeps what it can hold (docs/formats.md). USD holds all classes in one file,
+    `objects.usdc`. All files of an earlier export are replaced in one step, as `gsseg_core.files.run_folder` says;
+    other files stay.
+
+    Parameters
+    ----------
+    scene_format : str
+        One of `gsseg_core.scene.scene_writers.SCENE_WRITERS`.
+    collision : str, optional
+        One of `gsseg_core.export.collision.KINDS`: such a mesh of every object, as `<id>_<name>.obj` and in the USD.
+
+    Returns
+    -------
+    dict of int to pathlib.Path
+        The file of each class.
+
+    Raises
+    ------
+    SettingsError
+        There is no such format or kind of mesh, or the library that it needs is not installed.
+    SceneValueError
+        The format cannot hold the scene.
+    PathTakenError
+        The folder, or the name of a file, is taken by what is no earlier export; nothing was written.
+    WriteError
+        Something cannot be written; an earlier export is unchanged.
+    """
+    check_format(scene_format)
+    check_collision(collision)
+    folder = Path(folder)
+    with staged_run(folder, "classes") as run:
+        meshes = collision_meshes(scene, segmentation, collision) if collision else {}
+        written = write_classes(scene, segmentation, run.folder, run.id, scene_format, meshes)
+    return {k: folder / path.name for k, path in written.items()}
+
+
+def write_classes(
+    scene: GaussianScene,
+    segmentation: Segmentation,
+    folder: Path,
+    run: str,
+    scene_format: str = DEFAULT,
+    meshes: Mapping[int, TriangleMesh] | None = None,
+) -> dict[int, Path]:
+    """Write the files of `export_classes` into a folder of a run with this id, with these meshes to collide with."""
+    confidence, meshes, names = segmentation.confidence, meshes or {}, segmentation.class_names
+    present = np.flatnonzero(segmentation.counts()).tolist()
+    paths = {k: folder / class_file_name(k, names[k], scene_format) for k in present}
+    for k, mesh in meshes.items():
+        mesh.save(folder / mesh_file_name(k, names[k]), run)
+    if SCENE_WRITERS[scene_format].together:
+        if paths:
+            objects = _objects(scene, segmentation.labels, names, meshes)
+            write_objects(objects, next(iter(paths.values())), scene_format, run)
+        return paths
+    for k, path in paths.items():
+        members = segmentation.labels == k
+        if scene_format == DEFAULT:
+            write_vertices(path, _with_confidence(scene.vertices[members], k, confidence[members]), run)
+        else:
+            write_scene(scene.subset(members), path, scene_format, run)
+    return paths
+
+
+def write_selection(
+    scene: GaussianScene,
+    chosen: np.ndarray,  # (N,) bool
+    labels: np.ndarray,  # (N,) int
+    class_names: Mapping[int, str],
+    path: str | os.PathLike[str],
+    scene_format: str,
+) -> None:
+    """Write some Gaussians of a scene as one file, in which USD keeps the classes of these labels apart.
+
+    Raises
+    ------
+    EmptySceneError
+        None is chosen.
+    SettingsError, SceneValueError, WriteError
+        As `gsseg_core.scene.scene_writers.write_scene` does.
+    """
+    part = scene.subset(chosen)
+    if not SCENE_WRITERS[scene_format].together:
+        write_scene(part, path, scene_format)
+        return
+    labels = labels[chosen]
+    objects = _objects(part, labels, class_names)
+    if (labels < 0).any():
+        objects.append(SceneObject(part.subset(labels < 0)))
+    write_objects(objects, path, scene_format)
+
+
+def _objects(
+    scene: GaussianScene,
+    labels: np.ndarray,  # (N,) int
+    class_names: Mapping[int, str],
+    meshes: Mapping[int, TriangleMesh] | None = None,
+) -> list[SceneObject]:
+    """All classes that have Gaussians, as objects of one file."""
+    present = np.unique(labels[labels >= 0]).tolist()
+    return [SceneObject(scene.subset(labels == k), k, class_names[k], (meshes or {}).get(k)) for k in present]
+
+
+def class_places(class_names: Mapping[int, str], scene_format: str, collision: str | None) -> list[str]:
+    """Names of the files that `write_classes` may write."""
+    meshes = [mesh_file_name(k, name) for k, name in class_names.items() if collision]
+    return [*dict.fromkeys(class_file_name(k, name, scene_format) for k, name in class_names.items()), *meshes]
+
+
+def class_file_name(label: int, name: str, scene_format: str = DEFAULT) -> str:
+    """File name of a class, safe on any file system."""
+    writer = SCENE_WRITERS[scene_format]
+    return f"{TOGETHER if writer.together else _stem(label, name)}{writer.suffixes[0]}"
+
+
+def mesh_file_name(label: int, name: str) -> str:
+    """File name of the mesh to collide with of a class, safe on any file system."""
+    return f"{_stem(label, name)}.obj"
+
+
+def _stem(label: int, name: str) -> str:
+    return f"{label}_{re.sub(r'[^0-9A-Za-z._-]+', '_', name)[:100].strip('._') or 'class'}"
+
+
+def _with_confidence(vertices: np.ndarray, label: int, confidence: np.ndarray) -> np.ndarray:
+    """Add properties `label` (int32) and `confidence` (M,) (float32) to vertices (M,); earlier ones are replaced."""
+    kept = [name for name in vertices.dtype.names or () if name not in ("label", "confidence")]
+    types = [(name, vertices.dtype[name]) for name in kept]
+    out = np.empty(len(vertices), [*types, ("label", np.int32), ("confidence", np.float32)])
+    for name in kept:
+        out[name] = vertices[name]
+    out["label"], out["confidence"] = label, confidence
+    return out

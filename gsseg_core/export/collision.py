@@ -1,0 +1,137 @@
+"""Meshes to collide with: what a simulator takes for the solid shape of an object.
+
+Both begin with the object's opaque Gaussians, without floaters as `gsseg_core.objects.oriented_boxes` finds them, each
+an ellipsoid of one standard deviation.
+
+- The hull is the convex hull of the ends of their axes.
+- The surface is watertight, follows hollows, and has no cavity. The ellipsoids fill voxels; gaps between these are
+  closed and what they enclose is filled; marching cubes at half of the smoothed filling make the triangles. A Poisson
+  surface would need normals, which Gaussians do not have.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
+from scipy.spatial import ConvexHull, QhullError
+
+from gsseg_core.errors import SettingsError
+from gsseg_core.objects.oriented_boxes import without_floaters
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.quaternions import rotations
+from gsseg_core.scene.triangle_mesh import TriangleMesh
+from gsseg_core.segmentation import Segmentation
+
+HULL, SURFACE = "hull", "surface"
+KINDS = (HULL, SURFACE)
+
+OPAQUE = 0.1
+"""Opacity from which on a Gaussian is solid."""
+
+VOXELS = 64
+"""Of a surface, along the longest side of the object."""
+
+_MARGIN, _CLOSED, _SAMPLES, _AT_ONCE = 4, 2, 128, 1 << 14
+
+
+def check_collision(kind: str | None) -> None:
+    """Raise `SettingsError` if there is no such kind of mesh, or the library that makes it is not installed."""
+    if kind is not None and kind not in KINDS:
+        raise SettingsError(f"collision is {kind!r}; expected one of {', '.join(KINDS)}")
+    if kind == SURFACE:
+        try:
+            import skimage.measure  # noqa: F401
+        except ImportError as error:
+            raise SettingsError(
+                "collision surface: needs scikit-image, which is not installed; expected: pip install 'gsseg[usd]'"
+            ) from error
+
+
+def collision_meshes(scene: GaussianScene, segmentation: Segmentation, kind: str) -> dict[int, TriangleMesh]:
+    """Make a mesh for every object of a segmentation.
+
+    Returns
+    -------
+    dict of int to TriangleMesh
+        By class id, ascending; neither the background, which is around the objects, nor objects without an opaque
+        Gaussian or a volume.
+
+    Raises
+    ------
+    SettingsError
+        There is no such kind, or the library that makes it is not installed.
+    """
+    check_collision(kind)
+    make = _hull if kind == HULL else _surface
+    solid, confidence = scene.opacities >= OPAQUE, segmentation.confidence
+    meshes = {}
+    for k in np.flatnonzero(segmentation.counts()).tolist():
+        index = np.flatnonzero((segmentation.labels == k) & solid)
+        if k and len(index):
+            kept = without_floaters(scene.means[index].astype(np.float64), scene.opacities[index] * confidence[index])
+            mesh = make(scene.means[index[kept]], _half_axes(scene, index[kept]))
+            if mesh is not None:
+                meshes[k] = mesh
+    return meshes
+
+
+def _half_axes(scene: GaussianScene, index: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:  # (M,)
+    """Half axes (M, 3, 3) of ellipsoids, one in each column."""
+    return rotations(scene.quats[index]) * scene.scales[index, None, :]
+
+
+def _hull(
+    means: npt.NDArray[np.float32],  # (M, 3)
+    half_axes: npt.NDArray[np.float32],  # (M, 3, 3)
+) -> TriangleMesh | None:
+    """Convex hull of the ends of all axes; None where they have no volume."""
+    ends = np.concatenate([means[:, None] + sign * half_axes.transpose(0, 2, 1) for sign in (1, -1)]).reshape(-1, 3)
+    try:
+        hull = ConvexHull(ends.astype(np.float64))
+    except QhullError:
+        return None
+    triangles = np.searchsorted(np.sort(hull.vertices), hull.simplices).astype(np.int32)
+    points = ends[np.sort(hull.vertices)]
+    a, b, c = (points[triangles[:, i]] for i in range(3))
+    inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0
+    triangles[inwards] = triangles[inwards][:, ::-1]
+    return TriangleMesh(points.astype(np.float32), triangles, convex=True)
+
+
+def _surface(
+    means: npt.NDArray[np.float32],  # (M, 3)
+    half_axes: npt.NDArray[np.float32],  # (M, 3, 3)
+) -> TriangleMesh | None:
+    """Watertight surface around ellipsoids; None where they have no extent."""
+    from skimage.measure import marching_cubes
+
+    reach = np.linalg.norm(half_axes, axis=2)  # (M, 3): of an ellipsoid along x, y, z
+    low, high = (means - reach).min(axis=0), (means + reach).max(axis=0)
+    voxel = float((high - low).max()) / VOXELS
+    if not voxel > 0:
+        return None
+    shape = np.ceil((high - low) / voxel).astype(np.int64) + 1 + 2 * _MARGIN
+    filled = np.zeros(shape, bool)
+    for first in range(0, len(means), _AT_ONCE):
+        own = slice(first, first + _AT_ONCE)
+        inside = means[own, None] + np.einsum("sk,mjk->msj", _BALL, half_axes[own])  # (m, samples, 3)
+        cells = ((inside - low) / voxel).astype(np.int64) + _MARGIN
+        filled[tuple(cells.reshape(-1, 3).T)] = True
+    filled = ndimage.binary_fill_holes(ndimage.binary_closing(filled, iterations=_CLOSED))
+    smooth = ndimage.gaussian_filter(filled.astype(np.float32), 1.0)
+    points, triangles, _, _ = marching_cubes(smooth, 0.5 * float(smooth.max()), gradient_direction="ascent")
+    points = (points - _MARGIN + 0.5) * voxel + low  # middles of voxels
+    return TriangleMesh(points.astype(np.float32), triangles.astype(np.int32))
+
+
+def _ball(count: int) -> npt.NDArray[np.float32]:
+    """Points (count, 3) spread evenly over the unit ball: on a Fibonacci spiral, at radii in a fixed random order."""
+    k = np.arange(count) + 0.5
+    z, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
+    across, radius = np.sqrt(1 - z * z), (np.random.default_rng(0).permutation(k) / count) ** (1 / 3)
+    points = np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1) * radius[:, None]
+    return np.asarray(points, np.float32)
+
+
+_BALL = _ball(_SAMPLES)

@@ -1,0 +1,161 @@
+"""The table of formats that scenes are written in: who writes each, and which extra that needs."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from gsseg_core.errors import SettingsError
+from gsseg_core.files.atomic import write_atomically
+from gsseg_core.text import clipped
+
+if TYPE_CHECKING:
+    from gsseg_core.scene.gaussian_scene import GaussianScene
+    from gsseg_core.scene.triangle_mesh import TriangleMesh
+
+
+class SceneWriter(NamedTuple):
+    """A format that scenes are written in.
+
+    Attributes
+    ----------
+    name : str
+        What messages call it.
+    suffixes : tuple of str
+        Of its files; the first is what gsseg gives them.
+    write : str
+        The function that writes a file, as "module:function", imported when it is used. It takes the path of an empty
+        file, a `GaussianScene`, and the id of a run or None. "" is `GaussianScene.save`.
+    extra : str
+        The extra of gsseg with the library that this needs, if it needs one.
+    together : bool
+        Whether a file holds several objects and keeps them apart: then the function takes a sequence of `SceneObject`
+        in place of the scene.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    write: str = ""
+    extra: str = ""
+    together: bool = False
+
+
+class SceneObject(NamedTuple):
+    """An object of a file that holds several: its Gaussians; of its class, if any, id and name; its collision mesh."""
+
+    scene: GaussianScene
+    label: int | None = None
+    name: str = ""
+    collision: TriangleMesh | None = None
+
+
+_WRITERS = "gsseg_core.scene.writers"
+
+SCENE_WRITERS = {
+    "ply": SceneWriter("3DGS PLY", (".ply",)),
+    "compressed-ply": SceneWriter(
+        "compressed PLY", (".compressed.ply",), f"{_WRITERS}.compressed_ply:write_compressed_ply", "formats"
+    ),
+    "spz": SceneWriter("SPZ", (".spz",), f"{_WRITERS}.spz:write_spz", "formats"),
+    "sog": SceneWriter("SOG", (".sog",), f"{_WRITERS}.sog:write_sog", "formats"),
+    "splat": SceneWriter(".splat", (".splat",), f"{_WRITERS}.splat:write_splat"),
+    "glb": SceneWriter("GLB", (".glb",), f"{_WRITERS}.glb:write_glb"),
+    "usd": SceneWriter("USD", (".usdc", ".usd", ".usda"), f"{_WRITERS}.usd:write_usd", "usd", together=True),
+}
+"""Every format by the name that options have for it; the first is the default."""
+
+DEFAULT = next(iter(SCENE_WRITERS))
+
+
+def check_format(name: str) -> None:
+    """Raise `SettingsError` if there is no such format, or the library that writes it is not installed."""
+    if name not in SCENE_WRITERS:
+        raise SettingsError(f"format is {clipped(name)!r}; expected one of {', '.join(SCENE_WRITERS)}")
+    writer_of(name)
+
+
+def writer_of(name: str) -> Any:
+    """Import the module that writes one of `SCENE_WRITERS`, and return its function; None where the scene does it.
+
+    Raises
+    ------
+    SettingsError
+        The library that it needs is not installed.
+    """
+    writer = SCENE_WRITERS[name]
+    if not writer.write:
+        return None
+    module, function = writer.write.split(":")
+    try:
+        return getattr(importlib.import_module(module), function)
+    except ImportError as error:
+        raise SettingsError(
+            f"format {name}: needs {error.name}, which is not installed; expected: pip install 'gsseg[{writer.extra}]'"
+        ) from error
+
+
+def format_of(path: str | os.PathLike[str], asked: str | None = None) -> str:
+    """Name of the format for a file: what is asked for; else what its suffix says, and PLY if that says nothing.
+
+    Raises
+    ------
+    SettingsError
+        The suffix says another format than the one that is asked for.
+    """
+    file = Path(path).name.lower()
+    fits = {max((s for s in writer.suffixes if file.endswith(s)), default="", key=len): name
+            for name, writer in SCENE_WRITERS.items()}  # fmt: skip
+    suffix = max(fits, key=len)
+    said = fits[suffix] if suffix else None
+    if asked is None or said in (None, asked):
+        return asked or said or DEFAULT
+    raise SettingsError(
+        f"{path}: has the suffix of the format {said}, but {asked} is asked for; expected the suffix "
+        f"{SCENE_WRITERS[asked].suffixes[0]}"
+    )
+
+
+def write_scene(
+    scene: GaussianScene, path: str | os.PathLike[str], scene_format: str | None = None, run: str | None = None
+) -> None:
+    """Write a scene in a format of `SCENE_WRITERS`, atomically.
+
+    Parameters
+    ----------
+    scene_format : str, optional
+        Name of the format; by default, what the suffix of `path` says, and PLY if that says nothing.
+    run : str, optional
+        Id of the run that it belongs to, which PLY, GLB and USD keep.
+
+    Raises
+    ------
+    SettingsError
+        There is no such format, the suffix is that of another, or the library that writes it is not installed.
+    SceneValueError
+        The format cannot hold this scene.
+    WriteError
+        The file cannot be written; an earlier one is unchanged.
+    """
+    name = format_of(path, scene_format)
+    check_format(name)
+    if SCENE_WRITERS[name].together:
+        write_objects([SceneObject(scene)], path, name, run)
+        return
+    write = writer_of(name)
+    if write is None:
+        scene.save(path, run)
+        return
+    with write_atomically(path) as temporary:
+        write(temporary, scene, run)
+
+
+def write_objects(
+    objects: Sequence[SceneObject], path: str | os.PathLike[str], scene_format: str, run: str | None = None
+) -> None:
+    """Write objects into one file of a format that keeps them apart, atomically; raises what `write_scene` does."""
+    check_format(scene_format)
+    with write_atomically(path) as temporary:
+        writer_of(scene_format)(temporary, objects, run)

@@ -1,0 +1,37 @@
+"""Triangle meshes, and OBJ files of them."""
+
+from __future__ import annotations
+
+import os
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gsseg_core.files.atomic import write_atomically
+
+
+class TriangleMesh(NamedTuple):
+    """A mesh whose triangles are counter-clockwise, seen from outside.
+
+    Attributes
+    ----------
+    points : (V, 3) float32
+        In scene units and axes.
+    triangles : (T, 3) int32
+        Indices of points.
+    convex : bool
+        Whether it is its own convex hull.
+    """
+
+    points: npt.NDArray[np.float32]
+    triangles: npt.NDArray[np.int32]
+    convex: bool = False
+
+    def save(self, path: str | os.PathLike[str], run: str | None = None) -> None:
+        """Write an OBJ, atomically (`WriteError`); `run` is the id of the run that it belongs to, for a comment."""
+        with write_atomically(path) as temporary, open(temporary, "w", encoding="ascii") as file:
+            if run is not None:
+                file.write(f"# gsseg_run {run}\n")
+            np.savetxt(file, self.points, "v %.9g %.9g %.9g")
+            np.savetxt(file, self.triangles + 1, "f %d %d %d")

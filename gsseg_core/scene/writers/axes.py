@@ -1,0 +1,48 @@
+"""Scenes turned to the axes that a format defines, and values bounded to what eight bits can say.
+
+The y axis of a 3DGS PLY points down by custom, as cameras' do. Formats that define y as up hold scenes turned by half a
+turn. Half a turn about an axis of the scene changes signs and nothing else: of two coordinates, of the same two parts
+of each quaternion, and of those spherical harmonics that are odd in them. So it is exact, and undone by itself.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.spherical_harmonics import basis
+
+HALF_TURN_X, HALF_TURN_Z = (1, -1, -1), (-1, -1, 1)
+"""Signs of x, y, z after half a turn about x or z."""
+
+_GENERIC = np.array([[0.36, 0.48, 0.8]])
+"""A unit direction in which none of the harmonics is zero."""
+
+
+class Turned(NamedTuple):
+    """What turns with a scene: centres (N, 3), quaternions w, x, y, z (N, 4), harmonics (N, (d + 1)^2, 3); float32."""
+
+    means: npt.NDArray[np.float32]
+    quats: npt.NDArray[np.float32]
+    sh: npt.NDArray[np.float32]
+
+
+def turned(scene: GaussianScene, signs: tuple[int, int, int]) -> Turned:
+    """Turn a scene by half a turn, whose `signs` are those of x, y, z after it."""
+    xyz = np.array(signs, np.float32)
+    degree = round(scene.sh.shape[1] ** 0.5) - 1
+    parity = np.sign(basis(_GENERIC * xyz, degree) / basis(_GENERIC, degree))[0]
+    return Turned(scene.means * xyz, scene.quats * np.array((1, *signs), np.float32), scene.sh * parity[:, None])
+
+
+def logits_of_bytes(scene: GaussianScene) -> npt.NDArray[np.float32]:
+    """Logits (N,) of opacities that stay finite when they are rounded to eight bits: none is 0 or 255.
+
+    No pixel shows the difference: alphas end at 0.99, and below 1/255 nothing is drawn.
+    """
+    opacities = scene.opacities.clip(1 / 255, 254 / 255)
+    logits: npt.NDArray[np.float32] = np.log(opacities / (1 - opacities))
+    return logits

@@ -1,0 +1,184 @@
+"""Classes and selections in every format that scenes are written in, and meshes to collide with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from other_readers import by_usd
+from pxr import Usd, UsdGeom, UsdPhysics, UsdSemantics
+from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table
+
+from gsseg_core.errors import EmptySceneError, SettingsError
+from gsseg_core.export.class_files import class_file_name, export_classes, write_selection
+from gsseg_core.export.collision import HULL, KINDS, SURFACE, collision_meshes
+from gsseg_core.files.run_folder import RUN_FILE
+from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.scene_writers import SCENE_WRITERS
+from gsseg_core.segmentation import Segmentation
+
+SCENE, TRUTH = balls_on_a_table()
+HOSTILE = {
+    0: "background", 1: "<script>alert(1)</script>", 2: "../../etc/passwd", 3: "x" * 300,
+}  # fmt: skip
+
+
+def segmented(names: Mapping[int, str] = NAMES, scene: GaussianScene = SCENE) -> Segmentation:
+    codes = np.eye(NUM_CLASSES, dtype=np.float32)[TRUTH[: len(scene)]]
+    return Segmentation.from_codes(scene, codes, names, RefineSettings(cluster=False, filter=False))
+
+
+def visible(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir() if path.name != RUN_FILE)
+
+
+@pytest.mark.parametrize("scene_format", [name for name, writer in SCENE_WRITERS.items() if not writer.together])
+def test_every_class_has_a_file_of_the_format_asked_for(tmp_path: Path, scene_format: str) -> None:
+    suffix = SCENE_WRITERS[scene_format].suffixes[0]
+    paths = export_classes(SCENE, segmented(), tmp_path, scene_format)
+    names = ["0_background", "1_red_ball", "2_cup_mug", "3_box"]
+    assert [path.name for path in paths.values()] == visible(tmp_path) == [f"{name}{suffix}" for name in names]
+
+
+def test_usd_has_a_labelled_prim_for_every_class_under_one_scene(tmp_path: Path) -> None:
+    paths = export_classes(SCENE, segmented(), tmp_path, "usd")
+    assert set(paths.values()) == {tmp_path / "objects.usdc"} and list(paths) == [0, 1, 2, 3]
+    stage = Usd.Stage.Open(str(tmp_path / "objects.usdc"))
+    root = stage.GetDefaultPrim()
+    assert UsdGeom.GetStageUpAxis(stage) == "Y" and root.GetPath() == "/Scene"
+    names = ["class_0_background", "class_1_red_ball", "class_2_cup_mug", "class_3_box"]
+    assert [prim.GetName() for prim in root.GetChildren()] == names
+    for k, prim in enumerate(root.GetChildren()):
+        splats = prim.GetChild("splats")
+        assert splats.GetTypeName() == "ParticleField3DGaussianSplat"
+        assert list(UsdSemantics.LabelsAPI(splats, "class").GetLabelsAttr().Get()) == [NAMES[k]]
+        found = by_usd(tmp_path / "objects.usdc", str(splats.GetPath()))
+        np.testing.assert_array_equal(found.means, SCENE.means[k == TRUTH])
+    # Up, which is -y in a scene, is y in the world of the stage.
+    world = UsdGeom.XformCache().GetLocalToWorldTransform(splats).TransformDir((0, -1, 0))
+    np.testing.assert_allclose(world, (0, 1, 0), atol=1e-6)
+
+
+@pytest.mark.parametrize("scene_format", SCENE_WRITERS)
+def test_hostile_names_of_classes_are_harmless(tmp_path: Path, scene_format: str) -> None:
+    out = tmp_path / "out"
+    paths = export_classes(SCENE, segmented(HOSTILE), out, scene_format, HULL)
+    assert all(path.parent == out and path.is_file() for path in paths.values())
+    assert [path for path in tmp_path.iterdir()] == [out]
+    assert all(path.is_file() and len(path.name) < 120 and "<" not in path.name for path in out.iterdir())
+    if scene_format == "usd":
+        stage = Usd.Stage.Open(str(out / "objects.usdc"))
+        labels = [UsdSemantics.LabelsAPI(prim, "class").GetLabelsAttr().Get()[0]
+                  for prim in stage.Traverse() if prim.GetName() == "splats"]  # fmt: skip
+        assert labels == list(HOSTILE.values())
+
+
+def test_names_that_become_the_same_are_kept_apart_by_their_ids(tmp_path: Path) -> None:
+    names = {0: "background", 1: "a/b", 2: "a b", 3: "a?b"}
+    assert len(set(export_classes(SCENE, segmented(names), tmp_path, "glb").values())) == 4
+    export_classes(SCENE, segmented(names), tmp_path, "usd")
+    stage = Usd.Stage.Open(str(tmp_path / "objects.usdc"))
+    assert len(stage.GetDefaultPrim().GetChildren()) == 4
+    assert visible(tmp_path) == ["objects.usdc"]  # The files of the export before it are gone.
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_object_but_the_background_has_a_closed_mesh(tmp_path: Path, kind: str) -> None:
+    export_classes(SCENE, segmented(), tmp_path, "ply", kind)
+    meshes = sorted(tmp_path.glob("*.obj"))
+    assert [path.name for path in meshes] == ["1_red_ball.obj", "2_cup_mug.obj", "3_box.obj"]
+    for k, path in enumerate(meshes, start=1):
+        mesh = trimesh.load(path, force="mesh")
+        assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
+        assert mesh.is_convex or kind == SURFACE
+        own = SCENE.means[k == TRUTH]
+        np.testing.assert_allclose(mesh.bounds, [own.min(axis=0) - 0.09, own.max(axis=0) + 0.09], atol=0.04)
+        assert path.read_text().startswith("# gsseg_run ")
+
+
+def test_a_surface_follows_a_hollow_that_a_hull_closes() -> None:
+    turns = 2 * np.pi * np.arange(200) / 200
+    rings = [np.stack([np.cos(turns) * r, np.sin(turns) * r, np.full(200, z)], axis=1)
+             for z in (-0.1, 0, 0.1) for r in (0.8, 0.9, 1.0)]  # fmt: skip
+    means = np.concatenate(rings)
+    scene = GaussianScene.from_arrays(
+        means, np.tile([1.0, 0, 0, 0], (len(means), 1)), np.full((len(means), 3), 0.05), np.full(len(means), 0.9),
+        np.zeros((len(means), 1, 3)),
+    )  # fmt: skip
+    codes = np.tile(np.float32([0, 1]), (len(means), 1))
+    ring = Segmentation.from_codes(scene, codes, {0: "background", 1: "ring"}, RefineSettings(cluster=False))
+    volumes = {}
+    for kind in KINDS:
+        mesh = collision_meshes(scene, ring, kind)[1]
+        closed = trimesh.Trimesh(mesh.points, mesh.triangles)
+        assert closed.is_watertight and closed.euler_number == (2 if kind == HULL else 0)
+        volumes[kind] = closed.volume
+    ring_volume = np.pi * (1.05**2 - 0.75**2) * 0.3
+    assert abs(volumes[SURFACE] / ring_volume - 1) < 0.15 and volumes[HULL] > 1.8 * volumes[SURFACE]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_meshes_are_in_the_usd_with_the_collision_schemas(tmp_path: Path, kind: str) -> None:
+    export_classes(SCENE, segmented(), tmp_path, "usd", kind)
+    stage = Usd.Stage.Open(str(tmp_path / "objects.usdc"))
+    parents = stage.GetDefaultPrim().GetChildren()
+    assert [prim.GetChild("collision").IsValid() for prim in parents] == [False, True, True, True]
+    for k, parent in enumerate(parents[1:], start=1):
+        prim = parent.GetChild("collision")
+        assert prim.HasAPI(UsdPhysics.CollisionAPI) and UsdGeom.Imageable(prim).GetPurposeAttr().Get() == "guide"
+        approximation = UsdPhysics.MeshCollisionAPI(prim).GetApproximationAttr().Get()
+        assert approximation == ("convexHull" if kind == HULL else "none")
+        written = collision_meshes(SCENE, segmented(), kind)[k]
+        np.testing.assert_array_equal(np.array(UsdGeom.Mesh(prim).GetPointsAttr().Get()), written.points)
+
+
+def test_floaters_and_haze_do_not_blow_a_mesh_up() -> None:
+    far = SCENE.means.copy()
+    ball = np.flatnonzero(TRUTH == 1)
+    far[ball[0]] = 50
+    opacities = SCENE.opacities.copy()
+    opacities[ball[1]], far[ball[1]] = 0.01, far[ball[2]] + 1
+    scene = GaussianScene.from_arrays(far, SCENE.quats, SCENE.scales, opacities, SCENE.sh)
+    for kind in KINDS:
+        points = collision_meshes(scene, segmented(), kind)[1].points
+        assert np.ptp(points, axis=0).max() < 1.1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_object_of_one_gaussian_has_a_mesh_and_one_that_is_not_opaque_has_none(kind: str) -> None:
+    labels = np.zeros(len(SCENE), np.int32)
+    labels[-1] = 1
+    opacities = SCENE.opacities.copy()
+    opacities[0], labels[0] = 0.01, 2
+    scene = GaussianScene.from_arrays(SCENE.means, SCENE.quats, SCENE.scales, opacities, SCENE.sh)
+    assert list(collision_meshes(scene, replace(segmented(), labels=labels), kind)) == [1]
+
+
+def test_a_selection_in_usd_keeps_its_classes_apart(tmp_path: Path) -> None:
+    labels = np.where(TRUTH == 3, -2, TRUTH)
+    write_selection(SCENE, TRUTH != 0, labels, NAMES, tmp_path / "selection.usda", "usd")
+    stage = Usd.Stage.Open(str(tmp_path / "selection.usda"))
+    assert [prim.GetName() for prim in stage.GetDefaultPrim().GetChildren()] == [
+        "class_1_red_ball", "class_2_cup_mug", "scene",
+    ]  # fmt: skip
+    with pytest.raises(EmptySceneError):
+        write_selection(SCENE, TRUTH > 9, labels, NAMES, tmp_path / "none.usda", "usd")
+    assert not (tmp_path / "none.usda").exists()
+
+
+def test_a_format_or_mesh_that_is_not_there_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="format is 'obj'"):
+        export_classes(SCENE, segmented(), tmp_path / "out", "obj")
+    with pytest.raises(SettingsError, match="collision is 'box'; expected one of hull, surface"):
+        export_classes(SCENE, segmented(), tmp_path / "out", "ply", "box")
+    assert not (tmp_path / "out").exists()
+
+
+def test_file_names_have_the_suffix_of_the_format() -> None:
+    assert class_file_name(7, "a chair", "compressed-ply") == "7_a_chair.compressed.ply"
+    assert class_file_name(7, "a chair", "usd") == "objects.usdc"

@@ -1,0 +1,220 @@
+"""Scenes in other formats: what is written, another program reads."""
+
+from __future__ import annotations
+
+import json
+import struct
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from other_readers import ABOUT_X, Read, by_gaussforge, by_gsply, by_pygltflib, by_splat_transform, by_usd
+
+from gsseg_core.errors import PathTakenError, SceneValueError, SettingsError
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.scene_writers import SCENE_WRITERS, check_format, format_of, write_scene
+from gsseg_core.scene.writers.axes import HALF_TURN_X, HALF_TURN_Z, turned
+
+EXTENT = 6.0
+
+
+def some_scene(count: int = 700, degree: int = 3, seed: int = 0) -> GaussianScene:
+    """Gaussians in a cube, of sizes, opacities and colours that trained ones have."""
+    rng = np.random.default_rng(seed)
+    sh = rng.uniform(-0.4, 0.4, (count, (degree + 1) ** 2, 3))
+    sh[:, 0] = rng.uniform(-1.7, 1.7, (count, 3))
+    scales, opacities = np.exp(rng.uniform(-6, -1, (count, 3))), rng.uniform(0.02, 0.98, count)
+    means = rng.uniform(-EXTENT / 2, EXTENT / 2, (count, 3))
+    return GaussianScene.from_arrays(means, rng.normal(size=(count, 4)), scales, opacities, sh)
+
+
+class Kept(NamedTuple):
+    """How far values may be off: positions in scene units, logarithms of scales, opacities, 1 - |q . q'|, colours.
+
+    `degree` is the largest SH degree that is kept, and `ordered` says whether the order is.
+    """
+
+    position: float
+    log_scale: float
+    opacity: float
+    rotation: float
+    dc: float
+    rest: float = 0.0
+    degree: int = 3
+    ordered: bool = True
+
+
+EXACT = Kept(0, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6)
+KEPT = {
+    "ply": EXACT,
+    "compressed-ply": Kept(EXTENT / 2**10, 5 / 2**10, 1 / 254, 1e-4, 0.02, 1 / 63),
+    "spz": Kept(EXTENT / 2**22, 1 / 31, 1 / 254, 1e-4, 0.0135, 1 / 250),
+    "sog": Kept(EXTENT / 2**13, 0.06, 1 / 254, 1e-4, 0.04, 0.5, ordered=False),
+    "splat": Kept(0, 1e-6, 1 / 254, 2e-3, 0.007, degree=0),
+    "glb": EXACT,
+    "usd": EXACT,
+}
+"""What each format keeps; docs/formats.md says the same in words."""
+
+
+def spz_by_gaussforge(path: Path) -> Read:
+    return by_gaussforge(path).turned(ABOUT_X)
+
+
+READERS: list[tuple[str, Callable[[Path], Read]]] = [
+    ("ply", by_gsply),
+    ("ply", by_splat_transform),
+    ("compressed-ply", by_gaussforge),
+    ("compressed-ply", by_splat_transform),
+    ("spz", spz_by_gaussforge),
+    ("spz", by_splat_transform),
+    ("sog", by_splat_transform),
+    ("splat", by_gaussforge),
+    ("splat", by_splat_transform),
+    ("glb", by_pygltflib),
+    ("usd", by_usd),
+]
+
+
+def assert_kept(found: Read, scene: GaussianScene, kept: Kept) -> None:
+    expected = Read.of(scene)
+    assert len(found.means) == len(scene)
+    if not kept.ordered:
+        found = Read(*(values[nearest(found.means, scene.means)] for values in found))
+    terms = (min(round(scene.sh.shape[1] ** 0.5) - 1, kept.degree) + 1) ** 2
+    assert found.sh.shape == (len(scene), terms, 3)
+    assert np.abs(found.means - expected.means).max() <= kept.position
+    assert np.abs(np.log(found.scales / expected.scales)).max() <= kept.log_scale
+    assert np.abs(found.opacities - expected.opacities).max() <= kept.opacity
+    assert 1 - np.abs((found.quats * expected.quats).sum(axis=1)).min() <= kept.rotation
+    assert np.abs(found.sh[:, 0] - expected.sh[:, 0]).max() <= kept.dc
+    if terms > 1:
+        assert np.abs(found.sh[:, 1:] - expected.sh[:, 1:terms]).max() <= kept.rest
+
+
+def nearest(points: np.ndarray, to: np.ndarray) -> np.ndarray:
+    """Index of the point nearest to each of others; each is one's only."""
+    index: np.ndarray = np.linalg.norm(points[None] - to[:, None], axis=2).argmin(axis=1)
+    assert len(np.unique(index)) == len(to)
+    return index
+
+
+def written(folder: Path, name: str, scene: GaussianScene, run: str | None = None) -> Path:
+    path = folder / f"some{SCENE_WRITERS[name].suffixes[0]}"
+    write_scene(scene, path, run=run)
+    assert [file.name for file in folder.iterdir()] == [path.name]
+    return path
+
+
+@pytest.mark.parametrize(("name", "read"), READERS, ids=lambda case: getattr(case, "__name__", case))
+def test_what_is_written_another_program_reads(tmp_path: Path, name: str, read: Callable[[Path], Read]) -> None:
+    scene = some_scene()
+    assert_kept(read(written(tmp_path, name, scene)), scene, KEPT[name])
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2])
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [case for case in READERS if case[1] is not by_splat_transform],
+    ids=lambda case: getattr(case, "__name__", case),
+)
+def test_lower_degrees_of_harmonics_stay_what_they_are(
+    tmp_path: Path, name: str, read: Callable[[Path], Read], degree: int
+) -> None:
+    scene = some_scene(40, degree)
+    assert_kept(read(written(tmp_path, name, scene)), scene, KEPT[name])
+
+
+@pytest.mark.parametrize("name", SCENE_WRITERS)
+@pytest.mark.parametrize("count", [1, 257])
+def test_a_scene_of_any_size_is_written(tmp_path: Path, name: str, count: int) -> None:
+    assert written(tmp_path, name, some_scene(count, 1)).stat().st_size > 0
+
+
+@pytest.mark.parametrize("name", ["compressed-ply", "spz", "splat"])
+def test_no_opacity_becomes_infinite_as_a_logit(tmp_path: Path, name: str) -> None:
+    scene = some_scene(300, 0)
+    opacities = np.resize([0.0, 1.0, 1e-4, 1 - 1e-4], len(scene))
+    scene = GaussianScene.from_arrays(scene.means, scene.quats, scene.scales, opacities, scene.sh)
+    found = by_gaussforge(written(tmp_path, name, scene)).opacities
+    assert (found > 0).all() and (found < 1).all() and np.abs(found - opacities).max() < 1 / 200
+
+
+def test_positions_as_far_away_as_spz_goes_are_kept_and_farther_ones_refused(tmp_path: Path) -> None:
+    scene = some_scene(100, 0)
+
+    def moved(by: float) -> GaussianScene:
+        return GaussianScene.from_arrays(
+            scene.means + np.array([0, by, 0]), scene.quats, scene.scales, scene.opacities, scene.sh
+        )
+
+    far = moved(3e6)
+    found = spz_by_gaussforge(written(tmp_path, "spz", far))
+    assert np.abs(found.means - far.means).max() <= 0.5
+    with pytest.raises(SceneValueError, match=r"positions reach 5e\+06; expected at most 4,194,303"):
+        write_scene(moved(5e6), tmp_path / "far.spz")
+    assert not (tmp_path / "far.spz").exists()
+
+
+@given(st.sampled_from([HALF_TURN_X, HALF_TURN_Z]), st.integers(0, 3), st.integers(0, 99))
+def test_half_a_turn_turns_shapes_and_colours_and_two_undo_each_other(
+    signs: tuple[int, int, int], degree: int, seed: int
+) -> None:
+    scene = some_scene(5, degree, seed)
+    means, quats, sh = turned(scene, signs)
+    expected = Read.of(scene).turned(np.diag(np.array(signs, float)))
+    np.testing.assert_allclose(means, expected.means)
+    np.testing.assert_allclose(sh, expected.sh, atol=1e-5)
+    again = turned(GaussianScene.from_arrays(means, quats, scene.scales, scene.opacities, sh), signs)
+    np.testing.assert_array_equal(again.means, scene.means)
+    np.testing.assert_array_equal(np.abs(again.sh), np.abs(scene.sh))
+
+
+def test_a_glb_is_as_its_specification_says(tmp_path: Path) -> None:
+    data = written(tmp_path, "glb", some_scene(9, 1), run="a run").read_bytes()
+    magic, version, length, json_length, kind = struct.unpack("<4sII I4s", data[:20])
+    assert (magic, version, length, kind) == (b"glTF", 2, len(data), b"JSON") and json_length % 4 == 0
+    content = json.loads(data[20 : 20 + json_length])
+    assert content["asset"]["extras"] == {"gsseg_run": "a run"}
+    primitive = content["meshes"][0]["primitives"][0]
+    assert primitive["mode"] == 0 and content["extensionsUsed"] == ["KHR_gaussian_splatting"]
+    assert primitive["extensions"]["KHR_gaussian_splatting"]["colorSpace"] == "srgb_rec709_display"
+    for accessor in content["accessors"]:
+        view = content["bufferViews"][accessor["bufferView"]]
+        assert accessor["count"] == 9 and view["byteOffset"] % 4 == view["byteLength"] % 4 == 0
+    assert content["buffers"][0]["byteLength"] == length - 28 - json_length
+
+
+def test_the_format_of_a_file_is_what_its_suffix_says() -> None:
+    asked = {"a.ply": "ply", "a.COMPRESSED.ply": "compressed-ply", "a.usda": "usd", "a.glb": "glb", "a": "ply"}
+    assert {name: format_of(name) for name in asked} == asked
+    assert format_of("a.dat", "spz") == "spz"
+    with pytest.raises(SettingsError, match=r"a\.spz: has the suffix of the format spz, but glb is asked for"):
+        format_of("a.spz", "glb")
+    with pytest.raises(SettingsError, match="suffix of the format compressed-ply, but ply"):
+        format_of("a.compressed.ply", "ply")
+
+
+def test_a_format_that_is_not_there_is_refused_by_one_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(SettingsError, match="format is 'obj'; expected one of ply, compressed-ply, spz, sog"):
+        check_format("obj")
+    for name, module, extra in (("spz", "gsply", "formats"), ("sog", "gaussforge", "formats"), ("usd", "pxr", "usd")):
+        with monkeypatch.context() as missing:
+            missing.setitem(sys.modules, module, None)
+            missing.delitem(sys.modules, SCENE_WRITERS[name].write.split(":")[0], raising=False)
+            with pytest.raises(SettingsError, match=rf"format {name}: needs {module}.*pip install 'gsseg\[{extra}\]'"):
+                check_format(name)
+
+
+@pytest.mark.parametrize("name", SCENE_WRITERS)
+def test_a_write_that_fails_leaves_the_earlier_file_whole(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / f"taken{SCENE_WRITERS[name].suffixes[0]}"
+    folder.mkdir()
+    with pytest.raises(PathTakenError, match="it is a folder"):
+        write_scene(some_scene(5, 0), folder)
+    assert list(tmp_path.rglob("*")) == [folder]
