@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from gsseg_core.errors import SettingsError
+from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.text import clipped
 
@@ -149,7 +149,10 @@ def write_scene(
         scene.save(path, run)
         return
     with write_atomically(path) as temporary:
-        write(temporary, scene, run)
+        try:
+            write(temporary, scene, run)
+        except SceneValueError as error:  # Nobody knows the file into which it was written.
+            raise SceneValueError(f"{path}: {error}") from error
 
 
 def write_objects(

@@ -149,6 +149,16 @@ def test_floaters_and_haze_do_not_blow_a_mesh_up() -> None:
         assert np.ptp(points, axis=0).max() < 1.1
 
 
+def test_an_object_without_a_volume_has_no_hull_and_a_surface_of_its_voxels() -> None:
+    labels = np.zeros(len(SCENE), np.int32)
+    labels[0] = 1
+    scales = SCENE.scales.copy()
+    scales[0] = (0.1, 0.1, np.exp(-40))
+    scene = GaussianScene.from_arrays(SCENE.means, SCENE.quats, scales, SCENE.opacities, SCENE.sh)
+    flat = replace(segmented(), labels=labels)
+    assert collision_meshes(scene, flat, HULL) == {} and list(collision_meshes(scene, flat, SURFACE)) == [1]
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_object_of_one_gaussian_has_a_mesh_and_one_that_is_not_opaque_has_none(kind: str) -> None:
     labels = np.zeros(len(SCENE), np.int32)

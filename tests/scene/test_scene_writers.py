@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -132,8 +133,11 @@ def test_lower_degrees_of_harmonics_stay_what_they_are(
 
 @pytest.mark.parametrize("name", SCENE_WRITERS)
 @pytest.mark.parametrize("count", [1, 257])
-def test_a_scene_of_any_size_is_written(tmp_path: Path, name: str, count: int) -> None:
+def test_a_scene_of_any_size_is_written_without_a_word(
+    tmp_path: Path, name: str, count: int, capfd: pytest.CaptureFixture[str]
+) -> None:
     assert written(tmp_path, name, some_scene(count, 1)).stat().st_size > 0
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("name", ["compressed-ply", "spz", "splat"])
@@ -156,7 +160,7 @@ def test_positions_as_far_away_as_spz_goes_are_kept_and_farther_ones_refused(tmp
     far = moved(3e6)
     found = spz_by_gaussforge(written(tmp_path, "spz", far))
     assert np.abs(found.means - far.means).max() <= 0.5
-    with pytest.raises(SceneValueError, match=r"positions reach 5e\+06; expected at most 4,194,303"):
+    with pytest.raises(SceneValueError, match=r"far\.spz: positions reach 5e\+06; expected at most 4,194,303"):
         write_scene(moved(5e6), tmp_path / "far.spz")
     assert not (tmp_path / "far.spz").exists()
 
@@ -218,3 +222,34 @@ def test_a_write_that_fails_leaves_the_earlier_file_whole(tmp_path: Path, name: 
     with pytest.raises(PathTakenError, match="it is a folder"):
         write_scene(some_scene(5, 0), folder)
     assert list(tmp_path.rglob("*")) == [folder]
+
+
+FULL_DISK = """
+import resource, signal, sys
+from gsseg_core import GaussianScene, GssegError, write_scene
+from gsseg_core.scene.scene_writers import SCENE_WRITERS, check_format
+
+scene = GaussianScene.load(sys.argv[1])
+for name in SCENE_WRITERS:
+    check_format(name)  # Compiled kernels are files, too.
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000))
+for name, writer in SCENE_WRITERS.items():
+    try:
+        write_scene(scene, f"{sys.argv[2]}/some{writer.suffixes[0]}")
+    except GssegError as error:
+        print(name, type(error).__name__, "cannot be written (" in str(error))
+"""
+
+
+def test_a_full_disk_is_one_error_and_the_earlier_file_stays_whole(tmp_path: Path) -> None:
+    some_scene().save(tmp_path / "scene.ply")
+    (tmp_path / "out").mkdir()
+    before = {tmp_path / "out" / f"some{writer.suffixes[0]}" for writer in SCENE_WRITERS.values()}
+    for path in before:
+        path.write_text("as it was")
+    command = [sys.executable, "-c", FULL_DISK, str(tmp_path / "scene.ply"), str(tmp_path / "out")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == [f"{name} WriteError True" for name in SCENE_WRITERS]
+    assert set((tmp_path / "out").iterdir()) == before
+    assert all(path.read_text() == "as it was" for path in before)

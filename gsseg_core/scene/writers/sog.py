@@ -27,5 +27,5 @@ def write_sog(path: Path, scene: GaussianScene, run: str | None) -> None:
     plyfile.PlyData([plyfile.PlyElement.describe(plain.vertices, "vertex")], byte_order="<").write(ply)
     made = gaussforge.GaussForge().convert(ply.getvalue(), "ply", "sog")
     if "error" in made:
-        raise SceneValueError(f"{path}: gaussforge cannot write this scene as SOG ({one_line(str(made['error']))})")
+        raise SceneValueError(f"gaussforge cannot write this scene as SOG ({one_line(str(made['error']))})")
     path.write_bytes(made["data"])

@@ -29,7 +29,7 @@ def write_spz(path: Path, scene: GaussianScene, run: str | None) -> None:
     bits = 24 if farthest == 0 else min(24, math.floor(math.log2(_LARGEST / farthest)))
     if bits < 1:
         raise SceneValueError(
-            f"{path}: positions reach {farthest:.3g}; expected at most {_LARGEST // 2:,}, which is as far as SPZ goes"
+            f"positions reach {farthest:.3g}; expected at most {_LARGEST // 2:,}, which is as far as SPZ goes"
         )
     means, quats, sh = turned(scene, HALF_TURN_X)
     packed = GSData(

@@ -15,13 +15,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdPhysics, UsdSemantics, UsdVol, Vt
+from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdSemantics, UsdVol, Vt
 
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.quaternions import covariances
 from gsseg_core.scene.scene_writers import SceneObject
 from gsseg_core.scene.triangle_mesh import TriangleMesh
-from gsseg_core.text import printable
+from gsseg_core.text import one_line, printable
 
 TAXONOMY = "class"
 """Of the semantic labels."""
@@ -51,7 +51,10 @@ def write_usd(path: Path, objects: Sequence[SceneObject], run: str | None) -> No
             UsdSemantics.LabelsAPI.Apply(splats, TAXONOMY).CreateLabelsAttr([printable(one.name)])
         if one.collision is not None:
             _define_collision(stage, place.AppendChild("collision"), one.collision)
-    stage.GetRootLayer().Export(str(path))
+    try:
+        stage.GetRootLayer().Export(str(path))
+    except Tf.ErrorException as error:
+        raise OSError(one_line(str(error.args[0].commentary))) from error
 
 
 def _identifier(one: SceneObject) -> str:
