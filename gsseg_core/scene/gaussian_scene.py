@@ -11,37 +11,30 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numpy.lib.recfunctions import structured_to_unstructured
 
 from gsseg_core.errors import EmptySceneError, ScenePropertyError, SceneValueError
 from gsseg_core.files.limits import LIMITS
 from gsseg_core.scene import spherical_harmonics
 from gsseg_core.scene.ply import write_vertices
 from gsseg_core.scene.scene_formats import read_scene
-
-_MEANS = ("x", "y", "z")
-DC = ("f_dc_0", "f_dc_1", "f_dc_2")
-_OPACITY = ("opacity",)
-_SCALES = ("scale_0", "scale_1", "scale_2")
-_QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
-_REST_COUNTS = tuple(3 * (d + 1) ** 2 - 3 for d in range(spherical_harmonics.MAX_DEGREE + 1))
+from gsseg_core.scene.vertices import (
+    DC,
+    MEANS,
+    OPACITY,
+    QUATS,
+    REST_COUNTS,
+    SCALES,
+    columns,
+    logits,
+    pack_vertices,
+    rest_names,
+)
 
 # Logits and log scales beyond these change nothing that can be seen, but the activated values would leave (0, 1), or
 # their squares the range of float32.
 _ANY = float(np.finfo(np.float32).max)
 _MAX_LOGIT = 16.0
 _MAX_LOG_SCALE = 40.0
-
-
-def _rest(count: int) -> tuple[str, ...]:
-    return tuple(f"f_rest_{i}" for i in range(count))
-
-
-def _columns(vertices: npt.NDArray[np.void], names: tuple[str, ...]) -> npt.NDArray[np.float32]:  # (N,)
-    """Properties side by side, (N, len(names)): a view where they lie so in memory, else a copy."""
-    with np.errstate(over="ignore"):  # doubles beyond float32 become infinite, which validation reports
-        columns: npt.NDArray[np.float32] = structured_to_unstructured(vertices[list(names)], dtype=np.float32)
-    return columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +66,7 @@ class GaussianScene:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], within: Path | None = None) -> GaussianScene:
-        """Load a scene of any of `gsseg_core.scene.scene_formats.SCENE_FORMATS`.
+        """Load a scene of any of `gsseg_core.scene.scene_formats.SCENE_FORMATS`; Gaussian i is record i of the file.
 
         A 3DGS PLY has SH degree 0 to 3, is ascii or binary, float or double, with properties in any order. With
         `within`, the file must lie below that folder, links followed.
@@ -92,7 +85,7 @@ class GaussianScene:
             The file lies outside `within`.
         """
         path = Path(path)
-        return cls._from_vertices(read_scene(path, within), path)
+        return cls._from_vertices(read_scene(path, within).vertices, path)
 
     @classmethod
     def from_arrays(
@@ -142,18 +135,8 @@ class GaussianScene:
             raise SceneValueError("scene: opacities hold values that are NaN or outside [0, 1]")
 
         dc, rest = arrays["sh"][:, 0], arrays["sh"][:, 1:]
-        rest = rest.transpose(0, 2, 1).reshape(n, 3 * rest.shape[1])  # all of red, then green, then blue
-        opacity = np.clip(arrays["opacities"], 1e-7, 1 - 1e-7)
-        columns = {
-            _MEANS: arrays["means"], ("nx", "ny", "nz"): np.zeros((n, 3)), DC: dc, _rest(rest.shape[1]): rest,
-            _OPACITY: np.log(opacity / (1 - opacity))[:, None], _SCALES: np.log(arrays["scales"]),
-            _QUATS: arrays["quats"],
-        }  # fmt: skip
-        vertices = np.empty(n, [(name, np.float32) for names in columns for name in names])
-        with np.errstate(over="ignore"):
-            for names, values in columns.items():
-                for name, column in zip(names, values.T, strict=True):
-                    vertices[name] = column
+        opacities, log_scales = logits(arrays["opacities"]), np.log(arrays["scales"])
+        vertices = pack_vertices(arrays["means"], arrays["quats"], log_scales, opacities, dc, rest)
         return cls._from_vertices(vertices, None)
 
     @classmethod
@@ -163,10 +146,10 @@ class GaussianScene:
         sh_names = _check_properties(vertices, source)
         if len(vertices) == 0:
             raise EmptySceneError(f"{source}: holds no Gaussian (0 vertices); expected at least one")
-        means, logits, log_scales, quats = (_columns(vertices, names) for names in (_MEANS, _OPACITY, _SCALES, _QUATS))
-        for values, what in ((logits, "opacities"), (log_scales, "scales"), (quats, "rotations")):
+        means, opacities, log_scales, quats = (columns(vertices, names) for names in (MEANS, OPACITY, SCALES, QUATS))
+        for values, what in ((opacities, "opacities"), (log_scales, "scales"), (quats, "rotations")):
             _check_finite(values, what, source, _ANY)
-        for values, what in ((means, "positions"), (_columns(vertices, sh_names), "SH coefficients")):
+        for values, what in ((means, "positions"), (columns(vertices, sh_names), "SH coefficients")):
             _check_finite(values, what, source, LIMITS.max_value)
 
         lengths = np.linalg.norm(quats.astype(np.float64), axis=1, keepdims=True)
@@ -180,7 +163,7 @@ class GaussianScene:
             means=np.ascontiguousarray(means),
             quats=(quats / lengths).astype(np.float32),
             scales=np.exp(np.clip(log_scales, -_MAX_LOG_SCALE, _MAX_LOG_SCALE)),
-            opacities=np.reciprocal(1 + np.exp(-np.clip(logits[:, 0], -_MAX_LOGIT, _MAX_LOGIT))),
+            opacities=np.reciprocal(1 + np.exp(-np.clip(opacities[:, 0], -_MAX_LOGIT, _MAX_LOGIT))),
             vertices=vertices,
             path=path,
         )
@@ -213,16 +196,16 @@ class GaussianScene:
     @property
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 3."""
-        return _REST_COUNTS.index(_count_rest(self.vertices))
+        return REST_COUNTS.index(_count_rest(self.vertices))
 
     @cached_property
     def sh(self) -> npt.NDArray[np.float32]:
         """Coefficients of spherical harmonics, (N, (d + 1)^2, 3) float32, band after band, RGB last."""
-        sh = _columns(self.vertices, DC)[:, None, :]
+        sh = columns(self.vertices, DC)[:, None, :]
         count = _count_rest(self.vertices)
         if count:
             # In the PLY all of red comes first, then green, then blue; f_dc is one of each.
-            rest = _columns(self.vertices, _rest(count)).reshape(len(self), 3, -1).transpose(0, 2, 1)
+            rest = columns(self.vertices, rest_names(count)).reshape(len(self), 3, -1).transpose(0, 2, 1)
             sh = np.concatenate([sh, rest], axis=1)
         return np.ascontiguousarray(sh)
 
@@ -235,13 +218,13 @@ class GaussianScene:
     @cached_property
     def digest(self) -> str:
         """SHA-256 (hex) of the geometry: positions, opacities, scales and rotations as stored, not colours."""
-        geometry = _columns(self.vertices, _MEANS + _OPACITY + _SCALES + _QUATS)
+        geometry = columns(self.vertices, MEANS + OPACITY + SCALES + QUATS)
         return hashlib.sha256(np.ascontiguousarray(geometry, "<f4").data).hexdigest()
 
     def colors(self, camera_center: npt.ArrayLike | None = None) -> npt.NDArray[np.float32]:  # (3,)
         """Evaluate the colours (N, 3), RGB float32 in [0, 1], seen from `camera_center`; of degree 0 only if None."""
         if camera_center is None:
-            return spherical_harmonics.to_rgb(_columns(self.vertices, DC)[:, None, :], self.means)
+            return spherical_harmonics.to_rgb(columns(self.vertices, DC)[:, None, :], self.means)
         offsets = self.means - np.asarray(camera_center, np.float32)
         lengths = np.linalg.norm(offsets, axis=1, keepdims=True)
         return spherical_harmonics.to_rgb(self.sh, offsets / np.maximum(lengths, np.finfo(np.float32).tiny))
@@ -254,13 +237,13 @@ def _count_rest(vertices: npt.NDArray[np.void]) -> int:
 def _check_properties(vertices: npt.NDArray[np.void], source: str) -> tuple[str, ...]:
     """Names of the SH properties, after making sure that all properties of 3DGS are there."""
     names = set(vertices.dtype.names or ())
-    missing = [name for name in _MEANS + DC + _OPACITY + _SCALES + _QUATS if name not in names]
+    missing = [name for name in MEANS + DC + OPACITY + SCALES + QUATS if name not in names]
     if missing:
         raise ScenePropertyError(f"{source}: not a 3DGS scene, lacks the vertex properties {', '.join(missing)}")
     count = _count_rest(vertices)
-    rest = _rest(count)
-    if count not in _REST_COUNTS or not names.issuperset(rest):
-        expected = ", ".join(map(str, _REST_COUNTS))
+    rest = rest_names(count)
+    if count not in REST_COUNTS or not names.issuperset(rest):
+        expected = ", ".join(map(str, REST_COUNTS))
         raise ScenePropertyError(
             f"{source}: has {count} properties f_rest_*; expected {expected} (SH degree 0, 1, 2, 3), numbered from 0"
         )

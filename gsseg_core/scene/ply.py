@@ -35,16 +35,7 @@ def read_vertices(path: str | os.PathLike[str], within: Path | None = None) -> n
         The file lies outside `within`.
     """
     path = Path(path)
-    try:
-        # Text is wrapped here, since plyfile would leave its own wrapper open.
-        with open_input(path, within) as file, io.TextIOWrapper(file, "ascii") if _is_text(file) else file as stream:
-            ply = plyfile.PlyData.read(stream)
-    except OSError as error:
-        raise SceneFileError(f"{path}: cannot be read ({reason(error)}); expected a 3DGS PLY") from error
-    except (plyfile.PlyParseError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError) as error:
-        raise SceneFileError(
-            f"{path}: truncated or not a PLY file ({reason(error)}); expected a whole 3DGS PLY"
-        ) from error
+    ply = _parse(path, within)
     if "vertex" not in ply:
         found = ", ".join(element.name for element in ply) or "none"
         raise SceneFileError(f"{path}: PLY has no element 'vertex' (elements found: {clipped(found)})")
@@ -54,9 +45,38 @@ def read_vertices(path: str | os.PathLike[str], within: Path | None = None) -> n
         raise ScenePropertyError(
             f"{path}: vertex properties {clipped(', '.join(lists))} are lists; expected one number each"
         )
-    # A copy, so that the scene outlives changes to the memory-mapped file.
-    data = element.data
+    return _native(element.data)
+
+
+def read_elements(path: Path, within: Path | None = None) -> dict[str, npt.NDArray[np.void]]:
+    """Read all elements of a PLY by name, as `read_vertices` reads one; properties that are lists are objects.
+
+    Raises
+    ------
+    SceneFileError
+        The file is missing, truncated, or not a PLY.
+    PathNotAllowedError
+        The file lies outside `within`.
+    """
+    return {element.name: _native(element.data) for element in _parse(path, within)}
+
+
+def _native(data: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
+    """Copy rows in native byte order, so that a scene outlives changes to the memory-mapped file."""
     return np.array(data, dtype=data.dtype.newbyteorder("="), subok=False)
+
+
+def _parse(path: Path, within: Path | None) -> Any:
+    try:
+        # Text is wrapped here, since plyfile would leave its own wrapper open.
+        with open_input(path, within) as file, io.TextIOWrapper(file, "ascii") if _is_text(file) else file as stream:
+            return plyfile.PlyData.read(stream)
+    except OSError as error:
+        raise SceneFileError(f"{path}: cannot be read ({reason(error)}); expected a 3DGS PLY") from error
+    except (plyfile.PlyParseError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError) as error:
+        raise SceneFileError(
+            f"{path}: truncated or not a PLY file ({reason(error)}); expected a whole 3DGS PLY"
+        ) from error
 
 
 def _is_text(file: BinaryIO) -> bool:

@@ -1,4 +1,4 @@
-"""Rotation matrices of unit quaternions."""
+"""Rotation matrices of unit quaternions, and quaternions of which a file keeps the three smallest components."""
 
 from __future__ import annotations
 
@@ -30,3 +30,17 @@ def covariances(
     half = rotations(quats) * scales[:, None, :]
     product: npt.NDArray[Number] = half @ half.transpose(0, 2, 1)
     return product
+
+
+def from_smallest_three(
+    largest: npt.NDArray[np.integer],  # (M,) 0 to 3
+    others: npt.NDArray[np.floating],  # (M, 3)
+) -> npt.NDArray[np.float32]:
+    """Restore unit quaternions (M, 4) from which component is largest, and the others in their order."""
+    rest = np.sqrt(np.maximum(0, 1 - np.square(others).sum(axis=1)))
+    quats = np.empty((len(others), 4), np.float32)
+    for k in range(4):
+        before = others[:, min(k, 2)]  # where the largest comes later
+        after = others[:, max(k - 1, 0)]
+        quats[:, k] = np.where(largest == k, rest, np.where(largest > k, before, after))
+    return quats

@@ -1,4 +1,4 @@
-"""The table of scene formats: how each is recognised, and who reads it."""
+"""The table of scene formats: how each is recognised, who reads it, and what it keeps of a Gaussian."""
 
 from __future__ import annotations
 
@@ -8,25 +8,28 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
-
 from gsseg_core.errors import SceneFileError
-from gsseg_core.files.input_files import reason
-from gsseg_core.scene.ply import read_vertices
+from gsseg_core.files.input_files import open_input, reason
+from gsseg_core.scene import checkpoint, compressed_ply, gltf, ksplat, ply_variants, sog, splat, spz
+from gsseg_core.scene.vertices import ReadScene
+
+_HEAD = 1 << 16  # bytes that tell one format from another; a header of PLY with 60 properties takes 2,000
 
 
 @dataclass(frozen=True)
 class SceneFormat:
-    """A format of scenes: what messages call it, its reader, and the suffixes of its files.
+    """A format of scenes: what messages call it, its reader, the suffixes of its files, and what it keeps.
 
-    The reader gets a file, and a folder below which that must lie, or None. It returns the Gaussians as a structured
-    array (N,) with the properties of a 3DGS PLY.
+    The reader gets a file, and a folder below which that must lie, or None. It returns the Gaussians in the order of
+    the file, as vertices of a 3DGS PLY (`gsseg_core.scene.vertices.pack_vertices`). `marks` tells from the first bytes
+    of a file, whatever its suffix, that it is of this format; without it the suffix decides.
     """
 
     name: str
-    read: Callable[[Path, Path | None], npt.NDArray[np.void]]
+    read: Callable[[Path, Path | None], ReadScene]
     suffixes: tuple[str, ...]
+    keeps: str = ""
+    marks: Callable[[bytes], bool] | None = None
 
     @property
     def looked_for(self) -> str:
@@ -34,12 +37,80 @@ class SceneFormat:
         return " or ".join(self.suffixes)
 
 
-SCENE_FORMATS = [SceneFormat("3DGS PLY", read_vertices, (".ply",))]
-"""All formats, the first being that of a file whose suffix nobody knows; who adds one, adds it here."""
+SCENE_FORMATS = [
+    SceneFormat("3DGS PLY", ply_variants.read_3dgs, (".ply",), "everything, as written by trainers"),
+    SceneFormat(
+        "PlayCanvas compressed PLY", compressed_ply.read_compressed_ply, (".compressed.ply",),
+        "SH degree 0 to 3 in 8 bits; positions and scales in 10 to 11 bits per block of 256, rotations in 10, colours "
+        "and opacities in 8", compressed_ply.is_compressed_ply,
+    ),
+    SceneFormat(
+        "Mip-Splatting PLY", ply_variants.read_mip_splatting, (".ply",),
+        "everything; its 3D filter is fused into scales and opacities, its 2D filter is left out",
+        ply_variants.is_mip_splatting,
+    ),
+    SceneFormat(
+        "2DGS PLY", ply_variants.read_2dgs, (".ply",), "everything; the discs become a thousandth as thick as wide",
+        ply_variants.is_2dgs,
+    ),
+    SceneFormat(
+        "SPZ", spz.read_spz, (".spz",),
+        "SH degree 0 to 3 in 4 to 8 bits; positions to 1/4096 of a unit as a rule, scales, colours and opacities in 8 "
+        "bits, rotations in 8 to 10", spz.is_spz,
+    ),
+    SceneFormat(
+        "SOG", sog.read_sog, (".sog", "meta.json"),
+        "SH degree 0 to 3 from a palette of up to 65,536; positions in 16 bits, all else in 8; its writers sort the "
+        "Gaussians", sog.is_sog,
+    ),
+    SceneFormat(
+        "splat", splat.read_splat, (".splat",),
+        "no SH above degree 0; positions and scales as floats, colours, opacities and rotations in 8 bits; some "
+        "writers sort the Gaussians",
+    ),
+    SceneFormat(
+        "ksplat", ksplat.read_ksplat, (".ksplat",),
+        "SH degree 0 to 3; floats (level 0), or 16 bits for positions, scales and rotations (levels 1 and 2); colours "
+        "and opacities in 8 bits; its writers sort the Gaussians",
+    ),
+    SceneFormat(
+        "glTF with KHR_gaussian_splatting", gltf.read_gltf, (".glb", ".gltf"),
+        "everything, as floats or as normalised integers", gltf.is_gltf,
+    ),
+    SceneFormat(
+        "gsplat or nerfstudio checkpoint", checkpoint.read_checkpoint, (".pt", ".ckpt"), "everything",
+        checkpoint.is_checkpoint,
+    ),
+]  # fmt: skip
+"""All formats, the first being that of a file that nobody knows; who adds one, adds it here."""
 
 
-def read_scene(path: str | os.PathLike[str], within: Path | None = None) -> npt.NDArray[np.void]:
-    """Read a scene of any of `SCENE_FORMATS`, a structured array (N,) with the properties of a 3DGS PLY.
+def find_format(path: Path, within: Path | None = None) -> SceneFormat | None:
+    """Find the format of a file, or of a folder of SOG, by its first bytes or else by its suffix; None if unknown.
+
+    A file that cannot be opened is of the format of its suffix, whose reader says why.
+
+    Raises
+    ------
+    PathNotAllowedError
+        It lies outside `within`.
+    """
+    name = path.name.lower()
+    suited = [known for known in SCENE_FORMATS if name.endswith(known.suffixes)]
+    if path.is_dir():
+        return next((known for known in SCENE_FORMATS if known.name == "SOG" and (path / "meta.json").exists()), None)
+    by_suffix = next((known for known in suited if known.marks is None and known is not SCENE_FORMATS[0]), None)
+    try:
+        with open_input(path, within) as file:
+            head = file.read(_HEAD)
+    except OSError:
+        head = b""
+    by_content = (known for known in SCENE_FORMATS if known.marks and known.marks(head))
+    return by_suffix or next(by_content, None) or next(iter(suited), None)
+
+
+def read_scene(path: str | os.PathLike[str], within: Path | None = None) -> ReadScene:
+    """Read a scene of any of `SCENE_FORMATS`: its Gaussians in the order of the file, as vertices of a 3DGS PLY.
 
     With `within`, the file must lie below that folder, links followed.
 
@@ -51,8 +122,8 @@ def read_scene(path: str | os.PathLike[str], within: Path | None = None) -> npt.
         It lies outside `within`.
     """
     path = Path(path)
-    suited = [known for known in SCENE_FORMATS if path.suffix.lower() in known.suffixes]
-    scene_format = (suited or SCENE_FORMATS)[0]
+    suited = find_format(path, within)
+    scene_format = suited or SCENE_FORMATS[0]
     try:
         return scene_format.read(path, within)
     except (SceneFileError, OSError) as error:
@@ -79,5 +150,5 @@ def scene_hint(path: Path) -> str:
 
 
 def _scenes_in(folder: Path) -> list[Path]:
-    suffixes = {suffix for known in SCENE_FORMATS for suffix in known.suffixes}
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in suffixes) if folder.is_dir() else []
+    suffixes = tuple(suffix for known in SCENE_FORMATS for suffix in known.suffixes)
+    return sorted(path for path in folder.iterdir() if path.name.lower().endswith(suffixes)) if folder.is_dir() else []

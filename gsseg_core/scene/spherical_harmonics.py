@@ -62,3 +62,18 @@ def to_rgb(
     degree = round(sqrt(sh.shape[1])) - 1
     rgb: npt.NDArray[np.float32] = np.einsum("nb,nbc->nc", basis(directions, degree), sh)
     return (rgb + np.float32(0.5)).clip(0, 1)
+
+
+def turned(turn: npt.NDArray[np.float64], degree: int) -> npt.NDArray[np.float64]:  # (3, 3) orthogonal
+    """Matrix that turns coefficients along with a scene, (B, B) with B = (degree + 1)^2, block by block of a band.
+
+    The colour that was seen along a direction is seen along the turned one afterwards. Raises `SceneValueError` as
+    `basis` does.
+    """
+    directions = np.random.default_rng(0).normal(size=(64, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    # A function of the turned scene along d is that of the scene before along turn^T d.
+    now, before = (basis(along, degree).astype(np.float64) for along in (directions, directions @ turn))
+    matrix = np.linalg.lstsq(now, before, rcond=None)[0]
+    whole = matrix.round()
+    return np.where(np.abs(matrix - whole) < 1e-5, whole, matrix)

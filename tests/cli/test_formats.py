@@ -15,6 +15,7 @@ from gsseg_core.errors import CameraFileError, SceneFileError
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_formats import SCENE_FORMATS, SceneFormat
+from gsseg_core.scene.vertices import ReadScene
 
 
 @pytest.fixture
@@ -48,15 +49,15 @@ def test_a_scene_format_is_one_line_in_the_table(
 ) -> None:
     scene, _ = balls_on_a_table()
 
-    def read(path: Path, within: Path | None) -> np.ndarray:
-        return scene.vertices[: int(path.read_text())]
+    def read(path: Path, within: Path | None) -> ReadScene:
+        return ReadScene(scene.vertices[: int(path.read_text())])
 
     SCENE_FORMATS.append(SceneFormat("toys", read, (".toy",)))
     request.addfinalizer(SCENE_FORMATS.pop)
     (tmp_path / "room.toy").write_text("7")
     np.testing.assert_array_equal(GaussianScene.load(tmp_path / "room.toy").means, scene.means[:7])
     (tmp_path / "room.txt").write_text("7")
-    with pytest.raises(SceneFileError, match=r"gsseg reads 3DGS PLY \(.ply\), toys \(.toy\)"):
+    with pytest.raises(SceneFileError, match=r"gsseg reads 3DGS PLY \(.ply\), .*, toys \(.toy\)"):
         GaussianScene.load(tmp_path / "room.txt")
     with pytest.raises(SceneFileError, match=r"found room.toy in"):
         GaussianScene.load(tmp_path / "rooom.toy")

@@ -25,7 +25,8 @@ from gsseg_core.files.input_files import open_input
 from gsseg_core.learn.em.confusion_model import ErrorModel
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import UNITS, UnusableViewError
-from gsseg_core.scene.gaussian_scene import DC, GaussianScene
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.vertices import DC
 
 Part = tuple[Any, dict[str, Any]]
 """A sum over some views, of int64, or None, and by view what else came out."""

@@ -1,0 +1,102 @@
+"""PlayCanvas' compressed PLY: blocks of 256 Gaussians, each value a few bits between the extremes of its block."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from gsseg_core.errors import SceneFileError
+from gsseg_core.scene.ply import read_elements
+from gsseg_core.scene.quaternions import from_smallest_three
+from gsseg_core.scene.vertices import REST_COUNTS, ReadScene, dc_of, logits, pack_vertices, rest_names
+
+_BLOCK = 256
+_PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_SH_RANGE = 8.0  # coefficients lie within -4 and 4
+
+
+def is_compressed_ply(head: bytes) -> bool:
+    """Tell a compressed PLY by its header."""
+    header = head.partition(b"end_header")[0]
+    return head.startswith(b"ply") and b"element chunk " in header and b" packed_position" in header
+
+
+def read_compressed_ply(path: Path, within: Path | None = None) -> ReadScene:
+    """Read a compressed PLY, with or without extremes of colours and with or without SH.
+
+    Raises
+    ------
+    SceneFileError
+        The file is missing, truncated, or its elements do not fit each other.
+    """
+    elements = read_elements(path, within)
+    chunks, vertices = elements.get("chunk"), elements.get("vertex")
+    if chunks is None or vertices is None or not set(_PACKED).issubset(vertices.dtype.names or ()):
+        raise SceneFileError(f"{path}: lacks elements or properties of a compressed PLY; expected {', '.join(_PACKED)}")
+    n = len(vertices)
+    if len(chunks) != -(-n // _BLOCK):
+        raise SceneFileError(f"{path}: has {len(chunks):,} chunks for {n:,} vertices; expected {-(-n // _BLOCK):,}")
+    try:
+        position, rotation, scale, color = (vertices[name].astype(np.uint32, casting="safe") for name in _PACKED)
+        rgba = np.stack([_fraction(color, shift, 8) for shift in (24, 16, 8, 0)], axis=1)
+        rgb = (
+            _between(chunks, "min_{}", "max_{}", "rgb", rgba[:, :3])
+            if "min_r" in (chunks.dtype.names or ())
+            else rgba[:, :3]
+        )
+        packed = pack_vertices(
+            _between(chunks, "min_{}", "max_{}", "xyz", _three(position)),
+            _rotations(rotation),
+            _between(chunks, "min_scale_{}", "max_scale_{}", "xyz", _three(scale)),
+            logits(rgba[:, 3]),
+            dc_of(rgb),
+            _rest(elements.get("sh"), n),
+        )
+    except (ValueError, TypeError) as error:
+        raise SceneFileError(f"{path}: not a compressed PLY ({error}); expected one of PlayCanvas") from error
+    return ReadScene(packed)
+
+
+def _fraction(bits: npt.NDArray[np.uint32], shift: int, count: int) -> npt.NDArray[np.float32]:
+    """Take `count` bits of each number as a fraction of the largest that they can say."""
+    most = (1 << count) - 1
+    return ((bits >> np.uint32(shift)) & np.uint32(most)).astype(np.float32) / np.float32(most)
+
+
+def _three(bits: npt.NDArray[np.uint32]) -> npt.NDArray[np.float32]:  # (N,)
+    """Unpack three fractions (N, 3) of 11, 10 and 11 bits."""
+    return np.stack([_fraction(bits, 21, 11), _fraction(bits, 11, 10), _fraction(bits, 0, 11)], axis=1)
+
+
+def _between(
+    chunks: npt.NDArray[np.void], low: str, high: str, axes: str, fractions: npt.NDArray[np.float32]
+) -> npt.NDArray[np.float32]:  # (N, 3)
+    """Place fractions between the extremes of their chunks."""
+    out = np.empty_like(fractions)
+    for i, axis in enumerate(axes):
+        least = chunks[low.format(axis)].repeat(_BLOCK)[: len(fractions)]
+        most = chunks[high.format(axis)].repeat(_BLOCK)[: len(fractions)]
+        with np.errstate(all="ignore"):  # What is NaN or infinite is reported by the scene.
+            out[:, i] = least * (1 - fractions[:, i]) + most * fractions[:, i]
+    return out
+
+
+def _rotations(bits: npt.NDArray[np.uint32]) -> npt.NDArray[np.float32]:  # (N,)
+    others = np.stack([_fraction(bits, shift, 10) for shift in (20, 10, 0)], axis=1)
+    return from_smallest_three(bits >> np.uint32(30), (others - 0.5) * np.float32(np.sqrt(2)))
+
+
+def _rest(sh: npt.NDArray[np.void] | None, n: int) -> npt.NDArray[np.float32] | None:
+    """Coefficients (N, B, 3) of SH above degree 0; a byte is the middle of one of 256 steps, the ends are exact."""
+    if sh is None:
+        return None
+    names = rest_names(len(sh.dtype.names or ()))
+    if len(sh) != n or len(names) not in REST_COUNTS:
+        raise ValueError(f"{len(sh):,} rows of {len(names)} SH coefficients for {n:,} vertices")
+    steps = (np.arange(256, dtype=np.float32) + np.float32(0.5)) / 256
+    steps[0], steps[255] = 0, 1
+    levels = (steps - np.float32(0.5)) * np.float32(_SH_RANGE)
+    values: npt.NDArray[np.float32] = levels[np.stack([sh[name] for name in names], axis=1)]
+    return values.reshape(n, 3, -1).transpose(0, 2, 1)

@@ -1,0 +1,103 @@
+"""3DGS PLYs, and those of relatives that would look right and be wrong: Mip-Splatting, 2DGS, and colours as bytes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from gsseg_core.errors import ScenePropertyError, SceneValueError
+from gsseg_core.scene.ply import read_vertices
+from gsseg_core.scene.vertices import DC, OPACITY, SCALES, ReadScene, columns, dc_of
+
+_RGB = ("red", "green", "blue")
+_FILTER = "filter_3D"
+_FLATNESS = float(np.log(1e-3))  # Thin enough to be a disc, and thick enough for float32.
+
+
+def read_3dgs(path: Path, within: Path | None = None) -> ReadScene:
+    """Read a 3DGS PLY; one with colours as bytes instead of SH, as nerfstudio exports it if asked to, counts as one."""
+    vertices = read_vertices(path, within)
+    names = vertices.dtype.names or ()
+    if DC[0] in names or OPACITY[0] not in names or not set(_RGB).issubset(names):
+        return ReadScene(vertices)
+    dc = dc_of(columns(vertices, _RGB) / 255)
+    return ReadScene(_with(vertices, dict(zip(DC, dc.T, strict=True))), "", ("colours in 8 bits instead of SH",))
+
+
+def is_mip_splatting(head: bytes) -> bool:
+    """Tell by its header a PLY of Mip-Splatting whose 3D filter is not fused."""
+    return b"filter_3D" in _properties(head)
+
+
+def read_mip_splatting(path: Path, within: Path | None = None) -> ReadScene:
+    """Read a PLY of Mip-Splatting, with the 3D smoothing filter fused into scales and opacities.
+
+    A Gaussian of scales s and a filter of size f is that of scales sqrt(s^2 + f^2), its opacity multiplied by
+    sqrt(prod s^2 / prod (s^2 + f^2)): equation 9 of Yu et al., Mip-Splatting, CVPR 2024. The property `filter_3D` is
+    left out, so that nobody fuses it twice.
+
+    Raises
+    ------
+    SceneValueError
+        A filter is negative or NaN.
+    ScenePropertyError
+        A property of 3DGS is missing.
+    """
+    vertices = read_vertices(path, within)
+    _expect(path, vertices, (*SCALES, *OPACITY))
+    size = vertices[_FILTER].astype(np.float64)[:, None]
+    if not (size >= 0).all():
+        raise SceneValueError(f"{path}: {_FILTER} holds values that are NaN or negative; expected sizes of at least 0")
+    with np.errstate(all="ignore"):  # What is NaN or infinite is reported by the scene.
+        logs = columns(vertices, SCALES).astype(np.float64)
+        grown = np.logaddexp(2 * logs, 2 * np.log(size)) / 2
+        opacity = np.exp(-np.logaddexp(0, -vertices[OPACITY[0]].astype(np.float64)) + (logs - grown).sum(axis=1))
+        logit = np.log(opacity) - np.log1p(-opacity)
+    # Where nothing is smoothed, the logit of an opacity near 1 stays as exact as it was.
+    logit = np.where(size[:, 0] > 0, logit, vertices[OPACITY[0]])
+    changed = {**dict(zip(SCALES, grown.T, strict=True)), OPACITY[0]: logit}
+    return ReadScene(_with(vertices, changed, without=_FILTER), "", ("filter_3D is fused into scales and opacities",))
+
+
+def is_2dgs(head: bytes) -> bool:
+    """Tell by its header a PLY of 2DGS, whose Gaussians are discs: they have two scales."""
+    properties = _properties(head)
+    return {b"scale_0", b"scale_1", b"rot_3"}.issubset(properties) and b"scale_2" not in properties
+
+
+def read_2dgs(path: Path, within: Path | None = None) -> ReadScene:
+    """Read a PLY of 2DGS; the third scale, along the normal, is a thousandth of the smaller of the two."""
+    vertices = read_vertices(path, within)
+    _expect(path, vertices, SCALES[:2])
+    thin = np.minimum(vertices[SCALES[0]], vertices[SCALES[1]]) + _FLATNESS
+    return ReadScene(_with(vertices, {SCALES[2]: thin}), "", ("discs, made a thousandth as thick as wide",))
+
+
+def _properties(head: bytes) -> set[bytes]:
+    """Names of the properties in the header of a PLY; none if it is no PLY."""
+    if not head.startswith((b"ply\n", b"ply\r\n")):
+        return set()
+    lines = head.partition(b"end_header")[0].splitlines()
+    return {line.split()[-1] for line in lines if line.startswith(b"property ")}
+
+
+def _expect(path: Path, vertices: npt.NDArray[np.void], names: tuple[str, ...]) -> None:
+    missing = [name for name in names if name not in (vertices.dtype.names or ())]
+    if missing:
+        raise ScenePropertyError(f"{path}: not a 3DGS scene, lacks the vertex properties {', '.join(missing)}")
+
+
+def _with(
+    vertices: npt.NDArray[np.void],  # (N,)
+    changed: dict[str, npt.NDArray[np.floating]],  # (N,)
+    without: str = "",
+) -> npt.NDArray[np.void]:
+    """Copy vertices with properties replaced or added as float32, and one left out."""
+    kept = [(name, vertices.dtype[name]) for name in vertices.dtype.names or () if name != without]
+    added = [(name, np.dtype(np.float32)) for name in changed if name not in (vertices.dtype.names or ())]
+    out = np.empty(len(vertices), [*kept, *added])
+    for name in out.dtype.names or ():
+        out[name] = changed[name] if name in changed else vertices[name]
+    return out

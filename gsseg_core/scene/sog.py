@@ -1,0 +1,176 @@
+"""PlayCanvas' SOG, versions 1 and 2: WebP images of one pixel per Gaussian, in a folder or a zip, and `meta.json`."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
+
+from gsseg_core.errors import SceneFileError
+from gsseg_core.files.input_files import check_pixels, open_input, reason
+from gsseg_core.files.json_files import kind_of, read_json
+from gsseg_core.files.limits import LIMITS
+from gsseg_core.files.npz_files import UnfitError, whole_number
+from gsseg_core.scene.quaternions import from_smallest_three
+from gsseg_core.scene.scene_file import check_count, open_scene
+from gsseg_core.scene.vertices import ReadScene, logits, pack_vertices
+from gsseg_core.text import quoted
+
+_META = "meta.json"
+_EXPECTED = "a SOG scene"
+_PER_ROW = 64  # entries of the palette of SH in a row of its image
+_MAX_IMAGE = 1 << 30  # bytes of one WebP file
+
+Pixels = npt.NDArray[np.uint8]  # (H * W, C)
+Load = Callable[[str], bytes]
+
+
+def is_sog(head: bytes) -> bool:
+    """Tell SOG by its first bytes: a zip that is no checkpoint of PyTorch, or a `meta.json`."""
+    if head.startswith(b"PK\x03\x04"):
+        return b"data.pkl" not in head[:256]
+    return head.lstrip()[:1] == b"{" and b'"means"' in head and b'"quats"' in head
+
+
+def read_sog(path: Path, within: Path | None = None) -> ReadScene:
+    """Read a SOG scene: a zip, the `meta.json` of a folder, or that folder.
+
+    Raises
+    ------
+    SceneFileError
+        A file is missing or broken, an image is too small for the count or larger than it needs to be, or a name leads
+        out of the folder.
+    """
+    if path.is_dir() or path.name == _META or not zipfile.is_zipfile(path):
+        meta = path / _META if path.is_dir() else path
+        with open_scene(meta, within, _EXPECTED):
+            content = read_json(meta, SceneFileError, within)
+            return _decode(content, lambda name: _beside(meta, name, within))
+    with open_scene(path, within, _EXPECTED) as file, zipfile.ZipFile(file) as archive:
+        content = json.loads(_member(archive, _META, LIMITS.max_json_bytes))
+        return _decode(content, lambda name: _member(archive, name, _MAX_IMAGE))
+
+
+def _member(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
+    info = archive.getinfo(name)
+    if info.file_size > most:
+        raise UnfitError(f"claims {info.file_size:,} bytes of {quoted(name)}; expected at most {most:,}")
+    return archive.read(info)
+
+
+def _beside(meta: Path, name: str, within: Path | None) -> bytes:
+    try:
+        with open_input(meta.parent / name, within) as file:
+            content = file.read(_MAX_IMAGE + 1)
+    except OSError as error:
+        raise SceneFileError(f"{meta.parent / name}: cannot be read ({reason(error)}); {_META} names it") from error
+    if len(content) > _MAX_IMAGE:
+        raise UnfitError(f"has {quoted(name)} beside it, which is too large; expected at most {_MAX_IMAGE:,} bytes")
+    return content
+
+
+def _decode(meta: Any, load: Load) -> ReadScene:
+    if not isinstance(meta, dict):
+        raise UnfitError(f"{_META} holds {kind_of(meta)}; expected an object")
+    version = whole_number(meta.get("version", 1), "version", 1, 2)
+    count = meta["count"] if version == 2 else meta["means"]["shape"][0]
+    check_count(whole_number(count, "count", 0, 2**63))
+
+    def pixels(part: str, index: int = 0) -> Pixels:
+        return _pixels(meta[part]["files"][index], load, count)
+
+    sh0 = pixels("sh0")
+    dc, opacity = sh0[:, :3], sh0[:, 3:]
+    vertices = pack_vertices(
+        _means(meta["means"], pixels("means", 0), pixels("means", 1)),
+        _rotations(pixels("quats")),
+        _values(meta["scales"], pixels("scales")[:, :3]),
+        # Version 1 stores logits between extremes, version 2 opacities.
+        logits(opacity[:, 0] / 255) if version == 2 else _values(meta["sh0"], opacity, 3)[:, 0],
+        _values(meta["sh0"], dc),
+        _rest(meta["shN"], pixels("shN", 1), load) if meta.get("shN") else None,
+    )
+    return ReadScene(vertices, str(version))
+
+
+@contextmanager
+def _image(name: object, load: Load) -> Iterator[Image.Image]:
+    if not isinstance(name, str) or not name or Path(name).name != name or "\\" in name:
+        raise UnfitError(f"names the image {quoted(name)}; expected the name of a file beside {_META}")
+    with Image.open(io.BytesIO(load(name)), formats=("WEBP", "PNG")) as image:
+        check_pixels(*image.size, name, UnfitError)  # type: ignore[arg-type]
+        yield image
+
+
+def _pixels(name: object, load: Load, count: int) -> Pixels:
+    """Read the pixels (N, 4) of an image, one per Gaussian."""
+    with _image(name, load) as image:
+        size = image.width * image.height
+        if not count <= size <= 4 * count + (1 << 16):
+            raise UnfitError(
+                f"has {size:,} pixels in {quoted(name)}; expected {count:,}, one per Gaussian, or few more"
+            )
+        return np.asarray(image.convert("RGBA")).reshape(-1, 4)[:count]
+
+
+def _numbers(values: Any, what: str, count: int | None = None) -> npt.NDArray[np.float32]:
+    numbers = np.asarray(values, np.float32).reshape(-1)
+    if count is not None and len(numbers) != count:
+        raise UnfitError(f"has {len(numbers)} numbers in {what}; expected {count}")
+    return numbers
+
+
+def _means(meta: Any, low: Pixels, high: Pixels) -> npt.NDArray[np.float32]:
+    """Positions (N, 3), of which sign(x) ln(1 + |x|) is stored in 16 bits between extremes."""
+    steps = (low[:, :3] | high[:, :3].astype(np.uint16) << 8).astype(np.float32) / np.float32(65535)
+    least, most = (_numbers(meta[key], f"means.{key}", 3) for key in ("mins", "maxs"))
+    with np.errstate(all="ignore"):  # What is NaN or infinite is reported by the scene.
+        logs = least + steps * (most - least)
+        return np.sign(logs) * np.expm1(np.abs(logs))
+
+
+def _values(meta: Any, pixels: Pixels, first: int = 0) -> npt.NDArray[np.float32]:  # (N, C)
+    """Values of bytes: by a code book of 256, or in version 1 between extremes of each channel."""
+    if "codebook" in meta:
+        return _numbers(meta["codebook"], "codebook", 256)[pixels]
+    channels = slice(first, first + pixels.shape[1])
+    least, most = (_extremes(meta[key], key)[channels] for key in ("mins", "maxs"))
+    return least + pixels / np.float32(255) * (most - least)
+
+
+def _extremes(values: Any, what: str) -> npt.NDArray[np.float32]:
+    """Take extremes of up to four channels; a single number is that of all."""
+    numbers = _numbers(values, what)
+    return numbers if len(numbers) > 1 else numbers.repeat(4)
+
+
+def _rotations(pixels: Pixels) -> npt.NDArray[np.float32]:
+    """Quaternions (N, 4): alpha tells which of w, x, y, z is largest, the colours are the others."""
+    largest = pixels[:, 3].astype(np.int64) - 252
+    if largest.min(initial=0) < 0:
+        raise UnfitError(f"has rotations of kind {pixels[:, 3].min()}; expected 252 to 255 (is the image lossless?)")
+    others = (pixels[:, :3] / np.float32(255) * 2 - 1) * np.float32(np.sqrt(0.5))
+    return from_smallest_three(largest, others)
+
+
+def _rest(meta: Any, labels: Pixels, load: Load) -> npt.NDArray[np.float32]:
+    """Coefficients (N, B, 3) of SH above degree 0: each Gaussian names an entry of a palette."""
+    with _image(meta["files"][0], load) as image:
+        palette = np.asarray(image.convert("RGB"))
+    coefficients = palette.shape[1] // _PER_ROW
+    if coefficients not in (3, 8, 15) or palette.shape[1] % _PER_ROW:
+        raise UnfitError(f"has a palette of SH {palette.shape[1]} pixels wide; expected 192, 512 or 960")
+    entries = palette.reshape(-1, coefficients, 3)
+    index = labels[:, 0].astype(np.int64) | labels[:, 1].astype(np.int64) << 8
+    if index.max(initial=0) >= len(entries):
+        raise UnfitError(f"names entry {index.max():,} of a palette of SH; expected at most {len(entries) - 1:,}")
+    values: npt.NDArray[np.float32] = _values(meta, entries.reshape(-1, 3)).reshape(entries.shape)[index]
+    return values

@@ -1,0 +1,218 @@
+"""Niantic's SPZ, versions 1 to 4: bytes and 24-bit numbers, attribute after attribute, under gzip or zstd."""
+
+from __future__ import annotations
+
+import gzip
+import math
+import struct
+from collections.abc import Iterator
+from io import BufferedReader
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gsseg_core.errors import SceneFileError
+from gsseg_core.files.npz_files import UnfitError
+from gsseg_core.scene.moving import move
+from gsseg_core.scene.quaternions import from_smallest_three
+from gsseg_core.scene.scene_file import check_count, check_size, open_scene
+from gsseg_core.scene.spherical_harmonics import MAX_DEGREE
+from gsseg_core.scene.vertices import ReadScene, logits, pack_vertices
+
+_MAGIC = b"NGSP"
+_GZIP = b"\x1f\x8b"
+_HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved or streams
+_HEADER_4 = 32  # from version 4 on; the offset of the table of streams follows those above
+_ANTIALIASED, _EXTENSIONS = 1, 2
+_COORDINATE_SYSTEM = 0xADBE0003
+_COLOR_SCALE = 0.15  # of coefficients of degree 0, so that colours beyond [0, 1] fit
+# The axes of the file, by the number that the extension SPZ_ADOBE_coordinate_system says; 0 and none mean RUB.
+_SYSTEMS = (
+    "RUB", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF",
+    "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU",
+)  # fmt: skip
+# Each direction in the axes of a PLY: right, down, front.
+_AXES = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
+
+
+class _Header(NamedTuple):
+    version: int
+    gaussians: int
+    degree: int
+    fractional_bits: int
+    flags: int
+
+    @property
+    def sizes(self) -> list[int]:
+        """Bytes of positions, alphas, colours, scales, rotations and SH."""
+        position, rotation = (6 if self.version == 1 else 9), (4 if self.version >= 3 else 3)
+        per_gaussian = (position, 1, 3, 3, rotation, 3 * ((self.degree + 1) ** 2 - 1))
+        return [self.gaussians * size for size in per_gaussian]
+
+
+def is_spz(head: bytes) -> bool:
+    """Tell an SPZ file by its first bytes; what is gzipped and no SPZ is refused by its reader."""
+    return head.startswith((_MAGIC, _GZIP))
+
+
+def read_spz(path: Path, within: Path | None = None) -> ReadScene:
+    """Read an SPZ file into the axes of a PLY, which are right, down, front.
+
+    Those of the file are right, up, back unless it says others. SH of degree 4 are left out. Version 4 needs the
+    package zstandard.
+
+    Raises
+    ------
+    SceneFileError
+        The file is missing or broken, holds more or less than its header says, or zstandard is not installed.
+    """
+    with open_scene(path, within, "an SPZ file") as file:
+        return decode_spz(file, path)
+
+
+def decode_spz(file: Any, path: Path) -> ReadScene:
+    """Decode SPZ from an open binary file; raises what `read_spz` raises, or what `open_scene` takes for damage."""
+    magic = file.read(4)
+    file.seek(0)
+    if magic.startswith(_GZIP):
+        header, system, parts = _inflate(file)
+    elif magic == _MAGIC:
+        header, system, parts = _streams(file, path)
+    else:
+        raise ValueError("it starts neither with NGSP nor as gzip does")
+    vertices = _vertices(header, parts)
+    if system != "RDF":
+        move(vertices, np.array([_AXES[letter] for letter in system], np.float64).T)
+    remarks = [f"SH above degree {MAX_DEGREE} are left out"] if header.degree > MAX_DEGREE else []
+    if header.flags & _ANTIALIASED:
+        remarks.append("trained with antialiasing, which is left out")
+    if system != "RUB":
+        remarks.append(f"axes {system}, as the file says")
+    return ReadScene(vertices, str(header.version), tuple(remarks))
+
+
+def _header(content: bytes) -> _Header:
+    check_size(len(content), _HEADER.size, "header")
+    magic, version, count, degree, bits, flags, _ = _HEADER.unpack_from(content)
+    if magic != _MAGIC:
+        raise ValueError("its header does not start with NGSP")
+    if not 1 <= version <= 4:
+        raise UnfitError(f"is SPZ of version {version}; expected 1 to 4")
+    if degree > 4 or bits > 24:
+        raise UnfitError(f"has SH of degree {degree} and {bits} fractional bits; expected at most 4, and 24")
+    check_count(count)
+    return _Header(version, count, degree, bits, flags)
+
+
+def _inflate(file: Any) -> tuple[_Header, str, Iterator[bytes]]:
+    """Inflate what gzip packed, versions 1 to 3: no more of it than the header asks for."""
+    stream = gzip.GzipFile(fileobj=file)
+    header = _header(stream.read(_HEADER.size))
+    if header.version > 3:
+        raise UnfitError(f"is SPZ of version {header.version} under gzip; expected 1 to 3")
+    # Deflate packs a thousand bytes into one at best: a small file cannot hold what it claims.
+    check_size(1032 * file.seek(0, 2), sum(header.sizes), f"{header.gaussians:,} Gaussians")
+    file.seek(0)
+    stream = gzip.GzipFile(fileobj=file)
+    stream.read(_HEADER.size)
+    if header.flags & _EXTENSIONS:
+        raise UnfitError("has extensions under gzip; expected them in version 4 alone")
+
+    def parts() -> Iterator[bytes]:
+        for size in header.sizes:
+            part = stream.read(size)
+            check_size(len(part), size, "data")
+            yield part
+        if stream.read(1):  # Only at the end the checksum is compared.
+            raise UnfitError(f"holds more than {header.gaussians:,} Gaussians, as many as its header says")
+
+    return header, "RUB", parts()
+
+
+def _streams(file: BufferedReader, path: Path) -> tuple[_Header, str, Iterator[bytes]]:
+    """Take the streams of version 4 apart, each under zstd; those of no bytes are left out of the file."""
+    try:
+        from zstandard import ZstdDecompressor
+    except ImportError as error:
+        raise SceneFileError(
+            f"{path}: is SPZ of version 4, which takes the package zstandard: pip install 'gsseg[formats]'"
+        ) from error
+    content = file.read(_HEADER_4)
+    header = _header(content)
+    check_size(len(content), _HEADER_4, "header")
+    count, table = content[15], int.from_bytes(content[16:20], "little")
+    wanted = [size for size in header.sizes if size]
+    if header.version < 4 or not _HEADER_4 <= table <= 1 << 20 or count != len(wanted):
+        raise UnfitError(f"has {count} streams in version {header.version}; expected {len(wanted)}, and version 4")
+    system = _axes_said(file.read(table - _HEADER_4)) if header.flags & _EXTENSIONS else "RUB"
+    file.seek(table)
+    sizes = struct.unpack(f"<{2 * count}Q", file.read(16 * count))
+    if list(sizes[1::2]) != wanted:
+        raise UnfitError(f"has streams of {sizes[1::2]} bytes; expected {wanted} for its Gaussians")
+
+    def parts() -> Iterator[bytes]:
+        packed = iter(sizes[::2])
+        for size in header.sizes:
+            if not size:
+                yield b""
+                continue
+            content = file.read(min(next(packed), 2 * size + (1 << 20)))  # Zstd makes nothing much larger.
+            part = ZstdDecompressor().stream_reader(content).read(size)
+            check_size(len(part), size, "data")
+            yield part
+
+    return header, system, parts()
+
+
+def _axes_said(extensions: bytes) -> str:
+    """Find the axes in the extensions: records of a type, a length, and as many bytes."""
+    place = 0
+    while place + 8 <= len(extensions):
+        kind, size = struct.unpack_from("<II", extensions, place)
+        if kind == _COORDINATE_SYSTEM and size >= 4:
+            number = int.from_bytes(extensions[place + 8 : place + 12], "little")
+            if number >= len(_SYSTEMS):
+                raise UnfitError(f"says that its axes are number {number}; expected 0 to {len(_SYSTEMS) - 1}")
+            return _SYSTEMS[number]
+        place += 8 + size
+    return "RUB"
+
+
+def _vertices(header: _Header, parts: Iterator[bytes]) -> npt.NDArray[np.void]:
+    n, coefficients = header.gaussians, (min(header.degree, MAX_DEGREE) + 1) ** 2 - 1
+    position, alpha, color, scale, rotation, sh = (np.frombuffer(part, np.uint8) for part in parts)
+    rest = sh.reshape(n, -1, 3)[:, :coefficients] if coefficients else None
+    vertices = pack_vertices(
+        _positions(position, header),
+        _rotations(rotation.reshape(n, -1)),
+        scale.reshape(n, 3) / np.float32(16) - np.float32(10),
+        logits(alpha / 255),
+        (color.reshape(n, 3) / np.float32(255) - np.float32(0.5)) / np.float32(_COLOR_SCALE),
+        None if rest is None else (rest - np.float32(128)) / np.float32(128),
+    )
+    return vertices
+
+
+def _positions(packed: npt.NDArray[np.uint8], header: _Header) -> npt.NDArray[np.floating]:
+    """Positions (N, 3): half floats in version 1, else signed 24-bit numbers with a fixed point."""
+    if header.version == 1:
+        return packed.view("<f2").reshape(-1, 3).astype(np.float32)
+    wide = np.zeros((3 * header.gaussians, 4), np.uint8)
+    wide[:, 1:] = packed.reshape(-1, 3)
+    # Shifted down from the upper bytes, the sign comes along.
+    return (wide.view("<i4").reshape(-1, 3) >> 8) * np.float32(math.ldexp(1, -header.fractional_bits))
+
+
+def _rotations(packed: npt.NDArray[np.uint8]) -> npt.NDArray[np.floating]:  # (N, 3) or (N, 4)
+    """Quaternions (N, 4) w, x, y, z: of three bytes x, y, z, or of three components in ten bits each, of x, y, z, w."""
+    if packed.shape[1] == 3:
+        others = packed / np.float32(127.5) - np.float32(1)
+        return from_smallest_three(np.zeros(len(packed), int), others)
+    bits = np.ascontiguousarray(packed).view("<u4")[:, 0]
+    others = np.empty((len(packed), 3), np.float32)
+    for i, shift in enumerate((20, 10, 0)):
+        size = ((bits >> np.uint32(shift)) & np.uint32(511)).astype(np.float32) * np.float32(math.sqrt(0.5) / 511)
+        others[:, i] = np.where(bits >> np.uint32(shift + 9) & np.uint32(1), -size, size)
+    return from_smallest_three(bits >> np.uint32(30), others)[:, [3, 0, 1, 2]]

@@ -1,0 +1,103 @@
+"""Gaussians as vertices of a 3DGS PLY: one structured array for scenes of every format."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numpy.lib.recfunctions import structured_to_unstructured
+
+from gsseg_core.scene import spherical_harmonics
+
+MEANS = ("x", "y", "z")
+NORMALS = ("nx", "ny", "nz")
+DC = ("f_dc_0", "f_dc_1", "f_dc_2")
+OPACITY = ("opacity",)
+SCALES = ("scale_0", "scale_1", "scale_2")
+QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
+REST_COUNTS = tuple(3 * (d + 1) ** 2 - 3 for d in range(spherical_harmonics.MAX_DEGREE + 1))
+"""How many properties f_rest_* a scene of SH degree 0, 1, 2, 3 has."""
+
+_MARGIN = 1e-7  # Opacities are kept so far from 0 and 1, where the logit is infinite.
+_LEAST_SCALE = float(np.exp(-40))  # What half floats and bytes round to nothing is no more than this.
+
+
+class ReadScene(NamedTuple):
+    """What the reader of a scene format returns.
+
+    Attributes
+    ----------
+    vertices : ndarray (N,) structured
+        One Gaussian per record of the file, in the order of the file, with the properties of a 3DGS PLY.
+    version : str
+        Version of the format, empty if it has none.
+    remarks : tuple of str
+        What was left out or converted while reading this file, for `gsseg doctor`; beyond what its format loses.
+    """
+
+    vertices: npt.NDArray[np.void]  # (N,)
+    version: str = ""
+    remarks: tuple[str, ...] = ()
+
+
+def rest_names(count: int) -> tuple[str, ...]:
+    """Names of the first `count` properties f_rest_*."""
+    return tuple(f"f_rest_{i}" for i in range(count))
+
+
+def pack_vertices(
+    means: npt.NDArray[np.floating],  # (N, 3)
+    quats: npt.NDArray[np.floating],  # (N, 4) w, x, y, z
+    log_scales: npt.NDArray[np.floating],  # (N, 3)
+    logits: npt.NDArray[np.floating],  # (N,)
+    dc: npt.NDArray[np.floating],  # (N, 3)
+    rest: npt.NDArray[np.floating] | None = None,  # (N, (d + 1)^2 - 1, 3)
+) -> npt.NDArray[np.void]:
+    """Lay Gaussians out as trainers lay out a PLY, (N,) of float32; zeros for normals.
+
+    Values are those that a PLY stores: logarithms of scales, logits of opacities, quaternions of any length. `rest` are
+    the coefficients of spherical harmonics above degree 0, band after band, RGB last. What float32 cannot hold becomes
+    infinite, which validation reports.
+    """
+    n, bands = len(means), 0 if rest is None else rest.shape[1]
+    groups = (MEANS, NORMALS, DC, rest_names(3 * bands), OPACITY, SCALES, QUATS)
+    names = [name for group in groups for name in group]
+    table = np.zeros((n, len(names)), np.float32)
+    blocks = {MEANS: means, DC: dc, OPACITY: logits[:, None], SCALES: log_scales, QUATS: quats}
+    with np.errstate(over="ignore"):
+        for group, values in blocks.items():
+            first = names.index(group[0])
+            table[:, first : first + len(group)] = values
+        if rest is not None and bands:
+            first = names.index("f_rest_0")
+            # All of red comes first, then green, then blue.
+            table[:, first : first + 3 * bands].reshape(n, 3, bands)[:] = rest.transpose(0, 2, 1)
+    vertices: npt.NDArray[np.void] = table.view([(name, np.float32) for name in names])[:, 0]
+    return vertices
+
+
+def columns(vertices: npt.NDArray[np.void], names: tuple[str, ...]) -> npt.NDArray[np.float32]:  # (N,)
+    """Put properties side by side, (N, len(names)): a view where they lie so in memory, else a copy."""
+    with np.errstate(over="ignore"):  # doubles beyond float32 become infinite, which validation reports
+        side_by_side: npt.NDArray[np.float32] = structured_to_unstructured(vertices[list(names)], dtype=np.float32)
+    return side_by_side
+
+
+def logits(opacities: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+    """Logits of opacities in [0, 1], kept finite; of what is no opacity, NaN, which validation reports."""
+    given = np.asarray(opacities, np.float64)
+    inside = np.clip(np.where((given >= 0) & (given <= 1), given, np.nan), _MARGIN, 1 - _MARGIN)
+    found: npt.NDArray[np.float64] = np.log(inside / (1 - inside))
+    return found
+
+
+def log_scales(scales: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+    """Logarithms of scales, finite where one was rounded to 0; of a negative one NaN, which validation reports."""
+    with np.errstate(invalid="ignore"):
+        return np.log(np.where(scales == 0, _LEAST_SCALE, np.asarray(scales, np.float64)))
+
+
+def dc_of(rgb: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:  # (N, 3)
+    """Coefficients (N, 3) of degree 0 that show colours in [0, 1] from everywhere."""
+    return (np.asarray(rgb, np.float64) - 0.5) / spherical_harmonics.C0
