@@ -41,7 +41,7 @@ class PoseError(GssegError):
 
 
 class IntrinsicsError(GssegError):
-    """An intrinsic matrix or image size is unusable, or a lens is not a pinhole without distortion."""
+    """An intrinsic matrix or image size is unusable, or a lens of an unknown model or with impossible distortion."""
 
 
 class MaskFormatError(GssegError):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from gsseg_core.data.class_names import class_name
 from gsseg_core.data.label_images import UNKNOWN, read_mask
 from gsseg_core.errors import MaskFormatError, MaskSizeError, NoUsableViewsError
 from gsseg_core.files.run_folder import settle
+from gsseg_core.scene.camera import Camera
 
 BOUNDARY_SHARE = 0.02
 """Width of the boundary band as a share of the image diagonal (Cheng et al., Boundary IoU, CVPR 2021)."""
@@ -166,10 +167,11 @@ def boundary_band(labels: np.ndarray, width: int) -> np.ndarray:  # (H, W) of a 
     return np.asarray(lowest != highest)
 
 
-def evaluate_folders(pred_dir: str | Path, truth_dir: str | Path) -> Evaluation:
+def evaluate_folders(pred_dir: str | Path, truth_dir: str | Path, cameras: Iterable[Camera] = ()) -> Evaluation:
     """Compare every `<stem>.png` in one folder of label images with the file of the same name in another.
 
-    Truth without a prediction is ignored, since a folder of true masks holds the train views too.
+    Truth without a prediction is ignored, since a folder of true masks holds the train views too. With `cameras`, truth
+    that was drawn on images that a lens bent is undistorted: predictions are of the pinhole views.
 
     Raises
     ------
@@ -185,15 +187,20 @@ def evaluate_folders(pred_dir: str | Path, truth_dir: str | Path) -> Evaluation:
     predictions = sorted(pred_dir.glob("*.png"))
     if not predictions:
         raise NoUsableViewsError(f"{pred_dir}: found no predictions; expected label images <stem>.png")
-    missing = [path.name for path in predictions if not (truth_dir / path.name).is_file()]
+    from gsseg_core.data.view import View  # It loads numba, which is of no use to anybody else here.
+
+    bent = {camera.name: camera for camera in cameras if camera.undistortion is not None}
+    truths = [truth_dir / (f"{bent[path.stem].image}.png" if path.stem in bent else path.name) for path in predictions]
+    missing = [path.name for path in truths if not path.is_file()]
     if missing:
         raise MaskFormatError(
             f"{truth_dir}: found no {missing[0]} (and {len(missing) - 1} more of {len(predictions)} are missing); "
             f"expected a true mask for every prediction in {pred_dir}"
         )
     evaluation = Evaluation()
-    for path in predictions:
-        evaluation.add(read_mask(truth_dir / path.name).labels, read_mask(path).labels, name=str(path))
+    for path, truth in zip(predictions, truths, strict=True):
+        labels = View(bent[path.stem], truth).read_labels() if path.stem in bent else read_mask(truth).labels
+        evaluation.add(labels, read_mask(path).labels, name=str(path))
     return evaluation
 
 

@@ -9,7 +9,8 @@ from gsseg_core.cli.terminal import tell
 
 DESCRIPTION = """
 Scores predicted label maps against true ones of the same names: IoU, accuracy and boundary IoU of each class, and
-their means over the classes that occur. Pixels whose truth is unknown do not count.
+their means over the classes that occur. Pixels whose truth is unknown do not count. Where the cameras beside the truth
+have lenses that bend, the truth is undistorted first, as rendered label maps are those of pinhole views.
 """
 EXAMPLES = """
   gsseg eval --pred rendered --truth DATASET/labels
@@ -26,6 +27,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Score, and print a table."""
+    from gsseg_core.data.camera_files import read_cameras
+    from gsseg_core.data.camera_formats.table import CAMERA_FORMATS
     from gsseg_core.data.class_names import read_classes
     from gsseg_core.errors import ClassesFileError
     from gsseg_core.files.atomic import check_writable
@@ -36,9 +39,11 @@ def run(options: argparse.Namespace) -> int:
 
     if options.json:
         check_writable(options.json)
-    classes = Path(options.truth).parent / "classes.json"
+    root = Path(options.truth).parent
+    classes = root / "classes.json"
     names = read_classes(classes) if is_there(classes, ClassesFileError) else None
-    scores = evaluate_folders(options.pred, options.truth).as_dict(names)
+    cameras = read_cameras(root) if any(known.find(root) for known in CAMERA_FORMATS) else []
+    scores = evaluate_folders(options.pred, options.truth, cameras).as_dict(names)
     if options.json:
         write_json(options.json, scores)
     tell(evaluation_summary(scores))

@@ -37,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Pick, and say what was written."""
     from gsseg_core.data.dataset import Dataset
+    from gsseg_core.data.label_images import UNKNOWN
     from gsseg_core.data.view import View
     from gsseg_core.export.pictures import overlay, palette, save_png
     from gsseg_core.export.view_pictures import background_image
@@ -55,7 +56,10 @@ def run(options: argparse.Namespace) -> int:
     load_kernels(options.quiet, options.device)
     with staged_run(out, "pick", places=("object.ply", "pick.npz", "pick.png")) as run:
         if options.mask:
-            view = View.from_arrays(camera, read_object_mask(options.mask, options.label))
+            mask = read_object_mask(options.mask, options.label)
+            if camera.undistortion is not None:
+                mask = camera.undistortion.sample(mask, UNKNOWN)
+            view = View.from_arrays(camera, mask)
             picked = pick_mask(scene, view, device=options.device)
         else:
             inside, outside = ([(row, column) for column, row in clicks] for clicks in (options.click, options.outside))

@@ -17,14 +17,16 @@ from gsseg_core.text import quoted
 def read_cameras(folder: str | os.PathLike[str], within: Path | None = None) -> list[Camera]:
     """Read the cameras of a dataset folder, from the first of `CAMERA_FORMATS` that it has, in the order of the file.
 
-    Names are the stems of the image names. With `within`, the files must lie below that folder, links followed.
+    Names are the stems of the image names. Where a lens bent the images, the cameras are those of their pinhole views;
+    of a panorama there are six, named `<stem>_front` and so on: see `Camera.undistortion`. With `within`, the files
+    must lie below that folder, links followed.
 
     Raises
     ------
     CameraFileError
         No cameras are there, or a file is broken, or two images share a stem.
     PoseError, IntrinsicsError
-        A camera is unusable; only undistorted images are supported.
+        A camera is unusable, or its lens is of no known model.
     PathNotAllowedError
         A file lies outside `within`.
     """

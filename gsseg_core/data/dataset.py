@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import os
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +17,7 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import ClassesFileError, SettingsError, SplitFileError
 from gsseg_core.files.input_files import READABLE_IMAGES, is_there, list_folder
 from gsseg_core.files.json_files import read_object
+from gsseg_core.scene.camera import Camera
 from gsseg_core.text import clipped, quoted
 
 
@@ -59,17 +60,19 @@ class Dataset:
         self.cameras = read_cameras(self.root, self._within)
         classes = self.root / "classes.json"
         self._declared = read_classes(classes, self._within) if is_there(classes, ClassesFileError) else None
-        stems = [camera.name for camera in self.cameras]
+        stems = [camera.image for camera in self.cameras]
         masks = mask_files(self.root / labels, stems, self._within)
         supervises = self.root / labels / SUPERVISES
         supervised = read_supervises(supervises, masks, stems, self._declared, self._within)
         photos = list_folder(self.root / "images", self._within)
         images = {path.stem: path for path in photos if path.suffix.lower() in READABLE_IMAGES}
         self._views = {
-            name: View(camera, masks.get(name), images.get(name), self._declared, supervised.get(name), self._within)
-            for name, camera in zip(stems, self.cameras, strict=True)
+            camera.name: View(
+                camera, masks.get(stem), images.get(stem), self._declared, supervised.get(stem), self._within
+            )
+            for stem, camera in zip(stems, self.cameras, strict=True)
         }
-        self._split = _read_split(self.root / "split.json", self._views, self._within)
+        self._split = _read_split(self.root / "split.json", self.cameras, self._within)
 
     def views(self, split: str = "all") -> list[View]:
         """List the views of a split, "train", "test" or "all"; without `split.json` all views are for training."""
@@ -114,8 +117,8 @@ class Dataset:
         return other
 
 
-def _read_split(path: Path, views: Collection[str], within: Path | None = None) -> dict[str, list[str]]:
-    """Read `split.json`: stems of the views by "train" and "test"; without a file, all are for training.
+def _read_split(path: Path, cameras: Sequence[Camera], within: Path | None = None) -> dict[str, list[str]]:
+    """Read `split.json`, stems of images by "train" and "test", as names of views; without it, all are for training.
 
     Raises
     ------
@@ -125,11 +128,14 @@ def _read_split(path: Path, views: Collection[str], within: Path | None = None) 
         Links lead out of the folder `within`.
     """
     if not is_there(path, SplitFileError):
-        return {"train": list(views), "test": []}
+        return {"train": [camera.name for camera in cameras], "test": []}
     expected = '{"train": [stems], "test": [stems]}'
     content = read_object(path, SplitFileError, expected, within)
     if "train" not in content:
         raise SplitFileError(f'{path}: no "train" in it; expected {expected}')
+    views: dict[str, list[str]] = {}
+    for camera in cameras:
+        views.setdefault(camera.image, []).append(camera.name)
     split = {name: content.get(name, []) for name in ("train", "test")}
     for name, stems in split.items():
         if not isinstance(stems, list) or not all(isinstance(stem, str) for stem in stems):
@@ -143,4 +149,4 @@ def _read_split(path: Path, views: Collection[str], within: Path | None = None) 
     stem, count = Counter(split["train"] + split["test"] or [""]).most_common(1)[0]
     if count > 1:
         raise SplitFileError(f"{path}: stem {quoted(stem)} occurs {count} times; expected each stem once, in one split")
-    return split
+    return {name: [view for stem in stems for view in views[stem]] for name, stems in split.items()}

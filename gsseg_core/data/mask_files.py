@@ -123,7 +123,7 @@ def _check_claims(path: Path, arrays: NpzArrays, class_names: Mapping[int, str] 
     """Check what the headers of the arrays say, before any array is read."""
     probabilities = arrays.header("probabilities")
     classes, unknown = (arrays.header(name) if name in arrays.names else None for name in ("classes", _UNKNOWN))
-    shape, size = probabilities.shape, None if camera is None else (camera.height, camera.width)
+    shape, size = probabilities.shape, None if camera is None else camera.image_size[::-1]
     if len(shape) == 3 and shape[:2] == size != shape[1:]:
         raise MaskFormatError(
             f"{path}: probabilities are {probabilities}, the classes last; expected (K, H, W), the classes first"
@@ -131,7 +131,7 @@ def _check_claims(path: Path, arrays: NpzArrays, class_names: Mapping[int, str] 
     check_forms(probabilities, classes, unknown, str(path))
     count, height, width = shape
     if camera is not None:
-        camera.check_mask_size(width, height, str(path))
+        camera.check_image_mask_size(width, height, str(path))
     check_pixels(width, height, str(path), MaskFormatError)
     if classes is None and class_names is not None and count != max(class_names) + 1:
         raise UnknownLabelError(
@@ -161,7 +161,7 @@ def _read_image(path: Path, camera: Camera | None, within: Path | None) -> npt.N
     """Read an image of one class, as probabilities (H, W) float32."""
     with open_image(path, MaskFormatError, "image", "probabilities of one class", ("PNG", "TIFF"), within) as image:
         if camera is not None:
-            camera.check_mask_size(*image.size, str(path))
+            camera.check_image_mask_size(*image.size, str(path))
         mode, values = image.mode, np.array(image)
     if mode == "L":
         return values.astype(np.float32) / np.float32(2**8 - 1)

@@ -19,6 +19,7 @@ from gsseg_core.data.label_images import UNKNOWN, PackedLabels
 from gsseg_core.errors import MaskFormatError, MaskSizeError, UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.npz_files import Header
+from gsseg_core.scene.undistortion import Undistortion
 from gsseg_core.text import clipped
 
 STEPS = (16, 8, 4, 2, 1)
@@ -51,6 +52,13 @@ class SeenLabels(NamedTuple):
         if self.evidence is None:
             return self.labels
         return np.append(self.evidence.named(), np.int32(UNKNOWN))[self.labels]
+
+    def undistorted(self, undistortion: Undistortion) -> SeenLabels:
+        """Make the mask of a pinhole view of the one drawn on its image, by nearest pixels; `UNKNOWN` outside it."""
+        labels = undistortion.sample(self.labels, UNKNOWN)
+        if self.evidence is None or self.evidence.mass is None:
+            return SeenLabels(labels, self.evidence)
+        return _tidied(labels, self.evidence.classes, self.evidence.mass, self.evidence.supervised, None)
 
     def numbered(self, ids: npt.NDArray[np.int32], source: str) -> SeenLabels:
         """Renumber the classes by their place among some ids, ascending.

@@ -31,9 +31,9 @@ class View:
         Where from.
     mask_path : pathlib.Path or None
         The mask: a label image (.png), probabilities (.npz) or a folder of detections, see docs/masks.md; None if there
-        is none or it is in memory.
+        is none or it is in memory. It is drawn on the image as it was taken, and undistorted when it is read.
     image_path : pathlib.Path or None
-        The photo, if there is one.
+        The photo as it was taken, if there is one.
     class_names : mapping from id to name, or None
         If given, labels must be among its ids.
     supervised : tuple of int, or None
@@ -64,6 +64,8 @@ class View:
         supervised: Collection[int] | None = None,
     ) -> View:
         """Build a view from labels (H, W) of whole numbers, `UNKNOWN` (-1) where nothing is known.
+
+        Masks in memory are those of the pinhole view; `camera.undistortion.sample` makes them of one drawn on a photo.
 
         Parameters
         ----------
@@ -206,6 +208,8 @@ class View:
             seen = self._mask.unpack()
         elif self.mask_path is not None:
             seen = self._read_file(self.mask_path)
+            if self.camera.undistortion is not None:
+                seen = seen.undistorted(self.camera.undistortion)
         else:
             raise MaskFormatError(f"{source}: has no mask; expected a label image {self.name}.png")
         self._check_seen(seen, source)
@@ -215,7 +219,7 @@ class View:
         if path.suffix.lower() != ".png":
             return read_soft_mask(path, self.class_names, self.camera, self.within)
         header = mask_header(path, self.within)  # Before any pixel is read.
-        self.camera.check_mask_size(header.width, header.height, str(path))
+        self.camera.check_image_mask_size(header.width, header.height, str(path))
         labels = read_mask(path, self.within).labels
         return SeenLabels(labels) if self.supervised is None else restrict(labels, self.supervised, str(path))
 

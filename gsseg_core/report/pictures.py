@@ -163,12 +163,14 @@ def _extent(weights: np.ndarray, places: np.ndarray) -> tuple[int, int]:
 
 
 def _read_photo(view: View) -> np.ndarray | None:
-    """Read the photo of a view; None if there is none of the camera's size, or none that can be read."""
+    """Read the photo of a view, undistorted; None if there is none of its camera's, or none that can be read."""
     if view.image_path is None:
         return None
     try:
         with open_image(view.image_path, MaskFormatError, "image", "a photo") as photo:
-            fits = photo.size == (view.camera.width, view.camera.height)
-            return np.asarray(photo.convert("RGB")) if fits else None
+            if photo.size != view.camera.image_size:
+                return None
+            taken, undistortion = np.asarray(photo.convert("RGB")), view.camera.undistortion
+            return taken if undistortion is None else undistortion.photo(taken)
     except MaskFormatError:  # A picture for people is not worth an error.
         return None

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from gsseg_core.errors import IntrinsicsError, MaskSizeError, PoseError
 from gsseg_core.files.input_files import check_pixels
 from gsseg_core.files.limits import LIMITS
+from gsseg_core.scene.undistortion import Undistortion
 from gsseg_core.text import clipped
 
 # Poses come from text files of few digits; a deviation this small moves no point by a pixel.
@@ -18,18 +19,20 @@ _RIGID_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A posed pinhole camera without distortion.
+    """A posed pinhole camera; where a lens bent the image, the pinhole view that is made of it.
 
     Attributes
     ----------
     name : str
-        Stem of the image's file name.
+        Stem of the image's file name; of a view of a panorama, `_front`, `_right` and so on follow.
     width, height : int
         Image size in pixels.
     K : ndarray (3, 3) float64
         Intrinsic matrix in pixels, without skew.
     world_to_camera : ndarray (4, 4) float64
         Rigid motion from the world (the scene) to the camera.
+    undistortion : Undistortion or None
+        How the view is made of the image, and the masks of the view of those of the image; None if they are the same.
 
     Raises
     ------
@@ -44,6 +47,7 @@ class Camera:
     height: int
     K: npt.NDArray[np.float64]  # (3, 3)
     world_to_camera: npt.NDArray[np.float64]  # (4, 4)
+    undistortion: Undistortion | None = None
 
     def __post_init__(self) -> None:
         """Copy the matrices and validate."""
@@ -94,12 +98,31 @@ class Camera:
         divisor = np.where(depth > 0, depth, np.nan)[:, None]
         return local[:, :2] / divisor * self.K[[0, 1], [0, 1]] + self.K[:2, 2], depth
 
+    @property
+    def image(self) -> str:
+        """Stem of the file name of the image that the view is made of."""
+        face = self.undistortion.face if self.undistortion else ""
+        return self.name.removesuffix(f"_{face}") if face else self.name
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height in pixels of the image as it was taken, and of masks drawn on it."""
+        taken_by = self.undistortion.lens if self.undistortion else self
+        return taken_by.width, taken_by.height
+
     def check_mask_size(self, width: int, height: int, source: str) -> None:
-        """Raise `MaskSizeError` if a mask has another size in pixels than this camera."""
-        if (width, height) != (self.width, self.height):
+        """Raise `MaskSizeError` if the mask of this view has another size in pixels."""
+        self._check_size((width, height), (self.width, self.height), source)
+
+    def check_image_mask_size(self, width: int, height: int, source: str) -> None:
+        """Raise `MaskSizeError` if a mask drawn on the image has another size in pixels than the image."""
+        self._check_size((width, height), self.image_size, source)
+
+    def _check_size(self, found: tuple[int, int], expected: tuple[int, int], source: str) -> None:
+        if found != expected:
             raise MaskSizeError(
-                f"{source}: mask is {width} x {height} pixels; expected {self.width} x {self.height}, the size of "
-                f"{self._who} (masks are never resized)"
+                f"{source}: mask is {found[0]} x {found[1]} pixels; expected {expected[0]} x {expected[1]}, the size "
+                f"of {self._who} (masks are never resized)"
             )
 
     @property
@@ -139,3 +162,17 @@ class Camera:
             rigid = "a rotation of determinant 1, a translation, and 0 0 0 1 as the last row"
             return f"pose is not a rigid motion (determinant {determinant:.6g}, off by {off:.3g}); expected {rigid}"
         return ""
+
+
+def undistorted_camera(
+    image: str,
+    undistortion: Undistortion,
+    world_to_lens: npt.NDArray[np.float64],  # (4, 4)
+) -> Camera:
+    """Make the camera of a pinhole view of an image that was taken by a lens from a pose."""
+    lens_to_view = np.eye(4)
+    lens_to_view[:3, :3] = np.reshape(undistortion.rotation, (3, 3)).T
+    name = f"{image}_{undistortion.face}" if undistortion.face else image
+    with np.errstate(all="ignore"):  # A camera refuses what is NaN or too large.
+        pose = lens_to_view @ world_to_lens
+    return Camera(name, undistortion.width, undistortion.height, undistortion.K, pose, undistortion)

@@ -19,8 +19,9 @@ from std_msgs.msg import Header
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
-from gsseg_core.errors import GssegError, NoUsableViewsError
+from gsseg_core.errors import GssegError, MaskSizeError, NoUsableViewsError
 from gsseg_core.files.input_files import open_image
+from gsseg_core.scene.undistortion import Undistortion
 from gsseg_ros.conversions import camera_info, mask_image, pose_from_matrix, rgb_image
 
 if TYPE_CHECKING:
@@ -125,7 +126,7 @@ class FolderSource:
         yield "camera_info", camera_info(view.camera, header)
         yield "pose", PoseStamped(header=Header(frame_id=self._map_frame), pose=pose_from_matrix(camera_in_map))
         if view.image_path is not None:
-            yield "image", rgb_image(_read_photo(view.image_path), header)
+            yield "image", rgb_image(_read_photo(view.image_path, view.camera.undistortion), header)
         # The mask comes last, so that a receiver has all that belongs to it.
         yield "mask", mask_image(view.read_labels(), header, view.mask_bits or 16)
 
@@ -248,6 +249,10 @@ def _choose(path: Path, connections: list[Connection], role: str, wanted: str) -
     return fitting[0] if fitting else None
 
 
-def _read_photo(path: Path) -> npt.NDArray[np.uint8]:  # (H, W, 3)
+def _read_photo(path: Path, undistortion: Undistortion | None) -> npt.NDArray[np.uint8]:  # (H, W, 3)
     with open_image(path, PhotoFileError, "image", "a photo, JPEG or PNG") as picture:
-        return np.array(picture.convert("RGB"))
+        photo = np.array(picture.convert("RGB"))
+    try:
+        return photo if undistortion is None else undistortion.photo(photo)
+    except MaskSizeError as error:
+        raise PhotoFileError(f"{path}: {error}") from error

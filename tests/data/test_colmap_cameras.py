@@ -16,7 +16,7 @@ from camera_folders import (
 )
 
 from gsseg_core.data.camera_files import read_cameras
-from gsseg_core.errors import CameraFileError, IntrinsicsError, PathNotAllowedError, PoseError
+from gsseg_core.errors import CameraFileError, PathNotAllowedError, PoseError
 
 
 @pytest.mark.parametrize("text", [False, True], ids=["bin", "txt"])
@@ -57,15 +57,6 @@ def test_colmap_lenses_without_distortion_are_accepted(
     params += (0,) * 4 if model == "OPENCV" else ()
     write_colmap(tmp_path / "sparse" / "0", model=model, params=params)
     assert_lands(read_cameras(tmp_path)[0], 55, 20 + fy / 8)
-
-
-@pytest.mark.parametrize(
-    ("model", "params"),
-    [("SIMPLE_RADIAL", (FX, 30, 20, 0.1)), ("OPENCV", (FX, FY, 30, 20, 0, 0, 0, 1)), ("SIMPLE_FISHEYE", (FX, 30, 20))],
-)
-def test_colmap_lenses_with_distortion_are_refused(tmp_path: Path, model: str, params: tuple[float, ...]) -> None:
-    write_colmap(tmp_path / "sparse" / "0", model=model, params=params)
-    assert_refused(tmp_path, IntrinsicsError, "room/0001.jpg", model, "undistort the images first")
 
 
 def test_colmap_images_of_one_stem_are_refused(tmp_path: Path) -> None:

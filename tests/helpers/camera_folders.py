@@ -45,10 +45,11 @@ def write_colmap(
     model: str = "PINHOLE",
     params: tuple[float, ...] = (FX, FY, 30, 20),
     text: bool = False,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
 ) -> Path:
     """Write a model as COLMAP does, with keypoints, one triangulated point, and one image that was not registered."""
     reconstruction = pycolmap.Reconstruction()
-    camera = pycolmap.Camera(camera_id=7, model=model, width=WIDTH, height=HEIGHT, params=params)
+    camera = pycolmap.Camera(camera_id=7, model=model, width=size[0], height=size[1], params=params)
     reconstruction.add_camera_with_trivial_rig(camera)
     point = reconstruction.add_point3D(np.array(POINT), pycolmap.Track(), np.zeros(3, np.uint8))
     for i, name in enumerate(names):

@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
-from gsseg_core.data.camera_formats.entries import camera_of, stem_of
+from gsseg_core.data.camera_formats.entries import Intrinsics, cameras_of, stem_of
 from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError
 from gsseg_core.files.input_files import is_there, open_input, reason
 from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.lens import LENS_MODELS
 from gsseg_core.text import clipped
 
 if TYPE_CHECKING:
     import pycolmap
 
-# Models that are a pinhole once their distortion is zero; a fisheye is not.
-_MODELS = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
-_LEAST_CAMERA = 48
-"""Bytes of a camera in a binary model, of three parameters."""
+_MODELS = {model.name: model for model in LENS_MODELS}
+_LEAST_CAMERA = 40
+"""Bytes of a camera in a binary model, of two parameters."""
 
 
 def read_colmap(path: Path, within: Path | None) -> list[Camera]:
@@ -36,19 +36,28 @@ def read_colmap(path: Path, within: Path | None) -> list[Camera]:
         except UnicodeDecodeError as error:
             raise CameraFileError(f"{path}, image {image_id}: its name is not UTF-8 text") from error
         where = f"{path}, image '{clipped(name)}'"
-        lens = model.cameras[image.camera_id]
-        if lens.model_name not in _MODELS or any(lens.params[i] for i in lens.extra_params_idxs()):
-            raise IntrinsicsError(
-                f"{where}: camera is {lens.model_name} ({lens.params_info}: {clipped(lens.params_to_string())}); "
-                "expected one without distortion: undistort the images first"
-            )
-        focal, principal = (lens.focal_length_x, lens.focal_length_y), (lens.principal_point_x, lens.principal_point_y)
         motion = image.cam_from_world()
         if not motion.rotation.quat.any():  # pycolmap makes it the identity
             raise PoseError(f"{where}: the pose has a quaternion of zero; expected a unit quaternion")
         pose = np.vstack([motion.matrix(), (0, 0, 0, 1)])
-        cameras.append(camera_of(where, stem_of(name), (lens.width, lens.height), focal, principal, pose))
+        cameras += cameras_of(where, stem_of(name), _intrinsics(where, model.cameras[image.camera_id]), pose)
     return cameras
+
+
+def _intrinsics(where: str, camera: pycolmap.Camera) -> Intrinsics:
+    """Read the lens of a COLMAP camera."""
+    if camera.model_name not in _MODELS:
+        raise IntrinsicsError(
+            f"{where}: camera is {clipped(camera.model_name)} ({clipped(camera.params_info)}); expected one of "
+            f"{', '.join(_MODELS)}: undistort the images first"
+        )
+    params = dict(zip(camera.params_info.replace(" ", "").split(","), camera.params.tolist(), strict=True))
+    fx = params.get("f", params.get("fx", 1.0))
+    focal, principal = (fx, params.get("fy", fx)), (params.get("cx", 0.0), params.get("cy", 0.0))
+    model = _MODELS[camera.model_name]
+    params["k1"] = params.get("k1", params.get("k", 0.0))
+    coefficients = {name: params[name] for name in model.coefficients if name in params}
+    return Intrinsics(model, (camera.width, camera.height), focal, principal, coefficients)
 
 
 def _load(path: Path, within: Path | None) -> pycolmap.Reconstruction:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +13,9 @@ import numpy.typing as npt
 from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError
 from gsseg_core.files.input_files import IMAGE_SUFFIXES
 from gsseg_core.files.json_files import kind_of
-from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.camera import Camera, undistorted_camera
+from gsseg_core.scene.lens import Lens, LensModel, Projection
+from gsseg_core.scene.undistortion import undistortions
 from gsseg_core.text import clipped, quoted
 
 
@@ -83,6 +86,33 @@ def camera_of(
     K = np.array([[focal[0], 0, principal[0]], [0, focal[1], principal[1]], [0, 0, 1]], np.float64)
     try:
         return Camera(name, *size, K, pose)
+    except (PoseError, IntrinsicsError) as error:
+        raise type(error)(f"{where}: {error}") from None
+
+
+class Intrinsics(NamedTuple):
+    """What a file says of the lens of an image; coefficients by name, those that are left out being 0."""
+
+    model: LensModel
+    size: tuple[int, int]  # width, height
+    focal: tuple[float, float]
+    principal: tuple[float, float]
+    coefficients: Mapping[str, float]
+
+
+def cameras_of(
+    where: str,
+    name: str,
+    intrinsics: Intrinsics,
+    pose: npt.NDArray[np.float64],  # (4, 4) world to camera
+) -> list[Camera]:
+    """Make the camera of an image, or, where a lens bent it, those of its pinhole views; errors say where it stands."""
+    model, size, focal, principal, coefficients = intrinsics
+    if model.projection is Projection.PERSPECTIVE and not any(coefficients.values()):
+        return [camera_of(where, name, size, focal, principal, pose)]
+    try:
+        views = undistortions(Lens(model, *size, focal, principal, model.order(coefficients)))
+        return [undistorted_camera(name, view, pose) for view in views]
     except (PoseError, IntrinsicsError) as error:
         raise type(error)(f"{where}: {error}") from None
 

@@ -7,14 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from gsseg_core.data.camera_formats.entries import Entry, camera_of, entries, inverse_pose
+from gsseg_core.data.camera_formats.entries import Entry, Intrinsics, cameras_of, entries, inverse_pose
 from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError
 from gsseg_core.files.json_files import read_object
 from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.lens import LENS_MODELS, Projection
 from gsseg_core.text import clipped
 
-_MODELS = {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "PERSPECTIVE"}
-_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_MODELS = {model.name: model for model in LENS_MODELS}
+_BROWN = _MODELS["OPENCV"]
+_COEFFICIENTS = sorted({name for model in LENS_MODELS for name in model.coefficients})
 
 
 def read_nerfstudio(path: Path, within: Path | None) -> list[Camera]:
@@ -25,34 +27,35 @@ def read_nerfstudio(path: Path, within: Path | None) -> list[Camera]:
     for frame in entries(path, content.get("frames"), "a list 'frames'"):
         name, where = frame.stem("file_path"), frame.where
         entry = Entry(where, {**shared, **frame.fields})
-        _refuse_lens(entry)
-        if "w" not in entry or "h" not in entry:
-            raise IntrinsicsError(f"{where}: the image size is missing; expected 'w' and 'h', here or for all frames")
-        width, height = entry.size("w"), entry.size("h")
-        fx, fy = _focal(entry, "fl_x", "camera_angle_x", width), _focal(entry, "fl_y", "camera_angle_y", height)
-        if fx is None:
-            raise IntrinsicsError(f"{where}: the focal length is missing; expected 'fl_x' or 'camera_angle_x'")
-        cx = entry.number("cx") if "cx" in entry else width / 2
-        cy = entry.number("cy") if "cy" in entry else height / 2
         matrix = entry.array("transform_matrix", (4, 4), (3, 4))
         if matrix.shape == (4, 4) and not np.array_equal(matrix[3], (0, 0, 0, 1)):
             raise PoseError(f"{where}: the last row of the pose is {matrix[3].tolist()}; expected 0 0 0 1")
         pose = inverse_pose(matrix[:3, :3] * (1, -1, -1), matrix[:3, 3])
-        cameras.append(camera_of(where, name, (width, height), (fx, fx if fy is None else fy), (cx, cy), pose))
+        cameras += cameras_of(where, name, _intrinsics(entry), pose)
     return cameras
 
 
-def _refuse_lens(entry: Entry) -> None:
-    model = str(entry.fields.get("camera_model", "PINHOLE")).upper()
-    if model not in _MODELS or entry.fields.get("is_fisheye"):
-        raise IntrinsicsError(
-            f"{entry.where}: camera model is {clipped(model)}; expected a pinhole: undistort the images first"
-        )
-    distortion = ", ".join(f"{key} = {clipped(entry.fields[key])}" for key in _DISTORTION if entry.fields.get(key))
-    if distortion:
-        raise IntrinsicsError(
-            f"{entry.where}: the lens has distortion ({distortion}); expected none: undistort the images first"
-        )
+def _intrinsics(entry: Entry) -> Intrinsics:
+    """Read the lens of a frame; as in nerfstudio, a camera model without distortion may have it all the same."""
+    where, name = entry.where, str(entry.fields.get("camera_model", "OPENCV")).upper()
+    model = _MODELS.get("OPENCV_FISHEYE" if entry.fields.get("is_fisheye") else name, _BROWN)
+    if name not in _MODELS and name != "PERSPECTIVE":
+        known = ", ".join(_MODELS)
+        raise IntrinsicsError(f"{where}: camera model is {clipped(name)}; expected {known}: undistort the images first")
+    if model.projection is Projection.PERSPECTIVE and not model.rational:
+        model = _BROWN
+    if "w" not in entry or "h" not in entry:
+        raise IntrinsicsError(f"{where}: the image size is missing; expected 'w' and 'h', here or for all frames")
+    width, height = entry.size("w"), entry.size("h")
+    if model.projection is Projection.PANORAMA:
+        return Intrinsics(model, (width, height), (1.0, 1.0), (0.0, 0.0), {})
+    fx, fy = _focal(entry, "fl_x", "camera_angle_x", width), _focal(entry, "fl_y", "camera_angle_y", height)
+    if fx is None:
+        raise IntrinsicsError(f"{where}: the focal length is missing; expected 'fl_x' or 'camera_angle_x'")
+    cx = entry.number("cx") if "cx" in entry else width / 2
+    cy = entry.number("cy") if "cy" in entry else height / 2
+    coefficients = {name: entry.number(name) for name in _COEFFICIENTS if name in entry}
+    return Intrinsics(model, (width, height), (fx, fx if fy is None else fy), (cx, cy), coefficients)
 
 
 def _focal(entry: Entry, key: str, angle_key: str, size: int) -> float | None:
