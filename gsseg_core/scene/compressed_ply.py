@@ -93,8 +93,8 @@ def _rest(sh: npt.NDArray[np.void] | None, n: int) -> npt.NDArray[np.float32] | 
     if sh is None:
         return None
     names = rest_names(len(sh.dtype.names or ()))
-    if len(sh) != n or len(names) not in REST_COUNTS:
-        raise ValueError(f"{len(sh):,} rows of {len(names)} SH coefficients for {n:,} vertices")
+    if len(sh) != n or len(names) not in REST_COUNTS or any(sh.dtype[name] != np.uint8 for name in names):
+        raise ValueError(f"{len(sh):,} rows of {len(names)} SH coefficients, or not of bytes, for {n:,} vertices")
     steps = (np.arange(256, dtype=np.float32) + np.float32(0.5)) / 256
     steps[0], steps[255] = 0, 1
     levels = (steps - np.float32(0.5)) * np.float32(_SH_RANGE)

@@ -19,7 +19,7 @@ from gsseg_core.files.input_files import open_input, reason
 from gsseg_core.files.limits import LIMITS
 from gsseg_core.files.npz_files import UnfitError
 from gsseg_core.scene.moving import move
-from gsseg_core.scene.scene_file import check_count, check_size, open_scene
+from gsseg_core.scene.scene_file import check_count, check_size, open_scene, size_of
 from gsseg_core.scene.spz import decode_spz
 from gsseg_core.scene.vertices import ReadScene, log_scales, logits, pack_vertices
 from gsseg_core.text import clipped, quoted
@@ -195,7 +195,8 @@ class _Reader:
             raise UnfitError(f"names the buffer {quoted(name)}; expected the name of a file beside it")
         try:
             with open_input(self._path.parent / name, self._within) as file:
-                return file.read(size)
+                check_size(size_of(file), size, name)
+                return file.read()
         except OSError as error:
             raise SceneFileError(f"{self._path.parent / name}: cannot be read ({reason(error)})") from error
 

@@ -20,17 +20,18 @@ from gsseg_core.files.json_files import kind_of, read_json
 from gsseg_core.files.limits import LIMITS
 from gsseg_core.files.npz_files import UnfitError, whole_number
 from gsseg_core.scene.quaternions import from_smallest_three
-from gsseg_core.scene.scene_file import check_count, open_scene
+from gsseg_core.scene.scene_file import check_count, open_scene, size_of
 from gsseg_core.scene.vertices import ReadScene, logits, pack_vertices
 from gsseg_core.text import quoted
 
 _META = "meta.json"
 _EXPECTED = "a SOG scene"
 _PER_ROW = 64  # entries of the palette of SH in a row of its image
-_MAX_IMAGE = 1 << 30  # bytes of one WebP file
+# Bytes of an image: of four per pixel at most, for four pixels per Gaussian, or for the palette of SH.
+_PER_GAUSSIAN, _PER_IMAGE = 16, 1 << 23
 
 Pixels = npt.NDArray[np.uint8]  # (H * W, C)
-Load = Callable[[str], bytes]
+Load = Callable[[str, int], bytes]  # a file by its name, of so many bytes at most
 
 
 def is_sog(head: bytes) -> bool:
@@ -49,32 +50,33 @@ def read_sog(path: Path, within: Path | None = None) -> ReadScene:
         A file is missing or broken, an image is too small for the count or larger than it needs to be, or a name leads
         out of the folder.
     """
-    if path.is_dir() or path.name == _META or not zipfile.is_zipfile(path):
-        meta = path / _META if path.is_dir() else path
-        with open_scene(meta, within, _EXPECTED):
-            content = read_json(meta, SceneFileError, within)
-            return _decode(content, lambda name: _beside(meta, name, within))
-    with open_scene(path, within, _EXPECTED) as file, zipfile.ZipFile(file) as archive:
-        content = json.loads(_member(archive, _META, LIMITS.max_json_bytes))
-        return _decode(content, lambda name: _member(archive, name, _MAX_IMAGE))
+    if path.is_dir():
+        path = path / _META
+    with open_scene(path, within, _EXPECTED) as file:
+        if file.peek(2)[:2] != b"PK":
+            return _decode(
+                read_json(path, SceneFileError, within), lambda name, most: _beside(path, name, most, within)
+            )
+        with zipfile.ZipFile(file) as archive:
+            content = json.loads(_member(archive, _META, LIMITS.max_json_bytes))
+            return _decode(content, lambda name, most: _member(archive, name, most))
 
 
 def _member(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
     info = archive.getinfo(name)
-    if info.file_size > most:
+    if max(info.file_size, info.compress_size) > most:
         raise UnfitError(f"claims {info.file_size:,} bytes of {quoted(name)}; expected at most {most:,}")
     return archive.read(info)
 
 
-def _beside(meta: Path, name: str, within: Path | None) -> bytes:
+def _beside(meta: Path, name: str, most: int, within: Path | None) -> bytes:
     try:
         with open_input(meta.parent / name, within) as file:
-            content = file.read(_MAX_IMAGE + 1)
+            if size_of(file) > most:
+                raise UnfitError(f"has {size_of(file):,} bytes of {quoted(name)}; expected at most {most:,}")
+            return file.read()
     except OSError as error:
         raise SceneFileError(f"{meta.parent / name}: cannot be read ({reason(error)}); {_META} names it") from error
-    if len(content) > _MAX_IMAGE:
-        raise UnfitError(f"has {quoted(name)} beside it, which is too large; expected at most {_MAX_IMAGE:,} bytes")
-    return content
 
 
 def _decode(meta: Any, load: Load) -> ReadScene:
@@ -102,22 +104,20 @@ def _decode(meta: Any, load: Load) -> ReadScene:
 
 
 @contextmanager
-def _image(name: object, load: Load) -> Iterator[Image.Image]:
+def _image(name: object, load: Load, count: int) -> Iterator[Image.Image]:
     if not isinstance(name, str) or not name or Path(name).name != name or "\\" in name:
         raise UnfitError(f"names the image {quoted(name)}; expected the name of a file beside {_META}")
-    with Image.open(io.BytesIO(load(name)), formats=("WEBP", "PNG")) as image:
+    with Image.open(io.BytesIO(load(name, _PER_GAUSSIAN * count + _PER_IMAGE)), formats=("WEBP", "PNG")) as image:
         check_pixels(*image.size, name, UnfitError)  # type: ignore[arg-type]
         yield image
 
 
 def _pixels(name: object, load: Load, count: int) -> Pixels:
     """Read the pixels (N, 4) of an image, one per Gaussian."""
-    with _image(name, load) as image:
+    with _image(name, load, count) as image:
         size = image.width * image.height
         if not count <= size <= 4 * count + (1 << 16):
-            raise UnfitError(
-                f"has {size:,} pixels in {quoted(name)}; expected {count:,}, one per Gaussian, or few more"
-            )
+            raise UnfitError(f"has {size:,} pixels in {quoted(name)}; expected one for each of {count:,}, or few more")
         return np.asarray(image.convert("RGBA")).reshape(-1, 4)[:count]
 
 
@@ -163,7 +163,7 @@ def _rotations(pixels: Pixels) -> npt.NDArray[np.float32]:
 
 def _rest(meta: Any, labels: Pixels, load: Load) -> npt.NDArray[np.float32]:
     """Coefficients (N, B, 3) of SH above degree 0: each Gaussian names an entry of a palette."""
-    with _image(meta["files"][0], load) as image:
+    with _image(meta["files"][0], load, len(labels)) as image:
         palette = np.asarray(image.convert("RGB"))
     coefficients = palette.shape[1] // _PER_ROW
     if coefficients not in (3, 8, 15) or palette.shape[1] % _PER_ROW:

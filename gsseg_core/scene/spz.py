@@ -134,7 +134,7 @@ def _inflate(file: Any) -> tuple[_Header, str, Iterator[bytes]]:
 def _streams(file: BufferedReader, path: Path) -> tuple[_Header, str, Iterator[bytes]]:
     """Take the streams of version 4 apart, each under zstd; those of no bytes are left out of the file."""
     try:
-        from zstandard import ZstdDecompressor
+        from zstandard import ZstdDecompressor, ZstdError
     except ImportError as error:
         raise SceneFileError(
             f"{path}: is SPZ of version 4, which takes the package zstandard: pip install 'gsseg[formats]'"
@@ -159,7 +159,10 @@ def _streams(file: BufferedReader, path: Path) -> tuple[_Header, str, Iterator[b
                 yield b""
                 continue
             content = file.read(min(next(packed), 2 * size + (1 << 20)))  # Zstd makes nothing much larger.
-            part = ZstdDecompressor().stream_reader(content).read(size)
+            try:
+                part = ZstdDecompressor().stream_reader(content).read(size)
+            except ZstdError as error:
+                raise ValueError(str(error)) from error
             check_size(len(part), size, "data")
             yield part
 
