@@ -125,7 +125,7 @@ def refined(
     silhouettes = []
     for view in spread(train, RefineSettings.carve_views):
         operator = make_operator(scene, view.camera)
-        silhouettes.append(Silhouette.of(scene, operator, clustered.render(operator).labels))
+        silhouettes.append(Silhouette.of(scene, operator, clustered.label_map(operator)))
     found = kept_shares(scene, clustered.labels, silhouettes)
     parts[CARVED] = scene, np.where(sticking_out(found.kept, clustered.labels), -2, clustered.labels)
     halves, parents = split(scene, straddlers(found))

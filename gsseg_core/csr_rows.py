@@ -89,9 +89,11 @@ class CSRRows(NamedTuple):
         _take(self, ids, rows)
         return rows
 
-    def positions(self, ids: np.ndarray) -> CSRRows:  # (M,)
-        """Find where in `data` the entries of some rows stand: M rows of int64."""
-        return self.with_data(np.arange(len(self.data))).take(ids)
+    def with_rows(self, ids: np.ndarray, rows: CSRRows) -> CSRRows:  # (M,) distinct; M rows of the same patterns
+        """Replace the entries of some rows."""
+        replaced = self.with_data(self.data.copy())
+        _put(replaced, ids, rows)
+        return replaced
 
 
 def starts(counts: np.ndarray) -> np.ndarray:  # (n,)
@@ -165,6 +167,16 @@ def _take(rows: CSRRows, ids: np.ndarray, taken: CSRRows) -> None:
         for j in range(taken_indptr[m + 1] - taken_indptr[m]):
             z = taken_indptr[m] + j
             taken_indices[z], taken_data[z] = indices[first + j], data[first + j]
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _put(rows: CSRRows, ids: np.ndarray, others: CSRRows) -> None:
+    indptr, _, data = rows
+    other_indptr, _, other_data = others
+    for m in nb.prange(ids.shape[0]):
+        first = indptr[ids[m]]
+        for j in range(other_indptr[m + 1] - other_indptr[m]):
+            data[first + j] = other_data[other_indptr[m] + j]
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)

@@ -29,7 +29,7 @@ from gsseg_core.export.view_pictures import (
 from gsseg_core.files.json_files import write_json
 from gsseg_core.files.run_folder import StagedRun, staged_run
 from gsseg_core.learn.calibrate import Calibration, calibrate
-from gsseg_core.learn.learner import MEMORY_BUDGET, NO_MASK, Learner
+from gsseg_core.learn.learner import NO_MASK, Learner, default_budget
 from gsseg_core.learn.mask_reliability import MaskChecker, ViewCheck, compare_mask, reliability_report
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.objects.association import AssociationSettings
@@ -73,6 +73,7 @@ class Assessment:
     calibration: Calibration
     objective: list[float]  # of the learner, after each step
     report: Mapping[str, Any]  # `views` in `report.json`
+    memory: Mapping[str, int]  # `prepared_views` there
 
 
 def segment_places(class_names: Mapping[int, str], views: Iterable[View], settings: RunSettings) -> list[str]:
@@ -97,7 +98,7 @@ def segment(
     refine: RefineSettings | None = None,
     graph: bool = True,
     device: str = "cpu",
-    memory_budget: int = MEMORY_BUDGET,
+    memory_budget: int | None = None,
     seed: int = 0,
     scheduler: str | None = None,
     ids: str = "global",
@@ -127,8 +128,9 @@ def segment(
     graph : bool
         Where views are few, let class probabilities spread to Gaussians that few or no pixels saw, before
         refinement; see `gsseg_core.refine.label_propagation`.
-    memory_budget : int
-        Bytes of prepared views to keep between the steps of learning; see docs/memory.md.
+    memory_budget : int, optional
+        Bytes of prepared views to keep in memory between the steps of learning, an eighth of what is free by default;
+        see docs/memory.md.
     scheduler : str, optional
         Address of a Dask scheduler whose workers learn; everything else is done here.
     ids : str
@@ -151,6 +153,8 @@ def segment(
     GssegError
         Whatever is wrong with the input; see `gsseg_core.errors`. What was in `out` before is whole and unchanged.
     """
+    if memory_budget is None:
+        memory_budget = default_budget()
     settings = RunSettings(
         learner, labels, views, device, memory_budget, seed, scheduler, ids,
         refine or RefineSettings(), GraphSettings() if graph else None, granularity, scene_format, collision,
@@ -247,7 +251,9 @@ def _assess(learner: Learner, class_names: Mapping[int, str], watch: Stopwatch, 
     with watch.stage("calibrate"):
         calibration = calibrate(learner, checker, progress)
     views = {"used": len(learner.views), "rejected": learner.reject_summary(), "names": learner.rejected, **reliability}
-    return Assessment(dict(learner.views), checks, calibration, learner.history_, views)
+    in_memory, in_file = learner.prepared_bytes()
+    memory = {"budget": learner.memory_budget, "in_memory": in_memory, "in_file": in_file}
+    return Assessment(dict(learner.views), checks, calibration, learner.history_, views, memory)
 
 
 def _write(
@@ -269,7 +275,7 @@ def _write(
         images, evidence, pictures = _picture(run, inputs, assessment, result, settings.device)
     report = RunReport.of(
         scene, named, run=run.id, views=assessment.report, settings=settings.as_dict(), seconds=watch.seconds,
-        objective=assessment.objective, calibration=assessment.calibration.as_dict(),
+        objective=assessment.objective, calibration=assessment.calibration.as_dict(), prepared_views=assessment.memory,
         ids=None if inputs.objects is None else inputs.objects.summary(),
         files={k: str(path.relative_to(folder)) for k, path in files.items()},
         meshes={k: f"classes/{mesh_file_name(k, named.class_names[k])}" for k in meshes},

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -11,13 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsseg_core.csr_rows import largest
+from gsseg_core.csr_rows import CSRRows, largest
 from gsseg_core.data.class_names import class_name
 from gsseg_core.data.view import spread
 from gsseg_core.files.npz_files import UnfitError, check_shares, class_names_of, open_npz, temperature_of, write_npz
 from gsseg_core.files.run_folder import settle
 from gsseg_core.learn.temperature import tempered
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.cpu.tile_operator import TileOperator
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.refine.knn_filter import cluster, statistical_filter
 from gsseg_core.refine.settings import RefineSettings
@@ -197,9 +198,19 @@ class Segmentation:
         all masks together, so that errors of single masks carve nothing away. So many of the views have their say,
         spread evenly.
         """
-        operators = (make_operator(scene, camera, device) for camera in spread(cameras, num_views))
-        silhouettes = [Silhouette.of(scene, operator, self.render(operator).labels) for operator in operators]
-        return self._without(carve(scene, self.labels, silhouettes))
+        return self._without(carve(scene, self.labels, self._silhouettes(scene, spread(cameras, num_views), device)))
+
+    def _silhouettes(self, scene: GaussianScene, cameras: Sequence[Camera], device: str) -> Iterator[Silhouette]:
+        for camera in cameras:
+            operator = make_operator(scene, camera, device)
+            shown = Silhouette.of(scene, operator, self.label_map(operator))
+            yield shown._replace(operator=operator) if isinstance(operator, TileOperator) else shown
+
+    def label_map(self, operator: ViewOperator) -> np.ndarray:
+        """Class of every pixel of a view, (H, W) int32: the labels of `render`, in half the time."""
+        codes, shows_background = self._blended
+        strongest = operator.strongest(codes, len(self.class_names), shows_background)
+        return np.asarray(self.class_ids[strongest.classes])
 
     def blend(self, operator: ViewOperator) -> np.ndarray:
         """Blend what was learnt into a view, (H, W, K) float32, not calibrated; rows sum to what is known of a pixel.
@@ -207,16 +218,16 @@ class Segmentation:
         `gsseg_core.learn.temperature.tempered` at `temperature` makes probabilities of them.
         """
         codes, shows_background = self._blended
-        image, left_over = operator.blend(codes)
+        image, left_over = operator.blend_rows(codes, len(self.class_names))
         if shows_background:
             image[..., 0] += left_over
         return image
 
     @cached_property
-    def _blended(self) -> tuple[np.ndarray, bool]:
+    def _blended(self) -> tuple[CSRRows, bool]:
         codes = tempered(self.probabilities, 1 / self.temperature).copy()
         codes[self.clustered] = np.where(self.learnt.any(axis=1, keepdims=True), self.learnt, codes[self.clustered])
-        return codes, bool(codes[:, 0].any())
+        return CSRRows.from_dense(codes), bool(codes[:, 0].any())
 
     def save(self, path: str | os.PathLike[str], run: str | None = None) -> None:
         """Write labels, probabilities, confidence, class ids and names as one npz, atomically.

@@ -102,11 +102,17 @@ def segment_summary(report: Mapping[str, Any], out: str) -> str:
 {gaussians["unobserved"]:,} unobserved
 
 {seconds_table(report["seconds"])}
+{_memory_line(report["prepared_views"])}
 
 Objects: {out}/classes
 Pictures: {out}/pictures
 Labels: {out}/segmentation.npz
 Report: {out}/report.html, to look at; {out}/report.json"""
+
+
+def _memory_line(prepared: Mapping[str, int]) -> str:
+    in_memory, budget, in_file = (f"{prepared[part] / 2**20:,.0f} MiB" for part in ("in_memory", "budget", "in_file"))
+    return f"prepared views: {in_memory} in memory (at most {budget}), {in_file} in a temporary file"
 
 
 def evaluation_summary(scores: Mapping[str, Any]) -> str:

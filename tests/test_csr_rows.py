@@ -18,5 +18,14 @@ def test_rows_are_taken_as_from_an_array(array: np.ndarray, data: st.DataObject)
     rows = CSRRows.from_dense(array)
     np.testing.assert_array_equal(rows.dense(array.shape[1]), array)
     np.testing.assert_array_equal(rows.take(ids).dense(array.shape[1]), array[ids])
-    positions = rows.positions(ids)
-    np.testing.assert_array_equal(rows.data[positions.data], rows.take(ids).data)
+
+
+@given(codes, st.data())
+def test_rows_are_replaced_as_in_an_array(array: np.ndarray, data: st.DataObject) -> None:
+    ids = np.array(data.draw(st.lists(st.integers(0, len(array) - 1), unique=True)), np.int32)
+    rows, expected = CSRRows.from_dense(array), array.copy()
+    expected[ids] *= 3
+    chosen = rows.take(ids)
+    replaced = rows.with_rows(ids, chosen.with_data(3 * chosen.data))
+    np.testing.assert_array_equal(replaced.dense(array.shape[1]), expected)
+    np.testing.assert_array_equal(rows.dense(array.shape[1]), array)

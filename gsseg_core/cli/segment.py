@@ -39,8 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--learner", choices=tuple(LEARNERS), default=DEFAULT, help="default: %(default)s")
     add("--views", type=int, metavar="N", help="learn from N train views, spread evenly (default: all)")
     add("--seed", type=int, default=0, help="for learners that draw at random (default: %(default)s)")
-    budget = "for prepared views; those beyond it are prepared anew in each step (default: %(default)s)"
-    add("--memory-budget", type=int, default=2048, metavar="MIB", help=budget)
+    budget = "memory for prepared views; more of them go to a temporary file (default: an eighth of what is free)"
+    add("--memory-budget", type=int, metavar="MIB", help=budget)
     learners = " and ".join(distributed_learners())
     add("--scheduler", metavar="ADDRESS", help=f"learn on the workers of this Dask scheduler ({learners})")
     add = parser.add_argument_group("files of the classes").add_argument
@@ -77,9 +77,9 @@ def run(options: argparse.Namespace) -> int:
         report = pipeline.segment(
             options.scene, options.data, options.out, labels=options.labels, learner=options.learner,
             views=options.views, refine=refine, graph=not options.no_graph, device=options.device,
-            memory_budget=options.memory_budget << 20, seed=options.seed, scheduler=options.scheduler,
-            ids=options.ids, granularity=options.granularity, scene_format=options.format,
-            collision=options.collision, progress=progress,
+            memory_budget=None if options.memory_budget is None else options.memory_budget << 20,
+            seed=options.seed, scheduler=options.scheduler, ids=options.ids, granularity=options.granularity,
+            scene_format=options.format, collision=options.collision, progress=progress,
         )  # fmt: skip
     from gsseg_core.text import segment_summary
 

@@ -98,6 +98,8 @@ class RunReport:
         Files.
     seconds, versions : mappings
         Seconds of each stage, and what it ran on: version of each package.
+    prepared_views : mapping, optional
+        Bytes of prepared views in memory and in a temporary file, and the budget of those in memory.
     run, page : str, optional
         Id of the run, and file of the report page.
     calibration, ids : mappings, optional
@@ -116,6 +118,7 @@ class RunReport:
     run: str | None = None
     calibration: Mapping[str, Any] | None = None
     ids: Mapping[str, Any] | None = None
+    prepared_views: Mapping[str, int] | None = None
     page: str | None = None
 
     @classmethod

@@ -38,7 +38,9 @@ def view_file_name(name: str, prefix: str = "") -> str:
 
 def background_image(scene: GaussianScene, operator: ViewOperator) -> np.ndarray:
     """Render the scene's colours from a view, (H, W, 3) uint8, on black."""
-    image = operator.render(scene.colors(operator.camera.center))
+    colors = np.zeros((len(scene), 3), np.float32)
+    colors[operator.ids] = scene.colors(operator.camera.center, operator.ids)
+    image = operator.render(colors)
     pixels: np.ndarray = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
     return pixels
 
@@ -69,7 +71,7 @@ def draw_views(
     colors = palette(segmentation.num_classes)
     for view in views:
         operator = make_operator(scene, view.camera, device)
-        labels = segmentation.render(operator).labels
+        labels = segmentation.label_map(operator)
         image = background_image(scene, operator)
         yield Drawn(view, labels, overlay(image, labels, colors), image)
 

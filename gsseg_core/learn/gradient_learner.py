@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from gsseg_core.errors import SettingsError
-from gsseg_core.learn.learner import MEMORY_BUDGET, Learner, Progress, silent
+from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.raster.observation import Observation
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -70,7 +70,7 @@ class GradientLearner(Learner):
 
     def __init__(
         self, scene: GaussianScene, num_classes: int, settings: GradientSettings | None = None, *,
-        device: str = "cpu", memory_budget: int = MEMORY_BUDGET,
+        device: str = "cpu", memory_budget: int | None = None,
     ) -> None:  # fmt: skip
         super().__init__(scene, num_classes, device=device, memory_budget=memory_budget)
         self.settings = settings or GradientSettings()

@@ -14,22 +14,31 @@ from gsseg_core.data.label_evidence import impute_probabilities, is_resolved
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
+from gsseg_core.files.scratch_file import ScratchFile
 from gsseg_core.learn.em.em_kernels import normalise_votes
+from gsseg_core.learn.free_memory import free_memory
 from gsseg_core.learn.learner_state import State
 from gsseg_core.progress import Progress as Progress
 from gsseg_core.progress import silent as silent
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.observation import Observation
-from gsseg_core.raster.view_operator import ViewOperator
+from gsseg_core.raster.view_operator import Strongest, ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 VOTE_UNIT = 2.0**-24  # votes are counted in whole multiples of this many px, so that adding and taking back are exact
 UNITS = 1 / VOTE_UNIT  # units per px
-MEMORY_BUDGET = 2 << 30  # bytes of prepared views to keep between steps, unless asked otherwise
+MEMORY_SHARE = 8  # prepared views take this part of the free memory, unless asked otherwise; more goes to a file
+MEMORY_BUDGET = 2 << 30  # bytes of them where the system does not say how much is free
 
 NO_MASK, SEES_NOTHING, ALL_UNKNOWN = "no mask", "sees no Gaussian", "all pixels unknown"
 
 Self = TypeVar("Self", bound="Learner")
+
+
+def default_budget() -> int:
+    """Bytes of prepared views that are kept in memory where nobody says how many."""
+    free = free_memory()
+    return MEMORY_BUDGET if free is None else free // MEMORY_SHARE
 
 
 class UnusableViewError(Exception):
@@ -47,8 +56,10 @@ class Learner(ABC):
         K; labels are 0 (background) to K - 1.
     device : str
         Where views are rendered.
-    memory_budget : int
-        Bytes of prepared views to keep between steps; those beyond it are prepared anew each time.
+    memory_budget : int, optional
+        Bytes of prepared views to keep in memory between steps, an eighth of what is free by default. Those beyond it
+        are kept in a temporary file, or prepared anew each time where that has no space; with 0, always. What is learnt
+        does not depend on it.
 
     Attributes
     ----------
@@ -78,10 +89,12 @@ class Learner(ABC):
     checks_masks = False
 
     def __init__(
-        self, scene: GaussianScene, num_classes: int, *, device: str = "cpu", memory_budget: int = MEMORY_BUDGET
+        self, scene: GaussianScene, num_classes: int, *, device: str = "cpu", memory_budget: int | None = None
     ) -> None:
         if num_classes < 1:
             raise SettingsError(f"num_classes is {num_classes}; expected at least 1")
+        if memory_budget is None:
+            memory_budget = default_budget()
         if memory_budget < 0:
             raise SettingsError(f"memory_budget is {memory_budget} bytes; expected at least 0")
         self.scene, self.num_classes, self.device = scene, num_classes, device
@@ -91,6 +104,7 @@ class Learner(ABC):
         self.history_: list[float] = []
         self._votes = np.zeros((len(scene), num_classes), np.int64)
         self._prepared: dict[str, Observation] = {}
+        self._in_file = ScratchFile()
 
     @classmethod
     def default_settings(cls, max_steps: int | None, seed: int) -> tuple[Any, ...]:
@@ -146,8 +160,9 @@ class Learner(ABC):
         """
         if name not in self.views:
             raise SettingsError(f"view {name!r} was not observed; there are {len(self.views)} others")
-        if name in self._prepared:
-            self._prepared[name].vote(self._votes, UNITS, -1)
+        observation = self._kept(name)
+        if observation is not None:
+            observation.vote(self._votes, UNITS, -1)
         else:
             self._vote(self.views[name], -1)
         self.forget(name)
@@ -156,6 +171,7 @@ class Learner(ABC):
         """Drop a view and its mask; its votes stay. `fit` learns from the views that are left."""
         del self.views[name]
         self._prepared.pop(name, None)
+        self._in_file.drop(name)
 
     def grow(self, num_classes: int) -> None:
         """Have at least this many classes."""
@@ -187,6 +203,13 @@ class Learner(ABC):
         After `fit`, for one of its views; nothing of the learner changes. Rows sum to less where little is known.
         """
         return self._blend_codes(self.codes_, view)
+
+    def classes_without(self, view: View) -> np.ndarray:
+        """Tell the class of each pixel of a view by `predict_without`, (H, W) int32; `UNKNOWN` where little is known.
+
+        That is, where most of a ray ends on Gaussians that only this view has seen.
+        """
+        return Strongest.of(self.predict_without(view)).labels()
 
     def rejected_share(self, view: View) -> float:
         """Share of a view's labelled pixels that `fit` has not used, in [0, 1]."""
@@ -227,6 +250,7 @@ class Learner(ABC):
         self.num_classes = state.votes.shape[1]
         self.rejected.clear()
         self._prepared.clear()
+        self._in_file.clear()
 
     def vote_codes(self) -> np.ndarray:
         """Votes as probabilities, (N, K) float32; a row of zeros where no labelled pixel saw the Gaussian."""
@@ -255,12 +279,16 @@ class Learner(ABC):
         return dict(Counter(self.rejected.values()))
 
     def observation(self, name: str) -> Observation:
-        """Return a view with its mask, prepared; it is kept as far as the memory budget goes."""
-        if name not in self._prepared:
+        """Return a view with its mask, prepared; it is kept, in memory as far as the budget goes."""
+        observation = self._kept(name)
+        if observation is None:
             observation = self._prepare(self.views[name], self.views[name].read_seen())
             self._keep(name, observation)
-            return observation
-        return self._prepared[name]
+        return observation
+
+    def prepared_bytes(self) -> tuple[int, int]:
+        """Tell how many bytes of prepared views are kept, in memory and in the temporary file."""
+        return sum(kept.nbytes for kept in self._prepared.values()), self._in_file.nbytes
 
     def _vote(self, view: View, sign: int) -> None:
         """Add a view's votes, or take them away, and keep nothing of it."""
@@ -298,9 +326,14 @@ class Learner(ABC):
         return seen
 
     def _keep(self, name: str, observation: Observation) -> None:
-        used = sum(kept.nbytes for kept in self._prepared.values())
-        if used + observation.nbytes <= self.memory_budget:
+        if self.prepared_bytes()[0] + observation.nbytes <= self.memory_budget:
             self._prepared[name] = observation
+        elif self.memory_budget > 0 and self.device == "cpu":  # what lies on a GPU is not for a file
+            self._in_file.put(name, observation)
+
+    def _kept(self, name: str) -> Observation | None:
+        kept: Observation | None = self._prepared.get(name)
+        return self._in_file.get(name) if kept is None else kept
 
     def _observations(self, names: Iterable[str] | None = None) -> Iterator[tuple[str, Observation]]:
         for name in self.views if names is None else names:

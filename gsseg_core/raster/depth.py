@@ -24,14 +24,16 @@ class Surface(NamedTuple):
 
 def surface(scene: GaussianScene, operator: ViewOperator) -> Surface:
     """Render coverage and depth of a scene, or of an object alone, from the view of its operator."""
-    image, left_over = operator.blend(depths(scene, operator.camera)[:, None])
+    codes = np.zeros((len(scene), 1), np.float32)
+    codes[operator.ids, 0] = depths(scene, operator.camera, operator.ids)
+    image, left_over = operator.blend(codes)
     coverage = 1 - left_over
     depth = np.divide(image[..., 0], coverage, out=np.full_like(coverage, np.inf), where=coverage > _EMPTY)
     return Surface(coverage, depth)
 
 
-def depths(scene: GaussianScene, camera: Camera) -> np.ndarray:
-    """Depth of each centre from a camera, (N,) float32 in scene units, 0 for those behind it."""
-    row = camera.world_to_camera[2]
-    depth: np.ndarray = np.maximum(scene.means @ row[:3] + row[3], 0).astype(np.float32)
+def depths(scene: GaussianScene, camera: Camera, ids: np.ndarray | None = None) -> np.ndarray:
+    """Depth of each centre, or of some of them, (M,) float32 in scene units, from a camera; 0 for those behind it."""
+    row, means = camera.world_to_camera[2], scene.means if ids is None else scene.means[ids]
+    depth: np.ndarray = np.maximum(means @ row[:3] + row[3], 0).astype(np.float32)
     return depth

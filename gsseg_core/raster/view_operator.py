@@ -9,6 +9,7 @@ import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import MaskSizeError, SceneValueError, SettingsError
 from gsseg_core.raster.observation import Observation
 from gsseg_core.scene.camera import Camera
@@ -27,6 +28,22 @@ class Blended(NamedTuple):
 
     image: np.ndarray  # (H, W, K) float32: codes, blended, W q
     transmittance: np.ndarray  # (H, W) float32: what is left of each ray after the last Gaussian, in [0, 1]
+
+
+class Strongest(NamedTuple):
+    """The class that a view shows most of in each pixel."""
+
+    classes: np.ndarray  # (H, W) int32: the column of the largest blended probability
+    known: np.ndarray  # (H, W) float32: what is known of the pixel, the sum of its probabilities
+
+    @classmethod
+    def of(cls, image: np.ndarray) -> Strongest:  # (H, W, K)
+        """Find it in an image of probabilities."""
+        return cls(image.argmax(axis=2).astype(np.int32), image.sum(axis=2))
+
+    def labels(self) -> np.ndarray:
+        """Class of each pixel of which more than half is known, (H, W) int32; `UNKNOWN` elsewhere."""
+        return np.where(self.known > 0.5, self.classes, np.int32(UNKNOWN))
 
 
 class ViewOperator(ABC):
@@ -78,6 +95,16 @@ class ViewOperator(ABC):
     def blend_rows(self, codes: CSRRows, num_classes: int) -> Blended:
         """Do the same for codes (N, K) of which only the entries that are not zero are at hand."""
         return self._blend(codes.dense(num_classes))
+
+    def strongest(self, codes: CSRRows, num_classes: int, background: bool) -> Strongest:
+        """Find the class of each pixel, from codes (N, K) of which only the entries that are not zero are at hand.
+
+        What a ray has left over is `background`, class 0, or else nothing.
+        """
+        image, left_over = self.blend_rows(codes, num_classes)
+        if background:
+            image[..., 0] += left_over
+        return Strongest.of(image)
 
     def adjoint(self, residual: np.ndarray) -> np.ndarray:
         """Carry anything that a pixel carries, as labels or a loss's gradient, back to the Gaussians: W^T r.

@@ -26,6 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsseg_core.errors import MaskSizeError
+from gsseg_core.raster.cpu.objects_alone import ObjectsAlone
 from gsseg_core.raster.cpu.tile_operator import TileOperator
 from gsseg_core.raster.depth import BEHIND, depths, surface
 from gsseg_core.raster.view_operator import ViewOperator
@@ -44,6 +45,7 @@ class Silhouette(NamedTuple):
     camera: Camera
     labels: np.ndarray  # (H, W) int32: class of each pixel, negative where unknown
     depth: np.ndarray  # (H, W) float32: of the scene's surface, scene units; infinite where there is none
+    operator: TileOperator | None = None  # of the same scene from there, where there is one already
 
     @classmethod
     def of(cls, scene: GaussianScene, operator: ViewOperator, labels: np.ndarray) -> Silhouette:  # (H, W) int32
@@ -66,7 +68,7 @@ class KeptShares(NamedTuple):
     """Share of each Gaussian that its object keeps, and the reasons for it at the last step, in px: (N,) float64."""
 
     kept: np.ndarray  # 0.01 to 1; 1 where it has no object or no view says anything
-    stay: np.ndarray  # 0 where there is no reason to go
+    stay: np.ndarray  # as when the share was last in question; 0 where there is no reason to go
     go: np.ndarray
 
 
@@ -86,37 +88,47 @@ def kept_shares(
     steps : int
         How often to go through them, at least 1.
     """
-    labels = np.ascontiguousarray(labels, np.int32)
-    views = _Projected(scene, list(silhouettes))
-    go, kept = np.zeros(len(scene)), np.ones(len(scene))
-    for shown, operator in views:
-        ids, behind = operator.ids, shown.depth * np.float32(BEHIND)
-        go[ids] += operator.reasons_to_go(labels[ids], depths(scene, shown.camera)[ids], shown.labels, behind)
+    views = _ObjectViews(scene, np.ascontiguousarray(labels, np.int32))
+    go, kept, stay = np.zeros(len(scene)), np.ones(len(scene)), np.zeros(len(scene))
+    for shown in silhouettes:
+        alone, behind = views.add(shown), shown.depth * np.float32(BEHIND)
+        go[alone.ids] += alone.reasons_to_go(depths(scene, shown.camera, alone.ids), shown.labels, behind)
     asked = go > 0
-    for _ in range(steps):
-        stay = np.zeros(len(scene))
-        for shown, operator in views:
-            ids = operator.ids
-            stay[ids] += operator.reasons_to_stay(labels[ids], kept[ids], asked[ids], shown.labels)
-        kept = np.where(asked, np.clip(kept * stay / np.maximum(go, 1e-30), _LEAST, 1.0), kept)
-    return KeptShares(kept, np.where(asked, stay, 0), go)
+    for step in range(steps):
+        stay[asked] = 0
+        for shown, alone in views:
+            wanted = asked[alone.ids]
+            stay[alone.ids] += alone.reasons_to_stay(kept[alone.ids], wanted, shown.labels)
+        kept[asked] = np.clip(kept[asked] * stay[asked] / go[asked], _LEAST, 1.0)
+        if step == 0:
+            # The less is kept, the more reason there is to stay: who stays beside all others stays beside fewer.
+            asked &= kept < 1
+    return KeptShares(kept, stay, go)
 
 
-class _Projected:
-    """Views with their operators, of which those that do not fit into memory are made again each time."""
+class _ObjectViews:
+    """Views with the objects in them, of which those that do not fit into memory are projected again each time."""
 
-    def __init__(self, scene: GaussianScene, shown: list[Silhouette]) -> None:
-        self._scene, self._shown = scene, shown
-        self._kept: dict[int, TileOperator] = {}
+    def __init__(self, scene: GaussianScene, labels: np.ndarray) -> None:  # (N,) int32
+        self._scene, self._labels = scene, labels
+        self._shown: list[Silhouette] = []
+        self._kept: dict[int, ObjectsAlone] = {}
 
-    def __iter__(self) -> Iterator[tuple[Silhouette, TileOperator]]:
+    def add(self, shown: Silhouette) -> ObjectsAlone:
+        """Project a view, unless it comes with its operator."""
+        alone = self._project(shown)
+        if alone.nbytes + sum(kept.nbytes for kept in self._kept.values()) <= _MEMORY:
+            self._kept[len(self._shown)] = alone
+        self._shown.append(shown._replace(operator=None))
+        return alone
+
+    def __iter__(self) -> Iterator[tuple[Silhouette, ObjectsAlone]]:
         for number, shown in enumerate(self._shown):
-            operator = self._kept.get(number)
-            if operator is None:  # on the CPU, which alone tells the reasons
-                operator = TileOperator(self._scene, shown.camera)
-                if operator.nbytes + sum(kept.nbytes for kept in self._kept.values()) <= _MEMORY:
-                    self._kept[number] = operator
-            yield shown, operator
+            yield shown, self._kept.get(number) or self._project(shown)
+
+    def _project(self, shown: Silhouette) -> ObjectsAlone:
+        operator = shown.operator or TileOperator(self._scene, shown.camera)  # on the CPU, which alone tells reasons
+        return operator.objects_alone(self._labels)
 
 
 def carve(scene: GaussianScene, labels: np.ndarray, silhouettes: Iterable[Silhouette]) -> np.ndarray:

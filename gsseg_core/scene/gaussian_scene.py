@@ -221,13 +221,19 @@ class GaussianScene:
         geometry = columns(self.vertices, MEANS + OPACITY + SCALES + QUATS)
         return hashlib.sha256(np.ascontiguousarray(geometry, "<f4").data).hexdigest()
 
-    def colors(self, camera_center: npt.ArrayLike | None = None) -> npt.NDArray[np.float32]:  # (3,)
-        """Evaluate the colours (N, 3), RGB float32 in [0, 1], seen from `camera_center`; of degree 0 only if None."""
+    def colors(
+        self, camera_center: npt.ArrayLike | None = None, ids: npt.NDArray[np.integer] | None = None
+    ) -> npt.NDArray[np.float32]:  # (3,), (M,)
+        """Evaluate the colours (N, 3), RGB float32 in [0, 1], seen from `camera_center`; of degree 0 only if None.
+
+        With `ids`, only those of some Gaussians: (M, 3).
+        """
+        chosen = slice(None) if ids is None else ids
         if camera_center is None:
-            return spherical_harmonics.to_rgb(columns(self.vertices, DC)[:, None, :], self.means)
-        offsets = self.means - np.asarray(camera_center, np.float32)
+            return spherical_harmonics.to_rgb(columns(self.vertices, DC)[chosen, None, :], self.means[chosen])
+        offsets = self.means[chosen] - np.asarray(camera_center, np.float32)
         lengths = np.linalg.norm(offsets, axis=1, keepdims=True)
-        return spherical_harmonics.to_rgb(self.sh, offsets / np.maximum(lengths, np.finfo(np.float32).tiny))
+        return spherical_harmonics.to_rgb(self.sh[chosen], offsets / np.maximum(lengths, np.finfo(np.float32).tiny))
 
 
 def _count_rest(vertices: npt.NDArray[np.void]) -> int:

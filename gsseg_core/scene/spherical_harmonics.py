@@ -60,7 +60,7 @@ def to_rgb(
     The directions are unit vectors from the camera to each Gaussian; coefficients go band after band, RGB last.
     """
     degree = round(sqrt(sh.shape[1])) - 1
-    rgb: npt.NDArray[np.float32] = np.einsum("nb,nbc->nc", basis(directions, degree), sh)
+    rgb: npt.NDArray[np.float32] = np.matmul(basis(directions, degree)[:, None, :], sh)[:, 0]
     return (rgb + np.float32(0.5)).clip(0, 1)
 
 

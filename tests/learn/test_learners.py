@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import tracemalloc
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_scenes import NAMES, NUM_CLASSES, OUT_OF_SIGHT, balls_on_a_table, clean_views, look_at, mean_iou, taught
 
+from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import MaskSizeError, NoUsableViewsError, SettingsError, UnknownLabelError
+from gsseg_core.learn import learner as learner_module
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.gradient_learner import GradientLearner
 from gsseg_core.learn.learner import VOTE_UNIT, Learner
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.observation import Observation
 from gsseg_core.refine.settings import UNREFINED, RefineSettings
 from gsseg_core.segmentation import UNOBSERVED, Segmentation
 
@@ -58,6 +64,39 @@ def test_prepared_views_stay_within_the_memory_budget_and_results_are_the_same(s
     held = sum(observation.nbytes for observation in bounded._prepared.values())
     assert share * needed - max(o.nbytes for o in whole._prepared.values()) < held <= share * needed
     np.testing.assert_array_equal(bounded.codes_, whole.codes_)
+
+
+def test_views_beyond_the_memory_budget_are_prepared_once_and_memory_does_not_grow_with_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    prepared, peaks, largest = 0, [], 0
+    prepare = EMLearner._prepare
+
+    def counted(learner: EMLearner, view: View, seen: SeenLabels) -> Observation:
+        nonlocal prepared, largest
+        prepared += 1
+        observation = prepare(learner, view, seen)
+        largest = max(largest, observation.nbytes)
+        return observation
+
+    monkeypatch.setattr(EMLearner, "_prepare", counted)
+    many = [replace(view, camera=replace(view.camera, name=f"{view.name} {i}")) for i in range(8) for view in VIEWS]
+    for views in (VIEWS, VIEWS, many):  # the first time takes what is kept of the scene
+        prepared = 0
+        tracemalloc.start()
+        learner = taught(EMLearner(SCENE, NUM_CLASSES, memory_budget=1), views).fit()
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        assert prepared == len(views) and learner.prepared_bytes()[0] == 0 < learner.prepared_bytes()[1]
+    # What stays of a view is its error model, and the numbers of its labels: little, even of views as small as these.
+    assert peaks[2] - peaks[1] < 0.2 * (len(many) - len(VIEWS)) * largest
+
+
+def test_by_default_an_eighth_of_the_free_memory_is_for_prepared_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(learner_module, "free_memory", lambda: 8 << 30)
+    assert VoteLearner(SCENE, NUM_CLASSES).memory_budget == 1 << 30
+    monkeypatch.setattr(learner_module, "free_memory", lambda: None)
+    assert VoteLearner(SCENE, NUM_CLASSES).memory_budget == 2 << 30
 
 
 def test_a_negative_memory_budget_is_refused() -> None:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from operator_backends import CPU
 from operator_cases import dense, make_camera, make_scene, one_gaussian, random_mask, random_view
 
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.errors import MaskSizeError, SceneValueError, SettingsError
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu import blending as blend
@@ -72,6 +73,21 @@ def test_few_channels_are_rendered_as_they_are_among_many(backend, seed):
     many = operator.render(codes)
     for few in (1, 2, 3, 4, 5):
         assert np.abs(operator.render(codes[:, :few]) - many[..., :few]).max() <= backend.weight * (backend is not CPU)
+
+
+@pytest.mark.parametrize("background", [True, False])
+@pytest.mark.parametrize("channels", [1, 3, 40])
+def test_the_strongest_class_is_the_largest_of_all_that_are_rendered(backend, channels, background):
+    scene, camera = random_view(channels, 150, 37, 21)
+    operator, rng = backend.make(scene, camera), np.random.default_rng(channels)
+    codes = rng.choice([0, 0.25, 1], (len(scene), channels)).astype(np.float32)
+    image, left_over = operator.blend(codes)
+    image[..., 0] += left_over if background else 0
+    found = operator.strongest(CSRRows.from_dense(codes), channels, background)
+    assert found.classes.dtype == np.int32 and found.known.dtype == np.float32
+    np.testing.assert_array_equal(found.classes, image.argmax(axis=2))
+    np.testing.assert_allclose(found.known, image.sum(axis=2), atol=1e-5)
+    np.testing.assert_array_equal(found.labels(), np.where(found.known > 0.5, found.classes, -1))
 
 
 @pytest.mark.parametrize("seed", range(4))

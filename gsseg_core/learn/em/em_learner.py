@@ -38,7 +38,7 @@ from gsseg_core.learn.em.confusion_model import ErrorModel
 from gsseg_core.learn.em.em_kernels import ViewPairs
 from gsseg_core.learn.em.leave_one_out import leave_one_out_counts, subtract_votes
 from gsseg_core.learn.em.rejected_regions import find_rejected, split_regions
-from gsseg_core.learn.learner import MEMORY_BUDGET, VOTE_UNIT, Learner, Progress, silent
+from gsseg_core.learn.learner import VOTE_UNIT, Learner, Progress, silent
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.observation import Observation
 from gsseg_core.raster.view_operator import ViewOperator
@@ -139,7 +139,7 @@ class EMLearner(Learner):
         settings: EMSettings | None = None,
         *,
         device: str = "cpu",
-        memory_budget: int = MEMORY_BUDGET,
+        memory_budget: int | None = None,
     ) -> None:
         super().__init__(scene, num_classes, device=device, memory_budget=memory_budget)
         self.settings = settings or EMSettings()
@@ -224,18 +224,26 @@ class EMLearner(Learner):
 
         The spatial prior is left out, too, so rows sum to less where no other view has seen anything.
         """
+        codes, operator = self._codes_without(view), make_operator(self.scene, view.camera, self.device)
+        image, left_over = operator.blend_rows(codes, self.num_classes)
+        if (codes.indices == 0).any():
+            image[..., 0] += left_over
+        return image
+
+    def classes_without(self, view: View) -> np.ndarray:
+        """Tell the class of each pixel by `predict_without`, without an image of all classes."""
+        codes, operator = self._codes_without(view), make_operator(self.scene, view.camera, self.device)
+        return operator.strongest(codes, self.num_classes, bool((codes.indices == 0).any())).labels()
+
+    def _codes_without(self, view: View) -> CSRRows:
+        """Take one more step without a view's mask: all codes, N rows."""
         if self._leave_one_out is None:
             self.prepare_predictions()
         assert self._leave_one_out is not None
         codes, gradient = self._leave_one_out
-        observation, data = self.observation(view.name), codes.data.copy()
-        stepped = codes_without(observation, self.error_models_[view.name], codes, gradient, np.zeros_like(codes.data))
-        data[codes.positions(observation.ids[observation.order]).data] = stepped.data
-        operator = make_operator(self.scene, view.camera, self.device)
-        image, left_over = operator.blend_rows(codes.with_data(data), self.num_classes)
-        if (codes.indices == 0).any():
-            image[..., 0] += left_over
-        return image
+        observation, no_prior = self.observation(view.name), np.zeros_like(codes.data)
+        stepped = codes_without(observation, self.error_models_[view.name], codes, gradient, no_prior)
+        return codes.with_rows(observation.ids[observation.order], stepped)
 
     def rejected_share(self, view: View) -> float:
         """Share of a view's labelled pixels that lie in rejected regions."""

@@ -49,18 +49,51 @@ def render(tiles: Tiles, codes: CSRRows, channels: int) -> tuple[np.ndarray, np.
     stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
         tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
-        records, values = blend_tile(tiles, tile), np.zeros((TILE, channels, TILE), np.float32)
-        n = 0
-        for e in range(len(records.ends)):
-            g = tiles.entries[tiles.start[tile] + e]
-            for i in range(n, records.ends[e]):
-                weight, begin = load_row(records.weights, i), np.int64(records.blocks[i]) * channels
-                for z in range(codes.indptr[g], codes.indptr[g + 1]):
-                    k = begin + np.int64(codes.indices[z])
-                    store_row(values, k, add_scaled(load_row(values, k), weight, codes.data[z]))
-            n = records.ends[e]
-        _put(tiles, tile, values, records.rays, out, left_over)
+        values = np.zeros((TILE, channels, TILE), np.float32)
+        _put(tiles, tile, values, _blend_codes(tiles, tile, codes, values), out, left_over)
     return out, left_over
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def strongest(tiles: Tiles, codes: CSRRows, channels: int, background: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Find the column of the largest blended code in each pixel, (H, W) int32, the first of equal ones, and the sum.
+
+    What a ray has left over is added to column 0, if that is the background. No image of all columns is written.
+    """
+    out, total = np.empty((tiles.height, tiles.width), np.int32), np.empty((tiles.height, tiles.width), np.float32)
+    stride = stride_of(tiles.rows)
+    for turn in nb.prange(tiles.rows * tiles.columns):
+        tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
+        values = np.zeros((TILE, channels, TILE), np.float32)
+        rays = _blend_codes(tiles, tile, codes, values)
+        left, top = corner_of(tiles, tile)
+        for r in range(min(TILE, tiles.height - top)):
+            for c in range(min(TILE, tiles.width - left)):
+                b, lane = in_block(r, c)
+                most = values[b, 0, lane] + (rays[b, lane] if background else np.float32(0))
+                best, known = 0, most
+                for k in range(1, channels):
+                    value = values[b, k, lane]
+                    known += value
+                    if value > most:
+                        best, most = k, value
+                out[top + r, left + c], total[top + r, left + c] = best, known
+    return out, total
+
+
+@nb.njit
+def _blend_codes(tiles: Tiles, tile: int, codes: CSRRows, values: np.ndarray) -> np.ndarray:  # (16, K, 16) added to
+    """Blend the codes of a tile; returns its final transmittance, (16, 16) by block."""
+    records, channels, n = blend_tile(tiles, tile), values.shape[1], 0
+    for e in range(len(records.ends)):
+        g = tiles.entries[tiles.start[tile] + e]
+        for i in range(n, records.ends[e]):
+            weight, begin = load_row(records.weights, i), np.int64(records.blocks[i]) * channels
+            for z in range(codes.indptr[g], codes.indptr[g + 1]):
+                k = begin + np.int64(codes.indices[z])
+                store_row(values, k, add_scaled(load_row(values, k), weight, codes.data[z]))
+        n = records.ends[e]
+    return records.rays
 
 
 @nb.njit(parallel=True, nogil=True, cache=True, fastmath={"contract"}, error_model="numpy")

@@ -19,7 +19,7 @@ _FAST = {"contract", "reassoc", "nnan", "nsz"}
 
 @nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath=_FAST)
 def reasons_to_go(
-    tiles: Tiles, labels: np.ndarray, depths: np.ndarray,  # (M,) int32, (M,); labels above 0 are objects
+    tiles: Tiles, labels: np.ndarray, depths: np.ndarray,  # (M,) int32 above 0, (M,)
     shown: np.ndarray, hidden_from: np.ndarray,  # (H, W), (H, W)
     go: np.ndarray,  # (E,) out, zeros
 ) -> None:  # fmt: skip
@@ -41,7 +41,7 @@ def reasons_to_go(
         for e in range(start[tile], start[tile + 1]):
             g = entries[e]
             label, z = labels[g], depths[g]
-            if label <= 0 or label == tile_only or z > tile_farthest:
+            if label == tile_only or z > tile_farthest:
                 continue
             reached, total = aim(table, g, left, top, lines) & inside, np.float32(0)
             while reached:
@@ -58,7 +58,7 @@ def reasons_to_go(
 
 @nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath=_FAST)
 def reasons_to_stay(
-    tiles: Tiles, labels: np.ndarray, num_labels: int,  # (M,) int32; those above 0 are objects
+    tiles: Tiles, labels: np.ndarray, num_labels: int,  # (M,) int32 above 0
     kept: np.ndarray, asked: np.ndarray, shown: np.ndarray,  # (M,) float32, (M,) bool, (H, W)
     stay: np.ndarray,  # (E,) out, zeros
 ) -> None:  # fmt: skip
@@ -71,23 +71,27 @@ def reasons_to_stay(
         slots, count = np.full(num_labels, -1, np.int64), 0
         for e in range(start[tile], start[tile + 1]):
             label = labels[entries[e]]
-            if asked[entries[e]] and label > 0 and slots[label] < 0:
+            if asked[entries[e]] and slots[label] < 0:
                 slots[label] = count
                 count += 1
         if not count:
             continue
         fresh, lines = np.empty((TILE, TILE), np.float32), np.empty((2, TILE), np.float32)
         left, top, inside = open_rays(tiles, tile, fresh)
+        wanted = np.zeros(count, np.int64)  # blocks that they reach
+        for e in range(start[tile], start[tile + 1]):
+            if asked[entries[e]]:
+                wanted[slots[labels[entries[e]]]] |= aim(table, entries[e], left, top, lines) & inside
         seen = np.full((TILE, TILE), _UNKNOWN, np.int32)
         _cut(shown, *corner_of(tiles, tile), seen)
         through = np.ones((count * TILE, TILE), np.float32)  # T_k, block by block
-        live = _blocks_of(seen, slots, count)  # those that show the object, until it covers all in them
+        live = wanted & _blocks_of(seen, slots, count)  # those that show the object, until it covers all in them
         for e in range(start[tile], start[tile + 1]):
             g = entries[e]
-            slot = slots[labels[g]] if labels[g] > 0 else -1
+            slot = slots[labels[g]]
             if slot < 0 or not live[slot]:
                 continue
-            reached = aim(table, g, left, top, lines) & inside & live[slot]
+            reached = aim(table, g, left, top, lines) & live[slot]
             while reached:
                 b = first_bit(reached)
                 reached &= reached - 1
@@ -101,9 +105,9 @@ def reasons_to_stay(
         _weigh(seen, slots, through, need)
         for e in range(start[tile], start[tile + 1]):
             g = entries[e]
-            if asked[g] and labels[g] > 0 and live[slots[labels[g]]]:
+            if asked[g] and live[slots[labels[g]]]:
                 slot, total = slots[labels[g]], nothing()
-                reached = aim(table, g, left, top, lines) & inside & live[slot]
+                reached = aim(table, g, left, top, lines) & live[slot]
                 while reached:
                     b = first_bit(reached)
                     reached &= reached - 1

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import copy
+from typing import Any
 
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows, starts
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.raster.constants import CHANNELS, CHUNKS
-from gsseg_core.raster.cpu import label_pairs, products, silhouette_kernels
+from gsseg_core.raster.cpu import label_pairs, products
 from gsseg_core.raster.cpu.entry_votes import add_entry_votes
 from gsseg_core.raster.cpu.lifting import Lifted
+from gsseg_core.raster.cpu.objects_alone import ObjectsAlone
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_OPACITY, WIDTH
 from gsseg_core.raster.cpu.tiling import TILE, Tiles, assign
 from gsseg_core.raster.observation import Observation, VoteShares
-from gsseg_core.raster.view_operator import Blended, ViewOperator
+from gsseg_core.raster.view_operator import Blended, Strongest, ViewOperator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -36,11 +38,6 @@ class TileOperator(ViewOperator):
         self.ids = projected.ids
         self._tiles = assign(projected, camera.width, camera.height)
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes that it holds."""
-        return int(self.ids.nbytes + sum(part.nbytes for part in self._tiles if isinstance(part, np.ndarray)))
-
     def footprints(self) -> np.ndarray:
         """Sum of the alphas of each of `ids` over an endless image, (M,)."""
         # |S| = var(x|y) S_yy, and the table has log2(e) / 2 over each of them.
@@ -49,54 +46,9 @@ class TileOperator(ViewOperator):
         areas: np.ndarray = np.exp2(table[:, LOG_OPACITY]) * area
         return areas
 
-    def reasons_to_go(
-        self, labels: np.ndarray, depths: np.ndarray, shown: np.ndarray, hidden_from: np.ndarray
-    ) -> np.ndarray:
-        """Weigh what speaks against each Gaussian in its object, were the object alone in the view.
-
-        Parameters
-        ----------
-        labels : (M,) int32
-            Object of each of `ids`; 0 and below are none.
-        depths : (M,) float32
-            Depth of each Gaussian, in scene units.
-        shown : (H, W) int32
-            Object that the view shows in each pixel, negative where unknown.
-        hidden_from : (H, W) float32
-            Depth from which on the pixel hides a Gaussian.
-
-        Returns
-        -------
-        (M,) float64
-            Sum of alpha, in px, over the pixels that show another object and do not hide the Gaussian.
-        """
-        go = np.zeros(len(self._tiles.entries), np.float32)
-        silhouette_kernels.reasons_to_go(self._tiles, labels, depths, shown, hidden_from, go)
-        return np.bincount(self._tiles.entries, go, len(self.ids))
-
-    def reasons_to_stay(
-        self, labels: np.ndarray, kept: np.ndarray, asked: np.ndarray, shown: np.ndarray
-    ) -> np.ndarray:  # fmt: skip
-        """Weigh what speaks for each Gaussian in its object k, were the object alone in the view.
-
-        Parameters
-        ----------
-        labels, shown
-            As `reasons_to_go` takes them.
-        kept : (M,)
-            Share of each Gaussian that its object keeps, by which its alphas are multiplied.
-        asked : (M,) bool
-            Whose reasons are wanted; those of all others are 0.
-
-        Returns
-        -------
-        (M,) float64
-            Sum of alpha T_k / (1 - T_k), in px, over the pixels that show the object, whose transmittance is T_k; as
-            good as 0 where the object lets no light through.
-        """
-        stay, count = np.zeros(len(self._tiles.entries), np.float32), int(labels.max(initial=0)) + 1
-        silhouette_kernels.reasons_to_stay(self._tiles, labels, count, kept.astype(np.float32), asked, shown, stay)
-        return np.bincount(self._tiles.entries, stay, len(self.ids))
+    def objects_alone(self, labels: np.ndarray) -> ObjectsAlone:
+        """Choose the Gaussians that belong to an object, those of labels (N,) int32 above 0, each object by itself."""
+        return ObjectsAlone.of(self.ids, self._tiles, labels)
 
     def _without(self, hidden: np.ndarray) -> TileOperator:
         other, table = copy.copy(self), self._tiles.table.copy()
@@ -114,6 +66,10 @@ class TileOperator(ViewOperator):
     def blend_rows(self, codes: CSRRows, num_classes: int) -> Blended:
         """Blend codes without their zeros."""
         return Blended(*products.render(self._tiles, codes.take(self.ids), num_classes))
+
+    def strongest(self, codes: CSRRows, num_classes: int, background: bool) -> Strongest:
+        """Find the class of each pixel, tile by tile, without an image of all classes."""
+        return Strongest(*products.strongest(self._tiles, codes.take(self.ids), num_classes, background))
 
     def _adjoint(self, residual: np.ndarray) -> np.ndarray:
         out = np.zeros((self.num_gaussians, residual.shape[2]), np.float32)
@@ -189,6 +145,10 @@ class TileObservation(Observation):
             table=table, start=start, entries=entries, gaussian_start=none, gaussian_entries=none.astype(np.int32)
         )
         self._answered: tuple[np.ndarray, np.ndarray, VoteShares] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what `shares` was asked last."""
+        return {**self.__dict__, "_answered": None}
 
     @property
     def nbytes(self) -> int:

@@ -1,0 +1,140 @@
+"""What does not fit into memory, in a temporary file without a name: it is gone with the process, however that ends."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import shutil
+import tempfile
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+
+SPARED = 1 << 30  # bytes of the disk that are left to others
+_ALIGNED = 64  # bytes, as arrays in memory begin
+
+
+class _Place(NamedTuple):
+    """Where an object is: its arrays one after the other in the file, and all else here."""
+
+    offset: int
+    sizes: list[int]  # of the arrays, in bytes
+    rest: bytes
+
+    @property
+    def size(self) -> int:
+        return sum(map(_padded, self.sizes))
+
+
+class ScratchFile:
+    """Objects made of large arrays, by name; each is read as it was written, into memory of its own.
+
+    The file is made when it is first needed, in the folder that the environment variable TMPDIR names, or else in
+    /var/tmp, which no memory stands behind, or else where Python puts temporary files.
+    """
+
+    def __init__(self) -> None:
+        self._file: IO[bytes] | None = None
+        self._places: dict[str, _Place] = {}
+        self._holes: list[tuple[int, int]] = []  # offset and size of what was dropped
+
+    def __reduce__(self) -> tuple[type[ScratchFile], tuple[()]]:
+        """Have a copy begin empty."""
+        return ScratchFile, ()
+
+    def __del__(self) -> None:
+        """Close the file, with which it is gone."""
+        self.clear()
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the objects in the file."""
+        return sum(place.size for place in self._places.values())
+
+    def put(self, name: str, value: Any) -> bool:
+        """Write an object; whether that was possible: there may be no space, and what was there of the name is gone."""
+        self.drop(name)
+        buffers: list[pickle.PickleBuffer] = []
+        rest = pickle.dumps(value, protocol=5, buffer_callback=buffers.append)
+        arrays = [buffer.raw() for buffer in buffers]
+        place = _Place(0, [array.nbytes for array in arrays], rest)
+        try:
+            if self._file is None:
+                self._file = tempfile.TemporaryFile(dir=_folder())  # noqa: SIM115 - it lives as long as this object
+            place = place._replace(offset=self._room_for(place.size))
+            offset = place.offset
+            for array in arrays:
+                _write(self._file.fileno(), array, offset)
+                offset += _padded(array.nbytes)
+        except OSError:
+            return False
+        self._places[name] = place
+        return True
+
+    def get(self, name: str) -> Any:
+        """Read an object; None if there is none of that name, or the disk does not give it back."""
+        place = self._places.get(name)
+        if place is None or self._file is None:
+            return None
+        # Each array by itself: one that is kept must not keep the others.
+        arrays, offset = [np.empty(size, np.uint8) for size in place.sizes], place.offset
+        try:
+            for array in arrays:
+                _read(self._file.fileno(), array.data, offset)
+                offset += _padded(array.nbytes)
+        except OSError:
+            return None
+        return pickle.loads(place.rest, buffers=arrays)
+
+    def drop(self, name: str) -> None:
+        """Forget an object, if there is one of that name; its space is used again."""
+        place = self._places.pop(name, None)
+        if place is not None:
+            self._holes.append((place.offset, place.size))
+        if not self._places:
+            self.clear()
+
+    def clear(self) -> None:
+        """Forget all objects, and give the disk back."""
+        self._places.clear()
+        self._holes.clear()
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _room_for(self, size: int) -> int:
+        """Find where so many bytes go: into a hole that is large enough, or to the end, if the disk has room there."""
+        for number, (offset, room) in enumerate(self._holes):
+            if room >= size:
+                self._holes[number] = offset + size, room - size
+                return offset
+        assert self._file is not None
+        descriptor = self._file.fileno()
+        if shutil.disk_usage(descriptor).free < size + SPARED:
+            raise OSError("no space left for scratch")
+        return _padded(os.fstat(descriptor).st_size)
+
+
+def _folder() -> str:
+    asked = os.environ.get("TMPDIR", "")
+    return next((path for path in (asked, "/var/tmp") if os.path.isdir(path) and os.access(path, os.W_OK)), "") or (
+        tempfile.gettempdir()
+    )
+
+
+def _padded(size: int) -> int:
+    return -(-size // _ALIGNED) * _ALIGNED
+
+
+def _write(descriptor: int, data: memoryview, offset: int) -> None:
+    while len(data):
+        count = os.pwrite(descriptor, data, offset)
+        data, offset = data[count:], offset + count
+
+
+def _read(descriptor: int, into: memoryview, offset: int) -> None:
+    while len(into):
+        count = os.preadv(descriptor, [into], offset)
+        if not count:
+            raise OSError("the scratch file ends too early")
+        into, offset = into[count:], offset + count
