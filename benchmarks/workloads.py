@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from garden import build_garden
 from room import Room, build_room
 
 from gsseg_core.data.label_images import write_mask
@@ -30,6 +31,7 @@ class RoomSize:
     height: int
     tests: int = 0
     sh_degree: int = 0
+    outdoors: bool = False
 
     def __str__(self) -> str:
         """Describe for the report."""
@@ -140,6 +142,14 @@ SIZES = {
 }
 
 
+WHOLE = {
+    "a": SIZES["full"].room,
+    "c": RoomSize(3_000_000, 200, 20, 1600, 1064, sh_degree=3, outdoors=True),
+    "d": RoomSize(6_000_000, 300, 20, 1600, 1064, sh_degree=3, outdoors=True),
+}
+"""Workloads of the whole command: (c) is what people capture outdoors, (d) the largest of it."""
+
+
 def write_room(folder: Path, size: RoomSize, *, wrong: bool = False, seed: int = 0) -> Path:
     """Write a room as a dataset: scene, cameras, split and true masks, and wrong ones if asked for."""
     room = make_room(size, seed)
@@ -161,8 +171,8 @@ def write_room(folder: Path, size: RoomSize, *, wrong: bool = False, seed: int =
 
 
 def make_room(size: RoomSize, seed: int = 0) -> Room:
-    """Build a room with cameras for learning and for tests."""
-    return build_room(
+    """Build a room, or a garden, with cameras for learning and for tests."""
+    return (build_garden if size.outdoors else build_room)(
         size.gaussians,
         num_classes=size.classes,
         num_views=size.views + size.tests,
