@@ -17,7 +17,7 @@ class GssegError(Exception):
 
 
 class SceneFileError(GssegError):
-    """A scene file is missing, truncated, or not a PLY."""
+    """A scene file is missing, truncated, or of no format that is read."""
 
 
 class ScenePropertyError(GssegError):

@@ -112,7 +112,7 @@ def segment(
     Parameters
     ----------
     scene_path : path
-        A 3DGS PLY.
+        A scene of any format in `gsseg_core.scene.scene_formats`.
     data : path
         Dataset folder.
     out : path

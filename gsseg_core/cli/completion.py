@@ -20,7 +20,7 @@ EXAMPLES = """
 """
 
 _FOLDERS = {"DIR", "DATASET", "OUT"}
-_FILES = {"FILE", "SCENE.ply"}
+_FILES = {"FILE", "SCENE"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -18,6 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata
 from itertools import groupby
+from pathlib import Path
 
 from gsseg_core import kernel_cache
 from gsseg_core.cli.terminal import note, tell
@@ -27,9 +28,12 @@ DESCRIPTION = """
 Prints the versions of gsseg, Python and its packages, the devices, whether the kernels run and where they are cached,
 the formats of scenes and cameras that are read, which options are installed, and what is there of ROS 2. For everything
 that is missing it says what to type. The exit code is 0 if gsseg works without the options, and 2 if not.
+
+Given a scene, it says of that instead which format it has, and what this format keeps of a Gaussian.
 """
 EXAMPLES = """
   gsseg doctor
+  gsseg doctor scan.spz
 """
 
 _REQUIREMENT = re.compile(r"(?P<name>[A-Za-z0-9._-]+)")
@@ -64,11 +68,15 @@ class Finding:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare what the command takes: nothing."""
+    """Declare what the command takes."""
+    parser.add_argument("scene", nargs="?", metavar="SCENE", help="say what this file is, and not what the machine has")
 
 
 def run(options: argparse.Namespace) -> int:
     """Look, and print what was found."""
+    if options.scene:
+        tell(_listed(examine_scene(options.scene)))
+        return 0
     findings = examine(note)
     tell(describe(findings))
     return 0 if works(findings) else 2
@@ -82,6 +90,27 @@ def examine(say: Callable[[str], object] = lambda text: None) -> list[Finding]:
     return [*_versions(), *_devices(), *_kernels(say), *_formats(), *_extras(), *_ros()]
 
 
+def examine_scene(path: str) -> list[Finding]:
+    """Read a scene, and say its format, and what of it is lost; raises what `GaussianScene.load` raises."""
+    from gsseg_core.scene.gaussian_scene import GaussianScene
+    from gsseg_core.scene.scene_formats import SCENE_FORMATS, find_format, read_scene
+    from gsseg_core.text import clipped, counted
+
+    read = read_scene(path)
+    scene = GaussianScene.from_vertices(read.vertices, Path(path))
+    known = find_format(Path(path)) or SCENE_FORMATS[0]
+    version = f", version {read.version}" if read.version else ""
+    name = clipped(path)
+    remarks = [Finding(name, "here", remark, "") for remark in read.remarks]
+    return [
+        Finding(name, "format", f"{known.name}{version}"),
+        Finding(name, "holds", f"{counted(len(scene), 'Gaussian')}, SH of degree {scene.sh_degree}"),
+        Finding(name, "keeps", known.keeps, ""),
+        *remarks,
+        Finding(name, "order", "labels are in the order of this file", ""),
+    ]
+
+
 def works(findings: list[Finding]) -> bool:
     """Whether nothing is missing without which gsseg does not work."""
     return all(finding.mark != "!!" for finding in findings)
@@ -89,6 +118,13 @@ def works(findings: list[Finding]) -> bool:
 
 def describe(findings: list[Finding]) -> str:
     """Write findings as text for a terminal, group by group, and the verdict."""
+    missing = sum(finding.mark == "-" for finding in findings)
+    verdict = "gsseg works here" if works(findings) else "gsseg does not work here: see what is marked !!"
+    options = f"; what is marked - ({missing}) is needed only by those who use it" if missing else ""
+    return "\n".join([_listed(findings), "", verdict + options])
+
+
+def _listed(findings: list[Finding]) -> str:
     width = max(len(finding.name) for finding in findings)
     lines: list[str] = []
     for group, of_group in groupby(findings, lambda finding: finding.group):
@@ -97,10 +133,7 @@ def describe(findings: list[Finding]) -> str:
             lines.append(f"  {finding.mark:2}  {finding.name.ljust(width)}  {finding.state}".rstrip())
             if finding.fix:
                 lines.append(f"      {' ' * width}  -> {finding.fix}")
-    missing = sum(finding.mark == "-" for finding in findings)
-    verdict = "gsseg works here" if works(findings) else "gsseg does not work here: see what is marked !!"
-    options = f"; what is marked - ({missing}) is needed only by those who use it" if missing else ""
-    return "\n".join([*lines, "", verdict + options])
+    return "\n".join(lines)
 
 
 def _versions() -> Iterator[Finding]:

@@ -21,7 +21,7 @@ EXAMPLES = """
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the command takes."""
-    parser.add_argument("scene", metavar="SCENE.ply", help="trained 3DGS scene")
+    parser.add_argument("scene", metavar="SCENE", help="trained 3DGS scene, of any format that gsseg reads")
     parser.add_argument("--segmentation", required=True, metavar="FILE", help="segmentation.npz of this scene")
     classes = "id or name of a class to leave out, a number being an id; may be given several times"
     parser.add_argument("--class", dest="classes", action="append", required=True, metavar="NAME", help=classes)

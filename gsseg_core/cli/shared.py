@@ -13,7 +13,7 @@ from gsseg_core.scene.scene_writers import SCENE_WRITERS
 
 def add_scene(parser: argparse.ArgumentParser) -> None:
     """Add the scene, the dataset, the device and `--quiet`."""
-    parser.add_argument("scene", metavar="SCENE.ply", help="trained 3DGS scene")
+    parser.add_argument("scene", metavar="SCENE", help="trained 3DGS scene, of any format that gsseg reads")
     data = "folder with cameras, labels/<stem>.png, classes.json, split.json"
     parser.add_argument("--data", required=True, metavar="DATASET", help=data)
     add_device(parser)

@@ -31,7 +31,7 @@ EXAMPLES = """
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the command takes."""
-    parser.add_argument("scene", metavar="SCENE.ply", help="trained 3DGS scene")
+    parser.add_argument("scene", metavar="SCENE", help="trained 3DGS scene, of any format that gsseg reads")
     parser.add_argument("--segmentation", metavar="FILE", help="segmentation.npz of this scene")
     data = "folder of the views that it was learnt from, for jumping to them"
     parser.add_argument("--data", metavar="DATASET", help=data)

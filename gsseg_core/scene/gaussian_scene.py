@@ -85,7 +85,7 @@ class GaussianScene:
             The file lies outside `within`.
         """
         path = Path(path)
-        return cls._from_vertices(read_scene(path, within).vertices, path)
+        return cls.from_vertices(read_scene(path, within).vertices, path)
 
     @classmethod
     def from_arrays(
@@ -137,11 +137,11 @@ class GaussianScene:
         dc, rest = arrays["sh"][:, 0], arrays["sh"][:, 1:]
         opacities, log_scales = logits(arrays["opacities"]), np.log(arrays["scales"])
         vertices = pack_vertices(arrays["means"], arrays["quats"], log_scales, opacities, dc, rest)
-        return cls._from_vertices(vertices, None)
+        return cls.from_vertices(vertices, None)
 
     @classmethod
-    def _from_vertices(cls, vertices: npt.NDArray[np.void], path: Path | None) -> GaussianScene:
-        """Build a scene from PLY vertices, validated and activated."""
+    def from_vertices(cls, vertices: npt.NDArray[np.void], path: Path | None) -> GaussianScene:
+        """Build a scene from the vertices of a PLY, validated and activated; raises what `load` raises of values."""
         source = "scene" if path is None else str(path)
         sh_names = _check_properties(vertices, source)
         if len(vertices) == 0:

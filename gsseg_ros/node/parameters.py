@@ -62,7 +62,7 @@ DECLARATIONS = (
     Declaration(
         "scene_path",
         "",
-        "3DGS PLY to load when the node is configured; empty: wait for ~/load_scene; set later, it must lie below "
+        "scene to load when the node is configured; empty: wait for ~/load_scene; set later, it must lie below "
         "data_root",
     ),
     Declaration(

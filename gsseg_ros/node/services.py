@@ -198,7 +198,7 @@ class Services:
         elif workspace.settings.scene_path:
             path, within = workspace.scene_path()
         else:
-            raise InvalidRequestError("path and the parameter scene_path are both empty; expected a 3DGS PLY in either")
+            raise InvalidRequestError("path and the parameter scene_path are both empty; expected a scene in either")
         with workspace.slot.take("load_scene") as job, workspace.run("load_scene") as run:
 
             def check() -> None:

@@ -151,8 +151,8 @@ class Workspace:
         """
         path = Path(self.settings.scene_path)
         self.require_allowed_scene(self.settings.scene_path)
-        if not path.is_file():
-            raise MissingFileError(f"parameter scene_path: {path} does not exist; expected a 3DGS PLY")
+        if not path.exists():
+            raise MissingFileError(f"parameter scene_path: {path} does not exist; expected a scene")
         return path, None if self.settings.scene_path == self._scene_at_start else self.root
 
     def load_scene(
@@ -163,7 +163,7 @@ class Workspace:
         Parameters
         ----------
         path : path
-            A 3DGS PLY.
+            A scene of any format in `gsseg_core.scene.scene_formats`.
         within : pathlib.Path, optional
             A folder that its links must not lead out of.
         check : callable

@@ -6,16 +6,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_scenes import balls_on_a_table
+from scene_files import some_scene, write_glb, write_gsplat, write_spz
+from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, taught
 
 from gsseg_core.cli.main import main
 from gsseg_core.data.camera_files import read_cameras
 from gsseg_core.data.camera_formats.table import CAMERA_FORMATS, CameraFormat
 from gsseg_core.errors import CameraFileError, SceneFileError
+from gsseg_core.export.class_files import export_classes
+from gsseg_core.learn.vote_learner import VoteLearner
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_formats import SCENE_FORMATS, SceneFormat
 from gsseg_core.scene.vertices import ReadScene
+from gsseg_core.segmentation import Segmentation
 
 
 @pytest.fixture
@@ -65,3 +70,36 @@ def test_a_scene_format_is_one_line_in_the_table(
         GaussianScene.load(tmp_path)
     main(["doctor"])
     assert "toys" in (told := doctor.readouterr().out) and ".toy" in told
+
+
+def test_doctor_says_of_a_scene_its_format_and_what_of_it_is_lost(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_spz(3)(tmp_path / "scan.spz", some_scene(70, 2))
+    assert main(["doctor", str(tmp_path / "scan.spz")]) == 0
+    told = capsys.readouterr().out
+    assert "SPZ, version 3" in told and "70 Gaussians, SH of degree 2" in told and "in the order of this file" in told
+    assert next(known.keeps for known in SCENE_FORMATS if known.name == "SPZ") in told
+    assert "Python" not in told
+    (tmp_path / "scan.spz").write_bytes(b"NGSP")
+    assert main(["doctor", str(tmp_path / "scan.spz")]) == 2
+    assert "scan.spz: header: 4 bytes are there" in capsys.readouterr().err
+
+
+def test_a_scene_of_another_format_is_segmented_as_its_ply_is(tmp_path: Path) -> None:
+    scene, _ = balls_on_a_table()
+    views, settings = clean_views(3), RefineSettings(cluster=False, filter=False)
+    expected = taught(VoteLearner(scene, NUM_CLASSES), views).fit().codes_
+    for name, write in {"glb": write_glb, "pt": write_gsplat, "spz": write_spz(3)}.items():
+        write(tmp_path / f"scene.{name}", scene)
+        read = GaussianScene.load(tmp_path / f"scene.{name}")
+        codes = taught(VoteLearner(read, NUM_CLASSES), views).fit().codes_
+        assert (codes.argmax(axis=1) == expected.argmax(axis=1)).mean() > (0.98 if name == "spz" else 0.999)
+        result = Segmentation.from_codes(read, codes, NAMES, settings)
+        written = export_classes(read, result, tmp_path / name)
+        ball = GaussianScene.load(written[1])
+        np.testing.assert_array_equal(ball.means, read.means[result.labels == 1])
+        result.save(tmp_path / "segmentation.npz")
+        arguments = ["--segmentation", f"{tmp_path}/segmentation.npz", "--class", "1", "--out", f"{tmp_path}/rest.ply"]
+        assert main(["remove", f"{tmp_path}/scene.{name}", *arguments]) == 0
+        np.testing.assert_array_equal(GaussianScene.load(tmp_path / "rest.ply").means, read.means[result.labels != 1])

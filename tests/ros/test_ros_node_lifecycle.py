@@ -154,7 +154,7 @@ def test_a_configure_that_fails_leaves_it_unconfigured_until_the_parameter_is_ri
     process = robot.start({**parameters, "scene_path": root / "no.ply"})
     process.wait_for("cannot be configured")
     (line,) = (line for line in process.output.splitlines() if "[ERROR]" in line)
-    assert f"parameter scene_path: {root}/no.ply does not exist; expected a 3DGS PLY" in line
+    assert f"parameter scene_path: {root}/no.ply does not exist; expected a scene" in line
     assert robot.state == "unconfigured"
     assert not robot.change("configure")
     (root / "broken.ply").write_text("no PLY")

@@ -147,7 +147,7 @@ def test_what_is_moved_is_seen_from_the_moved_place_as_before(turn: np.ndarray, 
     scale, shift = float(rng.uniform(0.2, 5)), rng.normal(size=3)
     vertices = scene.vertices.copy()
     move(vertices, turn, scale, shift)
-    moved = GaussianScene._from_vertices(vertices, None)
+    moved = GaussianScene.from_vertices(vertices, None)
     np.testing.assert_allclose(moved.means, scale * scene.means @ turn.T + shift, atol=1e-4)
     there = turn @ covariances(scene.quats.astype(float), scene.scales) @ turn.T * scale**2
     np.testing.assert_allclose(covariances(moved.quats.astype(float), moved.scales), there, atol=1e-4 * scale**2)
