@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
 
 from gsseg_core.data.class_names import class_name
 from gsseg_core.data.label_images import UNKNOWN, read_mask
@@ -161,6 +160,8 @@ def boundary_band(labels: np.ndarray, width: int) -> np.ndarray:  # (H, W) of a 
     outside the image is no class. For each class this is the mask minus its erosion by `width` steps of a 3x3 square,
     as boundary IoU defines it. A square is all one label exactly where its smallest and largest label are the same.
     """
+    from scipy import ndimage  # Only where it is used: a node measures nothing.
+
     size = 2 * width + 1
     lowest = ndimage.minimum_filter(labels, size, mode="constant", cval=UNKNOWN - 1)
     highest = ndimage.maximum_filter(labels, size, mode="constant", cval=UNKNOWN - 1)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.hints import mask_hint
-from gsseg_core.data.label_images import write_mask
+from gsseg_core.data.label_images import PER_VIEW, write_mask
 from gsseg_core.data.view import View, spread
 from gsseg_core.errors import NoUsableViewsError
 from gsseg_core.export.class_files import class_places, mesh_file_name, write_classes
@@ -33,7 +33,7 @@ from gsseg_core.learn.learner import NO_MASK, Learner, default_budget
 from gsseg_core.learn.mask_reliability import MaskChecker, ViewCheck, compare_mask, reliability_report
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.objects.association import AssociationSettings
-from gsseg_core.objects.object_table import PER_VIEW, ObjectTable, find_objects
+from gsseg_core.objects.object_table import ObjectTable, find_objects
 from gsseg_core.progress import Progress, Stopwatch, silent
 from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, spread_if_scarce
 from gsseg_core.refine.settings import RefineSettings

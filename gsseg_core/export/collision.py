@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy import ndimage
-from scipy.spatial import ConvexHull, QhullError
 
 from gsseg_core.errors import SettingsError
 from gsseg_core.objects.oriented_boxes import without_floaters
@@ -86,6 +84,8 @@ def _hull(
     half_axes: npt.NDArray[np.float32],  # (M, 3, 3)
 ) -> TriangleMesh | None:
     """Convex hull of the ends of all axes; None where they have no volume."""
+    from scipy.spatial import ConvexHull, QhullError
+
     ends = np.concatenate([means[:, None] + sign * half_axes.transpose(0, 2, 1) for sign in (1, -1)]).reshape(-1, 3)
     try:
         hull = ConvexHull(ends.astype(np.float64))
@@ -104,6 +104,7 @@ def _surface(
     half_axes: npt.NDArray[np.float32],  # (M, 3, 3)
 ) -> TriangleMesh | None:
     """Watertight surface around ellipsoids; None where they have no extent."""
+    from scipy import ndimage
     from skimage.measure import marching_cubes
 
     reach = np.linalg.norm(half_axes, axis=2)  # (M, 3): of an ellipsoid along x, y, z

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from gsseg_core.data.label_images import IDS, PER_VIEW
 from gsseg_core.errors import SettingsError
 from gsseg_core.export.collision import check_collision
 from gsseg_core.learn.registry import check_learner
-from gsseg_core.objects.object_table import IDS, PER_VIEW
 from gsseg_core.objects.oriented_boxes import object_boxes
 from gsseg_core.refine.label_propagation import GraphSettings
 from gsseg_core.refine.settings import RefineSettings

@@ -23,7 +23,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 LOWEST, HIGHEST = 0.2, 5.0  # temperatures that are tried
 VIEWS = 16  # views whose masks the temperature is fitted to, at most
@@ -96,6 +95,8 @@ def fit_temperature(samples: Sequence[Sample]) -> float:
     float
         In [`LOWEST`, `HIGHEST`]; 1 where there is no pixel to go by.
     """
+    from scipy.optimize import minimize_scalar  # It loads half of SciPy, which most programs do not need.
+
     samples = [sample for sample in samples if len(sample.seen)]
     if not samples:
         return 1.0

@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from gsseg_core.data.class_names import BACKGROUND_NAME
 from gsseg_core.data.label_images import UNKNOWN
@@ -19,10 +18,6 @@ from gsseg_core.objects.association import AssociationSettings, associate
 from gsseg_core.objects.lifted_segments import Lifted, Profiles, sums
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
-
-PER_VIEW = "per-view"
-IDS = ("global", PER_VIEW)
-"""Whether an id means the same in every view, or the objects are to be found."""
 
 
 @dataclass(frozen=True)
@@ -248,6 +243,8 @@ class ObjectTable:
 
     def _renumbered(self, solved: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Give solved objects the numbers that most of their weight had before; also return the successors."""
+        from scipy.optimize import linear_sum_assignment
+
         names = sorted(self._objects)
         old, new = (np.concatenate([part[name] for name in names]) for part in (self._objects, solved))
         size = np.concatenate([sums(self._lifted[name].weights, 1) for name in names])

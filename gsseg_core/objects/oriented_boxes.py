@@ -23,16 +23,17 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import ConvexHull, QhullError
 
 from gsseg_core.errors import SceneValueError
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.quaternions import covariances
-from gsseg_core.segmentation import Segmentation
+
+if TYPE_CHECKING:
+    from gsseg_core.segmentation import Segmentation
 
 Array = npt.NDArray[np.float64]
 
@@ -199,6 +200,8 @@ def _turned(offsets: Array, share: Array, axes: Array) -> Array:
 
     It begins with the axes given, and with the sides of the points' hull.
     """
+    from scipy.spatial import ConvexHull, QhullError  # Who reads boxes only, as a client does, starts without.
+
     along = offsets @ axes
     low, high = _quantile(along, share, TRIM), -_quantile(-along, share, TRIM)
     points = offsets[((along >= low) & (along <= high)).all(axis=1)]
@@ -253,6 +256,8 @@ def _turned_about(points: Array, axes: Array, k: int) -> Array:
 
 def _smallest_rectangle(points: Array) -> tuple[float, float, float]:
     """Direction x, y of a side of the smallest rectangle around points (M, 2); its area by that of the upright one."""
+    from scipy.spatial import ConvexHull, QhullError
+
     try:
         hull = points[ConvexHull(points).vertices] if len(points) > 2 else points[:0]
     except QhullError:  # All on one line.

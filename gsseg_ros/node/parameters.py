@@ -15,9 +15,9 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from gsseg_core.data.class_names import flaw_of_class_name
+from gsseg_core.data.label_images import PER_VIEW
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.files.limits import MAX_LABEL
-from gsseg_core.objects.object_table import PER_VIEW
 from gsseg_core.raster.backends import devices, rasteriser_of
 from gsseg_core.refine.settings import MAX_K, RefineSettings
 from gsseg_core.scene.scene_writers import DEFAULT, SCENE_WRITERS, check_format

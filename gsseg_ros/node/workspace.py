@@ -15,10 +15,9 @@ from typing import Any
 from builtin_interfaces.msg import Time
 
 from gsseg_core.data.class_names import class_ids
+from gsseg_core.data.label_images import PER_VIEW
 from gsseg_core.errors import PathNotAllowedError, SettingsError
-from gsseg_core.live.per_view_session import PerViewSession
 from gsseg_core.live.session import LiveSession
-from gsseg_core.objects.object_table import PER_VIEW
 from gsseg_core.progress import Stopwatch
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -175,6 +174,8 @@ class Workspace:
             "max_views": settings.max_views, "device": settings.device, "max_classes": settings.max_classes,
         }  # fmt: skip
         if settings.ids == PER_VIEW:
+            from gsseg_core.live.per_view_session import PerViewSession  # Others start without SciPy.
+
             session: LiveSession = PerViewSession(scene, **kept)
         else:
             session = LiveSession(scene, settings.names_by_id, **kept)

@@ -17,8 +17,6 @@ import numpy.typing as npt
 from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import Header
 
-from gsseg_core.data.dataset import Dataset
-from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, MaskSizeError, NoUsableViewsError
 from gsseg_core.files.input_files import open_image
 from gsseg_core.scene.undistortion import Undistortion
@@ -26,6 +24,8 @@ from gsseg_ros.conversions import camera_info, mask_image, pose_from_matrix, rgb
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
+
+    from gsseg_core.data.view import View
 
 TYPES = {
     "mask": "sensor_msgs/msg/Image",
@@ -98,6 +98,8 @@ class FolderSource:
     """
 
     def __init__(self, folder: str | os.PathLike[str], labels: str, split: str, frame_id: str, map_frame: str) -> None:
+        from gsseg_core.data.dataset import Dataset  # It loads kernels; a bag is played without.
+
         dataset = Dataset(folder, labels)
         views = dataset.views(split)
         if not views:

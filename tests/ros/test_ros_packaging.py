@@ -133,6 +133,12 @@ def test_node_script_takes_the_interpreter_of_the_environment_it_lies_in(tmp_pat
         assert said() == f"elsewhere {script} --ros-args"
 
 
+@pytest.mark.parametrize("module", [*NODES.values(), "gsseg_ros.client"])
+def test_nodes_and_clients_start_without_the_parts_of_scipy_which_take_longer_to_load_than_they_do(module: str) -> None:
+    loaded = "{'scipy.' + part for part in ('linalg', 'ndimage', 'optimize', 'sparse', 'spatial')} & sys.modules.keys()"
+    subprocess.run([sys.executable, "-c", f"import sys, {module}; sys.exit(bool({loaded}))"], check=True)
+
+
 def test_launch_files_are_found() -> None:
     assert [file.name for file in LAUNCH_FILES] == ["replay.launch.py", "segment.launch.py"]
 
