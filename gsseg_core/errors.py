@@ -64,6 +64,10 @@ class SupervisesFileError(GssegError):
     """`supervises.json` is broken, or names views or classes that do not exist."""
 
 
+class LabelMapError(GssegError):
+    """A label map is broken, or names a class that the masks do not have."""
+
+
 class SplitFileError(GssegError):
     """`split.json` is broken, or names views that do not exist."""
 

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.hints import mask_hint
-from gsseg_core.data.label_images import PER_VIEW, write_mask
+from gsseg_core.data.label_images import GLOBAL, PER_VIEW, write_mask
 from gsseg_core.data.view import View, spread
-from gsseg_core.errors import NoUsableViewsError
+from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.export.class_files import class_places, mesh_file_name, write_classes
 from gsseg_core.export.collision import collision_meshes
 from gsseg_core.export.pictures import save_png
@@ -61,6 +61,7 @@ class Inputs:
     pictured: list[View]
     class_names: Mapping[int, str]  # of classes as they are learnt, numbered without gaps
     class_ids: tuple[int, ...] | None  # of these classes in the dataset; None where the classes are objects
+    masks: Mapping[str, Any] | None = None  # `masks` in `report.json`
     objects: ObjectTable | None = None  # which the ids of the views were found to be
 
 
@@ -92,7 +93,7 @@ def segment(
     data: str | os.PathLike[str],
     out: str | os.PathLike[str],
     *,
-    labels: str = "labels",
+    labels: str | os.PathLike[str] = "labels",
     learner: str = "em",
     views: int | None = None,
     refine: RefineSettings | None = None,
@@ -101,10 +102,11 @@ def segment(
     memory_budget: int | None = None,
     seed: int = 0,
     scheduler: str | None = None,
-    ids: str = "global",
+    ids: str | None = None,
     granularity: float | None = None,
     scene_format: str = DEFAULT_FORMAT,
     collision: str | None = None,
+    label_map: str | os.PathLike[str] | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Learn from the train views of a dataset, refine, and write everything into `out`.
@@ -117,8 +119,8 @@ def segment(
         Dataset folder.
     out : path
         Gets `segmentation.npz`, `classes/`, `pictures/`, and at last `report.html` and `report.json`.
-    labels : str
-        Sub-folder of the dataset with the masks.
+    labels : path
+        The masks: their sub-folder of the dataset, or a file or folder of another program, see docs/formats.md.
     learner : str
         One of `LEARNERS`.
     views : int, optional
@@ -133,8 +135,9 @@ def segment(
         see docs/memory.md.
     scheduler : str, optional
         Address of a Dask scheduler whose workers learn; everything else is done here.
-    ids : str
-        One of `IDS`: whether an id means the same in every view, or the objects are to be found.
+    ids : str, optional
+        One of `IDS`: whether an id means the same in every view, or the objects are to be found; by default, as the
+        format of the masks has it.
     granularity : float, optional
         Of these objects, between 0 and 1: ids of views are one object where the views agree by more than this on that;
         by default, the views tell. See docs/ids.md.
@@ -142,6 +145,8 @@ def segment(
         Of the files in `classes/`, one of `SCENE_WRITERS`; see docs/formats.md.
     collision : str, optional
         Kind of meshes to collide with, one of `gsseg_core.export.collision.KINDS`, for each object; none by default.
+    label_map : path, optional
+        Renames, merges and ignores classes of the masks; see `gsseg_core.data.label_map`.
 
     Returns
     -------
@@ -156,8 +161,9 @@ def segment(
     if memory_budget is None:
         memory_budget = default_budget()
     settings = RunSettings(
-        learner, labels, views, device, memory_budget, seed, scheduler, ids,
+        learner, str(labels), views, device, memory_budget, seed, scheduler, ids,
         refine or RefineSettings(), GraphSettings() if graph else None, granularity, scene_format, collision,
+        None if label_map is None else str(label_map),
     )  # fmt: skip
     watch = Stopwatch()
     settings.check()
@@ -165,8 +171,8 @@ def segment(
         with ExitStack() as workers:
             with watch.stage("load"):
                 client = _connect(scheduler, workers)
-                inputs = _load(scene_path, data, settings)
-            if ids == PER_VIEW:
+                inputs, settings = _load(scene_path, data, settings)
+            if settings.ids == PER_VIEW:
                 with watch.stage("associate"):
                     inputs = _associate(inputs, settings, progress)
             run.claim(segment_places(inputs.class_names, inputs.pictured, settings))
@@ -200,15 +206,32 @@ def _connect(scheduler: str | None, workers: ExitStack) -> Client | None:
     return workers.enter_context(connected(scheduler))
 
 
-def _load(scene_path: str | os.PathLike[str], data: str | os.PathLike[str], settings: RunSettings) -> Inputs:
-    """Read a scene and the views of a dataset, whose classes are numbered without gaps."""
-    scene, dataset = GaussianScene.load(scene_path), Dataset(data, settings.labels)
+def _load(
+    scene_path: str | os.PathLike[str], data: str | os.PathLike[str], settings: RunSettings
+) -> tuple[Inputs, RunSettings]:
+    """Read a scene and the views of a dataset, classes numbered without gaps; the settings then say what ids are."""
+    scene, dataset = GaussianScene.load(scene_path), Dataset(data, settings.labels, label_map=settings.label_map)
+    settings = replace(settings, ids=_ids(dataset, settings))
+    settings.check()
     # Ids that are a view's own are no classes; objects take their place.
     class_ids = None if settings.ids == PER_VIEW else dataset.class_ids
     if class_ids is not None:
         dataset = dataset.numbered()
     train, pictured = spread(dataset.views("train"), settings.views), spread(dataset.views("all"), PICTURED_VIEWS)
-    return Inputs(scene, dataset.root, train, pictured, {} if class_ids is None else dataset.class_names, class_ids)
+    names = {} if class_ids is None else dataset.class_names
+    return Inputs(scene, dataset.root, train, pictured, names, class_ids, dataset.describe_masks()), settings
+
+
+def _ids(dataset: Dataset, settings: RunSettings) -> str:
+    """Find out what ids mean, from the masks if the settings do not say; refuse what the masks contradict."""
+    masks = dataset.masks
+    if masks is None or not masks.per_view:
+        return settings.ids or GLOBAL
+    if settings.ids == GLOBAL:
+        raise SettingsError(
+            f"{dataset.root / settings.labels}: ids are to be global; expected per-view, as {masks.format} has them"
+        )
+    return PER_VIEW
 
 
 def _associate(inputs: Inputs, settings: RunSettings, progress: Progress) -> Inputs:
@@ -276,7 +299,7 @@ def _write(
     report = RunReport.of(
         scene, named, run=run.id, views=assessment.report, settings=settings.as_dict(), seconds=watch.seconds,
         objective=assessment.objective, calibration=assessment.calibration.as_dict(), prepared_views=assessment.memory,
-        ids=None if inputs.objects is None else inputs.objects.summary(),
+        ids=None if inputs.objects is None else inputs.objects.summary(), masks=inputs.masks,
         files={k: str(path.relative_to(folder)) for k, path in files.items()},
         meshes={k: f"classes/{mesh_file_name(k, named.class_names[k])}" for k in meshes},
         pictures=[str(path.relative_to(folder)) for path in pictures],

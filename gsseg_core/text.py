@@ -94,6 +94,8 @@ def segment_summary(report: Mapping[str, Any], out: str) -> str:
     worst = ", ".join(f"{clipped(view['name'])} ({percent(view['reliability'])})" for view in checked[:LEAST])
     if worst:
         used += f"\nmasks that agree least with the other views: {worst}"
+    if masks := report.get("masks"):
+        used = f"{_masks_line(masks)}\n{used}"
     return f"""{table(["class", "Gaussians", "confidence"], classes)}
 
 {used}
@@ -113,6 +115,12 @@ Report: {out}/report.html, to look at; {out}/report.json"""
 def _memory_line(prepared: Mapping[str, int]) -> str:
     in_memory, budget, in_file = (f"{prepared[part] / 2**20:,.0f} MiB" for part in ("in_memory", "budget", "in_file"))
     return f"prepared views: {in_memory} in memory (at most {budget}), {in_file} in a temporary file"
+
+
+def _masks_line(masks: Mapping[str, Any]) -> str:
+    """Write what a report says of masks that another program wrote, or that were scaled."""
+    scaled = f"; scaled by nearest pixel, {masks['scaled']}" if "scaled" in masks else ""
+    return f"masks: {masks['format']}, ids {masks['ids']}, {counted(masks['views'], 'view')}{scaled}"
 
 
 def evaluation_summary(scores: Mapping[str, Any]) -> str:

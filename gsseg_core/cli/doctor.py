@@ -211,11 +211,15 @@ def _kernels(say: Callable[[str], object]) -> Iterator[Finding]:
 def _formats() -> Iterator[Finding]:
     with suppress(ImportError):  # What is missing is said above.
         from gsseg_core.data.camera_formats.table import CAMERA_FORMATS
+        from gsseg_core.data.mask_formats.table import LABEL_IMAGES, MASK_FORMATS
         from gsseg_core.scene.scene_formats import SCENE_FORMATS
 
         for group, formats in (("scene formats", SCENE_FORMATS), ("camera formats", CAMERA_FORMATS)):
             for known in formats:
                 yield Finding(group, known.name, known.looked_for)
+        yield Finding("mask formats", LABEL_IMAGES, "<stem>.png")
+        for masks in MASK_FORMATS:
+            yield Finding("mask formats", masks.name, masks.looked_for.replace("`", ""))
 
 
 def _ros() -> Iterator[Finding]:

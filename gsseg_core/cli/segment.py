@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from gsseg_core.cli.shared import add_format, add_scene, load_kernels
+from gsseg_core.cli.shared import LABELS, add_format, add_scene, labels_path, load_kernels
 from gsseg_core.cli.terminal import tell
 from gsseg_core.learn.registry import DEFAULT, LEARNERS, distributed_learners
 from gsseg_core.progress import progress_bars
@@ -18,6 +18,7 @@ space, and writes OUT/segmentation.npz, one PLY (or another file) per class, a r
 EXAMPLES = """
   gsseg segment scene.ply --data DATASET --out out
   gsseg segment scene.ply --data DATASET --out out --labels sam --ids per-view
+  gsseg segment scene.ply --data DATASET --out out --labels annotations.json
   gsseg segment scene.ply --data DATASET --out out --learner votes --views 20
   gsseg segment scene.ply --data DATASET --out out --format usd --collision
 """
@@ -27,11 +28,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the command takes."""
     add_scene(parser)
     parser.add_argument("--out", required=True, metavar="OUT", help="folder to write to")
-    labels = "folder of the masks in DATASET (default: labels)"
-    parser.add_argument("--labels", default="labels", metavar="DIR", help=labels)
+    labels = "the masks: a folder in DATASET, or a file or folder of another program, as COCO (default: labels)"
+    parser.add_argument("--labels", default=LABELS, metavar="PATH", help=labels)
+    renames = "JSON that renames, merges and ignores classes of the masks, as in docs/masks.md"
+    parser.add_argument("--label-map", metavar="FILE", help=renames)
     parser.add_argument(
-        "--ids", choices=("global", "per-view"), default="global",
-        help="whether an id means the same in every view, or holds in its own view only (default: %(default)s)",
+        "--ids", choices=("global", "per-view"),
+        help="whether an id means the same in every view, or holds in its own view only (default: as the masks have)",
     )  # fmt: skip
     level = "per-view ids: more makes parts of objects, less puts objects together (default: what the views tell)"
     parser.add_argument("--granularity", type=float, metavar="G", help=level)
@@ -75,10 +78,11 @@ def run(options: argparse.Namespace) -> int:
     load_kernels(options.quiet, options.device)
     with progress_bars(options.quiet) as progress:
         report = pipeline.segment(
-            options.scene, options.data, options.out, labels=options.labels, learner=options.learner,
+            options.scene, options.data, options.out, labels=labels_path(options), learner=options.learner,
             views=options.views, refine=refine, graph=not options.no_graph, device=options.device,
             memory_budget=None if options.memory_budget is None else options.memory_budget << 20,
             seed=options.seed, scheduler=options.scheduler, ids=options.ids, granularity=options.granularity,
+            label_map=options.label_map,
             scene_format=options.format, collision=options.collision, progress=progress,
         )  # fmt: skip
     from gsseg_core.text import segment_summary

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Callable
 
 from gsseg_core.cli.terminal import note
 from gsseg_core.errors import SettingsError
 from gsseg_core.raster.backends import devices, rasteriser_of
 from gsseg_core.scene.scene_writers import SCENE_WRITERS
+
+LABELS = "labels"
+"""Where the masks are in a dataset, unless `--labels` says something else."""
 
 
 def add_scene(parser: argparse.ArgumentParser) -> None:
@@ -33,6 +37,14 @@ def add_quiet(parser: argparse.ArgumentParser) -> None:
 def add_format(add: Callable[..., object], default: str | None, otherwise: str = "%(default)s") -> None:
     """Add `--format` by the `add_argument` of a parser or group; `otherwise` says what counts where it is left out."""
     add("--format", choices=tuple(SCENE_WRITERS), default=default, help=f"format to write (default: {otherwise})")
+
+
+def labels_path(options: argparse.Namespace) -> str:
+    """Return the place of the masks: in the dataset, or else, where that lacks it, as a shell completes it."""
+    labels: str = options.labels
+    is_elsewhere = not os.path.exists(os.path.join(options.data, labels)) and os.path.exists(labels)
+    # The default is a folder of the dataset only: masks that lie here by chance were not asked for.
+    return os.path.abspath(labels) if is_elsewhere and labels != LABELS else labels
 
 
 def load_kernels(quiet: bool, device: str = "cpu") -> None:

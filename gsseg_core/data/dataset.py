@@ -5,14 +5,20 @@ from __future__ import annotations
 import copy
 import os
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from gsseg_core.data.camera_files import read_cameras
 from gsseg_core.data.class_names import BACKGROUND_NAME, class_name, read_classes
-from gsseg_core.data.mask_files import SUPERVISES, mask_files, read_supervises
+from gsseg_core.data.label_images import GLOBAL, PER_VIEW
+from gsseg_core.data.label_map import read_label_map
+from gsseg_core.data.mask_files import mask_files, read_supervises
+from gsseg_core.data.mask_formats.masks import MaskSet
+from gsseg_core.data.mask_formats.place import SUPERVISES
+from gsseg_core.data.mask_formats.table import LABEL_IMAGES, open_masks
 from gsseg_core.data.view import View
 from gsseg_core.errors import ClassesFileError, SettingsError, SplitFileError
 from gsseg_core.files.input_files import READABLE_IMAGES, is_there, list_folder
@@ -30,8 +36,10 @@ class Dataset:
     ----------
     root : path
         The folder.
-    labels : str
-        Sub-folder of the masks.
+    labels : path
+        The masks: their sub-folder, or a file or folder of another program, see docs/formats.md.
+    label_map : path, optional
+        What becomes of the masks' classes; see `gsseg_core.data.label_map`.
     within : path, optional
         If given, nothing is read that lies outside this folder once all links are followed.
 
@@ -41,38 +49,75 @@ class Dataset:
         The folder.
     cameras : list of Camera
         All cameras, in the order of their file.
+    masks : MaskSet or None
+        The masks, if another program wrote them.
 
     Raises
     ------
     CameraFileError, PoseError, IntrinsicsError, ClassesFileError, SplitFileError, SupervisesFileError
         A file is missing or broken. A mask that is missing is no error here.
     MaskFormatError
-        A view has masks of two kinds.
+        A view has masks of two kinds, or masks of another program cannot be read.
+    LabelMapError, SettingsError
+        The label map is broken, or the masks' ids hold in their own view only.
     PathNotAllowedError
         A file or folder lies outside `within`; of a mask that is found out when it is read.
     """
 
     def __init__(
-        self, root: str | os.PathLike[str], labels: str = "labels", *, within: str | os.PathLike[str] | None = None
+        self,
+        root: str | os.PathLike[str],
+        labels: str | os.PathLike[str] = "labels",
+        *,
+        label_map: str | os.PathLike[str] | None = None,
+        within: str | os.PathLike[str] | None = None,
     ) -> None:
         self.root = Path(root)
         self._within = None if within is None else Path(within)
         self.cameras = read_cameras(self.root, self._within)
         classes = self.root / "classes.json"
         self._declared = read_classes(classes, self._within) if is_there(classes, ClassesFileError) else None
-        stems = [camera.image for camera in self.cameras]
-        masks = mask_files(self.root / labels, stems, self._within)
-        supervises = self.root / labels / SUPERVISES
-        supervised = read_supervises(supervises, masks, stems, self._declared, self._within)
+        self._views = {camera.name: View(camera, within=self._within) for camera in self.cameras}
+        images = [camera.image for camera in self.cameras]
+        self.masks = open_masks(self.root / labels, images, self._within)
+        if self.masks is None:
+            self._take_own_masks(self.root / labels, images)
+        else:
+            self._take_masks(self.masks)
         photos = list_folder(self.root / "images", self._within)
-        images = {path.stem: path for path in photos if path.suffix.lower() in READABLE_IMAGES}
-        self._views = {
-            camera.name: View(
-                camera, masks.get(stem), images.get(stem), self._declared, supervised.get(stem), self._within
-            )
-            for stem, camera in zip(stems, self.cameras, strict=True)
-        }
+        photo = {path.stem: path for path in photos if path.suffix.lower() in READABLE_IMAGES}
+        self._change_views(lambda view: {"image_path": photo.get(view.camera.image), "class_names": self._declared})
+        if label_map is not None:
+            self._apply_label_map(label_map)
         self._split = _read_split(self.root / "split.json", self.cameras, self._within)
+
+    def _take_own_masks(self, folder: Path, images: list[str]) -> None:
+        """Find the masks of images, by their stems, in gsseg's own forms."""
+        masks = mask_files(folder, images, self._within)
+        supervised = read_supervises(folder / SUPERVISES, masks, images, self._declared, self._within)
+        self._change_views(
+            lambda view: {"mask_path": masks.get(view.camera.image), "supervised": supervised.get(view.camera.image)}
+        )
+
+    def _take_masks(self, masks: MaskSet) -> None:
+        """Take the masks of another program, with its names of classes if it has any."""
+        names = self._declared if masks.class_names is None else dict(masks.class_names)
+        self._declared = None if masks.per_view else names
+        self._change_views(lambda view: {"foreign_mask": masks.views.get(view.camera.image)})
+
+    def _apply_label_map(self, path: str | os.PathLike[str]) -> None:
+        """Have all views give their labels by a label map."""
+        if self.masks is not None and self.masks.per_view:
+            raise SettingsError(
+                f"{path}: a label map was given for masks of {self.masks.format}, whose ids hold in their own "
+                "view only; expected masks with ids that mean the same in every view"
+            )
+        label_map = read_label_map(path, self.class_names, self._within)
+        self._declared = self.__dict__["class_names"] = dict(label_map.class_names)
+        self._change_views(lambda view: {"class_names": self._declared, "label_map": label_map})
+
+    def _change_views(self, changes: Callable[[View], dict[str, Any]]) -> None:
+        self._views = {name: replace(view, **changes(view)) for name, view in self._views.items()}
 
     def views(self, split: str = "all") -> list[View]:
         """List the views of a split, "train", "test" or "all"; without `split.json` all views are for training."""
@@ -89,6 +134,31 @@ class Dataset:
             return self._declared
         ids = {0}.union(*(view.class_ids() for view in self.views() if view.has_mask))
         return {i: class_name({0: BACKGROUND_NAME}, i) for i in sorted(ids)}
+
+    def describe_masks(self) -> dict[str, Any] | None:
+        """Describe masks that another program wrote, or that are scaled to the size of their cameras; None of others.
+
+        Returns
+        -------
+        dict
+            `format`, `ids` ("per-view" or "global"), how many `views` have one, and from which size to which the first
+            that tells its size is `scaled`, if it is.
+        """
+        views = [view for view in self.views() if view.has_mask]
+        sizes = ((view.camera, view.mask_size) for view in views)
+        camera, size = next(((camera, size) for camera, size in sizes if size is not None), (None, None))
+        is_scaled = camera is not None and size != camera.image_size
+        if self.masks is None and not is_scaled:
+            return None
+        found = {
+            "format": LABEL_IMAGES if self.masks is None else self.masks.format,
+            "ids": PER_VIEW if self.masks is not None and self.masks.per_view else GLOBAL,
+            "views": len(views),
+        }
+        if camera is not None and size is not None and is_scaled:
+            width, height = camera.image_size
+            found["scaled"] = f"{size[0]} x {size[1]} to {width} x {height} pixels"
+        return found
 
     @property
     def num_classes(self) -> int:

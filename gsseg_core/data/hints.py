@@ -14,7 +14,8 @@ from pathlib import Path
 
 from gsseg_core.data.camera_formats.table import CAMERA_FORMATS
 from gsseg_core.data.label_images import mask_header
-from gsseg_core.data.mask_files import SUPERVISES, mask_files
+from gsseg_core.data.mask_files import mask_files
+from gsseg_core.data.mask_formats.place import SUPERVISES
 from gsseg_core.errors import GssegError
 from gsseg_core.files.input_files import READABLE_IMAGES
 

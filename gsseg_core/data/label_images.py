@@ -23,8 +23,9 @@ from gsseg_core.files.input_files import check_pixels, open_image, open_input, r
 
 UNKNOWN = -1
 
+GLOBAL = "global"
 PER_VIEW = "per-view"
-IDS = ("global", PER_VIEW)
+IDS = (GLOBAL, PER_VIEW)
 """Whether an id means the same in every view, or the objects are to be found."""
 
 _PNG_KINDS = {0: "gray", 2: "RGB", 3: "palette", 4: "gray + alpha", 6: "RGBA"}

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from gsseg_core.data.mask_formats.place import view_of
 from gsseg_core.data.soft_masks import SeenLabels, check_forms, combine_detections, quantise
 from gsseg_core.errors import MaskFormatError, SupervisesFileError, UnknownLabelError
 from gsseg_core.files.input_files import check_pixels, is_there, list_folder, open_image
@@ -22,14 +23,14 @@ from gsseg_core.files.npz_files import NpzArrays, open_arrays
 from gsseg_core.scene.camera import Camera
 from gsseg_core.text import clipped, quoted
 
-SUPERVISES = "supervises.json"
+DETECTIONS = (".png", ".tif", ".tiff")
+CLASS_ID = r"0|[1-9][0-9]{0,4}"
 _UNKNOWN = "unknown"
-_DETECTIONS = (".png", ".tif", ".tiff")
 _ANY = "*"
 
 
 def mask_files(folder: Path, stems: Iterable[str], within: Path | None = None) -> dict[str, Path]:
-    """Find the masks of views: `<stem>.png`, `<stem>.npz` or the folder `<stem>`.
+    """Find the masks of views: `<stem>.png`, `<stem>.npz` or the folder `<stem>`; else a file by `view_of`.
 
     Raises
     ------
@@ -39,16 +40,28 @@ def mask_files(folder: Path, stems: Iterable[str], within: Path | None = None) -
         The folder lies outside `within`.
     """
     found: dict[str, Path] = {}
-    wanted = set(stems)
+    wanted, others = set(stems), []
     for path in list_folder(folder, within):
         is_folder = path.is_dir()
         stem = path.name if is_folder else path.stem
-        if stem not in wanted or not (is_folder or path.suffix.lower() in (".png", ".npz")):
+        if not is_folder and path.suffix.lower() not in (".png", ".npz"):
             continue
-        if stem in found:
-            raise MaskFormatError(f"{folder}: has {found[stem].name} and {path.name}; expected one mask per view")
-        found[stem] = path
-    return found
+        if stem in wanted:
+            _add(found, stem, path)
+        elif not is_folder:
+            others.append(path)
+    longer: dict[str, Path] = {}
+    for path in others:
+        view = view_of(path.name, wanted)
+        if view is not None and view not in found:
+            _add(longer, view, path)
+    return found | longer
+
+
+def _add(found: dict[str, Path], stem: str, path: Path) -> None:
+    if stem in found:
+        raise MaskFormatError(f"{path.parent}: has {found[stem].name} and {path.name}; expected one mask per view")
+    found[stem] = path
 
 
 def read_supervises(
@@ -144,12 +157,12 @@ def _read_detections(folder: Path, camera: Camera | None, within: Path | None) -
     detections: dict[int, npt.NDArray[np.generic]] = {}
     unknown = None
     for path in list_folder(folder, within):
-        if path.suffix.lower() not in _DETECTIONS:
+        if path.suffix.lower() not in DETECTIONS:
             continue
         if path.stem == _UNKNOWN:
             unknown = _read_image(path, camera, within) > 0
             continue
-        if not re.fullmatch(r"0|[1-9][0-9]{0,4}", path.stem) or int(path.stem) > MAX_LABEL:
+        if not re.fullmatch(CLASS_ID, path.stem) or int(path.stem) > MAX_LABEL:
             raise UnknownLabelError(f"{path}: is named {path.stem!r}; expected the id of a class, as in '12.png'")
         if int(path.stem) in detections:
             raise MaskFormatError(f"{folder}: has two images of class {path.stem}; expected one")

@@ -83,6 +83,41 @@ class SeenLabels(NamedTuple):
         supervised = None if supervised is None else table[supervised]
         return SeenLabels(self.labels, LabelEvidence(table[classes], mass, supervised))
 
+    def relabelled(self, new_ids: Mapping[int, int], source: str) -> SeenLabels:
+        """Give the classes new ids, and merge those that get the same; pixels of a class that gets `UNKNOWN` are it.
+
+        Of a soft mask, those are the pixels that name such a class; elsewhere its share is left out of the whole. A
+        class made of several counts as looked for where all of them were; else what is left of 1 is unknown.
+
+        Raises
+        ------
+        UnknownLabelError
+            A class has no new id.
+        """
+        table = np.full(MAX_LABEL + 2, UNKNOWN - 1, np.int32)  # The last one is for unknown pixels.
+        table[[*new_ids, UNKNOWN]] = [*new_ids.values(), UNKNOWN]
+        concerned = self.labels if self.evidence is None else self.evidence.concerned
+        if (table[concerned] < UNKNOWN).any():
+            found = np.unique(concerned[table[concerned] < UNKNOWN]).tolist()
+            raise UnknownLabelError(f"{source}: mask holds the labels {clipped(found)}; expected ids of its classes")
+        if self.evidence is None:
+            return SeenLabels(table[self.labels])
+        given, supervised = self.evidence, self.evidence.supervised
+        mass = np.eye(len(given.classes), dtype=np.float32) if given.mass is None else given.mass
+        targets = table[given.classes]
+        classes = np.unique(targets[targets != UNKNOWN])
+        merged = np.stack([mass[:, targets == k].sum(axis=1) for k in classes] or [np.zeros(len(mass))], axis=1)
+        kept = 1 - mass[:, targets == UNKNOWN].sum(axis=1, keepdims=True)
+        merged = np.divide(merged, kept, out=np.zeros_like(merged), where=kept > 0).astype(np.float32)
+        named = given.named()
+        ignored = (named != UNKNOWN) & (table[named] == UNKNOWN)
+        if supervised is not None:
+            parts = [k for k, new in new_ids.items() if new != UNKNOWN and new in table[supervised]]
+            whole = np.isin(parts, supervised).all()
+            supervised = np.setdiff1d(table[supervised], [UNKNOWN]) if whole else None
+        unknown = np.append(ignored, False)[self.labels]
+        return _tidied(self.labels.copy(), classes, merged[:, : len(classes)], supervised, unknown)
+
 
 class PackedMask:
     """A soft or partial mask in memory, its prototypes compressed like a plain one's labels."""

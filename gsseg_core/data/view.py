@@ -11,9 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.data.label_images import UNKNOWN, mask_header, read_mask
+from gsseg_core.data.label_map import LabelMap
 from gsseg_core.data.mask_files import read_soft_mask
+from gsseg_core.data.mask_formats.masks import ViewMask
+from gsseg_core.data.mask_formats.shapes import check_fit, scaled
 from gsseg_core.data.soft_masks import PackedMask, SeenLabels, combine_detections, quantise, restrict
-from gsseg_core.errors import MaskFormatError, SettingsError, UnknownLabelError
+from gsseg_core.errors import GssegError, MaskFormatError, SettingsError, UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.npz_files import Header
 from gsseg_core.scene.camera import Camera
@@ -40,6 +43,10 @@ class View:
         If given, the segmenter looked for these classes only: 0 in its label image means "none of these".
     within : pathlib.Path or None
         If given, the folder below which the mask must lie, links followed.
+    foreign_mask : ViewMask or None
+        The mask, if another program has written it: then `mask_path` is None.
+    label_map : LabelMap or None
+        If given, the mask's ids become those of `class_names` by it.
     numbering : tuple of int, or None
         If given, the mask holds these ids, ascending, and labels are read as places among them; see
         `Dataset.numbered`. `class_names` are by place.
@@ -52,6 +59,8 @@ class View:
     supervised: tuple[int, ...] | None = None
     within: Path | None = None
     numbering: tuple[int, ...] | None = None
+    foreign_mask: ViewMask | None = field(default=None, repr=False)
+    label_map: LabelMap | None = field(default=None, repr=False)
     _mask: PackedMask | None = field(default=None, repr=False)
 
     @classmethod
@@ -163,7 +172,17 @@ class View:
     @property
     def has_mask(self) -> bool:
         """Whether there are labels to read."""
-        return self.mask_path is not None or self._mask is not None
+        return self.is_in_memory or self.mask_path is not None or self.foreign_mask is not None
+
+    @property
+    def is_in_memory(self) -> bool:
+        """Whether the labels are here, and need no file."""
+        return self._mask is not None
+
+    @property
+    def source(self) -> str:
+        """What messages call the mask: its file, or the view."""
+        return self.foreign_mask.where if self.foreign_mask else str(self.mask_path or f"view '{self.name}'")
 
     @property
     def mask_bits(self) -> int | None:
@@ -171,6 +190,19 @@ class View:
         if self.mask_path is not None and self.mask_path.suffix.lower() == ".png":
             return mask_header(self.mask_path, self.within).bits
         return (8 if self.largest_label < 255 else 16) if self.has_mask else None
+
+    @property
+    def mask_size(self) -> tuple[int, int] | None:
+        """Width and height of a mask in a file, as far as they are known without reading it."""
+        if self.foreign_mask is not None:
+            return self.foreign_mask.size
+        if self.mask_path is None or self.mask_path.suffix.lower() != ".png":
+            return None
+        try:
+            header = mask_header(self.mask_path, self.within)
+        except GssegError:  # Told to those who read it.
+            return None
+        return header.width, header.height
 
     @property
     def largest_label(self) -> int:
@@ -199,28 +231,35 @@ class View:
 
     def read_seen(self) -> SeenLabels:
         """Read the labels of the mask with their evidence, or raise as `read_labels`; of a soft mask, prototypes."""
-        source = str(self.mask_path or f"view '{self.name}'")
+        source = self.source
         if self.numbering is not None:
             names = dict(zip(self.numbering, self.class_names.values(), strict=True)) if self.class_names else None
             by_id = replace(self, class_names=names, numbering=None)
             return by_id.read_seen().numbered(np.array(self.numbering, np.int32), source)
         if self._mask is not None:
             seen = self._mask.unpack()
-        elif self.mask_path is not None:
-            seen = self._read_file(self.mask_path)
+        elif self.foreign_mask is None and self.mask_path is None:
+            raise MaskFormatError(f"{source}: has no mask; expected a label image {self.name}.png")
+        else:
+            seen = self._read_file()
             if self.camera.undistortion is not None:
                 seen = seen.undistorted(self.camera.undistortion)
-        else:
-            raise MaskFormatError(f"{source}: has no mask; expected a label image {self.name}.png")
+        if self.label_map is not None:
+            seen = seen.relabelled(self.label_map.new_ids, source)
         self._check_seen(seen, source)
         return seen
 
-    def _read_file(self, path: Path) -> SeenLabels:
+    def _read_file(self) -> SeenLabels:
+        """Read a mask from its file, in the size of the image as it was taken."""
+        if self.foreign_mask is not None:
+            return SeenLabels(self.foreign_mask.labels(self.camera))
+        path = Path(self.source)
         if path.suffix.lower() != ".png":
-            return read_soft_mask(path, self.class_names, self.camera, self.within)
+            names = self.class_names if self.label_map is None else None
+            return read_soft_mask(path, names, self.camera, self.within)
         header = mask_header(path, self.within)  # Before any pixel is read.
-        self.camera.check_image_mask_size(header.width, header.height, str(path))
-        labels = read_mask(path, self.within).labels
+        check_fit(header.width, header.height, self.camera, str(path))
+        labels = scaled(read_mask(path, self.within).labels, self.camera)
         return SeenLabels(labels) if self.supervised is None else restrict(labels, self.supervised, str(path))
 
     def _check_seen(self, seen: SeenLabels, source: str) -> None:

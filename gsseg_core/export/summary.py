@@ -31,8 +31,8 @@ class RunSettings:
 
     Attributes
     ----------
-    learner, labels, views, device, memory_budget, seed, scheduler, ids, granularity, scene_format, collision
-        As `gsseg_core.pipeline.segment` takes them.
+    learner, labels, views, device, memory_budget, seed, scheduler, ids, granularity, scene_format, collision, label_map
+        As `gsseg_core.pipeline.segment` takes them; `ids` is None until the masks were opened, if they are to tell.
     refine : RefineSettings
         The refinement.
     graph : GraphSettings, optional
@@ -48,31 +48,35 @@ class RunSettings:
     memory_budget: int
     seed: int
     scheduler: str | None
-    ids: str
+    ids: str | None
     refine: RefineSettings
     graph: GraphSettings | None
     granularity: float | None = None
     scene_format: str = DEFAULT
     collision: str | None = None
+    label_map: str | None = None
     learner_settings: Any = None
 
     def check(self) -> None:
         """Raise `SettingsError` where they do not go together."""
         check_learner(self.learner, self.scheduler)
-        if self.ids not in IDS:
+        if self.ids not in (*IDS, None):
             raise SettingsError(f"ids is {self.ids!r}; expected one of {', '.join(IDS)}")
         if self.granularity is not None and not 0 < self.granularity < 1:
             raise SettingsError(f"granularity is {self.granularity}; expected a share between 0 and 1")
-        if self.granularity is not None and self.ids != PER_VIEW:
+        if self.granularity is not None and self.ids not in (PER_VIEW, None):
             raise SettingsError("granularity is for ids that are a view's own; expected ids per-view")
         check_format(self.scene_format)
         check_collision(self.collision)
+        if self.label_map is not None and self.ids == PER_VIEW:
+            raise SettingsError("a label map is for ids that mean the same in every view; expected ids global")
 
     def as_dict(self) -> dict[str, Any]:
         """Give them as `report.json` does."""
         settings = asdict(self)
-        if self.learner_settings is None:
-            del settings["learner_settings"]
+        for name in ("learner_settings", "label_map"):
+            if settings[name] is None:
+                del settings[name]
         return settings
 
 
@@ -102,8 +106,9 @@ class RunReport:
         Bytes of prepared views in memory and in a temporary file, and the budget of those in memory.
     run, page : str, optional
         Id of the run, and file of the report page.
-    calibration, ids : mappings, optional
-        The temperature and what it was fitted to; objects that ids which are a view's own were found to be.
+    calibration, ids, masks : mappings, optional
+        The temperature and what it was fitted to; objects that ids which are a view's own were found to be; masks that
+        another program wrote, or that were scaled.
     """
 
     scene: Mapping[str, Any]
@@ -119,6 +124,7 @@ class RunReport:
     calibration: Mapping[str, Any] | None = None
     ids: Mapping[str, Any] | None = None
     prepared_views: Mapping[str, int] | None = None
+    masks: Mapping[str, Any] | None = None
     page: str | None = None
 
     @classmethod

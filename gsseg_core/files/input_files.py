@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
+from typing import IO
 
 from PIL import Image, UnidentifiedImageError
 
@@ -151,14 +152,27 @@ def open_image(
         file = open_input(path, within)
     except OSError as cause:
         raise error(f"{path}: cannot be read ({reason(cause)}); expected {expected}") from cause
+    with file, decode_image(file, str(path), error, kind, expected, formats) as image:
+        yield image
+
+
+@contextmanager
+def decode_image(
+    file: IO[bytes],
+    source: str,
+    error: type[GssegError],
+    kind: str,
+    expected: str,
+    formats: tuple[str, ...] | None = None,
+) -> Iterator[Image.Image]:
+    """Open an image that is open as a file, or in memory, as `open_image` does; messages begin with its `source`."""
     try:
-        with file:
-            with warnings.catch_warnings():  # Pillow warns of images that are within our own limit.
-                warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-                image = Image.open(file, formats=formats)
-            check_pixels(*image.size, str(path), error)
-            yield image
+        with warnings.catch_warnings():  # Pillow warns of images that are within our own limit.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            image = Image.open(file, formats=formats)
+        check_pixels(*image.size, source, error)
+        yield image
     except DAMAGED as cause:
         # Of what it does not know, Pillow tells nothing but the address of the object that it was handed.
         why = "of no known format" if isinstance(cause, UnidentifiedImageError) else reason(cause)
-        raise error(f"{path}: broken {kind} ({why}); expected {expected}") from cause
+        raise error(f"{source}: broken {kind} ({why}); expected {expected}") from cause

@@ -310,7 +310,7 @@ class Learner(ABC):
         largest = int(seen.labels.max()) if seen.evidence is None else seen.evidence.largest
         if largest >= self.num_classes:
             raise UnknownLabelError(
-                f"{view.mask_path or view.name}: mask holds the label {largest}; expected at most "
+                f"{view.source}: mask holds the label {largest}; expected at most "
                 f"{self.num_classes - 1}, since there are {self.num_classes} classes"
             )
         if not (seen.labels >= 0).any():

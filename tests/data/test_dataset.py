@@ -123,14 +123,29 @@ def test_another_folder_of_labels_can_be_named(tmp_path: Path) -> None:
     assert not any(view.has_mask for view in Dataset(root, labels="elsewhere").views())
 
 
-def test_a_mask_of_another_size_is_refused_and_never_resized(tmp_path: Path) -> None:
+@pytest.mark.parametrize("factor", [2, 3, 7])
+def test_a_larger_mask_of_the_same_shape_is_scaled_by_nearest_pixel_and_that_is_said(
+    tmp_path: Path, factor: int
+) -> None:
+    large = np.repeat(np.repeat(LABELS, factor, axis=0), factor, axis=1)
+    dataset = Dataset(make_dataset(tmp_path, labels=large))
+    np.testing.assert_array_equal(dataset.views()[0].read_labels(), LABELS)
+    size = f"{WIDTH * factor} x {HEIGHT * factor} to {WIDTH} x {HEIGHT} pixels"
+    assert dataset.describe_masks() == {"format": "label images", "ids": "global", "views": 2, "scaled": size}
+
+
+def test_of_masks_as_they_should_be_nothing_is_said(tmp_path: Path) -> None:
+    assert Dataset(make_dataset(tmp_path)).describe_masks() is None
+
+
+def test_a_mask_of_another_shape_is_refused(tmp_path: Path) -> None:
     view = Dataset(make_dataset(tmp_path)).views()[0]
-    write_mask(tmp_path / "labels" / "a.png", np.zeros((HEIGHT * 2, WIDTH * 2), np.int32), 8)
+    write_mask(tmp_path / "labels" / "a.png", np.zeros((HEIGHT * 2, WIDTH), np.int32), 8)
     with pytest.raises(MaskSizeError) as caught:
         view.read_labels()
     assert str(caught.value) == (
-        f"{tmp_path}/labels/a.png: mask is 12 x 8 pixels; expected 6 x 4, the size of camera 'a' "
-        "(masks are never resized)"
+        f"{tmp_path}/labels/a.png: is for an image of 6 x 8 pixels; expected 6 x 4, the size of camera 'a', or the "
+        "same larger or smaller"
     )
 
 

@@ -60,7 +60,7 @@ def photos(data: Path) -> None:
 
 def other_names(data: Path) -> None:
     for path in (data / "labels").iterdir():
-        path.rename(path.with_name(f"{path.stem}_mask.png"))
+        path.rename(path.with_name(f"{path.stem}_seen.png"))
 
 
 def other_files(data: Path) -> None:
@@ -91,7 +91,7 @@ def emptied(data: Path) -> None:
     ("change", "told"),
     [
         (photos, "there is no folder labels/ (images/ holds photos; a 2D segmenter makes masks of them)"),
-        (other_names, "labels/ holds names such as view0_mask.png: rename them"),
+        (other_names, "labels/ holds names such as view0_seen.png: rename them"),
         (other_files, "labels/ holds files such as view0.tif; expected label images as PNG, and probabilities as view"),
         (by_class, "labels/ has a folder for each class, such as 1/: make one for each view, labels/view"),
         (other_detections, "labels/ holds names such as view0_objects: rename them"),

@@ -272,6 +272,6 @@ def _by_path(view: View) -> tuple[View, str | None]:
 
 def _packed(view: View) -> tuple[View, None]:
     """Make a view that has its mask with it."""
-    if view.mask_path is None:
+    if view.is_in_memory:
         return view, None
     return View.from_seen(view.camera, view.read_seen(), view.class_names), None

@@ -1,0 +1,125 @@
+"""Label maps: a file that renames, merges and ignores the classes of masks.
+
+    {"armchair": "chair", "stool": "chair", "17": "wall", "person": null, "*": "background"}
+
+A key is an id or the name of a class that the masks have (a name stands for all classes of that name), or "*" for all
+that no other key names; without it, those stay as they are. A value is the new name: classes that are given the same
+one, or the one of a class that stays, are merged. null, or "ignore", makes pixels unknown.
+
+A class of several keeps the smallest of their ids. 0 is the background and stays free for it: where an object has it,
+`{"0": "floor"}`, that gets the next id after the largest; `{"background": null}` makes the rest unknown.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gsseg_core.data.class_names import BACKGROUND_NAME, flaw_of_class_name, listed
+from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.errors import LabelMapError
+from gsseg_core.files.json_files import read_json
+from gsseg_core.files.limits import MAX_LABEL
+from gsseg_core.files.yaml_files import read_yaml
+from gsseg_core.text import quoted
+
+_OTHERS = "*"
+_IGNORE = "ignore"
+_EXPECTED = 'an object such as {"armchair": "chair", "17": "wall", "person": null}'
+
+
+@dataclass(frozen=True)
+class LabelMap:
+    """What becomes of the ids of masks.
+
+    Attributes
+    ----------
+    new_ids : mapping from id to id
+        `UNKNOWN` where it is ignored.
+    class_names : mapping from new id to name
+        Ascending, the background included.
+    """
+
+    new_ids: Mapping[int, int]
+    class_names: Mapping[int, str]
+
+
+def read_label_map(
+    path: str | os.PathLike[str], class_names: Mapping[int, str], within: Path | None = None
+) -> LabelMap:
+    """Read a label map, JSON or (.yaml, .yml) YAML, for masks with these classes.
+
+    Raises
+    ------
+    LabelMapError
+        The file is missing or broken, or names a class that there is not.
+    PathNotAllowedError
+        It lies outside `within`.
+    SettingsError
+        It is YAML, and PyYAML is not installed.
+    """
+    path = Path(path)
+    is_yaml = path.suffix.lower() in (".yaml", ".yml")
+    content: Any = (read_yaml if is_yaml else read_json)(path, LabelMapError, within)
+    if not isinstance(content, dict):
+        raise LabelMapError(f"{path}: holds no object; expected {_EXPECTED}")
+    given = {str(key): _new_name(value, key, path) for key, value in content.items() if type(key) in (str, int)}
+    if len(given) < len(content):
+        raise LabelMapError(f"{path}: has keys that are neither names nor ids; expected {_EXPECTED}")
+    return map_labels(given, class_names, str(path))
+
+
+def map_labels(given: Mapping[str, str | None], class_names: Mapping[int, str], source: str) -> LabelMap:
+    """Apply what a label map says, new names (None: ignored) by id, name or "*", to classes.
+
+    Raises
+    ------
+    LabelMapError
+        It names a class that there is not, or more than there are labels.
+    """
+    renamed: dict[int, str | None] = dict.fromkeys(class_names, given[_OTHERS]) if _OTHERS in given else {}
+    # Ids after names, since an id says which of several classes of one name is meant.
+    for key in sorted(given, key=lambda key: _id_of(key, class_names) is not None):
+        number = _id_of(key, class_names)
+        meant = [k for k, name in class_names.items() if name == key] if number is None else [number]
+        if not meant and key != _OTHERS:
+            known = listed(f"{k} ({name})" for k, name in class_names.items())
+            raise LabelMapError(f"{source}: names {quoted(key)}, which the masks do not have; expected some of {known}")
+        if key != _OTHERS:
+            renamed.update(dict.fromkeys(meant, given[key]))
+    new_ids, names, of_name = {}, {0: BACKGROUND_NAME}, {BACKGROUND_NAME: 0}
+    for k, name in class_names.items():  # What stays takes its place before others join it.
+        if k not in renamed:
+            new_ids[k] = k
+            names[k] = name
+            of_name.setdefault(name, k)
+    following = max(class_names, default=0)
+    for k, new_name in sorted(renamed.items()):
+        if new_name is None:
+            new_ids[k] = UNKNOWN
+            continue
+        if new_name not in of_name:
+            following += k == 0
+            of_name[new_name] = following if k == 0 else k
+        new_ids[k] = of_name[new_name]
+        names[of_name[new_name]] = new_name
+    if following > MAX_LABEL:
+        raise LabelMapError(f"{source}: needs the id {following} for class 0; expected at most {MAX_LABEL}")
+    return LabelMap(new_ids, dict(sorted(names.items())))
+
+
+def _new_name(value: object, key: object, path: Path) -> str | None:
+    if value is None or value == _IGNORE:
+        return None
+    if flaw := flaw_of_class_name(value):
+        raise LabelMapError(f"{path}: gives {quoted(key)} the name {flaw}")
+    return str(value)
+
+
+def _id_of(key: str, class_names: Mapping[int, str]) -> int | None:
+    """Return the id that a key is, if it is one of the classes'."""
+    number = int(key) if key.isascii() and key.isdecimal() and len(key) < 9 else -1
+    return number if number in class_names else None

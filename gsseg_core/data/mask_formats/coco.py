@@ -1,0 +1,89 @@
+"""COCO: one JSON file with images, annotations and categories; polygons, and RLE as text or numbers."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from pathlib import Path
+
+from gsseg_core.data.class_names import BACKGROUND_NAME
+from gsseg_core.data.mask_formats.masks import MaskSet, ViewMask, ids_from_zero
+from gsseg_core.data.mask_formats.place import Place, view_of
+from gsseg_core.data.mask_formats.record import Record
+from gsseg_core.data.mask_formats.rle import run_lengths
+from gsseg_core.data.mask_formats.shapes import Drawing, Polygons, Region, Runs, Shape
+from gsseg_core.errors import MaskFormatError
+from gsseg_core.text import quoted
+
+
+def is_coco(place: Place) -> bool:
+    """Recognise COCO: an object with the lists `images` and `annotations`."""
+    content = place.sample[1] if place.sample else None
+    return isinstance(content, dict) and all(isinstance(content.get(key), list) for key in ("images", "annotations"))
+
+
+def read_coco(place: Place) -> MaskSet:
+    """Read COCO: ids are those of the categories, one more where 0 is an object; the last annotation is on top."""
+    assert place.sample is not None
+    path, content = place.sample
+    whole = Record.of(content, str(path))
+    categories = whole.records("categories", "category")
+    names = {category.id("id"): category.class_name("name") for category in categories}
+    labels = ids_from_zero(names)
+    shapes: defaultdict[object, list[Shape]] = defaultdict(list)
+    images = _images(whole, place, path)
+    for annotation in whole.records("annotations", "annotation"):
+        image_id = annotation.value("image_id")
+        if not isinstance(image_id, (int, str)) or image_id not in images:
+            continue
+        category = annotation.id("category_id")
+        if category not in labels:
+            raise MaskFormatError(
+                f"{annotation.where}: has the category {category}; expected one that 'categories' has"
+            )
+        width, height = images[image_id][2]
+        region = segmentation(annotation, width, height)
+        shapes[image_id].append(Shape(labels[category], region))
+    views = {
+        view: ViewMask.of(Drawing(*size, shapes[image_id]), where) for image_id, (view, where, size) in images.items()
+    }
+    return MaskSet(views, {**{labels[i]: name for i, name in sorted(names.items())}, 0: BACKGROUND_NAME})
+
+
+def segmentation(annotation: Record, width: int, height: int) -> Region:
+    """Read `segmentation` of an annotation: polygons, or runs for an image of this size."""
+    value, where = annotation.value("segmentation"), annotation.where
+    if isinstance(value, dict):
+        runs = Record.of(value, where)
+        if runs.value("size") != [height, width]:
+            raise MaskFormatError(
+                f"{where}: its runs are for {quoted(runs.value('size'))} pixels; expected [{height}, {width}], the "
+                "height and width of the image"
+            )
+        return Runs(run_lengths(runs.value("counts"), where), where)
+    if not isinstance(value, list) or not value:
+        raise MaskFormatError(f"{where}: has no segmentation, perhaps a box; expected polygons or RLE")
+    rings = [ring for polygon in value for ring in Polygons.of(polygon, where).rings]
+    return Polygons(rings, where)
+
+
+def _images(whole: Record, place: Place, path: Path) -> dict[object, tuple[str, str, tuple[int, int]]]:
+    """View, place for messages, and size of each image that is a view, by the id of the image."""
+    found: dict[object, tuple[str, str, tuple[int, int]]] = {}
+    taken: dict[str, str] = {}
+    for image in whole.records("images", "image"):
+        name = image.text("file_name")
+        extra = image.fields.get("extra")
+        given = extra.get("name") if isinstance(extra, dict) else None  # Roboflow's: the name before it renamed it.
+        view = view_of(name, place.stems) or (view_of(given, place.stems) if isinstance(given, str) else None)
+        if view is None:
+            continue
+        if view in taken:
+            raise MaskFormatError(
+                f"{path}: has images {quoted(taken[view])} and {quoted(name)} for view '{view}'; expected one for each"
+            )
+        image_id = image.value("id")
+        if not isinstance(image_id, (int, str)) or image_id in found:
+            raise MaskFormatError(f"{image.where}: has the id {quoted(image_id)}; expected another one for each image")
+        taken[view] = name
+        found[image_id] = (view, f"{path}, image {quoted(name)}", image.size("width", "height"))
+    return found

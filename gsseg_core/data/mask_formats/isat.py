@@ -1,0 +1,37 @@
+"""ISAT, in which the labels of LERF's scenes are published (LERF-OVS): a JSON file per image, polygons with categories.
+
+Objects of a higher layer are on top, and of those of one layer the last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from gsseg_core.data.mask_formats.masks import MaskSet
+from gsseg_core.data.mask_formats.named import NamedDrawing, NamedShape, read_named
+from gsseg_core.data.mask_formats.place import Place
+from gsseg_core.data.mask_formats.record import Record
+from gsseg_core.data.mask_formats.shapes import Polygons
+
+
+def is_isat(place: Place) -> bool:
+    """Recognise ISAT: an object with the object `info` and the list `objects`."""
+    content = place.sample[1] if place.sample else None
+    if not isinstance(content, dict):
+        return False
+    return isinstance(content.get("info"), dict) and isinstance(content.get("objects"), list)
+
+
+def read_isat(place: Place) -> MaskSet:
+    """Read ISAT."""
+    return read_named(place, _parse)
+
+
+def _parse(whole: Record) -> NamedDrawing:
+    return NamedDrawing(whole.record("info").size("width", "height"), _shapes(whole))
+
+
+def _shapes(whole: Record) -> Iterator[NamedShape]:
+    for entry in whole.records("objects", "object"):
+        region = Polygons.of(entry.value("segmentation"), entry.where)
+        yield NamedShape(entry.class_name("category"), region, entry.number("layer", 0.0))

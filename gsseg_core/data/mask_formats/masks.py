@@ -1,0 +1,106 @@
+"""Masks of views in files of other programs: where each is, how it is read, and what its labels are called."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+
+from gsseg_core.data.class_names import BACKGROUND_NAME, flaw_of_class_name
+from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.mask_formats.shapes import Drawing
+from gsseg_core.errors import MaskFormatError
+from gsseg_core.files.limits import MAX_LABEL
+from gsseg_core.scene.camera import Camera
+from gsseg_core.text import quoted
+
+_BACKGROUND = (BACKGROUND_NAME, "_background_", "__background__")
+_IGNORED = "__ignore__"
+
+
+@dataclass(frozen=True, eq=False)
+class ViewMask:
+    """The mask of one view: where it stands, and how it is read, when it is asked for.
+
+    `size` is the mask's own, width and height, as far as it is known without reading it.
+    """
+
+    where: str
+    read: Callable[[Camera], npt.NDArray[np.int32]]
+    size: tuple[int, int] | None = None
+
+    @classmethod
+    def of(cls, drawing: Drawing, where: str) -> ViewMask:
+        """Make the mask of a drawing."""
+        return cls(where, partial(drawing.labels, where=where), (drawing.width, drawing.height))
+
+    def labels(self, camera: Camera) -> npt.NDArray[np.int32]:
+        """Read labels (H, W) of the size of the image as it was taken, scaled if the mask has another one.
+
+        Raises
+        ------
+        MaskFormatError, MaskSizeError
+            The mask is missing, broken, or of another shape than the camera's image.
+        """
+        try:
+            return self.read(camera)
+        except RecursionError as cause:  # As deep as JSON may be nested, a message that quotes it may not be.
+            raise MaskFormatError(f"{self.where}: is nested too deep; expected a mask") from cause
+
+
+@dataclass(frozen=True, eq=False)
+class MaskSet:
+    """Masks by view. `class_names` are those of their ids, None where they have none; `format` is what they were.
+
+    With `per_view`, an id is something inside its own view only, and has no name.
+    """
+
+    views: Mapping[str, ViewMask]
+    class_names: Mapping[int, str] | None = None
+    per_view: bool = False
+    format: str = ""
+
+
+def number_names(names: Iterable[str], where: str) -> dict[str, int]:
+    """Assign ids to names of classes, from 1; the background is 0, and `__ignore__`, as LabelMe has it, unknown.
+
+    Raises
+    ------
+    MaskFormatError
+        There are more than labels.
+    """
+    numbers = {**dict.fromkeys(_BACKGROUND, 0), _IGNORED: UNKNOWN}
+    for name in names:
+        numbers.setdefault(name, len(numbers) - len(_BACKGROUND))
+    if len(numbers) > MAX_LABEL:
+        raise MaskFormatError(f"{where}: has {len(numbers):,} classes; expected at most {MAX_LABEL:,}")
+    return numbers
+
+
+def names_of(numbers: Mapping[str, int]) -> dict[int, str]:
+    """Names by id, the background as gsseg calls it, of names with their ids."""
+    found = {number: name for name, number in numbers.items() if number > 0}
+    return {0: BACKGROUND_NAME, **dict(sorted(found.items()))}
+
+
+def ids_from_zero(names: Mapping[int, str]) -> dict[int, int]:
+    """Labels for ids of a format in which 0 may be an object: one more than the id if it is, the id itself if not."""
+    shift = 1 if 0 in names and names[0].lower() not in _BACKGROUND else 0
+    return {i: i + shift for i in names}
+
+
+def check_name(name: object, where: str) -> str:
+    """Return the name of a class, or raise `MaskFormatError` if it is unusable."""
+    if flaw := flaw_of_class_name(name):
+        raise MaskFormatError(f"{where}: a class has the name {flaw}")
+    return str(name)
+
+
+def check_id(value: object, where: str) -> int:
+    """Return an id, or raise `MaskFormatError` if it is no label."""
+    if type(value) is not int or not 0 <= value < MAX_LABEL:
+        raise MaskFormatError(f"{where}: has the id {quoted(value)}; expected whole numbers from 0 to {MAX_LABEL - 1}")
+    return value

@@ -1,0 +1,126 @@
+"""The place of masks, a file or a folder, and what formats are recognised by: names of views, and what files hold."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path, PureWindowsPath
+
+from gsseg_core.errors import MaskFormatError
+from gsseg_core.files.input_files import IMAGE_SUFFIXES, list_folder, open_input, reason
+from gsseg_core.files.json_files import read_json
+from gsseg_core.files.limits import LIMITS
+
+SUPERVISES = "supervises.json"
+"""Which classes were looked for in gsseg's own label images; see `data/mask_files.py`."""
+
+_SUFFIXES = IMAGE_SUFFIXES | {".json", ".npz", ".txt", ".xml"}
+_MARK = re.compile(r"[_.-](?:masks?|labels?|seg|segmentation)$", re.IGNORECASE)
+_RENAMED = re.compile(r"_(?:bmp|jpe?g|png|tiff?|webp)\.rf\.[0-9a-f]+$", re.IGNORECASE)  # as Roboflow renames images
+_PEEKED = 4096
+
+
+def view_of(name: str, stems: Collection[str]) -> str | None:
+    """Find the view that a file of masks belongs to, by its name; None if there is none.
+
+    `frame_1.png`, `frame_1.jpg.png`, `frame_1_mask.png`, `images/frame_1.jpg` and the like all belong to `frame_1`,
+    unless there is a view that is closer to the name.
+    """
+    candidates = [PureWindowsPath(name[-1000:]).name]  # takes both kinds of slash
+    for _ in range(4):
+        tried = list(dict.fromkeys(s for c in candidates for s in (c, _MARK.sub("", c), _RENAMED.sub("", c))))
+        for stem in tried:
+            if stem in stems:
+                return stem
+        parts = [name.rpartition(".") for name in tried]
+        candidates = [stem for stem, dot, suffix in parts if dot + suffix.lower() in _SUFFIXES]
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """What `--labels` names, with what formats ask of it; it and all below must lie in `within`, if that is given."""
+
+    path: Path
+    stems: frozenset[str]
+    within: Path | None = None
+
+    @cached_property
+    def entries(self) -> list[Path]:
+        """Files and folders in it, sorted, but for gsseg's own `supervises.json`; none if it is a file."""
+        return [path for path in list_folder(self.path, self.within) if path.name != SUPERVISES]
+
+    @property
+    def folders(self) -> list[Path]:
+        """Folders in it that are not hidden."""
+        return [path for path in self.entries if path.is_dir() and not path.name.startswith(".")]
+
+    def by_view(self, suffix: str) -> dict[str, Path]:
+        """Find the files with a suffix that belong to a view, by view: those in a folder, or the file itself.
+
+        Raises
+        ------
+        MaskFormatError
+            A view has two.
+        """
+        files = [path for path in self.entries or [self.path] if path.suffix.lower() == suffix and not path.is_dir()]
+        return self.views((path.name, path) for path in files)
+
+    def views(self, named: Iterator[tuple[str, Path]]) -> dict[str, Path]:
+        """Find the views that names belong to; raises as `by_view` does."""
+        found: dict[str, Path] = {}
+        for name, path in named:
+            view = view_of(name, self.stems)
+            if view is not None and view in found:
+                raise MaskFormatError(
+                    f"{self.path}: has {found[view].name} and {path.name} for view '{view}'; expected one mask per view"
+                )
+            if view is not None:
+                found[view] = path
+        return found
+
+    @cached_property
+    def sample(self) -> tuple[Path, object] | None:
+        """The JSON file by which formats are told apart, with what it holds: the first of a view, or the only one."""
+        path = next(iter(self.by_view(".json").values()), None) or self.only(".json")
+        return None if path is None else (path, read_json(path, MaskFormatError, self.within))
+
+    def only(self, suffix: str) -> Path | None:
+        """Find the only file with a suffix, which the place itself may be; none beside masks of single views."""
+        files = [path for path in self.entries or [self.path] if path.suffix.lower() == suffix and path.is_file()]
+        return files[0] if len(files) == 1 and not self._has_views else None
+
+    @cached_property
+    def _has_views(self) -> bool:
+        return any(path.suffix.lower() != ".xml" and view_of(path.name, self.stems) for path in self.entries)
+
+    def holds(self, path: Path, pattern: bytes) -> bool:
+        """Tell whether a file begins with a pattern, a regular expression, within its first 4096 bytes."""
+        return re.match(pattern, self.read(path, _PEEKED)) is not None
+
+    def read(self, path: Path, most: int | None = None) -> bytes:
+        """Read a file, or its first bytes.
+
+        Raises
+        ------
+        MaskFormatError
+            It cannot be read, or is larger than any such file is.
+        """
+        limit = LIMITS.max_json_bytes
+        try:
+            with open_input(path, self.within) as file:
+                content = file.read(limit + 1 if most is None else most)
+        except OSError as cause:
+            raise MaskFormatError(f"{path}: cannot be read ({reason(cause)})") from cause
+        if len(content) > limit:
+            raise MaskFormatError(f"{path}: is too large; expected at most {limit:,} bytes (limit max_json_bytes)")
+        return content
+
+    def text(self, path: Path) -> str:
+        """Read a file of text; raises as `read` does, or if it is none."""
+        try:
+            return self.read(path).decode("utf-8-sig")
+        except UnicodeDecodeError as cause:
+            raise MaskFormatError(f"{path}: is no text in UTF-8 ({cause.reason}); expected text") from cause

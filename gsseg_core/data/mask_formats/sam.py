@@ -1,0 +1,111 @@
+"""Automatic masks of Segment Anything, as its `scripts/amg.py` writes them: a JSON list or a folder per image.
+
+Ids hold in their own view: mask i is i + 1. Where masks overlap, the smaller one is on top, so that a part shows on its
+whole; pixels in no mask are background.
+"""
+
+from __future__ import annotations
+
+import csv
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from gsseg_core.data.mask_formats.images import image_size, read_binary
+from gsseg_core.data.mask_formats.masks import MaskSet, ViewMask
+from gsseg_core.data.mask_formats.place import Place
+from gsseg_core.data.mask_formats.record import records
+from gsseg_core.data.mask_formats.rle import run_lengths
+from gsseg_core.data.mask_formats.shapes import Drawing, Runs, Shape, check_fit, scaled
+from gsseg_core.errors import MaskFormatError
+from gsseg_core.files.input_files import check_pixels
+from gsseg_core.files.json_files import read_json
+from gsseg_core.scene.camera import Camera
+from gsseg_core.text import quoted
+
+METADATA = "metadata.csv"
+_MARKS = ("predicted_iou", "stability_score")
+
+
+def is_sam_json(place: Place) -> bool:
+    """Recognise masks in JSON: objects with RLE in `segmentation`, and `predicted_iou` or `stability_score`."""
+    if place.sample is None:
+        return False
+    first = next(iter(_listed(place.sample[1])), None)
+    return isinstance(first, dict) and "segmentation" in first and any(mark in first for mark in _MARKS)
+
+
+def read_sam_json(place: Place) -> MaskSet:
+    """Read masks in JSON, a file per image: a list, or an object with the list `annotations`, as SA-1B has it."""
+    assert place.sample is not None
+    files, size = place.by_view(".json"), _drawing(*place.sample)[:2]
+    return MaskSet(
+        {view: ViewMask(str(path), partial(_read_json, place, path), size) for view, path in files.items()},
+        per_view=True,
+    )
+
+
+def is_sam_folder(place: Place) -> bool:
+    """Recognise masks in PNGs: a folder per image, with `metadata.csv`."""
+    return any(place.holds(path / METADATA, rb"id,area,bbox_x0,") for path in _folders(place).values())
+
+
+def read_sam_folder(place: Place) -> MaskSet:
+    """Read masks in PNGs, with their areas from `metadata.csv`."""
+    views = {view: ViewMask(str(path), partial(_read_folder, place, path)) for view, path in _folders(place).items()}
+    return MaskSet(views, per_view=True)
+
+
+def _read_json(place: Place, path: Path, camera: Camera) -> npt.NDArray[np.int32]:
+    return _drawing(path, read_json(path, MaskFormatError, place.within)).labels(camera, str(path))
+
+
+def _listed(content: object) -> list[object]:
+    """Return the masks in a JSON file; none if it is another kind of file."""
+    if isinstance(content, dict) and "image" in content:
+        content = content.get("annotations")
+    return content if isinstance(content, list) else []
+
+
+def _drawing(path: Path, content: object) -> Drawing:
+    regions: list[Runs] = []
+    sizes: set[tuple[int, int]] = set()
+    for mask in records(_listed(content), str(path), f"{path}, mask"):
+        runs = mask.record("segmentation")
+        size = runs.value("size")
+        if not isinstance(size, list) or len(size) != 2 or any(type(side) is not int or side < 1 for side in size):
+            raise MaskFormatError(f"{mask.where}: 'size' is {quoted(size)}; expected the height and width of the image")
+        sizes.add((size[1], size[0]))
+        regions.append(Runs(run_lengths(runs.value("counts"), mask.where), mask.where))
+    if len(sizes) != 1:
+        found = "no masks" if not sizes else f"masks for images of {len(sizes)} sizes"
+        raise MaskFormatError(f"{path}: has {found}; expected masks of one image")
+    ((width, height),) = sizes
+    check_pixels(width, height, str(path), MaskFormatError)
+    shapes = [Shape(i, region) for i, region in enumerate(regions, 1)]
+    return Drawing(width, height, sorted(shapes, key=lambda shape: -shape.region.area))  # type: ignore[attr-defined]
+
+
+def _folders(place: Place) -> dict[str, Path]:
+    """Folders with metadata by view; the place itself, if it is the folder of one view."""
+    folders = [path for path in (*place.folders, place.path) if (path / METADATA).is_file()]
+    return place.views((path.name, path) for path in folders)
+
+
+def _read_folder(place: Place, folder: Path, camera: Camera) -> npt.NDArray[np.int32]:
+    rows = list(csv.DictReader(place.text(folder / METADATA).splitlines()))
+    masks: list[tuple[float, int, Path]] = []
+    for row in rows:
+        number, area = str(row.get("id")), str(row.get("area"))
+        if not number.isdecimal() or not area.isdecimal() or len(number) > 6 or len(area) > 12:
+            raise MaskFormatError(
+                f"{folder / METADATA}: has a mask {quoted(number)} of {quoted(area)} pixels; expected whole numbers"
+            )
+        masks.append((-int(area), int(number) + 1, folder / f"{int(number)}.png"))
+    labels = np.zeros(camera.image_size[::-1], np.int32)
+    for _, label, path in sorted(masks):
+        check_fit(*image_size(path, place.within), camera, str(path))
+        labels[scaled(read_binary(path, place.within), camera)] = label
+    return labels

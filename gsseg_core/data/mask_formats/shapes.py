@@ -1,0 +1,215 @@
+"""Shapes of annotations and how they are painted into a label image.
+
+Coordinates are those of `docs/conventions.md`: pixel (column c, row r) covers [c, c + 1) x [r, r + 1), and is inside
+where its centre is. (Pillow's and OpenCV's polygons take all pixels that their outline touches, half a pixel more on
+each side.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from gsseg_core.data.mask_formats.rle import runs_to_mask
+from gsseg_core.errors import MaskFormatError, MaskSizeError
+from gsseg_core.files.input_files import check_pixels
+from gsseg_core.files.json_files import kind_of
+from gsseg_core.files.limits import LIMITS, MAX_LABEL
+from gsseg_core.scene.camera import Camera
+from gsseg_core.text import clipped
+
+T = TypeVar("T", bound=np.generic)
+
+_AT_ONCE = 2**18  # crossings of rows and edges that are worked on at a time
+_FEW = 2**16  # crossings that a polygon may have in any image
+
+
+class Part(NamedTuple):
+    """Pixels inside of a shape, within a rectangle of the image that has all of them."""
+
+    top: int
+    left: int
+    inside: npt.NDArray[np.bool_]  # (h, w)
+
+
+class Region(Protocol):
+    """What a shape covers."""
+
+    def parts(self, width: int, height: int) -> Iterator[Part]:
+        """Give the pixels that it covers of an image of this size, which may be in several parts."""
+
+
+@dataclass(frozen=True, eq=False)
+class Polygons:
+    """Polygons, each with the pixels inside of it by the even-odd rule; their `where` begins messages."""
+
+    rings: list[npt.NDArray[np.float64]]  # each (P, 2): x, y
+    where: str
+
+    @classmethod
+    def of(cls, value: object, where: str) -> Polygons:
+        """Read one polygon as JSON has it: [[x, y], ...] or [x, y, x, y, ...].
+
+        Raises
+        ------
+        MaskFormatError
+            It is none, or has NaN or coordinates that no image has.
+        """
+        try:
+            points = np.array(value, np.float64)
+            ring = points.reshape(-1, 2) if points.ndim == 1 else points
+        except (TypeError, ValueError, OverflowError):
+            ring = np.zeros((0, 0))
+        if not isinstance(value, list) or ring.ndim != 2 or (ring.shape[1] != 2 and ring.size + len(value)):
+            found = f"a list of {len(value)}" if isinstance(value, list) else kind_of(value)
+            raise MaskFormatError(f"{where}: has {found}; expected the points of a polygon, x and y of each")
+        ring = ring.reshape(-1, 2)
+        if not (np.abs(ring) <= LIMITS.max_value).all():
+            raise MaskFormatError(f"{where}: a polygon has the point {_odd(ring)}; expected pixels of an image")
+        return cls([ring], where)
+
+    def parts(self, width: int, height: int) -> Iterator[Part]:
+        """See `Region`."""
+        for ring in self.rings:
+            part = self._filled(ring, width, height)
+            if part is not None:
+                yield part
+
+    def _filled(self, ring: npt.NDArray[np.float64], width: int, height: int) -> Part | None:
+        """Fill one polygon: rows cross its edges, and between the first and second crossing a row is inside."""
+        if not len(ring):
+            return None
+        x, y = (ring - 0.5).T  # Centres of pixels are whole numbers then.
+        left, top = (int(np.clip(np.ceil(low.min()), 0, size)) for low, size in ((x, width), (y, height)))
+        right, bottom = (int(np.clip(np.ceil(high.max()), 0, size)) for high, size in ((x, width), (y, height)))
+        if right <= left or bottom <= top:
+            return None
+        first = np.clip(np.ceil(np.minimum(y, np.roll(y, -1))), top, bottom).astype(np.int64)
+        rows = np.clip(np.ceil(np.maximum(y, np.roll(y, -1))), top, bottom).astype(np.int64) - first  # (P,)
+        if rows.sum() > max(4 * width * height, _FEW):
+            raise MaskFormatError(
+                f"{self.where}: a polygon of {len(ring):,} points crosses the rows of the image {rows.sum():,} times; "
+                f"expected an outline of something in {width} x {height} pixels"
+            )
+        crossings = np.zeros((bottom - top, right - left + 1), np.uint8)
+        slope = (np.roll(x, -1) - x) / np.where(rows > 0, np.roll(y, -1) - y, 1)
+        for edges in _batches(rows):
+            count = rows[edges]
+            edge = np.repeat(edges, count)
+            row = first[edge] + np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)
+            column = np.clip(np.ceil(x[edge] + (row - y[edge]) * slope[edge]), left, right).astype(np.int64)
+            np.add.at(crossings, (row - top, column - left), np.uint8(1))
+        inside = np.cumsum(crossings, axis=1, dtype=np.uint8)[:, :-1] & 1
+        return Part(top, left, inside.astype(bool))
+
+
+@dataclass(frozen=True, eq=False)
+class Runs:
+    """A mask of a whole image as lengths of its runs, column by column."""
+
+    lengths: npt.NDArray[np.int64]  # (R,)
+    where: str
+
+    @property
+    def area(self) -> int:
+        """Pixels inside."""
+        return int(self.lengths[1::2].sum())
+
+    def parts(self, width: int, height: int) -> Iterator[Part]:
+        """See `Region`."""
+        yield Part(0, 0, runs_to_mask(self.lengths, width, height, self.where))
+
+
+@dataclass(frozen=True, eq=False)
+class Bitmap:
+    """A mask of a rectangle of the image, which may stick out of it."""
+
+    left: int
+    top: int
+    inside: npt.NDArray[np.bool_]  # (h, w)
+
+    def parts(self, width: int, height: int) -> Iterator[Part]:
+        """See `Region`."""
+        top, left = max(self.top, 0), max(self.left, 0)
+        inside = self.inside[top - self.top :, left - self.left :][: max(height - top, 0), : max(width - left, 0)]
+        if inside.size:
+            yield Part(top, left, inside)
+
+
+class Shape(NamedTuple):
+    """A region with its label, or `UNKNOWN`."""
+
+    label: int
+    region: Region
+
+
+class Drawing(NamedTuple):
+    """What is annotated in one image of this size: shapes, the last of them on top."""
+
+    width: int
+    height: int
+    shapes: list[Shape]
+
+    def labels(self, camera: Camera, where: str) -> npt.NDArray[np.int32]:
+        """Paint the label image (H, W) of the image that a camera took: 0 where there is no shape; scaled, where the sizes differ.
+
+        Raises
+        ------
+        MaskFormatError
+            A shape is broken, or there are more than labels.
+        MaskSizeError
+            The image has another shape than the camera's.
+        """
+        if len(self.shapes) > MAX_LABEL:
+            raise MaskFormatError(f"{where}: has {len(self.shapes):,} shapes; expected at most {MAX_LABEL:,} in a view")
+        check_fit(self.width, self.height, camera, where)
+        return scaled(paint(self.shapes, self.width, self.height), camera)
+
+
+def paint(shapes: Iterable[Shape], width: int, height: int) -> npt.NDArray[np.int32]:
+    """Paint shapes into a label image (H, W), each on top of those before it."""
+    labels = np.zeros((height, width), np.int32)
+    for label, region in shapes:
+        for top, left, inside in region.parts(width, height):
+            rows, columns = inside.shape
+            labels[top : top + rows, left : left + columns][inside] = label
+    return labels
+
+
+def check_fit(width: int, height: int, camera: Camera, where: str) -> None:
+    """Raise `MaskSizeError` unless a mask has the size of the camera's image, or becomes it by scaling, to a pixel."""
+    check_pixels(width, height, where, MaskFormatError)
+    expected = camera.image_size
+    scale = (expected[0] * expected[1] / max(width * height, 1)) ** 0.5
+    if max(abs(width * scale - expected[0]), abs(height * scale - expected[1])) > 1:
+        raise MaskSizeError(
+            f"{where}: is for an image of {width} x {height} pixels; expected {expected[0]} x {expected[1]}, the "
+            f"size of camera '{clipped(camera.name)}', or the same larger or smaller"
+        )
+
+
+def scaled(labels: npt.NDArray[T], camera: Camera) -> npt.NDArray[T]:
+    """Scale a label image, or a mask, to the size of the image that a camera took: each pixel gets the label at its centre."""
+    (height, width), (columns_wanted, rows_wanted) = labels.shape, camera.image_size
+    if (width, height) == (columns_wanted, rows_wanted):
+        return labels
+    rows = (np.arange(rows_wanted) + 0.5) * height / rows_wanted
+    columns = (np.arange(columns_wanted) + 0.5) * width / columns_wanted
+    near: npt.NDArray[T] = labels[rows.astype(np.int64)[:, None], columns.astype(np.int64)]
+    return near
+
+
+def _batches(rows: npt.NDArray[np.int64]) -> Iterator[npt.NDArray[np.int64]]:
+    """Split the edges that cross a row into batches, each with few crossings."""
+    edges = np.flatnonzero(rows)
+    batch = np.cumsum(rows[edges]) // _AT_ONCE
+    yield from np.split(edges, np.flatnonzero(np.diff(batch)) + 1)
+
+
+def _odd(ring: npt.NDArray[np.float64]) -> str:
+    x, y = ring[~(np.abs(ring) <= LIMITS.max_value).all(axis=1)][0]
+    return f"({x:g}, {y:g})"

@@ -1,0 +1,144 @@
+"""The table of mask formats of other programs: how each is recognised, and who reads it.
+
+gsseg's own masks, a label image, probabilities or detections per view, are no line of it: `data/mask_files.py`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from gsseg_core.data.label_images import mask_header
+from gsseg_core.data.mask_files import CLASS_ID, DETECTIONS, mask_files
+from gsseg_core.data.mask_formats.coco import is_coco, read_coco
+from gsseg_core.data.mask_formats.cvat import is_cvat, read_cvat
+from gsseg_core.data.mask_formats.eiseg import is_eiseg, read_eiseg
+from gsseg_core.data.mask_formats.isat import is_isat, read_isat
+from gsseg_core.data.mask_formats.labelme import is_labelme, read_labelme
+from gsseg_core.data.mask_formats.masks import MaskSet
+from gsseg_core.data.mask_formats.place import Place
+from gsseg_core.data.mask_formats.sam import METADATA, is_sam_folder, is_sam_json, read_sam_folder, read_sam_json
+from gsseg_core.data.mask_formats.sam2 import is_sam2, read_sam2
+from gsseg_core.data.mask_formats.yolo import is_yolo, read_yolo
+from gsseg_core.errors import MaskFormatError
+from gsseg_core.files.input_files import list_folder
+from gsseg_core.text import quoted
+
+
+@dataclass(frozen=True)
+class MaskFormat:
+    """A format of masks: what messages call it, by what it is recognised, and how it is read.
+
+    `recognise` and `read` get the place that `--labels` names. `looked_for` is what marks the format, `ids` what the
+    labels are, and `on_top` what is seen where shapes overlap, all for messages and docs/formats.md.
+    """
+
+    name: str
+    recognise: Callable[[Place], bool]
+    read: Callable[[Place], MaskSet]
+    looked_for: str
+    ids: str
+    on_top: str
+
+
+LABEL_IMAGES = "label images"
+"""What messages call gsseg's own masks; those of Gaussian Grouping, DEVA, SAM 2 and DAVIS are the same."""
+
+MASK_FORMATS = [
+    MaskFormat(
+        "COCO", is_coco, read_coco, "a JSON file with `images`, `annotations` and `categories`",
+        "those of the categories", "the last annotation",
+    ),
+    MaskFormat(
+        "SAM JSON", is_sam_json, read_sam_json, "`<stem>.json`, a list of masks with RLE and `predicted_iou`; SA-1B",
+        "per view", "the smaller mask",
+    ),
+    MaskFormat(
+        "SAM folders", is_sam_folder, read_sam_folder, "`<stem>/` with `0.png`, `1.png` ... and `metadata.csv`",
+        "per view", "the smaller mask",
+    ),
+    MaskFormat(
+        "SAM 2 video", is_sam2, read_sam2, "`001/<stem>.png`, a folder for each object",
+        "those of the objects", "the smaller id",
+    ),
+    MaskFormat(
+        "LabelMe", is_labelme, read_labelme, "`<stem>.json` with `shapes` and `imagePath`",
+        "from 1, names from A to Z", "the last shape",
+    ),
+    MaskFormat(
+        "ISAT (LERF)", is_isat, read_isat, "`<stem>.json` with `info` and `objects`",
+        "from 1, names from A to Z", "the higher `layer`",
+    ),
+    MaskFormat(
+        "CVAT", is_cvat, read_cvat, "an XML file of CVAT for images 1.1",
+        "from 1, in the order of the task's labels", "the higher `z_order`",
+    ),
+    MaskFormat(
+        "YOLO", is_yolo, read_yolo, "`<stem>.txt` with classes and outlines; names in `data.yaml`",
+        "one more than the class", "the last line",
+    ),
+    MaskFormat(
+        "EISeg", is_eiseg, read_eiseg, "`<stem>.png` or `<stem>.json`, and `autosave_label.txt`",
+        "those of the labels", "the last polygon",
+    ),
+]  # fmt: skip
+"""All formats; who adds one, adds it here."""
+
+
+def open_masks(path: Path, stems: Iterable[str], within: Path | None = None) -> MaskSet | None:
+    """Open the masks of another program, recognised by what they hold; None for gsseg's own, or where there are none.
+
+    Raises
+    ------
+    MaskFormatError
+        It is a file of no known format, may be of several, is broken, or has no mask of a view.
+    PathNotAllowedError
+        It lies outside `within`.
+    SettingsError
+        A library that it needs is not installed.
+    """
+    if not path.exists():
+        return None
+    place = Place(path, frozenset(stems), within)
+    try:
+        found = [known for known in MASK_FORMATS if known.recognise(place)]
+        names = [known.name for known in found]
+        if found and "EISeg" not in names and _has_own(place):
+            names.append(LABEL_IMAGES)
+        if len(names) > 1:
+            raise MaskFormatError(
+                f"{path}: may be masks of {' or '.join(names)}; expected those of one program: name the file itself, "
+                "or a folder without the others"
+            )
+        if not found and not path.is_dir():
+            raise MaskFormatError(f"{path}: is no file of masks that is known; gsseg reads {known_formats()}")
+        masks = found[0].read(place) if found else None
+    except RecursionError as cause:
+        raise MaskFormatError(f"{path}: is nested too deep; expected masks") from cause
+    if masks is not None and not masks.views:
+        names_of_views = ", ".join(map(quoted, sorted(place.stems)[:3]))
+        raise MaskFormatError(f"{path}: has masks of no view; expected names of views, such as {names_of_views}")
+    return None if masks is None else replace(masks, format=found[0].name)
+
+
+def known_formats() -> str:
+    """List all formats for messages."""
+    own = f"{LABEL_IMAGES} (<stem>.png)"
+    return ", ".join([own, *(f"{known.name} ({known.looked_for.replace('`', '')})" for known in MASK_FORMATS)])
+
+
+def _has_own(place: Place) -> bool:
+    """Whether a folder has masks of gsseg's own kinds, too, and not only photos beside the annotations."""
+    return any(_is_own(path, place) for path in mask_files(place.path, place.stems, place.within).values())
+
+
+def _is_own(path: Path, place: Place) -> bool:
+    if path.is_dir():
+        ids = [file.stem for file in list_folder(path, place.within) if file.suffix.lower() in DETECTIONS]
+        return not (path / METADATA).exists() and any(re.fullmatch(CLASS_ID, stem) for stem in ids)
+    with suppress(MaskFormatError):
+        return path.suffix.lower() == ".npz" or bool(mask_header(path, place.within))
+    return False

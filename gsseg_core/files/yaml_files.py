@@ -1,0 +1,41 @@
+"""YAML files as they come from users, where PyYAML is installed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from gsseg_core.errors import GssegError, SettingsError
+from gsseg_core.files.input_files import open_input, reason
+from gsseg_core.text import clipped
+
+_MOST_BYTES = 2**20
+
+
+def read_yaml(path: Path, error: type[GssegError], within: Path | None = None) -> Any:
+    """Read a YAML file, below `within` if given; raise `error` if it is missing, broken, or larger than any is.
+
+    Anchors are refused, since a few lines with them stand for more than any memory holds.
+
+    Raises
+    ------
+    SettingsError
+        PyYAML is not installed.
+    """
+    try:
+        import yaml
+    except ModuleNotFoundError as missing:
+        raise SettingsError(f"{path}: needs PyYAML, which is missing: pip install 'gsseg[yaml]'") from missing
+    try:
+        with open_input(path, within) as file:
+            content = file.read(_MOST_BYTES + 1)
+    except OSError as cause:
+        raise error(f"{path}: cannot be read ({reason(cause)})") from cause
+    if len(content) > _MOST_BYTES:
+        raise error(f"{path}: is too large; expected at most {_MOST_BYTES:,} bytes")
+    try:
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(content, yaml.SafeLoader)):
+            raise error(f"{path}: uses anchors, as in *name; expected YAML without")
+        return yaml.load(content, yaml.SafeLoader)
+    except (yaml.YAMLError, ValueError, RecursionError) as cause:
+        raise error(f"{path}: not valid YAML ({clipped(cause, 160)})") from cause
