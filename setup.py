@@ -66,6 +66,7 @@ setup(
             "mkdocstrings-python>=1.16",
             "mypy>=1.15",
             "playwright>=1.45",
+            "pycocotools>=2.0.8",
             "pygltflib>=1.16",
             "pytest>=8",
             "pytest-xdist>=3.6",
@@ -81,8 +82,8 @@ setup(
             "zstandard>=0.22",
         ],
         "docs": ["mkdocs-material>=9.6", "mkdocstrings-python>=1.16"],
-        # To write scenes in other formats than PLY, .splat and GLB, and to read SPZ of version 4.
-        "formats": ["gaussforge>=0.6", "gsply>=0.4.6", "zstandard>=0.22"],
+        # To write scenes in other formats than PLY, .splat and GLB, and to read SPZ of version 4 and YAML of masks.
+        "formats": ["gaussforge>=0.6", "gsply>=0.4.6", "pyyaml>=6.0", "zstandard>=0.22"],
         "examples": ["rosbags>=0.10", "scikit-image>=0.25"],
         # The view operator on CUDA. Below 1.6, since docs/gpu.md bounds what the rules of this version change. gsplat
         # imports packaging without asking for it.

@@ -10,6 +10,7 @@ import gsseg_core
 from gsseg_core.cli.arguments import build_parser, command_module
 from gsseg_core.cli.completion import subparsers
 from gsseg_core.data.camera_formats.table import CAMERA_FORMATS
+from gsseg_core.data.mask_formats.table import MASK_FORMATS
 from gsseg_core.scene.scene_formats import SCENE_FORMATS
 
 REPOSITORY = Path(__file__).parents[2]
@@ -75,7 +76,8 @@ def python() -> str:
 def _formats() -> str:
     scenes = [f"| scene | {known.name} | `{known.looked_for}` |" for known in SCENE_FORMATS]
     cameras = [f"| cameras | {known.name} | `{known.looked_for}` |" for known in CAMERA_FORMATS]
-    return "\n".join(["| what | format | recognised by |", "|---|---|---|", *scenes, *cameras, ""])
+    masks = [f"| masks | {known.name} | {known.looked_for} |" for known in MASK_FORMATS]
+    return "\n".join(["| what | format | recognised by |", "|---|---|---|", *scenes, *cameras, *masks, ""])
 
 
 def scenes_read() -> str:

@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, metavar="OUT", help="folder to write to")
     labels = "the masks: a folder in DATASET, or a file or folder of another program, as COCO (default: labels)"
     parser.add_argument("--labels", default=LABELS, metavar="PATH", help=labels)
-    renames = "JSON that renames, merges and ignores classes of the masks, as in docs/masks.md"
+    renames = "JSON that renames, merges and ignores classes of the masks, as in docs/formats.md"
     parser.add_argument("--label-map", metavar="FILE", help=renames)
     parser.add_argument(
         "--ids", choices=("global", "per-view"),

@@ -25,7 +25,7 @@ def read_yaml(path: Path, error: type[GssegError], within: Path | None = None) -
     try:
         import yaml
     except ModuleNotFoundError as missing:
-        raise SettingsError(f"{path}: needs PyYAML, which is missing: pip install 'gsseg[yaml]'") from missing
+        raise SettingsError(f"{path}: needs PyYAML, which is missing: pip install 'gsseg[formats]'") from missing
     try:
         with open_input(path, within) as file:
             content = file.read(_MOST_BYTES + 1)

@@ -8,9 +8,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import mask_writers
 import protocol_layouts
 import small_scenes
 
+from gsseg_core.data.class_names import read_classes
+from gsseg_core.data.label_images import read_mask
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
@@ -95,10 +98,19 @@ def protocols(desk: Path) -> None:
     protocol_layouts.true_segmentation().save(desk / "OUT/segmentation.npz")
 
 
+def annotated(desk: Path) -> None:
+    """What was segmented, and the masks once more as COCO."""
+    segmented(desk)
+    names = read_classes(desk / "DATASET/classes.json")
+    masks = {path.stem: read_mask(path).labels for path in sorted((desk / "DATASET/labels").iterdir())[::6]}
+    mask_writers.coco_text(desk, masks, names)
+    (desk / "names.json").write_text('{"*": "thing", "background": "background"}')
+
+
 FIRST: dict[str, Callable[[Path], None]] = {
     "docs/clean_objects.md": segmented,
     "docs/evaluation.md": protocols,
-    "docs/formats.md": segmented,
+    "docs/formats.md": annotated,
     "docs/results.md": apartment,
     "docs/ids.md": on_a_robot,
     "docs/tutorial_robot.md": on_a_robot,

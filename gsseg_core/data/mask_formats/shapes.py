@@ -155,7 +155,7 @@ class Drawing(NamedTuple):
     shapes: list[Shape]
 
     def labels(self, camera: Camera, where: str) -> npt.NDArray[np.int32]:
-        """Paint the label image (H, W) of the image that a camera took: 0 where there is no shape; scaled, where the sizes differ.
+        """Paint the labels (H, W) of the image that a camera took, 0 where there is no shape; scaled if need be.
 
         Raises
         ------
@@ -193,13 +193,12 @@ def check_fit(width: int, height: int, camera: Camera, where: str) -> None:
 
 
 def scaled(labels: npt.NDArray[T], camera: Camera) -> npt.NDArray[T]:
-    """Scale a label image, or a mask, to the size of the image that a camera took: each pixel gets the label at its centre."""
-    (height, width), (columns_wanted, rows_wanted) = labels.shape, camera.image_size
-    if (width, height) == (columns_wanted, rows_wanted):
+    """Scale labels, or a mask, to the size of the image that a camera took: each pixel gets the label at its centre."""
+    size = camera.image_size[::-1]
+    if labels.shape == size:
         return labels
-    rows = (np.arange(rows_wanted) + 0.5) * height / rows_wanted
-    columns = (np.arange(columns_wanted) + 0.5) * width / columns_wanted
-    near: npt.NDArray[T] = labels[rows.astype(np.int64)[:, None], columns.astype(np.int64)]
+    rows, columns = (((np.arange(n) + 0.5) * m / n).astype(np.int64) for n, m in zip(size, labels.shape, strict=True))
+    near: npt.NDArray[T] = labels[rows[:, None], columns]
     return near
 
 

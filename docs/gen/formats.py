@@ -1,0 +1,35 @@
+"""Tables what gsseg opens, from the tables of the code: python docs/gen/formats.py.
+
+A table of docs/formats.md stands between `<!-- NAME -->` and `<!-- end -->`; a test says when it is not the code's.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from gsseg_core.data.mask_formats.table import MASK_FORMATS
+
+PAGE = Path(__file__).parents[2] / "docs/formats.md"
+
+
+def masks() -> str:
+    """Table the formats of masks."""
+    rows = [f"| {known.name} | {known.looked_for} | {known.ids} | {known.on_top} |" for known in MASK_FORMATS]
+    return "\n".join(["| format | recognised by | ids | on top, where shapes overlap |", "|---|---|---|---|", *rows])
+
+
+TABLES = {"masks": masks}
+
+
+def page() -> str:
+    """Make the page with its tables as they are today."""
+    text = PAGE.read_text(encoding="utf-8")
+    for name, table in TABLES.items():
+        made = table() + "\n"
+        text = re.sub(rf"(?<=<!-- {name} -->\n).*?(?=<!-- end -->)", lambda _, made=made: made, text, flags=re.DOTALL)
+    return text
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
