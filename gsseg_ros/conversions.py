@@ -1,4 +1,4 @@
-"""Converts between ROS messages and the values of `gsseg_core`; `object_messages` does so for objects.
+"""Converts between ROS messages and the values of `gsseg_core`; objects have `object_messages`, cameras `camera_infos`.
 
 Numbers of a message are set as `array.array`, which rclpy takes over as a whole; anything else it checks and copies
 element by element, which takes seconds for a large cloud.
@@ -21,10 +21,10 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
 from gsseg_core.data.label_images import UNKNOWN
-from gsseg_core.errors import IntrinsicsError, MaskFormatError, PoseError, SceneValueError
+from gsseg_core.errors import MaskFormatError, PoseError, SceneValueError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.scene.camera import Camera
-from gsseg_ros.frames import Similarity, quaternion_from_rotation, rigid, rotation_from_quaternion
+from gsseg_ros.frames import quaternion_from_rotation, rigid, rotation_from_quaternion
 
 _NS = 1_000_000_000
 _UNIT_TOLERANCE = 1e-3
@@ -116,32 +116,6 @@ def picture_from_image(message: Image, topic: str) -> npt.NDArray[Any]:
     return pixels.reshape(message.height, message.width, channels) if channels > 1 else pixels
 
 
-def intrinsics_from_info(info: CameraInfo, topic: str) -> tuple[npt.NDArray[np.float64], int, int]:
-    """Read `K` (3, 3) in pixels, width and height of a rectified camera.
-
-    Raises
-    ------
-    IntrinsicsError
-        The lens is distorted, the image binned or cut, the size zero, or `k` not that of a pinhole camera.
-    """
-    if np.any(info.d):
-        raise IntrinsicsError(
-            f"{topic}: distortion d is {list(info.d)}; expected zeros: use the rectified topic, for example after "
-            "image_proc, for the masks, and a camera_info that describes the rectified image"
-        )
-    if max(info.binning_x, info.binning_y) > 1:
-        raise IntrinsicsError(f"{topic}: binning is {info.binning_x} x {info.binning_y}; expected images without it")
-    roi, size = info.roi, f"{info.width} x {info.height}"
-    if (roi.x_offset, roi.y_offset, roi.width, roi.height) not in ((0,) * 4, (0, 0, info.width, info.height)):
-        raise IntrinsicsError(
-            f"{topic}: roi is {roi.width} x {roi.height} at ({roi.x_offset}, {roi.y_offset}); expected the full image "
-            f"of {size}, or zeros"
-        )
-    # Camera checks the rest; the message names the topic in the camera's place.
-    camera = Camera(topic, info.width, info.height, np.reshape(info.k, (3, 3)), np.eye(4))
-    return camera.K, camera.width, camera.height
-
-
 def matrix_from_pose(pose: Pose, topic: str) -> npt.NDArray[np.float64]:
     """Turn a pose into a rigid motion (4, 4), in metres.
 
@@ -170,24 +144,6 @@ def pose_from_matrix(
     x, y, z = matrix[:3, 3].tolist()
     qx, qy, qz, qw = quaternion_from_rotation(matrix[:3, :3])
     return Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
-
-
-def camera_from_messages(
-    name: str,
-    info: CameraInfo,
-    camera_in_map: npt.NDArray[np.float64],  # (4, 4)
-    similarity: Similarity,
-    topic: str,
-) -> Camera:
-    """Build the scene's camera from a camera_info (of `topic`) and the pose of the optical frame in the map, in metres.
-
-    Raises
-    ------
-    IntrinsicsError, PoseError
-        The camera_info or the pose cannot be used.
-    """
-    K, width, height = intrinsics_from_info(info, topic)
-    return Camera(name, width, height, K, similarity.world_to_camera(camera_in_map))
 
 
 def viewpoint_messages(

@@ -58,6 +58,7 @@ def run(options: argparse.Namespace) -> int:
         if options.mask:
             mask = read_object_mask(options.mask, options.label)
             if camera.undistortion is not None:
+                camera.check_image_mask_size(mask.shape[1], mask.shape[0], options.mask)
                 mask = camera.undistortion.sample(mask, UNKNOWN)
             view = View.from_arrays(camera, mask)
             picked = pick_mask(scene, view, device=options.device)

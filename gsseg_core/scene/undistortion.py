@@ -68,10 +68,10 @@ class Undistortion:
 
     def sample(
         self,
-        image: npt.NDArray[Any],  # (H, W), of the lens
+        image: npt.NDArray[Any],  # (H, W, ...), of the lens
         outside: int,
     ) -> npt.NDArray[Any]:
-        """Take the nearest pixels of a label image: (height, width), `outside` where the image does not reach.
+        """Take the nearest pixels of an image: (height, width, ...), `outside` where the image does not reach.
 
         Raises
         ------
@@ -80,7 +80,9 @@ class Undistortion:
         """
         self._check_size(image)
         pixels = _nearest_pixels(self)
-        return np.where(pixels >= 0, image.ravel()[pixels], image.dtype.type(outside))
+        view: npt.NDArray[Any] = image.reshape(-1, *image.shape[2:])[pixels]
+        view[pixels < 0] = outside
+        return view
 
     def photo(
         self,

@@ -19,10 +19,12 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo, Image
 
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, PoseError
 from gsseg_core.live.results import SCENE_CHANGED, Rejection
-from gsseg_ros.conversions import camera_from_messages, labels_from_image, matrix_from_pose, stamp_ns
+from gsseg_ros.camera_infos import camera_of_image, is_rectified
+from gsseg_ros.conversions import labels_from_image, matrix_from_pose, stamp_ns
 from gsseg_ros.errors import NoSceneError, TooManyPixelsError
 from gsseg_ros.node.camera_images import CameraImages
 from gsseg_ros.node.complaints import LIVE, PERIOD, REFUSED_POSE, Complaints
@@ -82,6 +84,7 @@ class Inputs:
         self.counted: deque[tuple[float, Counter[str]]] = deque([(self.started, Counter())])
         self.logged: Counter[str] = Counter()
         self._told: Counter[str] = Counter()
+        self._said: set[str] = set()
         self._group = MutuallyExclusiveCallbackGroup()
         with ExitStack() as built:
             self._build(outputs, built)
@@ -250,5 +253,23 @@ class Inputs:
         settings, pose = workspace.settings, paired.pose
         if settings.pose_source == "odometry":
             pose = pose @ settings.camera_in_base
-        camera = camera_from_messages(paired.name, info, pose, settings.scene_to_map, info_topic)
+        size, rectified = (mask.width, mask.height), is_rectified(settings.rectified, topic, info_topic)
+        pose = settings.scene_to_map.world_to_camera(pose)
+        camera = camera_of_image(paired.name, info, size, pose, topic, info_topic, rectified=rectified)
+        if size != (info.width, info.height):
+            self._say_once(
+                f"{topic}: masks are {mask.width} x {mask.height} pixels, {info_topic} says {info.width} x "
+                f"{info.height}: its intrinsics are scaled"
+            )
+        if camera.undistortion is not None:
+            self._say_once(
+                f"{info_topic}: the lens is distorted ({info.distortion_model}): masks are undistorted; if they are of "
+                "rectified images, set the parameter rectified to true"
+            )
+            labels = camera.undistortion.sample(labels, UNKNOWN)
         return session.fuse(View.from_arrays(camera, labels), paired.era)
+
+    def _say_once(self, message: str) -> None:
+        if message not in self._said:
+            self._said.add(message)
+            self._node.get_logger().info(message)

@@ -21,8 +21,9 @@ from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.settings import UNREFINED
 from gsseg_core.segmentation import Segmentation
+from gsseg_ros.camera_infos import camera_of_image, is_rectified
 from gsseg_ros.color_images import color_from_image
-from gsseg_ros.conversions import camera_from_messages, rgb_image
+from gsseg_ros.conversions import rgb_image
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.pairing import Paired
 from gsseg_ros.node.reports import Selection
@@ -149,18 +150,17 @@ class LiveOutputs:
         for message, source in ((image, topic), (info, info_topic)):
             require_size(message, settings.max_pixels, source)
         pose = paired.pose @ settings.camera_in_base if settings.pose_source == "odometry" else paired.pose
-        camera = camera_from_messages(paired.name, info, pose, settings.scene_to_map, info_topic)
+        size, rectified = (image.width, image.height), is_rectified(settings.rectified, topic, info_topic)
+        pose = settings.scene_to_map.world_to_camera(pose)
+        camera = camera_of_image(paired.name, info, size, pose, topic, info_topic, rectified=rectified)
         result = self._current()
         colors = palette(result.num_classes)
         labels = result.render(make_operator(session.scene, camera, session.device)).labels
         picture = colors[labels]
         if with_image:
             photo = color_from_image(image, topic)
-            if photo.shape != picture.shape:
-                raise GssegError(
-                    f"{topic}: image is {image.width} x {image.height} pixels; expected {info.width} x {info.height}, "
-                    f"as {info_topic} says"
-                )
+            if camera.undistortion is not None:
+                photo = camera.undistortion.sample(photo, 0)
             picture = overlay(photo, labels, colors)
         header = Header(stamp=image.header.stamp, frame_id=image.header.frame_id)
         # A reset meanwhile has cleared the overlay.

@@ -21,6 +21,7 @@ from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.raster.backends import devices, rasteriser_of
 from gsseg_core.refine.settings import MAX_K, RefineSettings
 from gsseg_core.scene.scene_writers import DEFAULT, SCENE_WRITERS, check_format
+from gsseg_ros.camera_infos import AUTO, RECTIFIED
 from gsseg_ros.frames import Similarity, pose_from_parameters
 
 POSE_SOURCES = ("topic", "odometry", "tf")
@@ -45,6 +46,8 @@ class Declaration:
         Whether a change takes effect at once; others are accepted only while the node is unconfigured.
     at_start : bool
         Whether it is given at the start of the process, once for all: it bounds what peers may reach.
+    any_type : bool
+        Whether a value may be of another type than the default: true and false are no strings in YAML.
     """
 
     name: str
@@ -54,6 +57,7 @@ class Declaration:
     high: float | None = None
     at_once: bool = False
     at_start: bool = False
+    any_type: bool = False
 
 
 MAX_PIXELS = 1 << 24
@@ -92,6 +96,13 @@ DECLARATIONS = (
         "mask only, as automatic mask generators give, so that objects are found and named by the node",
     ),
     Declaration("pose_source", "topic", f"where the camera's pose comes from: {', '.join(POSE_SOURCES)}"),
+    Declaration(
+        "rectified",
+        AUTO,
+        "whether masks and images are rectified, as image_proc leaves them, so that p of camera_info counts: true, "
+        "false, or auto, where a topic with rect in its name is; others are undistorted if d is not zero",
+        any_type=True,
+    ),
     Declaration("map_frame", "map", "frame of the poses and of all outputs"),
     Declaration("max_views", 200, "views kept for learning, the last ones [count]", 1, 100_000),
     Declaration(
@@ -148,6 +159,7 @@ class Settings:
     class_names: tuple[str, ...]
     ids: str
     pose_source: str
+    rectified: str
     map_frame: str
     max_views: int
     max_classes: int
@@ -162,7 +174,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Validate."""
-        for name, allowed in (("pose_source", POSE_SOURCES), ("ids", IDS)):
+        for name, allowed in (("pose_source", POSE_SOURCES), ("ids", IDS), ("rectified", RECTIFIED)):
             if getattr(self, name) not in allowed:
                 raise SettingsError(f"parameter {name} is '{getattr(self, name)}'; expected {', '.join(allowed)}")
         try:
@@ -197,6 +209,7 @@ class Settings:
         plain = {f.name: values[f.name] for f in fields(cls) if f.name in values}
         for name in ("scene_path", "data_root"):
             plain[name] = os.path.expanduser(plain[name])
+        plain["rectified"] = str(plain["rectified"]).lower()  # Both true and "true", as YAML and shells have it.
         plain["class_names"] = tuple(values["class_names"] or ())
         return cls(**plain, scene_to_map=similarity, camera_in_base=camera)
 
@@ -245,7 +258,9 @@ def check(
 
 
 def _descriptor(declaration: Declaration) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(description=declaration.description, read_only=declaration.at_start)
+    descriptor = ParameterDescriptor(
+        description=declaration.description, read_only=declaration.at_start, dynamic_typing=declaration.any_type
+    )
     if declaration.low is not None and declaration.high is not None:
         if isinstance(declaration.default, int):
             limits = IntegerRange(from_value=int(declaration.low), to_value=int(declaration.high), step=0)

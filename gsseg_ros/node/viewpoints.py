@@ -16,8 +16,8 @@ from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.export.view_pictures import background_image
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
+from gsseg_ros.camera_infos import camera_from_messages
 from gsseg_ros.conversions import (
-    camera_from_messages,
     confidence_image,
     label_image,
     matrix_from_pose,

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
+import pycolmap
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -14,15 +15,14 @@ pytest.importorskip("sensor_msgs")
 
 from geometry_msgs.msg import Point, Pose, Quaternion, Transform, Vector3
 from ros_message_cases import HEADER, IDENTITY, K, info, refusal
-from sensor_msgs.msg import RegionOfInterest
+from sensor_msgs.msg import CameraInfo, RegionOfInterest
 
-from gsseg_core.errors import IntrinsicsError, PoseError
+from gsseg_core.errors import IntrinsicsError, MaskSizeError, PoseError
 from gsseg_core.scene.camera import Camera
+from gsseg_ros.camera_infos import camera_from_messages, camera_of_image, intrinsics_from_info, is_rectified
 from gsseg_ros.conversions import (
     array_from_point,
-    camera_from_messages,
     camera_info,
-    intrinsics_from_info,
     matrix_from_pose,
     matrix_from_transform,
     pose_from_matrix,
@@ -63,12 +63,6 @@ def test_no_distortion_no_binning_and_the_full_image_can_be_said_in_several_ways
 )
 def test_a_camera_info_that_is_not_of_a_rectified_pinhole_image_is_refused(changes: dict[str, Any], found: str) -> None:
     assert found in refusal(IntrinsicsError, intrinsics_from_info, info(**changes), "/some/topic")
-
-
-def test_distortion_is_refused_with_the_way_out() -> None:
-    message = refusal(IntrinsicsError, intrinsics_from_info, info(d=[0.1] * 5), "/some/topic")
-    assert "use the rectified topic" in message
-    assert "image_proc" in message
 
 
 def test_a_camera_survives_its_camera_info() -> None:
@@ -151,3 +145,105 @@ def test_a_viewpoint_comes_back_as_the_camera_it_was() -> None:
 
 def test_a_point_is_an_array() -> None:
     np.testing.assert_array_equal(array_from_point(Point(x=1.0, y=2.0, z=3.0)), [1, 2, 3])
+
+
+BENT = {"d": [-0.2, 0.03, 0.001, -0.001, 0.0], "distortion_model": "plumb_bob"}
+P = np.array([[90.0, 0, 33, -9], [0, 105, 22, 0], [0, 0, 1, 0]])
+
+
+def of_image(
+    message: CameraInfo, size: tuple[int, int] = (64, 48), rectified: bool = False, topic: str = "/some/topic"
+) -> Camera:
+    return camera_of_image("view", message, size, np.eye(4), "/mask", topic, rectified=rectified)
+
+
+@pytest.mark.parametrize(
+    ("setting", "topic", "expected"),
+    [
+        ("auto", "/camera/image_rect", True),
+        ("auto", "/camera/image_rect_color", True),
+        ("auto", "/camera/rect/camera_info", True),
+        ("auto", "/rectified/mask", True),
+        ("auto", "/segmenter/mask", False),
+        ("auto", "/rectangles/direct", False),
+        ("true", "/segmenter/mask", True),
+        ("false", "/camera/image_rect", False),
+    ],
+)
+def test_a_stream_is_rectified_as_the_parameter_or_its_name_says(setting: str, topic: str, expected: bool) -> None:
+    assert is_rectified(setting, topic, "/camera_info") == is_rectified(setting, "/mask", topic) == expected
+
+
+def test_of_a_rectified_image_p_counts_whatever_the_raw_camera_has() -> None:
+    camera = of_image(info(**BENT, p=P.ravel()), rectified=True)
+    assert np.array_equal(camera.K, P[:, :3]) and camera.undistortion is None
+    assert np.array_equal(of_image(info(**BENT), rectified=True).K, K), "without p, k"
+    assert np.array_equal(of_image(info(p=P.ravel())).K, K), "without distortion, image_proc passes images on"
+
+
+@pytest.mark.parametrize(
+    ("model", "d"),
+    [
+        ("plumb_bob", [-0.2, 0.03, 0.001, -0.001, 0.01]),
+        ("plumb_bob", [-0.2, 0.03, 0.001, -0.001]),
+        ("rational_polynomial", [0.2, -0.05, 0.001, 0.002, 0.01, 0.4, 0.02, 0.001]),
+        ("equidistant", [0.05, -0.01, 0.003, -0.0005]),
+    ],
+)
+def test_a_raw_image_becomes_what_image_proc_makes_of_it(model: str, d: list[float]) -> None:
+    turned = rotation_from_quaternion(0.01, -0.02, 0.005, 0.9997)
+    camera = of_image(info(d=d, distortion_model=model, p=P.ravel(), r=turned.ravel()))
+    assert (camera.width, camera.height) == (64, 48) and np.array_equal(camera.K, P[:, :3])
+    assert np.array_equal(camera.world_to_camera, np.eye(4)), "the frame is that of the rectified image"
+    colmap = {"plumb_bob": "FULL_OPENCV", "rational_polynomial": "FULL_OPENCV", "equidistant": "OPENCV_FISHEYE"}[model]
+    count = 8 if colmap == "FULL_OPENCV" else 4
+    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *d, *[0.0] * (count - len(d))]
+    raw = pycolmap.Camera(camera_id=1, model=colmap, width=64, height=48, params=params)
+    image = np.arange(64 * 48, dtype=np.int32).reshape(48, 64)
+    assert camera.undistortion is not None
+    seen = camera.undistortion.sample(image, -1)
+    for row, column in np.ndindex(48, 64):
+        ray = turned.T @ np.linalg.inv(P[:, :3]) @ (column + 0.5, row + 0.5, 1)
+        u, v = raw.img_from_cam(ray).ravel()
+        inside = 0 <= u < 64 and 0 <= v < 48
+        assert seen[row, column] == (image[int(v), int(u)] if inside else -1)
+
+
+def test_without_p_a_raw_image_becomes_the_view_that_keeps_its_focal_length() -> None:
+    camera = of_image(info(**BENT))
+    assert (camera.fx, camera.fy) == (K[0, 0], K[1, 1]) and camera.width > 64
+    assert camera.image_size == (64, 48)
+
+
+def test_intrinsics_are_scaled_to_the_size_of_the_mask() -> None:
+    half = np.diag([0.5, 0.5, 1])
+    np.testing.assert_allclose(of_image(info(), (32, 24)).K, half @ K)
+    np.testing.assert_allclose(of_image(info(**BENT, p=P.ravel()), (32, 24), rectified=True).K, half @ P[:, :3])
+    raw = of_image(info(**BENT, p=P.ravel()), (32, 24))
+    np.testing.assert_allclose(raw.K, half @ P[:, :3])
+    assert raw.undistortion is not None and raw.undistortion.lens.focal == (50.0, 60.0)
+    assert of_image(info(width=1241, height=376), (620, 188)).width == 620, "rounded to whole pixels"
+    message = refusal(MaskSizeError, of_image, info(), (48, 48))
+    assert message.startswith(
+        "/mask: image is 48 x 48 pixels; expected 64 x 48, as /some/topic says, or a size of the "
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [
+        ({"d": [math.nan]}, "k1 = nan"),
+        ({"d": [1e12]}, "is it calibrated for"),
+        ({"d": [-99.0]}, "cannot be undone"),
+        ({"d": [0.1] * 8}, "d has 8 coefficients; expected the 5 of plumb_bob"),
+        ({"d": [0.1], "distortion_model": "mirror"}, "distortion_model is 'mirror'; expected plumb_bob, rational"),
+        ({**BENT, "p": P.ravel(), "r": np.diag([1.0, 1, 2]).ravel()}, "expected a rotation"),
+        ({**BENT, "p": np.where(P == 105, -1, P).ravel()}, "focal lengths are 90 and -1"),
+        ({**BENT, "k": np.zeros(9)}, "focal lengths are 0 and 0"),
+        ({**BENT, "width": 0}, "width is 0"),
+        ({**BENT, "binning_x": 2}, "binning is 2 x 0"),
+    ],
+)
+def test_an_absurd_lens_is_refused_by_the_name_of_its_topic(changes: dict[str, Any], found: str) -> None:
+    message = info(**{"distortion_model": "plumb_bob", **changes})
+    assert found in refusal(IntrinsicsError, of_image, message)

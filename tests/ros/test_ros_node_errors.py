@@ -88,7 +88,7 @@ CASES = [
     Case("segment", "NO_SCENE", "bare", "no scene is loaded; expected the parameter scene_path, or a call"),
     Case("segment", "NO_CODES", "fresh", "expected at least one posed mask"),
     Case("segment", "UNKNOWN_CLASS", "main", "class 'sofa' does not exist; expected one of", {"classes": ["sofa"]}),
-    Case("segment", "INVALID_VIEWPOINT", "main", "use the rectified topic", nowhere(d=[0.1, 0.0, 0.0, 0.0, 0.0])),
+    Case("segment", "INVALID_VIEWPOINT", "main", "expected zeros: what is", nowhere(d=[0.1, 0.0, 0.0, 0.0, 0.0])),
     Case("segment", "NO_TRANSFORM", "main", "frame_id is 'odom'", nowhere("odom")),
     Case("segment", "UNKNOWN", "starved", "unexpected MemoryError"),
     Case("render_view", "NOT_ACTIVE", "idle", "the node is not active"),

@@ -25,6 +25,7 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
+from gsseg_ros.camera_infos import camera_of_image
 from gsseg_ros.conversions import arrays_from_cloud, mask_image, pose_from_matrix, stamp_message
 
 
@@ -101,6 +102,27 @@ def test_views_of_another_process_are_fused_with_the_default_quality_of_service(
     found, wanted = learnt(robot, "replayed"), expected(scene, views)
     assert (found.labels == wanted.labels).mean() > 0.99
     assert np.abs(found.probabilities - wanted.probabilities).max() < 0.2
+
+
+def test_a_raw_stream_is_undistorted_and_smaller_masks_fit_which_is_said_once(
+    robot: Robot, scene: GaussianScene
+) -> None:
+    view = clean_views(1)[0]
+    smaller = view.read_labels()[::2, ::2]
+    for _ in range(2):
+        sent = messages(view, robot.next_stamp())
+        sent["mask"] = mask_image(smaller, sent["mask"].header, 8)
+        sent["camera_info"].d = [-0.2, 0.03, 0.001, -0.001, 0.0]
+        robot.publish(sent)
+    robot.ros.wait_until(lambda: robot.ask("segment").report.num_views == 2, "two views")
+    camera = camera_of_image("raw", sent["camera_info"], (32, 24), view.camera.world_to_camera, "", "", rectified=False)
+    assert camera.undistortion is not None
+    undistorted = View.from_arrays(camera, camera.undistortion.sample(smaller, -1))
+    assert_same(learnt(robot, "raw"), expected(scene, renamed([undistorted] * 2)))
+    assert robot.process is not None
+    for said in ("/camera_info says 64 x 48: its intrinsics are scaled", "(plumb_bob): masks are undistorted; if they"):
+        robot.process.wait_for(said)
+        assert robot.process.output.count(said) == 1
 
 
 def test_a_camera_info_of_before_serves_masks_that_have_none_of_their_own(robot: Robot, scene: GaussianScene) -> None:

@@ -193,7 +193,7 @@ def live() -> Iterator[tuple[LiveOutputs, Shown, dict[str, bool]]]:
     for view in clean_views(2):
         session.fuse(view)
     similarity = Similarity(np.eye(3), np.zeros(3), 1.0)
-    settings = SimpleNamespace(pose_source="topic", scene_to_map=similarity, max_pixels=1 << 24)
+    settings = SimpleNamespace(pose_source="topic", rectified="auto", scene_to_map=similarity, max_pixels=1 << 24)
     shown, state = Shown(), {"busy": False}
     workspace: Any = SimpleNamespace(session=session, settings=settings, era=session.era)
     outputs: Any = shown

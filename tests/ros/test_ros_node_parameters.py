@@ -68,6 +68,7 @@ STEMS = ("0_background", "1_red_ball", "2_cup_mug", "3_box")
         ("device", "tpu", "parameter device is 'tpu'; expected cpu, cuda (the first GPU) or cuda:1 and so on"),
         ("device", "cuda:x", "parameter device is 'cuda:x'"),
         ("export_format", "obj", "parameter export_format is 'obj'; expected one of ply, compressed-ply, spz"),
+        ("rectified", "maybe", "parameter rectified is 'maybe'; expected auto, true, false"),
         ("ids", "mine", "parameter ids is 'mine'; expected given, per-view"),
         ("ids", "per-view", "parameter class_names gives 4 names, but with ids 'per-view' the node finds the objects"),
         ("map_frame", "", "parameter map_frame is empty; expected the name of a frame"),
@@ -88,6 +89,12 @@ def test_a_parameter_that_cannot_be_is_refused_when_it_is_set(robot: Robot, name
     assert not taken
     assert why.lower() in reason.lower()
     assert robot.get(name) == before
+
+
+@pytest.mark.parametrize("value", [True, "false", "auto"])
+def test_rectified_may_be_a_word_or_a_truth_value_as_yaml_makes_of_it(robot: Robot, value: Any) -> None:
+    assert robot.set("rectified", value) == (True, "")
+    assert robot.get("rectified") == value
 
 
 def test_a_parameter_that_does_not_exist_cannot_be_set(robot: Robot) -> None:

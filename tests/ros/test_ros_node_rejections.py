@@ -73,15 +73,15 @@ def set_orientation(sent: Messages, x: float, w: float) -> None:
 
 
 BAD = [
-    Bad("a mask of another size", "size_mismatch", "mask is 64 x 47 pixels; expected 64 x 48",
+    Bad("a mask of another size", "size_mismatch", "/mask: image is 64 x 47 pixels; expected 64 x 48, as",
         lambda sent: set_labels(sent, np.zeros((47, 64), int))),
     Bad("a picture", "mask_format", "/mask: encoding is 'rgb8'; expected labels as one of mono8",
         set_fields("mask", encoding="rgb8")),
     Bad("a mask cut short", "mask_format", "", set_fields("mask", step=65)),
     Bad("an unknown label", "unknown_label", "mask holds the label 4; expected at most 3",
         lambda sent: set_labels(sent, np.full((48, 64), 4))),
-    Bad("a distorted lens", "bad_camera_info", "/camera_info: distortion d is [-0.3, 0.0, 0.0, 0.0, 0.0]; expected "
-        "zeros: use the rectified topic", set_fields("camera_info", d=[-0.3, 0.0, 0.0, 0.0, 0.0])),
+    Bad("an impossible lens", "bad_camera_info", "/camera_info: lens OPENCV (k1 = -99, k2 = 0, p1 = 0, p2 = 0, k3 = "
+        "0): its distortion cannot be undone", set_fields("camera_info", d=[-99.0, 0.0, 0.0, 0.0, 0.0])),
     Bad("no focal length", "bad_camera_info", "", set_fields("camera_info", k=np.zeros(9))),
     Bad("all unknown", "all_pixels_unknown", "all pixels unknown",
         lambda sent: set_labels(sent, np.full((48, 64), -1))),

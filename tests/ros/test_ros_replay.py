@@ -27,9 +27,9 @@ from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
+from gsseg_ros.camera_infos import intrinsics_from_info
 from gsseg_ros.conversions import (
     camera_info,
-    intrinsics_from_info,
     labels_from_image,
     mask_image,
     matrix_from_pose,

@@ -1,0 +1,180 @@
+"""Cameras from camera_infos: those of rectified images, and those of raw ones, whose lens is undone."""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+from sensor_msgs.msg import CameraInfo
+
+from gsseg_core.errors import IntrinsicsError, MaskSizeError
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.lens import LENS_MODELS, Lens
+from gsseg_core.scene.undistortion import Undistortion, undistortions
+from gsseg_core.text import clipped
+from gsseg_ros.frames import Similarity
+
+AUTO = "auto"
+RECTIFIED = (AUTO, "true", "false")
+"""Values of the parameter `rectified`."""
+
+_SAYS_RECTIFIED = re.compile(r"(?:^|[/_])rect(?:ified)?(?:[/_]|$)")
+_MODELS = {model.ros: model for model in LENS_MODELS if model.ros}
+_COEFFICIENTS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
+_ROTATION_TOLERANCE = 1e-3
+_lens = lru_cache(maxsize=16)(Lens)
+
+
+def is_rectified(setting: str, *topics: str) -> bool:
+    """Decide by the parameter `rectified`, or by "auto" and the names of topics, whether images are rectified.
+
+    A name says so with `rect` or `rectified` as a word of its own, as in `/camera/image_rect_color`.
+    """
+    return setting == "true" or (setting == AUTO and any(_SAYS_RECTIFIED.search(topic) for topic in topics))
+
+
+def intrinsics_from_info(info: CameraInfo, topic: str) -> tuple[npt.NDArray[np.float64], int, int]:
+    """Read `K` (3, 3) in pixels, width and height of a pinhole camera.
+
+    Raises
+    ------
+    IntrinsicsError
+        The lens is distorted, the image binned or cut, the size zero, or `k` not that of a pinhole camera.
+    """
+    if np.any(info.d):
+        raise IntrinsicsError(
+            f"{topic}: distortion d is {list(info.d)}; expected zeros: what is drawn is what a pinhole camera sees"
+        )
+    K = _matrix_of_full_image(info, np.reshape(info.k, (3, 3)), topic)
+    return K, int(info.width), int(info.height)
+
+
+def camera_from_messages(
+    name: str,
+    info: CameraInfo,
+    camera_in_map: npt.NDArray[np.float64],  # (4, 4)
+    similarity: Similarity,
+    topic: str,
+) -> Camera:
+    """Build the scene's camera from a camera_info (of `topic`) and the pose of the optical frame in the map, in metres.
+
+    Raises
+    ------
+    IntrinsicsError, PoseError
+        The camera_info or the pose cannot be used.
+    """
+    K, width, height = intrinsics_from_info(info, topic)
+    return Camera(name, width, height, K, similarity.world_to_camera(camera_in_map))
+
+
+def camera_of_image(
+    name: str,
+    info: CameraInfo,
+    size: tuple[int, int],  # width, height
+    world_to_camera: npt.NDArray[np.float64],  # (4, 4)
+    topic: str,
+    info_topic: str,
+    *,
+    rectified: bool,
+) -> Camera:
+    """Build the camera of an image (of `topic`) of some size, which may be another than that of its camera_info.
+
+    Of a rectified image, `p` counts, as image_proc publishes such images beside the raw camera's `d` and `k`. Of one
+    with distortion it is the pinhole view that image_proc would make, by `d`, `k`, `r` and `p`; without `p`, that of
+    `gsseg_core.scene.undistortion`. The optical frame is that of the rectified image, as `image_geometry` has it, and
+    the fourth column of `p`, the baseline of a stereo pair, does not count.
+
+    Raises
+    ------
+    IntrinsicsError
+        The camera_info is impossible, or of an unknown lens.
+    MaskSizeError
+        Width and height are not in the proportion of those in the camera_info.
+    """
+    projection = np.reshape(info.p, (3, 4))[:, :3]
+    has_projection = projection[0, 0] != 0
+    matrix = projection if rectified and has_projection else np.reshape(info.k, (3, 3))
+    K, scale = _matrix_of_full_image(info, matrix, info_topic), _scale(info, size, topic, info_topic)
+    if rectified or not np.any(info.d):
+        return Camera(name, *size, scale @ K, world_to_camera)
+    lens = _lens_of(info, size, scale @ K, info_topic)
+    if has_projection:
+        rectified_K = scale @ _matrix_of_full_image(info, projection, info_topic)
+        view = Undistortion(lens, *size, *_focal_and_principal(rectified_K), _rotation(info, info_topic))
+    else:
+        view = _view_of(lens, info_topic)
+    return Camera(name, view.width, view.height, view.K, world_to_camera, view)
+
+
+def _scale(info: CameraInfo, size: tuple[int, int], topic: str, info_topic: str) -> npt.NDArray[np.float64]:
+    """Make the matrix (3, 3) that scales intrinsics of a camera_info to an image of another size."""
+    (width, height), across, down = size, info.width, info.height
+    if min(abs(width - height * across / down), abs(height - width * down / across)) >= 1:
+        raise MaskSizeError(
+            f"{topic}: image is {width} x {height} pixels; expected {info.width} x {info.height}, as {info_topic} "
+            "says, or a size of the same proportions"
+        )
+    return np.diag([width / across, height / down, 1.0])
+
+
+def _rotation(info: CameraInfo, topic: str) -> tuple[float, ...]:
+    """Read the rotation from the rectified image's axes to the lens's, the inverse of `r`; none where `r` is zeros."""
+    turn = np.reshape(info.r, (3, 3)) if np.any(info.r) else np.eye(3)
+    if not np.abs(turn @ turn.T - np.eye(3)).max() < _ROTATION_TOLERANCE:
+        raise IntrinsicsError(f"{topic}: r is {clipped(turn.tolist(), 160)}; expected a rotation, or zeros")
+    return tuple(turn.T.ravel().tolist())
+
+
+def _matrix_of_full_image(
+    info: CameraInfo,
+    matrix: npt.NDArray[np.float64],  # (3, 3)
+    topic: str,
+) -> npt.NDArray[np.float64]:
+    """Return an intrinsic matrix (3, 3) of a camera_info, if it is one, and that of the full image."""
+    if max(info.binning_x, info.binning_y) > 1:
+        raise IntrinsicsError(f"{topic}: binning is {info.binning_x} x {info.binning_y}; expected images without it")
+    roi, size = info.roi, f"{info.width} x {info.height}"
+    if (roi.x_offset, roi.y_offset, roi.width, roi.height) not in ((0,) * 4, (0, 0, info.width, info.height)):
+        raise IntrinsicsError(
+            f"{topic}: roi is {roi.width} x {roi.height} at ({roi.x_offset}, {roi.y_offset}); expected the full image "
+            f"of {size}, or zeros"
+        )
+    # Camera checks the rest; the message names the topic in the camera's place.
+    return Camera(topic, info.width, info.height, matrix, np.eye(4)).K
+
+
+def _lens_of(
+    info: CameraInfo,
+    size: tuple[int, int],
+    K: npt.NDArray[np.float64],  # (3, 3)
+    topic: str,
+) -> Lens:
+    model, given = _MODELS.get(info.distortion_model), tuple(info.d)
+    if model is None:
+        raise IntrinsicsError(
+            f"{topic}: distortion_model is '{info.distortion_model}'; expected {', '.join(_MODELS)}, or a rectified "
+            "image and the parameter rectified"
+        )
+    known = given[: _COEFFICIENTS[info.distortion_model]]
+    if any(given[len(known) :]):
+        expected = f"the {len(known)} of {model.ros}, or zeros after these"
+        raise IntrinsicsError(f"{topic}: distortion d has {len(given)} coefficients; expected {expected}")
+    try:
+        return _lens(model, *size, *_focal_and_principal(K), known)
+    except IntrinsicsError as error:
+        raise IntrinsicsError(f"{topic}: {error}") from None
+
+
+def _view_of(lens: Lens, topic: str) -> Undistortion:
+    try:
+        return undistortions(lens)[0]
+    except IntrinsicsError as error:
+        raise IntrinsicsError(f"{topic}: {error}") from None
+
+
+def _focal_and_principal(
+    K: npt.NDArray[np.float64],  # (3, 3)
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    return (float(K[0, 0]), float(K[1, 1])), (float(K[0, 2]), float(K[1, 2]))
