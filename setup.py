@@ -82,8 +82,8 @@ setup(
             "zstandard>=0.22",
         ],
         "docs": ["mkdocs-material>=9.6", "mkdocstrings-python>=1.16"],
-        # To write scenes in other formats than PLY, .splat and GLB, and to read SPZ of version 4 and YAML of masks.
-        "formats": ["gaussforge>=0.6", "gsply>=0.4.6", "pyyaml>=6.0", "zstandard>=0.22"],
+        # Writing compressed PLY and SPZ, and reading SPZ of version 4 and YAML of masks.
+        "formats": ["gsply>=0.4.6", "pyyaml>=6.0", "zstandard>=0.22"],
         "examples": ["rosbags>=0.10", "scikit-image>=0.25"],
         # The view operator on CUDA. Below 1.6, since docs/gpu.md bounds what the rules of this version change. gsplat
         # imports packaging without asking for it.

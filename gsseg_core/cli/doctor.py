@@ -41,7 +41,7 @@ _EXTRA = re.compile(r"""extra\s*==\s*["'](?P<extra>[^"']+)["']""")
 # For those who use gsseg; the extras for those who develop it are looked for by their own tools.
 _EXTRAS_FOR = {
     "view": "gsseg view, the scene in the browser",
-    "formats": "--format compressed-ply, spz, sog; reading SPZ of version 4, YAML of masks",
+    "formats": "--format compressed-ply, spz; reading SPZ of version 4, YAML of masks",
     "usd": "--format usd, --collision surface",
     "ros": "the ROS 2 nodes, on a machine without ROS from apt",
     "distributed": "gsseg segment --scheduler, several machines",

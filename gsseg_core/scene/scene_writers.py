@@ -60,7 +60,7 @@ SCENE_WRITERS = {
         "compressed PLY", (".compressed.ply",), f"{_WRITERS}.compressed_ply:write_compressed_ply", "formats"
     ),
     "spz": SceneWriter("SPZ", (".spz",), f"{_WRITERS}.spz:write_spz", "formats"),
-    "sog": SceneWriter("SOG", (".sog",), f"{_WRITERS}.sog:write_sog", "formats"),
+    "sog": SceneWriter("SOG", (".sog",), f"{_WRITERS}.sog:write_sog"),
     "splat": SceneWriter(".splat", (".splat",), f"{_WRITERS}.splat:write_splat"),
     "glb": SceneWriter("GLB", (".glb",), f"{_WRITERS}.glb:write_glb"),
     "usd": SceneWriter("USD", (".usdc", ".usd", ".usda"), f"{_WRITERS}.usd:write_usd", "usd", together=True),
@@ -128,7 +128,7 @@ def write_scene(
     scene_format : str, optional
         Name of the format; by default, what the suffix of `path` says, and PLY if that says nothing.
     run : str, optional
-        Id of the run that it belongs to, which PLY, GLB and USD keep.
+        Id of the run that it belongs to, which PLY, SOG, GLB and USD keep.
 
     Raises
     ------

@@ -211,14 +211,14 @@ def test_a_library_that_is_missing_is_told_before_anything_is_read(
     place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = contents(place)
-    monkeypatch.setitem(sys.modules, "gaussforge", None)
-    monkeypatch.delitem(sys.modules, "gsseg_core.scene.writers.sog", raising=False)
+    monkeypatch.setitem(sys.modules, "gsply", None)
+    monkeypatch.delitem(sys.modules, "gsseg_core.scene.writers.spz", raising=False)
     monkeypatch.setattr(GaussianScene, "load", lambda *_: pytest.fail("reads"))
-    remove = ["remove", "no.ply", "--segmentation", "no.npz", "--class", "box", "--out", f"{place}/rest.sog"]
-    for asked in ([*command(place), "--format", "sog"], remove):
+    remove = ["remove", "no.ply", "--segmentation", "no.npz", "--class", "box", "--out", f"{place}/rest.spz"]
+    for asked in ([*command(place), "--format", "spz"], remove):
         assert main(asked) == 2
         stderr = capsys.readouterr().err
-        assert "format sog: needs gaussforge, which is not installed; expected: pip install 'gsseg[formats]'" in stderr
+        assert "format spz: needs gsply, which is not installed; expected: pip install 'gsseg[formats]'" in stderr
     assert contents(place) == before
 
 

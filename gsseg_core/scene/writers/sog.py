@@ -1,31 +1,157 @@
-"""PlayCanvas SOG, by gaussforge: images in a zip, with Gaussians in another order and a palette of harmonics."""
+"""PlayCanvas SOG, version 2: lossless images in a zip, a pixel for each Gaussian, in the order given.
+
+The format asks for no order, though it is named after one. Its other writers sort the Gaussians, which makes images a
+little smaller and takes labels apart from what they belong to.
+"""
 
 from __future__ import annotations
 
 import io
+import json
+import math
+import zipfile
 from pathlib import Path
+from typing import Any
 
-import gaussforge
-import plyfile
+import numpy as np
+import numpy.typing as npt
+from PIL import Image
 
-from gsseg_core.errors import SceneValueError
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.text import one_line
+
+LARGEST_PALETTE = 1 << 16
+"""Entries of the palette of harmonics; a scene of no more Gaussians loses nothing by it."""
+
+_PER_ROW = 64  # entries of the palette of harmonics in a row of its image
+_COARSE, _STEPS = 256, 2  # clusters that the palette is divided into, and steps of k-means
+_AT_ONCE = 1 << 12
 
 
 def write_sog(path: Path, scene: GaussianScene, run: str | None) -> None:
-    """Write a scene as SOG, all in one file; there is no place in it for the id of a run.
+    """Write a scene as SOG, all in one file; the id of a run is in `asset.gsseg_run`."""
+    images: dict[str, npt.NDArray[np.uint8]] = {}
+    asset = {"generator": "gsseg", **({} if run is None else {"gsseg_run": run})}
+    meta: dict[str, Any] = {"version": 2, "asset": asset, "count": len(scene)}
 
-    Raises
-    ------
-    SceneValueError
-        gaussforge cannot write it.
+    logs = np.sign(scene.means) * np.log1p(np.abs(scene.means).astype(np.float64))
+    low, high = logs.min(axis=0), logs.max(axis=0)
+    steps = np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(np.uint16)
+    images["means_l.webp"], images["means_u.webp"] = _pixels(steps & 255), _pixels(steps >> 8)
+    meta["means"] = {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]}
+
+    book, codes = _coded(np.log(scene.scales))
+    images["scales.webp"] = _pixels(codes)
+    meta["scales"] = {"codebook": book, "files": ["scales.webp"]}
+
+    images["quats.webp"] = _pixels(_smallest_three(scene.quats))
+    meta["quats"] = {"files": ["quats.webp"]}
+
+    book, codes = _coded(scene.sh[:, 0])
+    alpha = np.rint(scene.opacities * 255).clip(1, 254)  # finite logits for whoever reads it
+    images["sh0.webp"] = _pixels(np.concatenate([codes, alpha[:, None]], axis=1))
+    meta["sh0"] = {"codebook": book, "files": ["sh0.webp"]}
+
+    terms = scene.sh.shape[1] - 1
+    if terms:
+        palette, index = _palette(np.ascontiguousarray(scene.sh[:, 1:].reshape(len(scene), -1)))
+        book, codes = _coded(palette)
+        rows = np.zeros((-(-len(palette) // _PER_ROW) * _PER_ROW, 3 * terms), np.uint8)
+        rows[: len(palette)] = codes
+        images["shN_centroids.webp"] = rows.reshape(-1, _PER_ROW * terms, 3)
+        images["shN_labels.webp"] = _pixels(np.stack([index & 255, index >> 8], axis=1))
+        meta["shN"] = {"count": len(palette), "bands": round(math.sqrt(terms + 1)) - 1, "codebook": book,
+                       "files": ["shN_centroids.webp", "shN_labels.webp"]}  # fmt: skip
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("meta.json", json.dumps(meta))
+        for name, image in images.items():
+            content = io.BytesIO()
+            Image.fromarray(image).save(content, "WEBP", lossless=True, exact=True, quality=50, method=2)
+            archive.writestr(name, content.getvalue())
+
+
+def _pixels(values: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:  # (N, C), whole numbers below 256
+    """Lay values out as an image (H, W, 4), row by row; alpha is 255 where it is not given."""
+    width = 4 * math.ceil(math.sqrt(len(values)) / 4)
+    height = 4 * math.ceil(len(values) / width / 4)
+    image = np.zeros((height * width, 4), np.uint8)
+    image[:, 3] = 255
+    image[: len(values), : values.shape[1]] = values
+    return image.reshape(height, width, 4)
+
+
+def _coded(values: npt.NDArray[np.float32]) -> tuple[list[float], npt.NDArray[np.uint8]]:
+    """Replace values by the nearest of 256, which are returned first: Lloyd's quantiser, from quantiles and even steps.
+
+    Quantiles alone would leave the few large values to the ends, even steps the many small ones to a few.
     """
-    # Of the vertices, it understands none but those of float32, with nothing besides what 3DGS has.
-    plain = GaussianScene.from_arrays(scene.means, scene.quats, scene.scales, scene.opacities, scene.sh)
-    ply = io.BytesIO()
-    plyfile.PlyData([plyfile.PlyElement.describe(plain.vertices, "vertex")], byte_order="<").write(ply)
-    made = gaussforge.GaussForge().convert(ply.getvalue(), "ply", "sog")
-    if "error" in made:
-        raise SceneValueError(f"gaussforge cannot write this scene as SOG ({one_line(str(made['error']))})")
-    path.write_bytes(made["data"])
+    seen = np.sort(values.reshape(-1)[:: max(1, values.size >> 20)]).astype(np.float64)
+    even = np.linspace(values.min(), values.max(), 128)
+    book = np.sort(np.concatenate([np.quantile(seen, np.linspace(0, 1, 128)), even]))
+    for _ in range(12):
+        cells = np.searchsorted((book[1:] + book[:-1]) / 2, seen)
+        count = np.bincount(cells, minlength=256)
+        book = np.where(count > 0, np.bincount(cells, seen, 256) / np.maximum(count, 1), book)
+    codes = np.searchsorted((book[1:] + book[:-1]) / 2, values).astype(np.uint8)
+    return book.astype(np.float32).tolist(), codes
+
+
+def _smallest_three(quats: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:  # (N, 4) w, x, y, z, unit
+    """Three components of each quaternion without its largest, which they tell, and 252 + which that is: (N, 4)."""
+    largest = np.abs(quats).argmax(axis=1)[:, None]
+    signed = quats * np.where(np.take_along_axis(quats, largest, axis=1) < 0, -1, 1)
+    others = signed[np.arange(4) != largest].reshape(-1, 3)
+    coded = np.rint((others * math.sqrt(0.5) + 0.5) * 255).clip(0, 255)
+    return np.concatenate([coded, 252 + largest], axis=1).astype(np.uint8)
+
+
+def _palette(
+    values: npt.NDArray[np.float32],  # (N, D)
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
+    """Entries (K, D) that stand for all values, and which of them stands for each, (N,).
+
+    K-means of two levels: a few coarse clusters, and in each of them as many entries as fit its size. That compares
+    each value with some hundreds of entries, not with tens of thousands.
+    """
+    if len(values) <= LARGEST_PALETTE:
+        return values, np.arange(len(values))
+    rng = np.random.default_rng(0)
+    _, coarse = _k_means(values, _COARSE, rng)
+    order = np.argsort(coarse, kind="stable")
+    entries, index, total = [], np.empty(len(values), np.int64), 0
+    for own in np.split(order, np.cumsum(np.bincount(coarse, minlength=_COARSE))[:-1]):
+        if len(own):
+            fine, nearest = _k_means(values[own], 1 + len(own) * (LARGEST_PALETTE - _COARSE) // len(values), rng)
+            index[own] = total + nearest
+            entries.append(fine)
+            total += len(fine)
+    return np.concatenate(entries), index
+
+
+def _k_means(
+    values: npt.NDArray[np.float32],  # (M, D)
+    count: int,
+    rng: np.random.Generator,
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
+    """Lloyd's k-means from entries drawn at random: entries (count, D), and the nearest of each value, (M,)."""
+    if count >= len(values):
+        return values, np.arange(len(values))
+    entries = values[rng.choice(len(values), count, replace=False)]
+    for step in range(_STEPS):
+        # Whoever has few entries for many values need not ask all of these where the entries go.
+        sample = values if step == _STEPS - 1 else values[rng.permutation(len(values))[: max(count * 64, 1 << 14)]]
+        index = _nearest(entries, sample)
+        order, number = np.argsort(index, kind="stable"), np.bincount(index, minlength=count)
+        filled = np.flatnonzero(number)
+        starts = np.concatenate([[0], np.cumsum(number[filled])[:-1]])
+        entries[filled] = np.add.reduceat(sample[order], starts) / number[filled, None]
+    return entries, _nearest(entries, values)
+
+
+def _nearest(entries: npt.NDArray[np.float32], values: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
+    """Index (M,) of the entry (K, D) that is nearest to each value (M, D)."""
+    half = 0.5 * (entries * entries).sum(axis=1)
+    parts = [
+        (half - values[first : first + _AT_ONCE] @ entries.T).argmin(axis=1)
+        for first in range(0, len(values), _AT_ONCE)
+    ]
+    return np.concatenate(parts)
