@@ -36,7 +36,9 @@ if TYPE_CHECKING:
 
 FILE_KINDS = (
     "scene.ply", "cameras.json", "transforms.json", "colmap bin", "colmap txt", "labels 8 bit", "labels 16 bit",
-    "soft npz", "mask folder", "classes.json", "split.json", "supervises.json", "segmentation.npz", "state",
+    "soft npz", "mask folder", "classes.json", "split.json", "supervises.json", "COCO polygons", "COCO text",
+    "SAM JSON", "SAM folders", "LabelMe polygons", "LabelMe masks", "ISAT", "CVAT polygons", "CVAT masks", "YOLO",
+    "EISeg images", "EISeg polygons", "SAM 2 video", "label map", "segmentation.npz", "state",
 )  # fmt: skip
 NODE_KINDS = (
     "mask", "camera_info", "pose", "odometry", "image", "segment", "render_view", "load_scene", "save_state",

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import forked  # noqa: F401 - first: it says how numba runs, and where small scenes are
+import mask_writers
 import mutations
 import numpy as np
 from mutations import Mutation
@@ -162,6 +163,28 @@ def _supervises(folder: Path) -> None:
     (folder / "labels" / "supervises.json").write_text(json.dumps({"*": [1, 2, 3], "view0": [0, 1, 2, 3]}))
 
 
+def _masks_of(name: str) -> Callable[[Path], None]:
+    """Make a dataset that has its masks once more, in `masks`, as another program writes them."""
+
+    def write(folder: Path) -> None:
+        (folder / "masks").mkdir()
+        labels = {path.stem: np.maximum(read_mask(path).labels, 0) for path in sorted((folder / "labels").iterdir())}
+        (mask_writers.WRITERS | mask_writers.PER_VIEW_WRITERS)[name](folder / "masks", labels, NAMES)
+
+    return write
+
+
+def _masks(name: str, file: str, mutations: tuple[Mutation, ...]) -> Kind:
+    """Give the kind of a file of masks of another program, in `masks`."""
+    place = "masks/labels" if name == "YOLO" else "masks"
+    command = (*VOTES, "--labels", place)
+    return Kind(name, _masks_of(name), (f"masks/{file}",), mutations, (command,))
+
+
+def _label_map(folder: Path) -> None:
+    (folder / "map.json").write_text(json.dumps({"1": "ball", "cup/mug": "ball", "box": None, "background": "ignore"}))
+
+
 _LABELS = ("labels/view0.png",)
 _ALL_CAMERAS = (SEGMENT, VOTES, CLICK, CLICK, RENDER)
 KINDS = (
@@ -177,6 +200,20 @@ KINDS = (
     Kind("classes.json", _as_it_is, ("classes.json", "truth/classes.json"), JSON, (SEGMENT, VOTES, RENDER, EVAL)),
     Kind("split.json", _as_it_is, ("split.json",), JSON, (SEGMENT, VOTES, RENDER)),
     Kind("supervises.json", _supervises, ("labels/supervises.json",), JSON, (SEGMENT, VOTES)),
+    _masks("COCO polygons", "annotations.json", JSON),
+    _masks("COCO text", "annotations.json", JSON),
+    _masks("SAM JSON", "view0.json", JSON),
+    _masks("SAM folders", "view0/metadata.csv", TEXT),
+    _masks("LabelMe polygons", "view0.json", JSON),
+    _masks("LabelMe masks", "view0.json", JSON),
+    _masks("ISAT", "view0.json", JSON),
+    _masks("CVAT polygons", "annotations.xml", TEXT),
+    _masks("CVAT masks", "annotations.xml", TEXT),
+    _masks("YOLO", "labels/view0.txt", TEXT),
+    _masks("EISeg images", "view0.png", PNG),
+    _masks("EISeg polygons", "view0.json", JSON),
+    _masks("SAM 2 video", "001/view0.png", PNG),
+    Kind("label map", _label_map, ("map.json",), JSON, ((*VOTES, "--label-map", "{data}/map.json"),)),
     Kind("segmentation.npz", _as_it_is, (SEGMENTATION,), NPZ, (RENDER, REMOVE)),
     Kind("state", _as_it_is, (STATE,), NPZ, (LOAD_STATE,)),
 )  # fmt: skip

@@ -15,6 +15,7 @@ import small_scenes
 from gsseg_core.data.class_names import read_classes
 from gsseg_core.data.label_images import read_mask
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.scene_writers import write_scene
 from gsseg_core.segmentation import Segmentation
 
 REPOSITORY = Path(__file__).parents[2]
@@ -107,12 +108,18 @@ def annotated(desk: Path) -> None:
     (desk / "names.json").write_text('{"*": "thing", "background": "background"}')
 
 
+def phone(desk: Path) -> None:
+    """A splat from a phone, without cameras."""
+    write_scene(GaussianScene.load(desk / "scene.ply"), desk / "capture.spz")
+
+
 FIRST: dict[str, Callable[[Path], None]] = {
     "docs/clean_objects.md": segmented,
     "docs/evaluation.md": protocols,
     "docs/formats.md": annotated,
     "docs/results.md": apartment,
     "docs/ids.md": on_a_robot,
+    "docs/tutorial_phone.md": phone,
     "docs/tutorial_robot.md": on_a_robot,
     "docs/viewer.md": segmented,
 }
