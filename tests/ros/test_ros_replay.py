@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from camera_folders import transforms, write_json
 from PIL import Image as Picture
 from ros_helpers import Process, Ros, ros_fixture  # noqa: F401
 from small_scenes import NAMES, balls_on_a_table, many_classes, ring, write_dataset
@@ -37,7 +38,7 @@ from gsseg_ros.conversions import (
     stamp_message,
     stamp_ns,
 )
-from gsseg_ros.replay.sources import BagSource
+from gsseg_ros.replay.sources import BagSource, FolderSource, PhotoFileError
 
 KINDS = {"mask": Image, "camera_info": CameraInfo, "pose": PoseStamped, "image": Image}
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
@@ -336,3 +337,20 @@ def test_a_signal_stops_it_while_it_waits_for_a_subscriber(ros: Ros, folder: Pat
     ros.wait_until(lambda: ros.node.count_publishers("/other") == 1, "the node")
     assert process.stop() == 0, process.output
     assert "stopped: published 0 mask" in process.output
+
+
+def test_a_folder_of_bent_images_is_replayed_as_what_a_pinhole_sees(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    Picture.fromarray(photo()).save(tmp_path / "images" / "0001.png")
+    write_mask(tmp_path / "labels" / "0001.png", np.ones((48, 64), np.int32), 8)
+    content = transforms(camera_model="OPENCV", k1=-0.2, fl_x=40.0, fl_y=40.0, cx=32.0, cy=24.0)
+    write_json(tmp_path / "transforms.json", content)
+    ((_, sent),) = FolderSource(tmp_path, "labels", "train", "camera", "map")
+    messages = dict(sent)
+    sizes = {(messages[role].width, messages[role].height) for role in ("mask", "image", "camera_info")}
+    assert len(sizes) == 1 and (64, 48) not in sizes
+    K, *_ = intrinsics_from_info(messages["camera_info"], "camera_info")
+    assert (K[0, 0], K[1, 1]) == (40, 40)
+    Picture.fromarray(photo()[1:]).save(tmp_path / "images" / "0001.png")
+    with pytest.raises(PhotoFileError, match=r"0001\.png: image is 64 x 47 pixels; expected 64 x 48"):
+        list(FolderSource(tmp_path, "labels", "train", "camera", "map"))
