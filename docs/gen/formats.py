@@ -8,7 +8,9 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from gsseg_core.data.camera_formats.table import CAMERA_FORMATS
 from gsseg_core.data.mask_formats.table import MASK_FORMATS
+from gsseg_core.scene.lens import LENS_MODELS
 
 PAGE = Path(__file__).parents[2] / "docs/formats.md"
 
@@ -19,7 +21,23 @@ def masks() -> str:
     return "\n".join(["| format | recognised by | ids | on top, where shapes overlap |", "|---|---|---|---|", *rows])
 
 
-TABLES = {"masks": masks}
+def lenses() -> str:
+    """Table the lens models."""
+    rows = [
+        f"| {known.name} | {known.projection.value} | {', '.join(known.coefficients) or 'none'} | {known.ros} |"
+        for known in LENS_MODELS
+    ]
+    header = "| in files of COLMAP and nerfstudio | distance of a ray at an angle a | coefficients | in ROS |"
+    return "\n".join([header, "|---|---|---|---|", *rows])
+
+
+def cameras() -> str:
+    """Table the formats of cameras."""
+    rows = [f"| {known.name} | {known.looked_for} |" for known in CAMERA_FORMATS]
+    return "\n".join(["| format | recognised by |", "|---|---|", *rows])
+
+
+TABLES = {"masks": masks, "cameras": cameras, "lenses": lenses}
 
 
 def page() -> str:

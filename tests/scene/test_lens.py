@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -112,10 +111,3 @@ def test_a_lens_that_cannot_be_undone_is_refused(name: str, coefficients: tuple[
 def test_impossible_intrinsics_are_refused(size: tuple[int, int], focal: tuple[float, float], found: str) -> None:
     with pytest.raises(IntrinsicsError, match=found):
         Lens(MODELS["SIMPLE_RADIAL"], *size, focal, (160.0, 120.0), (-0.15,))
-
-
-def test_the_page_of_conventions_lists_the_models_as_the_table_has_them() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "conventions.md").read_text(encoding="utf-8")
-    for model in LENS_MODELS:
-        coefficients = ", ".join(model.coefficients) or "none"
-        assert f"\n| {model.name} | {model.projection.value} | {coefficients} | {model.ros} |\n" in page, model.name
