@@ -9,8 +9,10 @@ import numba as nb
 import numpy as np
 
 from gsseg_core import kernel_cache as _kernel_cache  # noqa: F401 - before any kernel is defined
+from gsseg_core.simd import prefetch
 
 _NONE = np.uint32(2**32 - 1)
+_AHEAD = 12  # rows between the one that is copied and the one that is fetched from memory
 
 
 class CSRRows(NamedTuple):
@@ -162,7 +164,13 @@ def _normalise(rows: CSRRows) -> None:
 def _take(rows: CSRRows, ids: np.ndarray, taken: CSRRows) -> None:
     indptr, indices, data = rows
     taken_indptr, taken_indices, taken_data = taken
+    last = ids.shape[0] - 1
     for m in nb.prange(ids.shape[0]):
+        # Rows are anywhere in memory: they are asked for before they are needed.
+        prefetch(indptr, ids[min(m + 2 * _AHEAD, last)])
+        begin = indptr[ids[min(m + _AHEAD, last)]]
+        prefetch(indices, begin)
+        prefetch(data, begin)
         first = indptr[ids[m]]
         for j in range(taken_indptr[m + 1] - taken_indptr[m]):
             z = taken_indptr[m] + j

@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,6 +29,7 @@ from gsseg_core.export.view_pictures import (
 )
 from gsseg_core.files.json_files import write_json
 from gsseg_core.files.run_folder import StagedRun, staged_run
+from gsseg_core.files.write_behind import WriteBehind, writing_behind
 from gsseg_core.learn.calibrate import Calibration, calibrate
 from gsseg_core.learn.learner import NO_MASK, Learner, default_budget
 from gsseg_core.learn.mask_reliability import MaskChecker, ViewCheck, compare_mask, reliability_report
@@ -192,9 +194,13 @@ def segment(
             with watch.stage("carve"):
                 cameras = [view.camera for view in inputs.train]
                 result = result.carved(inputs.scene, cameras, device, settings.refine.carve_views)
-        report = _write(run, inputs, assessment, result, settings, watch).as_dict()
-        write_json(run.folder / "report.json", report)
-    return report
+        with ExitStack() as writing:
+            behind = writing.enter_context(writing_behind())
+            report = _write(run, inputs, assessment, result, settings, watch, behind)
+            with watch.stage("export"):  # what is left of it
+                writing.close()
+        write_json(run.folder / "report.json", report.as_dict())
+    return report.as_dict()
 
 
 def _connect(scheduler: str | None, workers: ExitStack) -> Client | None:
@@ -286,16 +292,17 @@ def _write(
     result: Segmentation,
     settings: RunSettings,
     watch: Stopwatch,
+    behind: WriteBehind[...],
 ) -> RunReport:
-    """Write all files of a run but `report.json`, and report it."""
+    """Write all files of a run but `report.json`, some of them behind the work, and report it."""
     scene, folder = inputs.scene, run.folder
     named = result if inputs.class_ids is None else result.with_ids(inputs.class_ids)
     with watch.stage("export"):
-        named.save(folder / "segmentation.npz", run.id)
+        behind(named.save, folder / "segmentation.npz", run.id)
         meshes = collision_meshes(scene, named, settings.collision) if settings.collision else {}
         files = write_classes(scene, named, folder / "classes", run.id, settings.scene_format, meshes)
     with watch.stage("pictures"):
-        images, evidence, pictures = _picture(run, inputs, assessment, result, settings.device)
+        images, evidence, pictures = _picture(run, inputs, assessment, result, settings.device, behind)
     report = RunReport.of(
         scene, named, run=run.id, views=assessment.report, settings=settings.as_dict(), seconds=watch.seconds,
         objective=assessment.objective, calibration=assessment.calibration.as_dict(), prepared_views=assessment.memory,
@@ -310,7 +317,12 @@ def _write(
 
 
 def _picture(
-    run: StagedRun, inputs: Inputs, assessment: Assessment, result: Segmentation, device: str
+    run: StagedRun,
+    inputs: Inputs,
+    assessment: Assessment,
+    result: Segmentation,
+    device: str,
+    behind: WriteBehind[...],
 ) -> tuple[ViewImages, Evidence, list[Path]]:
     """Write the pictures; what the report page can use of them is kept."""
     views, folder, images = assessment.views, run.folder / "pictures", ViewImages(inputs.scene, device)
@@ -323,10 +335,11 @@ def _picture(
                 checks.append(compare_mask(views[drawn.view.name], drawn.labels, result.num_classes))
             yield drawn
 
-    pictures = write_pictures(result, noted(), folder, run.id)
+    save = partial(behind, save_png)
+    pictures = write_pictures(result, noted(), folder, run.id, save)
     if assessment.checks:
         pictures.append(folder / "worst_views.png")
-        save_png(pictures[-1], draw_worst_views(inputs.scene, views, assessment.checks, device=device), run.id)
+        save(pictures[-1], draw_worst_views(inputs.scene, views, assessment.checks, device=device), run.id)
     return images, Evidence(checks, views, assessment.checks is not None), pictures
 
 

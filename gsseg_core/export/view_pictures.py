@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +21,8 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
 _DIFFERENT = np.array([[0, 0, 0], [230, 40, 40]], np.uint8)
+SavePicture = Callable[[Path, np.ndarray, "str | None"], object]
+"""Writes a picture as `save_png` does, now or later."""
 _LONGEST_NAME = 255
 """Bytes that file systems take as the name of a file."""
 
@@ -38,8 +40,8 @@ def view_file_name(name: str, prefix: str = "") -> str:
 
 def background_image(scene: GaussianScene, operator: ViewOperator) -> np.ndarray:
     """Render the scene's colours from a view, (H, W, 3) uint8, on black."""
-    colors = np.zeros((len(scene), 3), np.float32)
-    colors[operator.ids] = scene.colors(operator.camera.center, operator.ids)
+    colors, seen = np.zeros((len(scene), 3), np.float32), np.sort(operator.ids)  # once through memory
+    colors[seen] = scene.colors(operator.camera.center, seen)
     image = operator.render(colors)
     pixels: np.ndarray = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
     return pixels
@@ -77,9 +79,15 @@ def draw_views(
 
 
 def write_pictures(
-    segmentation: Segmentation, drawn: Iterable[Drawn], folder: str | os.PathLike[str], run: str | None = None
+    segmentation: Segmentation,
+    drawn: Iterable[Drawn],
+    folder: str | os.PathLike[str],
+    run: str | None = None,
+    save: SavePicture = save_png,
 ) -> list[Path]:
     """Write overlays of some views, as `draw_views` gives them, a contact sheet of them, and the legend.
+
+    Pictures are written by `save`, which may do that later.
 
     Returns
     -------
@@ -92,21 +100,26 @@ def write_pictures(
         images.append(one.overlay)
         captions.append(one.view.name)
         paths.append(folder / view_file_name(one.view.name, "overlay_"))
-        save_png(paths[-1], one.overlay, run)
-    return paths + write_overview(segmentation, images, captions, folder, run)
+        save(paths[-1], one.overlay, run)
+    return paths + write_overview(segmentation, images, captions, folder, run, save)
 
 
 def write_overview(
-    result: Segmentation, images: Sequence[np.ndarray], captions: Sequence[str], folder: Path, run: str | None = None
+    result: Segmentation,
+    images: Sequence[np.ndarray],
+    captions: Sequence[str],
+    folder: Path,
+    run: str | None = None,
+    save: SavePicture = save_png,
 ) -> list[Path]:
     """Write `contact_sheet.png` of some pictures, if there are any, and `legend.png`."""
     paths = []
     if images:
         paths.append(folder / "contact_sheet.png")
-        save_png(paths[-1], contact_sheet(images, captions, min(4, len(images))), run)
+        save(paths[-1], contact_sheet(images, captions, min(4, len(images))), run)
     paths.append(folder / "legend.png")
     colors = palette(result.num_classes)
-    save_png(paths[-1], legend(result.class_names, colors, result.counts()), run)
+    save(paths[-1], legend(result.class_names, colors, result.counts()), run)
     return paths
 
 

@@ -96,9 +96,11 @@ def kept_shares(
     asked = go > 0
     for step in range(steps):
         stay[asked] = 0
+        shares = kept.astype(np.float32)
         for shown, alone in views:
             wanted = asked[alone.ids]
-            stay[alone.ids] += alone.reasons_to_stay(kept[alone.ids], wanted, shown.labels)
+            reasons = alone.reasons_to_stay(shares[alone.ids], wanted, shown.labels)
+            stay[alone.ids[wanted]] += reasons[wanted]
         kept[asked] = np.clip(kept[asked] * stay[asked] / go[asked], _LEAST, 1.0)
         if step == 0:
             # The less is kept, the more reason there is to stay: who stays beside all others stays beside fewer.

@@ -72,7 +72,7 @@ class ObjectsAlone:
 
         Parameters
         ----------
-        kept : (M,)
+        kept : (M,) float32
             Share of each Gaussian that its object keeps, by which its alphas are multiplied.
         asked : (M,) bool
             Whose reasons are wanted; those of all others are 0. Only the blocks of pixels that these reach are looked
@@ -87,6 +87,5 @@ class ObjectsAlone:
             good as 0 where the object lets no light through.
         """
         stay, count = np.zeros(len(self.tiles.entries), np.float32), int(self.labels.max(initial=0)) + 1
-        share = kept.astype(np.float32)
-        silhouette_kernels.reasons_to_stay(self.tiles, self.labels, count, share, asked, shown, stay)
+        silhouette_kernels.reasons_to_stay(self.tiles, self.labels, count, kept, asked, shown, stay)
         return np.bincount(self.tiles.entries, stay, len(self.ids))

@@ -1,0 +1,35 @@
+"""Files that are written while the work goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Concatenate, ParamSpec
+
+Arguments = ParamSpec("Arguments")
+
+WriteBehind = Callable[Concatenate[Callable[Arguments, object], Arguments], None]
+"""Called with what writes a file, and the arguments of that."""
+
+
+@contextmanager
+def writing_behind() -> Iterator[WriteBehind[...]]:
+    """Give a function that has files written by another thread, one after the other; all are when the body has ended.
+
+    To compress and to wait for the disk takes little of the cores that the body works on. Only what writes belongs
+    there: nothing else may change what it is given. The first error of a writer is raised with the next call, or at the
+    end.
+    """
+    with ThreadPoolExecutor(1, "gsseg-write") as thread:
+        waiting: list[Future[object]] = []
+
+        def write(job: Callable[..., object], *arguments: object, **named: object) -> None:
+            for done in [future for future in waiting if future.done()]:
+                waiting.remove(done)
+                done.result()
+            waiting.append(thread.submit(job, *arguments, **named))
+
+        yield write
+        for future in waiting:
+            future.result()
