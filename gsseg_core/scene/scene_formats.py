@@ -60,7 +60,7 @@ SCENE_FORMATS = [
     ),
     SceneFormat(
         "SOG", sog.read_sog, (".sog", "meta.json"),
-        "SH degree 0 to 3 from a palette of up to 65,536; positions in 16 bits, all else in 8; its writers sort the "
+        "SH degree 0 to 3 from a palette of up to 65,536; positions in 16 bits, all else in 8; most writers sort the "
         "Gaussians", sog.is_sog,
     ),
     SceneFormat(
