@@ -344,7 +344,10 @@ class SegmentationClient:
         *,
         timeout: float = 120.0,
     ) -> Exported:
-        """Write segmentation.npz, one PLY per class, and report.json; by default to gsseg_export in `data_root`."""
+        """Write segmentation.npz, one PLY per class, and report.json; by default to gsseg_export in `data_root`.
+
+        The node's parameter `export_format` has it write the classes in another format than PLY.
+        """
         request = Export.Request(
             directory=os.fspath(directory),
             classes=class_names(classes),
