@@ -263,7 +263,7 @@ def _learn(
             learner.fit(progress)
         except NoUsableViewsError as error:
             blank = set(learner.rejected.values()) == {NO_MASK}
-            names = [view.name for view in inputs.train]
+            names = [view.camera.image for view in inputs.train]
             hint = mask_hint(inputs.root, settings.labels, names) if blank else ""
             raise NoUsableViewsError(f"{inputs.root}: {error}{hint}") from error
     return learner

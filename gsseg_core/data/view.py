@@ -239,7 +239,7 @@ class View:
         if self._mask is not None:
             seen = self._mask.unpack()
         elif self.foreign_mask is None and self.mask_path is None:
-            raise MaskFormatError(f"{source}: has no mask; expected a label image {self.name}.png")
+            raise MaskFormatError(f"{source}: has no mask; expected a label image {self.camera.image}.png")
         else:
             seen = self._read_file()
             if self.camera.undistortion is not None:
