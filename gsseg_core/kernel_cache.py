@@ -1,4 +1,4 @@
-"""Where compiled kernels are kept from one run to the next, and what is done where they cannot be kept.
+"""How kernels are compiled: where they are kept from one run to the next, and what is done where they cannot be.
 
 numba looks for a folder when a kernel is defined, that is, when its module is imported, and raises an error if it may
 write to none. So each room with kernels imports this module first, which looks before numba does; where there is no
@@ -11,6 +11,8 @@ import contextlib
 import os
 import sys
 import tempfile
+from collections.abc import Callable
+from typing import Any
 
 REMEDY = "set NUMBA_CACHE_DIR to a folder that you can write to"
 
@@ -32,6 +34,17 @@ def writable(folder: str) -> bool:
     except OSError:
         return False
     return True
+
+
+def called_by_kernels(function: Callable[..., Any] | None = None, **options: Any) -> Any:
+    """Compile a function that only kernels call, never Python: without the code that Python would call it by.
+
+    That code, which takes arrays apart and puts them together, is a tenth of what there is to compile.
+    """
+    import numba
+
+    njit: Any = numba.njit  # Its types know fewer options than it takes.
+    return njit(function, no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)
 
 
 def _do_without() -> None:

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
+from typing import Any
 
 import numpy as np
 from numba.core import event
 
 from gsseg_core import kernel_cache
 from gsseg_core.data.view import View
+from gsseg_core.learn.em.boundary_alignment import align_boundaries
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.backends import make_operator
@@ -41,11 +47,25 @@ class _FirstCompilation(event.Listener):
 def warm_up(device: str = "cpu", say: Callable[[str], object] = lambda text: None) -> None:
     """Take some thousand Gaussians through everything that segmenting does, so that all its kernels are there.
 
-    That takes a third of a second when they are in the cache, and a minute or two at the first time after an
-    installation; then `say` is told.
+    That takes a second when they are in the cache, and a minute or two at the first time after an installation; then
+    `say` is told, and a second process compiles beside this one.
     """
-    with telling(say):
-        _segment_something(device)
+    beside: list[subprocess.Popen[bytes]] = []
+
+    def begin(text: str) -> None:
+        say(text)
+        beside.extend(_start_beside())
+
+    try:
+        with telling(begin):
+            _learn_something(device)
+            for process in beside:
+                process.wait()
+            refine_something(device)
+    finally:
+        for process in beside:
+            process.kill()
+            process.wait()
 
 
 def telling(say: Callable[[str], object]) -> AbstractContextManager[object]:
@@ -54,24 +74,51 @@ def telling(say: Callable[[str], object]) -> AbstractContextManager[object]:
     return context
 
 
-def _segment_something(device: str) -> None:
+def _start_beside() -> Iterator[subprocess.Popen[bytes]]:
+    """Start the process that compiles what needs nothing learnt, for this one to find in the cache."""
+    is_python = os.path.basename(sys.executable or "").startswith("python")  # And no program that has it built in.
+    if kernel_cache.FOLDER and is_python:
+        # Where this process finds its modules, and nowhere else: not in the folder in which the user happens to be.
+        work = f"import sys; sys.path[:] = {sys.path}; from gsseg_core.warm_up import refine_something as f; f()"
+        with contextlib.suppress(OSError):
+            quiet: Any = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+            yield subprocess.Popen([sys.executable, "-I", "-c", work], **quiet)
+
+
+def _square() -> tuple[GaussianScene, Camera, np.ndarray]:
+    """Scene, camera and labels (32, 32) of a square whose left and right half are of two classes."""
     x, y = (axis.ravel() for axis in np.meshgrid(np.linspace(-1.5, 1.5, SIDE), np.linspace(-1.5, 1.5, SIDE)))
     means, ones, light = np.stack([x, y, 4 + 0.1 * x], axis=1), np.ones(len(x)), np.where(x < 0, -1.0, 1.0)
     quats, sh = np.tile([1.0, 0, 0, 0], (len(x), 1)), np.tile(light[:, None, None], (1, 1, 3))
     scene = GaussianScene.from_arrays(means, quats, np.full((len(x), 3), 0.05), 0.9 * ones, sh)
     # The square is larger than the image: edges are only where the classes meet, and so the outline is moved there.
     K = np.array([[48.0, 0, 16], [0, 48, 16], [0, 0, 1]])
-    camera = Camera("warm_up", 32, 32, K, np.eye(4))
-    labels = np.repeat(np.arange(2), 16)[None].repeat(32, axis=0)
+    return (
+        scene,
+        Camera("warm_up", 32, 32, K, np.eye(4)),
+        np.repeat(np.arange(2, dtype=np.int32), 16)[None].repeat(32, 0),
+    )
+
+
+def _learn_something(device: str) -> None:
+    scene, camera, labels = _square()
     view = View.from_arrays(camera, labels)
     passing = VoteLearner(scene, 2, device=device, memory_budget=0)
     passing.observe(view)
     passing.fit()
     learner = EMLearner(scene, 2, EMSettings(max_steps=2), device=device)
     learner.observe(view)
-    codes, names = learner.fit().codes_, {0: "left", 1: "right"}
-    result = Segmentation.from_codes(scene, codes, names, PAPER).carved(scene, [camera])
+    learner.fit()
     learner.predict_without(view)
+
+
+def refine_something(device: str = "cpu") -> None:
+    """Do all with a small scene that needs nothing learnt: align boundaries, refine, carve and render."""
+    scene, camera, labels = _square()
+    align_boundaries(labels, np.ones(labels.shape, np.float32), EMSettings.edge_px, telling=0)
+    share = np.clip(0.5 + scene.means[:, 0], 0.05, 0.95)  # Unsure in the middle, where neighbours decide.
+    codes = np.stack([1 - share, share], axis=1).astype(np.float32)
+    result = Segmentation.from_codes(scene, codes, {0: "left", 1: "right"}, PAPER).carved(scene, [camera])
     operator = make_operator(scene, camera, device)
     result.render(operator)
     operator.render(scene.colors(camera.center))

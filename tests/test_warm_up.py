@@ -8,6 +8,7 @@ import pytest
 from numba.core import event
 from small_scenes import write_dataset
 
+from gsseg_core import warm_up as warming
 from gsseg_core.errors import SettingsError
 from gsseg_core.warm_up import telling, warm_up
 
@@ -34,6 +35,31 @@ def test_the_first_compilation_is_said_and_only_once() -> None:
             with event.trigger_event("numba:compile"):
                 pass
     assert len(said) == 1 and said[0].startswith("compiling kernels")
+
+
+def test_the_first_compilation_is_shared_with_a_second_process_and_no_third(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[list[str]] = []
+
+    class Helper:
+        def __init__(self, command: list[str], **_: object) -> None:
+            started.append(command)
+
+        def wait(self) -> None: ...
+        def kill(self) -> None: ...
+
+    def learn(device: str) -> None:
+        for _ in range(2):
+            with event.trigger_event("numba:compile"):
+                pass
+
+    monkeypatch.setattr(warming.subprocess, "Popen", Helper)
+    monkeypatch.setattr(warming, "_learn_something", learn)
+    warm_up()
+    assert len(started) == 1 and "refine_something" in started[0][-1]
+    started.clear()
+    monkeypatch.setattr(warming.kernel_cache, "FOLDER", None)  # Nothing that it compiles would be found.
+    warm_up()
+    assert not started
 
 
 def test_warm_up_says_nothing_where_the_kernels_are_there() -> None:

@@ -24,6 +24,7 @@ import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.kernel_cache import called_by_kernels
 
 _ROUNDS = 50
 
@@ -202,7 +203,7 @@ def _scaled(rows: np.ndarray) -> np.ndarray:  # (U, K)
     return np.asarray(np.divide(rows, total, out=np.zeros_like(rows), where=total > 0))
 
 
-@nb.njit(nogil=True)
+@called_by_kernels
 def vote_units(weight: np.float32, votes: np.float64, units: float) -> np.int64:
     """Round a (Gaussian, label) pair's votes for a class to whole units: everywhere the same, so sums stay exact."""
     return np.int64(np.rint(np.float64(weight) * votes * units))

@@ -19,6 +19,7 @@ from gsseg_core.data.label_images import UNKNOWN, PackedLabels
 from gsseg_core.errors import MaskFormatError, MaskSizeError, UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.npz_files import Header
+from gsseg_core.kernel_cache import called_by_kernels
 from gsseg_core.scene.undistortion import Undistortion
 from gsseg_core.text import clipped
 
@@ -333,7 +334,7 @@ def _group(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # (P, C) uint8
     return numbers, firsts[:n].copy()
 
 
-@nb.njit(nogil=True)
+@called_by_kernels
 def _same(one: np.ndarray, two: np.ndarray) -> bool:
     for c in range(one.shape[0]):  # noqa: SIM110 - compiled: there is no generator.
         if one[c] != two[c]:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
+from gsseg_core.kernel_cache import called_by_kernels
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 
@@ -79,7 +80,7 @@ def _grow_subtree(points: np.ndarray, order: np.ndarray, depth: int, top: int, r
             _split(points, order, level, j)
 
 
-@nb.njit
+@called_by_kernels
 def _split(points: np.ndarray, order: np.ndarray, level: int, j: int) -> None:
     """Bring the lower half of node j of a level, along its widest axis, to the front."""
     n = points.shape[0]
@@ -94,7 +95,7 @@ def _split(points: np.ndarray, order: np.ndarray, level: int, j: int) -> None:
     _partition(points, order, first, last - 1, ((2 * j + 1) * n) >> (level + 1), axis)
 
 
-@nb.njit
+@called_by_kernels
 def _partition(points: np.ndarray, order: np.ndarray, low: int, high: int, middle: int, axis: int) -> None:
     """Quickselect of rows low to high (inclusive): those before `middle` get the smallest coordinates."""
     while low < high:

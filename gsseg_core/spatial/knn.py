@@ -13,13 +13,13 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
+from gsseg_core.kernel_cache import called_by_kernels
 from gsseg_core.simd import count_at_most, squared_distances, store_row
 from gsseg_core.spatial.kd_tree import LEAF, Tree, gap, leaf_of, leaf_range
 
 CHUNK = 256  # consecutive points of one thread
 DEPTH = 64  # nodes that can wait at once; a descent leaves at most one behind at each level
 FAR = np.float32(np.inf)
-NO_SKIP = np.zeros(0, np.int32)
 
 DIGITS = 24  # distances are summed in steps of 2^-DIGITS of the k-th one, or finer: the precision of a float32
 SLACK = np.float32(1.00001)  # covers float32 rounding in a bound
@@ -36,7 +36,7 @@ def nearest(tree: Tree, places: np.ndarray, k: int) -> tuple[np.ndarray, np.ndar
     points, boxes = tree.points, tree.boxes
     m, n, leaves = places.shape[0], points.shape[1], boxes.shape[0] // 2
     radii, distances = np.empty(m, np.float32), np.empty(m, np.float64)
-    bits = radii.view(np.int32)
+    bits, skip = radii.view(np.int32), np.empty(0, np.int32)
     for chunk in nb.prange((m + CHUNK - 1) // CHUNK):
         gaps, close, candidates = np.empty(DEPTH, np.float32), np.empty(3 * k + 2 * LEAF, np.float32), scratch_for(128)
         box, bounds = np.empty(6, np.float32), np.empty((2, LEAF), np.float32)
@@ -51,7 +51,7 @@ def nearest(tree: Tree, places: np.ndarray, k: int) -> tuple[np.ndarray, np.ndar
             found = _search(points, boxes, own, k, bound, close, candidates.nodes, gaps)
             bits[middle] = _smallest_of(close, found, k)
             reach = _bound(points, places, first, last, middle, radii[middle], bounds)
-            candidates, found = find_leaves(boxes, box, reach, NO_SKIP, 0, candidates)
+            candidates, found = find_leaves(boxes, box, reach, skip, np.int32(0), candidates)
             near = candidates.near.reshape(-1)
             near_bits = near.view(np.int32)
             for q in range(first, last):
@@ -64,7 +64,7 @@ def nearest(tree: Tree, places: np.ndarray, k: int) -> tuple[np.ndarray, np.ndar
     return radii, distances
 
 
-@nb.njit
+@called_by_kernels
 def _leave_out(own: int, leaf: int, leaves: int, n: int, rows: int, candidates: LeafCandidates) -> None:
     """Take a point out of what was measured from it."""
     for h in range(rows):
@@ -72,7 +72,7 @@ def _leave_out(own: int, leaf: int, leaves: int, n: int, rows: int, candidates: 
             candidates.near[h, own - leaf_range(leaf, leaves, n)[0]] = FAR
 
 
-@nb.njit
+@called_by_kernels
 def middle_of(points: np.ndarray, places: np.ndarray, first: int, last: int, box: np.ndarray) -> int:
     """Box some points in, and return which of them is nearest to its middle."""
     for d in range(3):
@@ -105,7 +105,7 @@ def _farthest(points: np.ndarray, known: int, own: int, radius: float) -> np.flo
     return max(reach * reach * SLACK, LEAST)
 
 
-@nb.njit
+@called_by_kernels
 def _bound(
     points: np.ndarray, places: np.ndarray, first: int, last: int, middle: int, radius: float, bounds: np.ndarray
 ) -> np.float32:
@@ -119,7 +119,7 @@ def _bound(
     return reach
 
 
-@nb.njit
+@called_by_kernels
 def _mean_root(near: np.ndarray, found: int, k: int, radius: float) -> float:
     """Mean distance of the k nearest; those at the radius share the places that are left."""
     root = np.sqrt(radius)
@@ -131,7 +131,7 @@ def _mean_root(near: np.ndarray, found: int, k: int, radius: float) -> float:
     return (total - (found - k) * np.int64(root * scale)) / 2.0**exponent / k
 
 
-@nb.njit
+@called_by_kernels
 def _search(
     points: np.ndarray, boxes: np.ndarray, own: int, k: int,  # (3, n), (2 L, 6)
     bound: float,  # above the k-th smallest squared distance
@@ -167,7 +167,7 @@ def _search(
     return found
 
 
-@nb.njit
+@called_by_kernels
 def _shorten(near: np.ndarray, found: int, k: int) -> np.float32:
     """Keep the k smallest, of equal ones any; returns the largest of them."""
     bits, limit, kept = near.view(np.int32), _smallest_of(near, found, k), 0
@@ -180,7 +180,7 @@ def _shorten(near: np.ndarray, found: int, k: int) -> np.float32:
     return largest
 
 
-@nb.njit
+@called_by_kernels
 def _smallest_of(near: np.ndarray, found: int, k: int) -> np.int32:
     """Bits of the k-th smallest of some distances; the array has room for a row more."""
     bits, rows, largest = near.view(np.int32), (found + LEAF - 1) // LEAF, np.int32(0)
@@ -191,7 +191,7 @@ def _smallest_of(near: np.ndarray, found: int, k: int) -> np.int32:
     return smallest
 
 
-@nb.njit
+@called_by_kernels
 def _smallest(bits: np.ndarray, rows: int, k: int, low: np.int32, high: np.int32) -> np.int32:
     """Bits of the k-th smallest of sixteen times so many float32, none negative, known to be between two others.
 
@@ -226,7 +226,7 @@ class LeafCandidates(NamedTuple):
     near: np.ndarray  # (n, LEAF) float32: squared distances to the points of these
 
 
-@nb.njit
+@called_by_kernels
 def scratch_for(count: int) -> LeafCandidates:
     """Allocate the scratch of one thread for so many leaves."""
     return LeafCandidates(
@@ -235,7 +235,7 @@ def scratch_for(count: int) -> LeafCandidates:
     )  # fmt: skip
 
 
-@nb.njit
+@called_by_kernels
 def end_of_group(tree: Tree, places: np.ndarray, first: int) -> int:
     """Where the points of a chunk of ascending places, (M,) int32, end that are in the same leaf as place `first`."""
     n, leaves = tree.points.shape[1], len(tree.blocks)
@@ -246,7 +246,7 @@ def end_of_group(tree: Tree, places: np.ndarray, first: int) -> int:
     return last
 
 
-@nb.njit
+@called_by_kernels
 def find_leaves(
     boxes: np.ndarray, box: np.ndarray, reach: float,  # (2 L, 6), (6,), squared
     skip: np.ndarray, skipped: int,  # (2 L,) int32, or none: nodes with this number there are left out
@@ -263,7 +263,7 @@ def find_leaves(
     return candidates, found
 
 
-@nb.njit
+@called_by_kernels
 def _descend(
     boxes: np.ndarray, box: np.ndarray, reach: float, skip: np.ndarray, skipped: int, candidates: LeafCandidates
 ) -> int:
@@ -285,7 +285,7 @@ def _descend(
     return found
 
 
-@nb.njit
+@called_by_kernels
 def measure(tree: Tree, own: int, reach: float, found: int, candidates: LeafCandidates) -> int:
     """Measure from a point to those of the leaves within reach, squared, into `near`; returns how many leaves."""
     x, y, z = tree.points[0, own], tree.points[1, own], tree.points[2, own]

@@ -19,7 +19,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 from gsseg_core.simd import at_most, first_bit, load_row
 from gsseg_core.spatial.kd_tree import Tree, leaf_range, scaled, tree_of
-from gsseg_core.spatial.knn import NO_SKIP, find_leaves, measure, nearest, scratch_for
+from gsseg_core.spatial.knn import find_leaves, measure, nearest, scratch_for
 
 NEIGHBOURS = 12  # neighbours of a Gaussian in its graph, unless others are asked for
 
@@ -77,11 +77,11 @@ def _list_near(
     indices: np.ndarray,  # (E,) int32 out
 ) -> None:  # fmt: skip
     """List the others within the radius of each point, or count them."""
-    n, leaves = len(radii), len(tree.blocks)
+    n, leaves, skip = len(radii), len(tree.blocks), np.empty(0, np.int32)
     for leaf in nb.prange(leaves):
         first, last = leaf_range(leaf, leaves, n)
         box, reach = tree.boxes[leaves + leaf], radii[first:last].max()
-        candidates, found = find_leaves(tree.boxes, box, reach, NO_SKIP, 0, scratch_for(128))
+        candidates, found = find_leaves(tree.boxes, box, reach, skip, np.int32(0), scratch_for(128))
         for own in range(first, last):
             count, e = 0, indptr[own]
             for h in range(measure(tree, own, radii[own], found, candidates)):

@@ -18,6 +18,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
+from gsseg_core.kernel_cache import called_by_kernels
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 from gsseg_core.simd import at_most, first_bit, load_row
@@ -140,7 +141,7 @@ def average(
     Those exactly at the radius share the places that are left.
     """
     m, leaves, n = len(places), len(tree.blocks), len(tree.order)
-    out = np.zeros((m, num_classes), np.float32)
+    out, skip = np.zeros((m, num_classes), np.float32), np.empty(0, np.int32)
     for chunk in nb.prange((m + knn.CHUNK - 1) // knn.CHUNK):
         sums = np.empty((2, num_classes), np.int64)  # inside the radius, and on it
         counts = np.empty((2, 2), np.int64)  # the same, and of these the ones that count
@@ -152,7 +153,7 @@ def average(
             reach = np.float32(0)
             for q in range(begin, end):
                 reach = max(reach, radii[places[q]])
-            candidates, found = knn.find_leaves(tree.boxes, box, reach, knn.NO_SKIP, 0, candidates)
+            candidates, found = knn.find_leaves(tree.boxes, box, reach, skip, np.int32(0), candidates)
             for q in range(begin, end):
                 own = places[q]
                 sums[:], counts[:] = 0, 0
@@ -207,7 +208,7 @@ def pure_distances(tree: Tree, labels: np.ndarray, radii: np.ndarray, distances:
     return out
 
 
-@nb.njit
+@called_by_kernels
 def _is_pure(
     labels: np.ndarray, label: int, radius: float, reached: int, leaves: int, candidates: knn.LeafCandidates
 ) -> bool:
@@ -221,7 +222,7 @@ def _is_pure(
     return True
 
 
-@nb.njit
+@called_by_kernels
 def _labels_of_nodes(labels: np.ndarray, leaves: int) -> np.ndarray:
     of_node = np.empty(2 * leaves, np.int32)
     for leaf in range(leaves):

@@ -23,6 +23,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import starts
+from gsseg_core.kernel_cache import called_by_kernels
 from gsseg_core.learn.em.rejected_regions import connected_pixels
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -228,7 +229,7 @@ def _nearest_regions(region: np.ndarray, farthest: int) -> tuple[np.ndarray, np.
     return other, ring
 
 
-@nb.njit
+@called_by_kernels
 def _borders(region: np.ndarray) -> np.ndarray:
     """Find pixels that touch another region, over sides or corners, (H, W) bool."""
     height, width = region.shape
@@ -246,7 +247,7 @@ def _borders(region: np.ndarray) -> np.ndarray:
     return borders
 
 
-@nb.njit
+@called_by_kernels
 def _spread_region(
     region: np.ndarray, y: int, begin: int, end: int, farthest: int, first: int, last: int, other: np.ndarray,
     away: np.ndarray,
@@ -304,7 +305,7 @@ def _boundary_strengths(
     return pairs[:n].copy(), pair, lengths, strengths
 
 
-@nb.njit
+@called_by_kernels
 def _sort_by_lower_region(of_pixel: np.ndarray, of_other: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Sort the pixels near another region by the lower number of the two: where each begins, and the pixels."""
     begin = np.zeros(count + 1, np.int64)

@@ -12,6 +12,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core import simd
+from gsseg_core.kernel_cache import called_by_kernels
 from gsseg_core.raster.constants import AHEAD, CHUNKS, TINY
 from gsseg_core.raster.cpu.blending import open_rays, stride_of, tile_of_turn
 from gsseg_core.raster.cpu.lifting import Labels
@@ -157,7 +158,7 @@ def share(
     return logs, left_over, sums
 
 
-@nb.njit(fastmath=simd.FAST, error_model="numpy")
+@called_by_kernels(fastmath=simd.FAST, error_model="numpy")
 def _blend_likelihood(
     left: float, top: float, table: np.ndarray,  # (M, 8)
     entries: np.ndarray, blocks: np.ndarray, label_count: int,  # (E_t,), (E_t,) of this tile
@@ -190,7 +191,7 @@ def _blend_likelihood(
             simd.store_row(value, b, total)
 
 
-@nb.njit(error_model="numpy")
+@called_by_kernels(error_model="numpy")
 def invert(
     spans: np.ndarray, labels: Labels, rest: np.ndarray, rays: np.ndarray,  # (17,), (L_t,), (16, 16)
     value: np.ndarray,  # (16, 16) in: W likelihood; out: 1 / likelihood, 0 where there is no label
@@ -221,7 +222,7 @@ def invert(
     return total
 
 
-@nb.njit(fastmath=simd.FAST)
+@called_by_kernels(fastmath=simd.FAST)
 def sum_shares(
     blocks: np.ndarray, label_count: int, spans: np.ndarray, labels: Labels,  # (E_t,), (17,)
     inverse: np.ndarray, weights: np.ndarray, sums: np.ndarray,  # (16, 16), (R, 16), (E_t * label_count,) out

@@ -13,6 +13,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import starts
+from gsseg_core.kernel_cache import called_by_kernels
 from gsseg_core.raster.cpu.blending import aim_next, in_tile, open_rays, stride_of, tile_of_turn
 from gsseg_core.raster.cpu.splat import OPEN, WIDTH, blend_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
@@ -96,7 +97,7 @@ def _cut(mask: np.ndarray, columns: int, rows: int, num_labels: int) -> tuple[tu
     return (start, present[:n].copy(), span_start, slots[:spans].copy(), lanes[:spans].copy()), areas
 
 
-@nb.njit
+@called_by_kernels
 def _is_uniform(mask: np.ndarray, left: int, top: int) -> bool:
     """Whether a tile lies in the image as a whole, and all its pixels have one label, or none has."""
     if top + TILE > mask.shape[0] or left + TILE > mask.shape[1]:

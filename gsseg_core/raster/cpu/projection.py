@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
+from gsseg_core.kernel_cache import called_by_kernels
 from gsseg_core.raster.constants import CHUNKS, DILATION, NEAR
 from gsseg_core.raster.cpu.depth_sort import sort_by_depth
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
@@ -139,7 +140,7 @@ def _break_ties(
                 run[free] = moving
 
 
-@nb.njit
+@called_by_kernels
 def _is_before(table: np.ndarray, rows: np.ndarray, one: int, other: int) -> bool:
     for column in range(table.shape[1]):
         if table[rows[one], column] != table[rows[other], column]:
@@ -187,7 +188,7 @@ def _project(
     return found
 
 
-@nb.njit(error_model="numpy", fastmath={"contract", "nnan", "ninf", "nsz"})
+@called_by_kernels(error_model="numpy", fastmath={"contract", "nnan", "ninf", "nsz"})
 def _find_near(
     means: np.ndarray, scales: np.ndarray, log_opacities: np.ndarray,  # (B, 3), (B, 3), (B,)
     lens: _Lens, near: np.ndarray,  # (BATCH,) bool out
@@ -216,7 +217,7 @@ def _find_near(
         near[i] = (z >= NEAR) & (log_opacities[i] >= LOG_ALPHA_MIN) & beside
 
 
-@nb.njit
+@called_by_kernels
 def _collect(
     begin: int, near: np.ndarray, splats: _Splats,  # (B,) bool: which of the Gaussians from `begin` on
     who: np.ndarray, lanes: np.ndarray,  # (BATCH,) int64 out; (NUMBERS * BATCH,) out, number after number
@@ -237,7 +238,7 @@ def _collect(
     return n
 
 
-@nb.njit(error_model="numpy")
+@called_by_kernels(error_model="numpy")
 def _project_near(
     count: int,
     lanes: np.ndarray,  # (NUMBERS * BATCH,) in: what `_collect` put there; out: what the table holds, and depth

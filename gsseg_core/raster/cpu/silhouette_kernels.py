@@ -5,6 +5,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
+from gsseg_core.kernel_cache import called_by_kernels
 from gsseg_core.raster.constants import T_MIN
 from gsseg_core.raster.cpu.blending import corner_of, in_block, open_rays, stride_of, tile_of_turn
 from gsseg_core.raster.cpu.splat import WIDTH, aim, alpha_of
@@ -115,7 +116,7 @@ def reasons_to_stay(
                 stay[e] = sum_row(total)
 
 
-@nb.njit
+@called_by_kernels
 def _cut(image: np.ndarray, left: int, top: int, out: np.ndarray) -> None:  # (H, W); (16, 16)
     """One tile of an image, by block; what lies outside of the image stays as it was."""
     for r in range(min(TILE, image.shape[0] - top)):
@@ -123,7 +124,7 @@ def _cut(image: np.ndarray, left: int, top: int, out: np.ndarray) -> None:  # (H
             out[in_block(r, c)] = image[top + r, left + c]
 
 
-@nb.njit
+@called_by_kernels
 def _summed_up(
     seen: np.ndarray, limit: np.ndarray, only: np.ndarray, farthest: np.ndarray,  # (16, 16) each; (16,) out, each
 ) -> tuple[np.int32, np.float32]:  # fmt: skip
@@ -149,12 +150,12 @@ def _joined(known: np.int32, label: np.int32) -> np.int32:
     return known if known == label else _MIXED
 
 
-@nb.njit
+@called_by_kernels
 def _slot_of(label: int, slots: np.ndarray) -> int:
     return slots[label] if 0 < label < len(slots) else -1
 
 
-@nb.njit
+@called_by_kernels
 def _blocks_of(seen: np.ndarray, slots: np.ndarray, count: int) -> np.ndarray:  # (16, 16)
     """Blocks of a tile that show each label, as bits, (count,) int64."""
     blocks = np.zeros(count, np.int64)
@@ -166,7 +167,7 @@ def _blocks_of(seen: np.ndarray, slots: np.ndarray, count: int) -> np.ndarray:  
     return blocks
 
 
-@nb.njit(fastmath={"contract", "nnan", "nsz"}, error_model="numpy")
+@called_by_kernels(fastmath={"contract", "nnan", "nsz"}, error_model="numpy")
 def _weigh(
     seen: np.ndarray, slots: np.ndarray,  # (16, 16)
     through: np.ndarray, need: np.ndarray,  # (16 S, 16) T_k; out, T_k / (1 - T_k) where label k is shown

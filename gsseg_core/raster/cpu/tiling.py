@@ -8,6 +8,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import starts
+from gsseg_core.kernel_cache import called_by_kernels
 from gsseg_core.raster.constants import CHUNKS
 from gsseg_core.raster.cpu.projection import Projected
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
@@ -93,7 +94,7 @@ def _tile_after(px: np.float32, limit: np.float32) -> np.int32:
     return min(_tile_of(px, limit) + np.int32(px >= 0), np.int32(limit))
 
 
-@nb.njit(error_model="numpy")
+@called_by_kernels(error_model="numpy")
 def _touch_two_rows(
     table: np.ndarray, columns: int, rows: int,  # (at most BATCH, 8)
     beside: np.ndarray,  # (8 * BATCH,) scratch: the table, column after column
@@ -163,7 +164,7 @@ def _list(
     return int(needed.max())
 
 
-@nb.njit(error_model="numpy")
+@called_by_kernels(error_model="numpy")
 def _list_many(
     splat: np.ndarray, low: int, high: int, columns: int,  # (8,) a row of the table; rows of tiles, high excluded
     touched: np.ndarray, n: int,  # (R,) int32 out, from n on, as far as they fit
