@@ -19,16 +19,23 @@ def move(
 
     What `pack_vertices` returned is changed, positions to colours. Raises nothing: what is NaN stays NaN.
     """
+    signs = np.diag(turn)
+    mirrored = not (turn - np.diag(signs)).any()  # Axes that only change their sign need no product of matrices.
     with np.errstate(all="ignore"):
-        _put(vertices, MEANS, scale * columns(vertices, MEANS) @ turn.T + np.asarray(shift))
+        means: npt.NDArray[np.floating] = columns(vertices, MEANS)
+        quats: npt.NDArray[np.floating] = columns(vertices, QUATS)
+        _put(vertices, MEANS, scale * (means * signs if mirrored else means @ turn.T) + np.asarray(shift))
         if scale != 1:
             _put(vertices, SCALES, columns(vertices, SCALES) + np.log(scale))
-        # A Gaussian is its own mirror image through its centre, so a mirror is half a turn of it.
-        half = turn if np.linalg.det(turn) > 0 else -turn
-        _put(vertices, QUATS, _product(_quaternion(half), columns(vertices, QUATS)))
+        if mirrored:
+            quats = quats * np.array([1, signs[1] * signs[2], signs[0] * signs[2], signs[0] * signs[1]], np.float32)
+        else:
+            # A Gaussian is its own mirror image through its centre, so a mirror is half a turn of it.
+            quats = _product(_quaternion(turn if np.linalg.det(turn) > 0 else -turn), quats)
+        _put(vertices, QUATS, quats)
         names = rest_names(sum(name.startswith("f_rest_") for name in vertices.dtype.names or ()))
         if names:
-            _turn_harmonics(columns(vertices, names).reshape(len(vertices), 3, -1), turn)
+            _turn_harmonics(columns(vertices, names).reshape(len(vertices), 3, -1), turn, mirrored)
 
 
 def _put(vertices: npt.NDArray[np.void], names: tuple[str, ...], values: npt.NDArray[np.floating]) -> None:
@@ -36,10 +43,14 @@ def _put(vertices: npt.NDArray[np.void], names: tuple[str, ...], values: npt.NDA
         vertices[name] = column
 
 
-def _turn_harmonics(rest: npt.NDArray[np.float32], turn: npt.NDArray[np.float64]) -> None:  # (N, 3, B)
+def _turn_harmonics(
+    rest: npt.NDArray[np.float32],  # (N, 3, B)
+    turn: npt.NDArray[np.float64],
+    mirrored: bool,
+) -> None:
     """Turn coefficients of SH above degree 0 in place, band by band."""
     matrix = spherical_harmonics.turned(turn, round(np.sqrt(rest.shape[2] + 1)) - 1)[1:, 1:]
-    if not (matrix - np.diag(np.diag(matrix))).any():  # Axes that only change their sign need no product.
+    if mirrored:
         rest *= np.diag(matrix).astype(np.float32)
     else:
         rest[:] = rest @ matrix.T.astype(np.float32)
@@ -55,7 +66,7 @@ def _quaternion(turn: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:  # (3
 
 def _product(
     first: npt.NDArray[np.float64],  # (4,) w, x, y, z
-    second: npt.NDArray[np.float32],  # (N, 4)
+    second: npt.NDArray[np.floating],  # (N, 4)
 ) -> npt.NDArray[np.float64]:
     """Quaternions (N, 4) of rotations by `second`, then by `first`."""
     w, x, y, z = first

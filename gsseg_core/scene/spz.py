@@ -19,7 +19,7 @@ from gsseg_core.scene.moving import move
 from gsseg_core.scene.quaternions import from_smallest_three
 from gsseg_core.scene.scene_file import check_count, check_size, open_scene
 from gsseg_core.scene.spherical_harmonics import MAX_DEGREE
-from gsseg_core.scene.vertices import ReadScene, logits, pack_vertices
+from gsseg_core.scene.vertices import ReadScene, logits, pack_in_blocks, pack_vertices
 
 _MAGIC = b"NGSP"
 _GZIP = b"\x1f\x8b"
@@ -27,6 +27,8 @@ _HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fracti
 _HEADER_4 = 32  # from version 4 on; the offset of the table of streams follows those above
 _ANTIALIASED, _EXTENSIONS = 1, 2
 _COORDINATE_SYSTEM = 0xADBE0003
+_LOGITS = logits(np.arange(256) / 255).astype(np.float32)
+_HARMONICS = (np.arange(256, dtype=np.float32) - 128) / 128
 _COLOR_SCALE = 0.15  # of coefficients of degree 0, so that colours beyond [0, 1] fit
 # The axes of the file, by the number that the extension SPZ_ADOBE_coordinate_system says; 0 and none mean RUB.
 _SYSTEMS = (
@@ -77,14 +79,14 @@ def decode_spz(file: Any, path: Path) -> ReadScene:
     magic = file.read(4)
     file.seek(0)
     if magic.startswith(_GZIP):
-        header, system, parts = _inflate(file)
+        header, system, packed = _inflate(file)
     elif magic == _MAGIC:
-        header, system, parts = _streams(file, path)
+        header, system, packed = _streams(file, path)
     else:
         raise ValueError("it starts neither with NGSP nor as gzip does")
-    vertices = _vertices(header, parts)
-    if system != "RDF":
-        move(vertices, np.array([_AXES[letter] for letter in system], np.float64).T)
+    parts = [np.frombuffer(part, np.uint8).reshape(header.gaussians, -1) for part in packed]
+    turn = None if system == "RDF" else np.array([_AXES[letter] for letter in system], np.float64).T
+    vertices = pack_in_blocks(header.gaussians, lambda block: _pack(header, [part[block] for part in parts], turn))
     remarks = [f"SH above degree {MAX_DEGREE} are left out"] if header.degree > MAX_DEGREE else []
     if header.flags & _ANTIALIASED:
         remarks.append("trained with antialiasing, which is left out")
@@ -183,26 +185,30 @@ def _axes_said(extensions: bytes) -> str:
     return "RUB"
 
 
-def _vertices(header: _Header, parts: Iterator[bytes]) -> npt.NDArray[np.void]:
-    n, coefficients = header.gaussians, (min(header.degree, MAX_DEGREE) + 1) ** 2 - 1
-    position, alpha, color, scale, rotation, sh = (np.frombuffer(part, np.uint8) for part in parts)
-    rest = sh.reshape(n, -1, 3)[:, :coefficients] if coefficients else None
+def _pack(
+    header: _Header, parts: list[npt.NDArray[np.uint8]], turn: npt.NDArray[np.float64] | None
+) -> npt.NDArray[np.void]:
+    """Pack Gaussians of their bytes (N, ...), attribute by attribute, and turn them to the axes of a PLY."""
+    position, alpha, color, scale, rotation, sh = parts
+    coefficients = (min(header.degree, MAX_DEGREE) + 1) ** 2 - 1
     vertices = pack_vertices(
         _positions(position, header),
-        _rotations(rotation.reshape(n, -1)),
-        scale.reshape(n, 3) / np.float32(16) - np.float32(10),
-        logits(alpha / 255),
-        (color.reshape(n, 3) / np.float32(255) - np.float32(0.5)) / np.float32(_COLOR_SCALE),
-        None if rest is None else (rest - np.float32(128)) / np.float32(128),
+        _rotations(rotation),
+        scale / np.float32(16) - np.float32(10),
+        _LOGITS[alpha[:, 0]],
+        (color / np.float32(255) - np.float32(0.5)) / np.float32(_COLOR_SCALE),
+        _HARMONICS[sh.reshape(len(sh), -1, 3)[:, :coefficients]] if coefficients else None,
     )
+    if turn is not None:
+        move(vertices, turn)
     return vertices
 
 
 def _positions(packed: npt.NDArray[np.uint8], header: _Header) -> npt.NDArray[np.floating]:
     """Positions (N, 3): half floats in version 1, else signed 24-bit numbers with a fixed point."""
     if header.version == 1:
-        return packed.view("<f2").reshape(-1, 3).astype(np.float32)
-    wide = np.zeros((3 * header.gaussians, 4), np.uint8)
+        return np.ascontiguousarray(packed).view("<f2").reshape(-1, 3).astype(np.float32)
+    wide = np.zeros((3 * len(packed), 4), np.uint8)
     wide[:, 1:] = packed.reshape(-1, 3)
     # Shifted down from the upper bytes, the sign comes along.
     return (wide.view("<i4").reshape(-1, 3) >> 8) * np.float32(math.ldexp(1, -header.fractional_bits))
