@@ -101,7 +101,7 @@ class Dataset:
 
     def _take_masks(self, masks: MaskSet) -> None:
         """Take the masks of another program, with its names of classes if it has any."""
-        names = self._declared if masks.class_names is None else dict(masks.class_names)
+        names = self._declared if masks.class_names is None else dict(sorted(masks.class_names.items()))
         self._declared = None if masks.per_view else names
         self._change_views(lambda view: {"foreign_mask": masks.views.get(view.camera.image)})
 

@@ -55,6 +55,7 @@ def test_masks_come_back_as_they_were_written(tmp_path: Path, name: str) -> None
         assert view.has_mask == (view.name in labels)
         if view.has_mask:
             np.testing.assert_array_equal(view.read_labels(), labels[view.name])
+    assert list(dataset.class_names) == sorted(dataset.class_names)
     if name in NAMELESS:
         assert dataset.class_names == {0: "background", 1: "class_01", 2: "class_02", 3: "class_03"}
     else:

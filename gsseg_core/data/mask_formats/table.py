@@ -113,8 +113,8 @@ def open_masks(path: Path, stems: Iterable[str], within: Path | None = None) -> 
                 f"{path}: may be masks of {' or '.join(names)}; expected those of one program: name the file itself, "
                 "or a folder without the others"
             )
-        if not found and not path.is_dir():
-            raise MaskFormatError(f"{path}: is no file of masks that is known; gsseg reads {known_formats()}")
+        if not found and (unknown := _unknown(place)):
+            raise MaskFormatError(f"{unknown}: is no file of masks that is known; gsseg reads {known_formats()}")
         masks = found[0].read(place) if found else None
     except RecursionError as cause:
         raise MaskFormatError(f"{path}: is nested too deep; expected masks") from cause
@@ -128,6 +128,14 @@ def known_formats() -> str:
     """List all formats for messages."""
     own = f"{LABEL_IMAGES} (<stem>.png)"
     return ", ".join([own, *(f"{known.name} ({known.looked_for.replace('`', '')})" for known in MASK_FORMATS)])
+
+
+def _unknown(place: Place) -> Path | None:
+    """Find a file that is meant as masks: the place itself, or JSON of a view where there is none of gsseg's own."""
+    if not place.path.is_dir():
+        return place.path
+    described = next(iter(place.by_view(".json").values()), None)
+    return None if mask_files(place.path, place.stems, place.within) else described
 
 
 def _has_own(place: Place) -> bool:

@@ -1,0 +1,91 @@
+"""`gsseg segment --labels` with masks of other programs: what comes out, and what is said of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import mask_writers
+import numpy as np
+import pytest
+from segmented_place import assert_one_line, segment
+from small_scenes import NAMES
+
+from gsseg_core.cli.main import main
+from gsseg_core.data.label_images import read_mask
+
+
+def masks_of(place: Path, writer: mask_writers.Writer, factor: int = 1) -> Path:
+    """Write the masks of a place once more; what `--labels` is to name."""
+    labels = {path.stem: read_mask(path).labels for path in sorted((place / "data/labels").iterdir())}
+    large = {stem: np.repeat(np.repeat(image, factor, axis=0), factor, axis=1) for stem, image in labels.items()}
+    (place / "masks").mkdir()
+    return writer(place / "masks", large, NAMES)
+
+
+def labels_of(place: Path) -> np.ndarray:
+    with np.load(place / "out/segmentation.npz") as file:
+        return np.array(file["labels"])
+
+
+@pytest.mark.parametrize("name", ["COCO text", "CVAT masks", "YOLO"])
+def test_masks_of_another_program_give_the_labels_of_the_same_label_images(
+    place: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    expected = labels_of(place)
+    masks = masks_of(place, mask_writers.WRITERS[name])
+    assert main([*segment(place), "--labels", str(masks)]) == 0
+    np.testing.assert_array_equal(labels_of(place), expected)
+    assert f"masks: {name.split()[0]}, ids global, 6 views\n" in capsys.readouterr().out
+    assert json.loads((place / "out/report.json").read_text())["masks"]["format"] == name.split()[0]
+
+
+def test_automatic_masks_are_taken_with_ids_of_their_own_view_and_that_is_said(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    masks = masks_of(place, mask_writers.sam_json, factor=2)
+    assert main([*segment(place), "--labels", str(masks)]) == 0
+    said = "masks: SAM JSON, ids per-view, 6 views; scaled by nearest pixel, 128 x 96 to 64 x 48 pixels\n"
+    assert said in capsys.readouterr().out
+    report = json.loads((place / "out/report.json").read_text())
+    assert report["settings"]["ids"] == "per-view" and report["ids"]["objects"] == 3
+
+
+@pytest.mark.parametrize(
+    ("extra", "said"),
+    [
+        (("--ids", "global"), "ids are to be global; expected per-view, as SAM JSON has them"),
+        (("--label-map", "map.json"), "a label map was given for masks of SAM JSON"),
+    ],
+)
+def test_what_automatic_masks_cannot_do_is_refused(
+    place: Path, extra: tuple[str, str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    masks = masks_of(place, mask_writers.sam_json)
+    assert main([*segment(place), "--labels", str(masks), *extra]) == 2
+    assert_one_line(capsys.readouterr().err, said)
+
+
+def test_a_label_map_names_the_objects_that_are_written(place: Path) -> None:
+    (place / "map.json").write_text('{"red ball": "ball", "cup/mug": "ball", "background": "background", "*": null}')
+    assert main([*segment(place), "--label-map", f"{place}/map.json"]) == 0
+    report = json.loads((place / "out/report.json").read_text())
+    assert [(entry["id"], entry["name"]) for entry in report["classes"]] == [(0, "background"), (1, "ball")]
+    assert report["settings"]["label_map"] == f"{place}/map.json"
+
+
+def test_masks_that_lie_where_the_command_is_typed_are_found(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    masks_of(place, mask_writers.coco_runs)
+    monkeypatch.chdir(place)
+    assert main([*segment(place), "--labels", "masks/annotations.json"]) == 0
+    assert "masks" in json.loads((place / "out/report.json").read_text())
+
+
+def test_a_folder_of_unknown_files_is_refused_with_what_is_read(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (place / "data/strange").mkdir()
+    for view in range(6):
+        (place / f"data/strange/view{view}.json").write_text("{}")
+    assert main([*segment(place), "--labels", "strange"]) == 2
+    assert_one_line(capsys.readouterr().err, "strange/view0.json: is no file of masks that is known; gsseg reads label")
