@@ -207,7 +207,7 @@ class Segmentation:
             yield shown._replace(operator=operator) if isinstance(operator, TileOperator) else shown
 
     def label_map(self, operator: ViewOperator) -> np.ndarray:
-        """Class of every pixel of a view, (H, W) int32: the labels of `render`, in half the time."""
+        """Class of every pixel of a view, (H, W) int32: those of `render`, without the confidence."""
         codes, shows_background = self._blended
         strongest = operator.strongest(codes, len(self.class_names), shows_background)
         return np.asarray(self.class_ids[strongest.classes])

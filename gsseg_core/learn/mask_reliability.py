@@ -102,7 +102,7 @@ class MaskChecker:
         checks, learner = [], self.learner
         for done, view in enumerate(learner.views.values()):
             progress("check views", done, len(learner.views))
-            if view.name in self._sampled:  # which takes twice as long as the classes alone
+            if view.name in self._sampled:  # which needs the probabilities, not the classes alone
                 image = learner.predict_without(view)
                 self._samples[view.name] = sample_pixels(image, view.read_labels())
                 predicted = Strongest.of(image).labels()
