@@ -18,6 +18,7 @@ from small_scenes import NAMES, balls_on_a_table, many_classes, ring, write_data
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN, write_mask
+from gsseg_core.errors import GssegError
 
 pytest.importorskip("rosbags", reason="rosbags is not installed")
 
@@ -38,6 +39,7 @@ from gsseg_ros.conversions import (
     stamp_message,
     stamp_ns,
 )
+from gsseg_ros.replay.replay_node import _PARAMETERS, make_source
 from gsseg_ros.replay.sources import BagSource, FolderSource, PhotoFileError
 
 KINDS = {"mask": Image, "camera_info": CameraInfo, "pose": PoseStamped, "image": Image}
@@ -113,6 +115,15 @@ def refusal(ros: Ros, parameters: dict[str, Any], *arguments: str) -> str:
     lines = process.output.splitlines()
     assert len(lines) == 1 and "[ERROR]" in lines[0], process.output
     return lines[0]
+
+
+def refused(**parameters: Any) -> str:
+    """The error with which a folder or bag is refused, here; `refusal` tells what a node makes of such an error."""
+    defaults = {name: default for name, default, *_ in _PARAMETERS}
+    with pytest.raises(GssegError) as raised:
+        make_source({**defaults, **{name: str(value) for name, value in parameters.items()}})
+    assert "\n" not in str(raised.value)
+    return str(raised.value)
 
 
 def finished(process: Process) -> str:
@@ -243,29 +254,25 @@ def test_topics_of_a_bag_are_chosen_by_name_where_the_type_is_not_enough(
     assert "(/b/mask, /odd, /pose, /image)" in output
 
 
-def test_a_missing_or_ambiguous_topic_is_one_error_that_lists_the_topics(
-    ros: Ros,
-    folder: Path,
-    tmp_path: Path,
-) -> None:
+def test_a_missing_or_ambiguous_topic_is_one_error_that_lists_the_topics(folder: Path, tmp_path: Path) -> None:
     topics = (("/a/mask", "mask"), ("/b/mask", "mask"), ("/camera_info", "camera_info"))
     write_bag(tmp_path / "bag", folder, topics=topics)
     listing = (
         "topics in the bag: /a/mask (sensor_msgs/msg/Image, 4 messages), /b/mask (sensor_msgs/msg/Image, 4 messages), "
         "/camera_info (sensor_msgs/msg/CameraInfo, 4 messages)"
     )
-    line = refusal(ros, {"bag": tmp_path / "bag"})
+    line = refused(bag=tmp_path / "bag")
     assert "2 topics (/a/mask, /b/mask) of type sensor_msgs/msg/Image" in line and listing in line
-    line = refusal(ros, {"bag": tmp_path / "bag", "mask_topic": "/a/mask"})
+    line = refused(bag=tmp_path / "bag", mask_topic="/a/mask")
     assert "no topic of type geometry_msgs/msg/PoseStamped with a name that ends in 'pose'" in line and listing in line
-    line = refusal(ros, {"bag": tmp_path / "bag", "mask_topic": "/camera_info"})
+    line = refused(bag=tmp_path / "bag", mask_topic="/camera_info")
     assert "no topic '/camera_info' of type sensor_msgs/msg/Image (mask_topic)" in line and listing in line
 
 
 def test_a_bag_that_is_missing_broken_or_empty_is_one_error(ros: Ros, folder: Path, tmp_path: Path) -> None:
-    assert f"{tmp_path}/no_bag: does not exist" in refusal(ros, {"bag": tmp_path / "no_bag"})
+    assert f"{tmp_path}/no_bag: does not exist" in refused(bag=tmp_path / "no_bag")
     (tmp_path / "bag.mcap").write_bytes(b"\x89MCAP0\r\nno more")
-    assert f"{tmp_path}/bag.mcap: not a readable bag" in refusal(ros, {"bag": tmp_path / "bag.mcap"})
+    assert f"{tmp_path}/bag.mcap: not a readable bag" in refused(bag=tmp_path / "bag.mcap")
     write_bag(tmp_path / "empty", folder, count=0)
     process = ros.start("replay_node", {"bag": tmp_path / "empty", "wait_for_subscribers": 0.0, "loop": 0})
     assert process.wait() == 2 and "no message on '/seg/mask'" in process.output
@@ -275,10 +282,7 @@ def test_a_bag_that_is_missing_broken_or_empty_is_one_error(ros: Ros, folder: Pa
     ("parameters", "expected"),
     [
         ({}, "neither 'data' nor 'bag' is set; expected exactly one of 'data'"),
-        ({"data": "a", "bag": "b"}, "data is 'a' and bag is 'b'; expected exactly one of 'data'"),
         ({"data": "no/folder"}, "no/folder: is not a folder; looked for cameras.json"),
-        ({"data": "", "split": "half"}, "split is 'half'; expected 'train', 'test' or 'all'"),
-        ({"data": "", "labels": "none"}, "none: no label image for any of the 4 views of split 'train'"),
         ({"data": "", "rate": 0.0}, "expected a number with a decimal point from 0.001 to 1000"),
         ({"data": "", "rate": float("nan")}, "parameter 'rate'"),
         ({"data": "", "rate": 10}, "parameter 'rate': Trying to set parameter 'rate' to '10' of type 'INTEGER'"),
@@ -294,6 +298,18 @@ def test_bad_parameters_are_one_error_that_says_what_was_expected(
     if parameters.get("data") == "":
         parameters = {**parameters, "data": folder}
     assert expected in refusal(ros, parameters)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "expected"),
+    [
+        ({"bag": "b"}, "and bag is 'b'; expected exactly one of 'data'"),
+        ({"split": "half"}, "split is 'half'; expected 'train', 'test' or 'all'"),
+        ({"labels": "none"}, "none: no label image for any of the 4 views of split 'train'"),
+    ],
+)
+def test_what_the_folder_does_not_go_with_is_one_error(folder: Path, parameters: dict[str, str], expected: str) -> None:
+    assert expected in refused(data=folder, **parameters)
 
 
 def test_arguments_that_ros_cannot_parse_are_refused_without_a_traceback(ros: Ros) -> None:
