@@ -40,6 +40,10 @@ class PoseError(GssegError):
     """A camera pose is NaN, not invertible, or not a rigid motion."""
 
 
+class AlignmentError(GssegError):
+    """It cannot be found where the cameras of a dataset are in a scene."""
+
+
 class IntrinsicsError(GssegError):
     """An intrinsic matrix or image size is unusable, or a lens of an unknown model or with impossible distortion."""
 

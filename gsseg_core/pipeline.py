@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gsseg_core.align.placing import Placed, place
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.hints import mask_hint
 from gsseg_core.data.label_images import GLOBAL, PER_VIEW, write_mask
@@ -63,6 +64,7 @@ class Inputs:
     pictured: list[View]
     class_names: Mapping[int, str]  # of classes as they are learnt, numbered without gaps
     class_ids: tuple[int, ...] | None  # of these classes in the dataset; None where the classes are objects
+    frame: Mapping[str, Any]  # `frame` in `report.json`
     masks: Mapping[str, Any] | None = None  # `masks` in `report.json`
     objects: ObjectTable | None = None  # which the ids of the views were found to be
 
@@ -109,6 +111,8 @@ def segment(
     scene_format: str = DEFAULT_FORMAT,
     collision: str | None = None,
     label_map: str | os.PathLike[str] | None = None,
+    align: bool = False,
+    dataparser: str | os.PathLike[str] | None = None,
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Learn from the train views of a dataset, refine, and write everything into `out`.
@@ -149,6 +153,8 @@ def segment(
         Kind of meshes to collide with, one of `gsseg_core.export.collision.KINDS`, for each object; none by default.
     label_map : path, optional
         Renames, merges and ignores classes of the masks; see `gsseg_core.data.label_map`.
+    align, dataparser
+        Where the cameras are in the scene, as for `gsseg_core.align.placing.place`; see docs/frames.md.
 
     Returns
     -------
@@ -173,7 +179,15 @@ def segment(
         with ExitStack() as workers:
             with watch.stage("load"):
                 client = _connect(scheduler, workers)
-                inputs, settings = _load(scene_path, data, settings)
+                scene, dataset = GaussianScene.load(scene_path), Dataset(data, labels, label_map=label_map)
+                settings = replace(settings, ids=_ids(dataset, settings))
+                settings.check()
+            with watch.stage("place cameras"):
+                placed = place(
+                    scene, dataset, align=align, check=True, dataparser=dataparser, device=device, progress=progress
+                )
+            with watch.stage("load"):
+                inputs = _inputs(scene, placed, settings)
             if settings.ids == PER_VIEW:
                 with watch.stage("associate"):
                     inputs = _associate(inputs, settings, progress)
@@ -212,20 +226,16 @@ def _connect(scheduler: str | None, workers: ExitStack) -> Client | None:
     return workers.enter_context(connected(scheduler))
 
 
-def _load(
-    scene_path: str | os.PathLike[str], data: str | os.PathLike[str], settings: RunSettings
-) -> tuple[Inputs, RunSettings]:
-    """Read a scene and the views of a dataset, classes numbered without gaps; the settings then say what ids are."""
-    scene, dataset = GaussianScene.load(scene_path), Dataset(data, settings.labels, label_map=settings.label_map)
-    settings = replace(settings, ids=_ids(dataset, settings))
-    settings.check()
+def _inputs(scene: GaussianScene, placed: Placed, settings: RunSettings) -> Inputs:
+    """List the views to learn from and to draw, whose classes are numbered without gaps."""
+    dataset = placed.dataset
     # Ids that are a view's own are no classes; objects take their place.
     class_ids = None if settings.ids == PER_VIEW else dataset.class_ids
     if class_ids is not None:
         dataset = dataset.numbered()
     train, pictured = spread(dataset.views("train"), settings.views), spread(dataset.views("all"), PICTURED_VIEWS)
     names = {} if class_ids is None else dataset.class_names
-    return Inputs(scene, dataset.root, train, pictured, names, class_ids, dataset.describe_masks()), settings
+    return Inputs(scene, dataset.root, train, pictured, names, class_ids, placed.as_dict(), dataset.describe_masks())
 
 
 def _ids(dataset: Dataset, settings: RunSettings) -> str:
@@ -306,7 +316,7 @@ def _write(
     report = RunReport.of(
         scene, named, run=run.id, views=assessment.report, settings=settings.as_dict(), seconds=watch.seconds,
         objective=assessment.objective, calibration=assessment.calibration.as_dict(), prepared_views=assessment.memory,
-        ids=None if inputs.objects is None else inputs.objects.summary(), masks=inputs.masks,
+        ids=None if inputs.objects is None else inputs.objects.summary(), masks=inputs.masks, frame=inputs.frame,
         files={k: str(path.relative_to(folder)) for k, path in files.items()},
         meshes={k: f"classes/{mesh_file_name(k, named.class_names[k])}" for k in meshes},
         pictures=[str(path.relative_to(folder)) for path in pictures],
@@ -351,6 +361,8 @@ def render(
     *,
     split: str = "test",
     device: str = "cpu",
+    align: bool = False,
+    dataparser: str | os.PathLike[str] | None = None,
     progress: Progress = silent,
 ) -> list[Path]:
     """Render label maps of a split as `<stem>.png`, in the masks' own encoding, and overlays in `overlays/`.
@@ -366,7 +378,8 @@ def render(
     dataset = Dataset(data)
     result = Segmentation.load(segmentation_path, scene)
     ids, numbered = result.class_ids, result.numbered()
-    views = dataset.views(split)
+    placed = place(scene, dataset, align=align, dataparser=dataparser, device=device, progress=progress)
+    views = placed.dataset.views(split)
     if not views:
         raise NoUsableViewsError(f"{data}: split {split!r} has no views; expected at least one to render")
     bits = 16 if result.num_classes > 255 else max((view.mask_bits or 8 for view in views), default=8)

@@ -18,7 +18,8 @@ FIGURE = REPOSITORY / "docs/pictures/rooms.svg"
 PAGE = REPOSITORY / "docs/architecture.md"
 CORE, ROS = "gsseg_core", "gsseg_ros"
 BEGIN = {
-    "cli": "arguments.py", "data": "dataset.py", "demo": "run.py", "export": "class_files.py", "files": "atomic.py",
+    "align": "placing.py", "cli": "arguments.py", "data": "dataset.py", "demo": "run.py", "export": "class_files.py",
+    "files": "atomic.py",
     "learn": "learner.py", "live": "session.py", "objects": "object_table.py", "raster": "view_operator.py",
     "refine": "settings.py", "report": "page.py", "scene": "gaussian_scene.py", "spatial": "neighbourhood.py",
     "viewer": "viewer.py",

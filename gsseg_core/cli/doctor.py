@@ -21,19 +21,24 @@ from itertools import groupby
 from pathlib import Path
 
 from gsseg_core import kernel_cache
+from gsseg_core.cli.shared import add_dataparser, add_device, add_quiet, load_kernels
 from gsseg_core.cli.terminal import note, tell
-from gsseg_core.errors import GssegError
+from gsseg_core.errors import GssegError, SettingsError
+from gsseg_core.progress import progress_bars
 
 DESCRIPTION = """
 Prints the versions of gsseg, Python and its packages, the devices, whether the kernels run and where they are cached,
 the formats of scenes and cameras that are read, which options are installed, and what is there of ROS 2. For everything
 that is missing it says what to type. The exit code is 0 if gsseg works without the options, and 2 if not.
 
-Given a scene, it says of that instead which format it has, and what this format keeps of a Gaussian.
+Given a scene, it says of that instead which format it has, and what this format keeps of a Gaussian. Given a dataset
+and --scene, it says whether the cameras of the one fit the other (exit code 0), and if not (2), which axes, scale,
+rotation and translation make them fit.
 """
 EXAMPLES = """
   gsseg doctor
   gsseg doctor scan.spz
+  gsseg doctor DATASET --scene scene.ply
 """
 
 _REQUIREMENT = re.compile(r"(?P<name>[A-Za-z0-9._-]+)")
@@ -69,17 +74,46 @@ class Finding:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the command takes."""
-    parser.add_argument("scene", nargs="?", metavar="SCENE", help="say what this file is, and not what the machine has")
+    what = "say what this scene is, and not what the machine has; with --scene: a dataset, whose cameras are to fit it"
+    parser.add_argument("path", nargs="?", metavar="PATH", help=what)
+    parser.add_argument("--scene", metavar="SCENE", help="trained scene that the cameras of a dataset are to fit")
+    labels = "the dataset's folder of masks, which are looked at where there are no photos (default: labels)"
+    parser.add_argument("--labels", default="labels", metavar="DIR", help=labels)
+    add_dataparser(parser)
+    add_device(parser)
+    add_quiet(parser)
 
 
 def run(options: argparse.Namespace) -> int:
     """Look, and print what was found."""
+    if options.scene and not options.path:
+        raise SettingsError(
+            "gsseg doctor: --scene is given alone; expected a dataset, too, whose cameras are to fit it"
+        )
     if options.scene:
-        tell(_listed(examine_scene(options.scene)))
+        return _examine_frame(options)
+    if options.path:
+        tell(_listed(examine_scene(options.path)))
         return 0
     findings = examine(note)
     tell(describe(findings))
     return 0 if works(findings) else 2
+
+
+def _examine_frame(options: argparse.Namespace) -> int:
+    """Look whether the cameras of a dataset fit a scene, and print what makes them fit."""
+    from gsseg_core.align.placing import place
+    from gsseg_core.data.dataset import Dataset
+    from gsseg_core.scene.gaussian_scene import GaussianScene
+
+    scene, dataset = GaussianScene.load(options.scene), Dataset(options.path, options.labels)
+    load_kernels(options.quiet, options.device)
+    with progress_bars(options.quiet) as progress:
+        placed = place(
+            scene, dataset, align=True, dataparser=options.dataparser, device=options.device, progress=progress
+        )
+    tell(placed.describe())
+    return 0 if placed.fits else 2
 
 
 def examine(say: Callable[[str], object] = lambda text: None) -> list[Finding]:

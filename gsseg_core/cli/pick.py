@@ -9,6 +9,7 @@ from typing import Any
 from gsseg_core.cli.shared import add_scene, load_kernels
 from gsseg_core.cli.terminal import tell
 from gsseg_core.errors import SettingsError
+from gsseg_core.progress import progress_bars
 
 DESCRIPTION = """
 Finds the Gaussians of one object that is shown in one view, by a mask (best) or by clicks, and writes it as
@@ -36,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Pick, and say what was written."""
+    from gsseg_core.align.placing import place
     from gsseg_core.data.dataset import Dataset
     from gsseg_core.data.label_images import UNKNOWN
     from gsseg_core.data.view import View
@@ -46,14 +48,19 @@ def run(options: argparse.Namespace) -> int:
     from gsseg_core.raster.backends import make_operator
     from gsseg_core.scene.gaussian_scene import GaussianScene
 
-    cameras = {camera.name: camera for camera in Dataset(options.data).cameras}
-    if options.view not in cameras:
-        raise SettingsError(f"{options.data}: has no view {options.view!r}; expected a stem such as {min(cameras)!r}")
+    dataset = Dataset(options.data)
+    names = [camera.name for camera in dataset.cameras]
+    if options.view not in names:
+        raise SettingsError(f"{options.data}: has no view {options.view!r}; expected a stem such as {min(names)!r}")
     if options.mask and options.outside:
         raise SettingsError("--not goes with --click; found it with --mask, which says itself what is not the object")
-    camera, out = cameras[options.view], Path(options.out)
-    scene = GaussianScene.load(options.scene)
+    out, scene = Path(options.out), GaussianScene.load(options.scene)
     load_kernels(options.quiet, options.device)
+    with progress_bars(options.quiet) as progress:
+        placed = place(
+            scene, dataset, align=options.align, dataparser=options.dataparser, device=options.device, progress=progress
+        )
+    camera = placed.dataset.cameras[names.index(options.view)]
     with staged_run(out, "pick", places=("object.ply", "pick.npz", "pick.png")) as run:
         if options.mask:
             mask = read_object_mask(options.mask, options.label)

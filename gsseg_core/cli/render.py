@@ -37,7 +37,8 @@ def run(options: argparse.Namespace) -> int:
     with progress_bars(options.quiet) as progress:
         paths = pipeline.render(
             options.scene, options.data, options.segmentation, options.out,
-            split=options.split, device=options.device, progress=progress,
+            split=options.split, device=options.device, align=options.align,
+            dataparser=options.dataparser, progress=progress,
         )  # fmt: skip
     tell(f"{counted(len(paths), 'label map')} in {options.out}, overlays in {options.out}/overlays")
     return 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from gsseg_core.cli.shared import LABELS, add_format, add_scene, labels_path, load_kernels
-from gsseg_core.cli.terminal import tell
+from gsseg_core.cli.terminal import note, tell
 from gsseg_core.learn.registry import DEFAULT, LEARNERS, distributed_learners
 from gsseg_core.progress import progress_bars
 from gsseg_core.refine.settings import RefineSettings
@@ -83,9 +83,16 @@ def run(options: argparse.Namespace) -> int:
             memory_budget=None if options.memory_budget is None else options.memory_budget << 20,
             seed=options.seed, scheduler=options.scheduler, ids=options.ids, granularity=options.granularity,
             label_map=options.label_map,
-            scene_format=options.format, collision=options.collision, progress=progress,
+            scene_format=options.format, collision=options.collision, align=options.align,
+            dataparser=options.dataparser, progress=progress,
         )  # fmt: skip
     from gsseg_core.text import segment_summary
 
+    agreement = report["frame"]["agreement"]
+    if agreement and agreement["agrees"] is False:
+        note(
+            f"the scene does not look as the {agreement['compared']} do from these cameras: the two may be in "
+            f"different frames; try --align, or gsseg doctor {options.data} --scene {options.scene}"
+        )
     tell(segment_summary(report, options.out))
     return 0

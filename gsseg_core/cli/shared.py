@@ -20,8 +20,22 @@ def add_scene(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", metavar="SCENE", help="trained 3DGS scene, of any format that gsseg reads")
     data = "folder with cameras, labels/<stem>.png, classes.json, split.json"
     parser.add_argument("--data", required=True, metavar="DATASET", help=data)
+    add_frame(parser)
     add_device(parser)
     add_quiet(parser)
+
+
+def add_frame(parser: argparse.ArgumentParser) -> None:
+    """Add `--align` and `--dataparser`."""
+    find = "find where the cameras are in the scene, and put them there; see gsseg doctor"
+    parser.add_argument("--align", action="store_true", help=find)
+    add_dataparser(parser)
+
+
+def add_dataparser(parser: argparse.ArgumentParser) -> None:
+    """Add `--dataparser`."""
+    file = "nerfstudio's dataparser_transforms.json, if it lies neither beside the scene nor in DATASET"
+    parser.add_argument("--dataparser", metavar="FILE", help=file)
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:

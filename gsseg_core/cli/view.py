@@ -12,9 +12,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from gsseg_core.cli.shared import add_device, add_quiet, load_kernels
+from gsseg_core.cli.shared import add_device, add_frame, add_quiet, load_kernels
 from gsseg_core.cli.terminal import tell
 from gsseg_core.errors import SettingsError
+from gsseg_core.progress import progress_bars
 
 if TYPE_CHECKING:
     from gsseg_core.viewer.access import Listener
@@ -42,6 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     draw = "who draws: the browser; the server, which sends it images; or (default) the browser if it is fast"
     parser.add_argument("--draw", choices=("auto", "browser", "server"), default="auto", help=draw)
     parser.add_argument("--open", action="store_true", help="open the page, too")
+    add_frame(parser)
     add_device(parser)
     add_quiet(parser)
 
@@ -58,6 +60,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _show(options: argparse.Namespace, listener: Listener, viewer_module: ModuleType) -> int:
+    from gsseg_core.align.placing import place
     from gsseg_core.data.dataset import Dataset
     from gsseg_core.scene.gaussian_scene import GaussianScene
     from gsseg_core.segmentation import Segmentation
@@ -69,6 +72,12 @@ def _show(options: argparse.Namespace, listener: Listener, viewer_module: Module
     segmentation = Segmentation.load(options.segmentation, scene) if options.segmentation else None
     class_ids = segmentation.class_ids.tolist() if segmentation else None
     dataset = Dataset(options.data) if options.data else None
+    if dataset:
+        with progress_bars(options.quiet) as progress:
+            dataset = place(
+                scene, dataset, align=options.align, dataparser=options.dataparser, device=options.device,
+                progress=progress,
+            ).dataset  # fmt: skip
     if dataset and not options.ros:  # The node's ids are as they are.
         class_ids = class_ids or list(dataset.class_ids)
         dataset = dataset.numbered(class_ids)

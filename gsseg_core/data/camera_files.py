@@ -6,11 +6,12 @@ import os
 from collections import Counter
 from pathlib import Path
 
-from gsseg_core.data.camera_formats.table import CAMERA_FORMATS
+from gsseg_core.data.camera_formats.table import CAMERA_FORMATS, CameraFormat
 from gsseg_core.data.class_names import flaw_of_view_name
 from gsseg_core.data.hints import camera_hint
 from gsseg_core.errors import CameraFileError
 from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.similarity import Similarity
 from gsseg_core.text import quoted
 
 
@@ -31,15 +32,14 @@ def read_cameras(folder: str | os.PathLike[str], within: Path | None = None) -> 
         A file lies outside `within`.
     """
     folder = Path(folder)
-    for camera_format in CAMERA_FORMATS:
-        if path := camera_format.find(folder):
-            cameras = camera_format.read(path, within)
-            break
-    else:
+    found = _find(folder)
+    if found is None:
         hint = camera_hint(folder) if within is None else ""  # It looks around, wherever links lead.
         what = "has no cameras" if folder.is_dir() else "is not a folder"
         *most, last = (f"{known.looked_for} ({known.name})" for known in CAMERA_FORMATS)
         raise CameraFileError(f"{folder}: {what}; looked for {', '.join(most)}, and {last}{hint}")
+    camera_format, path = found
+    cameras = camera_format.read(path, within)
     if not cameras:
         raise CameraFileError(f"{path}: holds no camera; expected at least one")
     for camera in cameras:
@@ -49,3 +49,38 @@ def read_cameras(folder: str | os.PathLike[str], within: Path | None = None) -> 
     if count > 1:
         raise CameraFileError(f"{path}: {count} images have the stem {quoted(stem)}; expected another one for each")
     return cameras
+
+
+def frame_of_training(folder: Path, dataparser: Path) -> Similarity | None:
+    """Read what nerfstudio did to the cameras of a dataset folder before it trained on them.
+
+    Parameters
+    ----------
+    folder : pathlib.Path
+        The dataset.
+    dataparser : pathlib.Path
+        The `dataparser_transforms.json` beside the trained config.
+
+    Returns
+    -------
+    Similarity or None
+        From the frame of the cameras to that of the Gaussians; None if the cameras are of a format that nerfstudio does
+        not train from.
+
+    Raises
+    ------
+    CameraFileError, PoseError
+        A file is missing or broken.
+    """
+    found = _find(folder)
+    if found is None or found[0].frame_of_training is None:
+        return None
+    return found[0].frame_of_training(found[1], dataparser)
+
+
+def _find(folder: Path) -> tuple[CameraFormat, Path] | None:
+    """Find the cameras of a dataset folder, and of which format they are."""
+    for camera_format in CAMERA_FORMATS:
+        if path := camera_format.find(folder):
+            return camera_format, path
+    return None

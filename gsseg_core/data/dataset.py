@@ -170,6 +170,13 @@ class Dataset:
         """Ids of the classes, ascending, 0 included."""
         return tuple(self.class_names)
 
+    def moved(self, move: Callable[[Camera], Camera]) -> Dataset:
+        """Put every camera where `move` says; masks and photos stay what they are."""
+        other = copy.copy(self)
+        other._views = {stem: replace(view, camera=move(view.camera)) for stem, view in self._views.items()}
+        other.cameras = [view.camera for view in other._views.values()]
+        return other
+
     def numbered(self, ids: Collection[int] | None = None) -> Dataset:
         """Renumber the classes without gaps, so that one large id costs no more memory than any other.
 

@@ -104,6 +104,8 @@ class RunReport:
         Seconds of each stage, and what it ran on: version of each package.
     prepared_views : mapping, optional
         Bytes of prepared views in memory and in a temporary file, and the budget of those in memory.
+    frame : mapping, optional
+        How well the cameras fit the scene, and what was done to have them fit.
     run, page : str, optional
         Id of the run, and file of the report page.
     calibration, ids, masks : mappings, optional
@@ -126,6 +128,7 @@ class RunReport:
     prepared_views: Mapping[str, int] | None = None
     masks: Mapping[str, Any] | None = None
     page: str | None = None
+    frame: Mapping[str, Any] | None = None
 
     @classmethod
     def of(

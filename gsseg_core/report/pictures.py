@@ -11,11 +11,10 @@ import numpy as np
 from PIL import Image
 
 from gsseg_core.data.label_images import UNKNOWN, PackedLabels
+from gsseg_core.data.photos import read_photo
 from gsseg_core.data.view import View
-from gsseg_core.errors import MaskFormatError
 from gsseg_core.export.pictures import outline, overlay
 from gsseg_core.export.view_pictures import background_image
-from gsseg_core.files.input_files import open_image
 from gsseg_core.learn.mask_reliability import ViewCheck
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.report.findings import Evidence
@@ -63,7 +62,7 @@ class ViewImages:
         """Give the image, (H, W, 3) uint8 of the camera's size."""
         image = self._images.get(view.name)
         if image is None:
-            image = _read_photo(view)
+            image = read_photo(view)
         if image is None:
             image = background_image(self.scene, make_operator(self.scene, view.camera, self.device))
         return image
@@ -160,17 +159,3 @@ def _extent(weights: np.ndarray, places: np.ndarray) -> tuple[int, int]:
     share = np.cumsum(weights) / weights.sum()
     first, last = np.searchsorted(share, [0.01, 0.99])
     return int(places[first]), int(places[last]) + 1
-
-
-def _read_photo(view: View) -> np.ndarray | None:
-    """Read the photo of a view, undistorted; None if there is none of its camera's, or none that can be read."""
-    if view.image_path is None:
-        return None
-    try:
-        with open_image(view.image_path, MaskFormatError, "image", "a photo") as photo:
-            if photo.size != view.camera.image_size:
-                return None
-            taken, undistortion = np.asarray(photo.convert("RGB")), view.camera.undistortion
-            return taken if undistortion is None else undistortion.photo(taken)
-    except MaskFormatError:  # A picture for people is not worth an error.
-        return None

@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsseg_core.data.camera_formats.colmap import read_colmap
+from gsseg_core.data.camera_formats.dataparser import original_to_trained, saved_to_trained
 from gsseg_core.data.camera_formats.gaussian_splatting import read_3dgs
 from gsseg_core.data.camera_formats.nerfstudio import read_nerfstudio
 from gsseg_core.errors import CameraFileError
 from gsseg_core.files.input_files import is_there
 from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.similarity import Similarity
 
 
 @dataclass(frozen=True)
@@ -20,13 +22,15 @@ class CameraFormat:
 
     A dataset that has one of `files`, in one of its sub-folders `folders` or itself, is of this format. The reader gets
     the file, or the folder of a format with `folders`, and a folder below which all that is read must lie, or None. It
-    returns the cameras in the order of the file.
+    returns the cameras in the order of the file. nerfstudio moves cameras before it trains on them; for formats that it
+    reads, `frame_of_training` tells how, of what `read` got and of the `dataparser_transforms.json` that it wrote.
     """
 
     name: str
     read: Callable[[Path, Path | None], list[Camera]]
     files: tuple[str, ...]
     folders: tuple[str, ...] = ()
+    frame_of_training: Callable[[Path, Path], Similarity] | None = None
 
     def find(self, dataset: Path) -> Path | None:
         """Find what `read` reads of a dataset folder; None if it has no cameras of this format."""
@@ -48,7 +52,7 @@ class CameraFormat:
 
 CAMERA_FORMATS = [
     CameraFormat("3DGS", read_3dgs, ("cameras.json",)),
-    CameraFormat("nerfstudio", read_nerfstudio, ("transforms.json",)),
-    CameraFormat("COLMAP", read_colmap, ("cameras.bin", "cameras.txt"), ("sparse/0", "sparse")),
+    CameraFormat("nerfstudio", read_nerfstudio, ("transforms.json",), frame_of_training=saved_to_trained),
+    CameraFormat("COLMAP", read_colmap, ("cameras.bin", "cameras.txt"), ("sparse/0", "sparse"), original_to_trained),
 ]
 """All formats, the first that is there being read; who adds one, adds it here."""

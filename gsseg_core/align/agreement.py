@@ -1,0 +1,244 @@
+"""How well a scene, as cameras of a dataset see it, agrees with what their photos or masks show.
+
+A view is compared as a small square picture about its principal point, so that a camera turned about its axis by a
+quarter sees the same picture turned. Edges are compared, by normalised cross correlation, since those of a photo stay
+where they are in another light. Masks have no edges of light but outlines, which lie at edges of colour or depth; and
+their regions have colours of their own, so the share of the rendered variance that they explain counts, too.
+
+What pictures score that do not belong together depends on the scene: one is like another on a table, and nothing like
+it in a house. So each rendering is compared with what the other views show as well, and with what its own shows upside
+down. Only what a view scores above that says anything.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from PIL import Image
+from scipy import ndimage
+
+from gsseg_core.align.settings import AlignSettings
+from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.photos import read_photo
+from gsseg_core.data.view import View, spread
+from gsseg_core.errors import GssegError
+from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.depth import depths
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
+
+LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)  # of RGB, ITU-R BT.601
+_EDGE_PX = 3  # reach of the filter that finds edges, px of a picture
+_NEAREST = 1e-3  # depth in scene units below which logarithms are not taken
+
+
+class Rendered(NamedTuple):
+    """A scene as a square camera sees it."""
+
+    edges: np.ndarray  # (2, S, S) float32: of the luminance, and of colours and depth together
+    colours: np.ndarray  # (S, S, 3) float32
+
+    def turned(self, quarters: int) -> Rendered:
+        """Turn the camera about its axis, by quarters of a turn clockwise as it sees itself."""
+        edges = np.rot90(self.edges, quarters, (1, 2))
+        return Rendered(edges, np.rot90(self.colours, quarters))
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What a view shows, to be compared with a rendering.
+
+    Attributes
+    ----------
+    camera : Camera
+        Of the view, square, of S x S px with the principal point in the middle.
+    seen : (S, S) bool
+        Pixels that lie in the view.
+    edges : (S, S) float32
+        Edges of the photo, or outlines of the mask.
+    labels : (S, S) int32, optional
+        Regions of the mask, negative where unknown; None for a photo.
+    """
+
+    camera: Camera
+    seen: np.ndarray
+    edges: np.ndarray
+    labels: np.ndarray | None = None
+
+    def score(self, rendered: Rendered) -> float:
+        """Compare with a rendering: 0 to 1."""
+        edges = rendered.edges[0 if self.labels is None else 1]
+        score: float = max(_correlation(edges[self.seen], self.edges[self.seen]), 0.0)
+        if self.labels is None:
+            return score
+        known = self.seen & (self.labels >= 0)
+        return (score + math.sqrt(_explained(rendered.colours[known], self.labels[known]))) / 2
+
+    def upside_down(self) -> Shown:
+        """Turn what it shows by half a turn."""
+        labels = None if self.labels is None else np.rot90(self.labels, 2)
+        return replace(self, seen=np.rot90(self.seen, 2), edges=np.rot90(self.edges, 2), labels=labels)
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well a scene agrees with some views.
+
+    Attributes
+    ----------
+    compared : str
+        With their 'photos' or their 'masks'.
+    views : int
+        How many.
+    score : float
+        Of the views, 0 to 1.
+    chance : float
+        Of pictures that do not belong together.
+    agrees : bool or None
+        Whether cameras and scene belong together; None where nobody can tell.
+    """
+
+    compared: str
+    views: int
+    score: float
+    chance: float
+    agrees: bool | None
+
+    def __str__(self) -> str:
+        """Describe it for people."""
+        return f"{self.score:.2f} on {self.views} {self.compared}, {self.chance:.2f} by chance"
+
+
+def look_at(views: Sequence[View], settings: AlignSettings) -> list[Shown]:
+    """Read what some views show: their photos, if there are any, else their masks; those that are broken are left out.
+
+    Views are spread evenly over those that have what is compared.
+    """
+    for readable, read in ((lambda view: view.image_path is not None, _photo), (lambda view: view.has_mask, _mask)):
+        shown = []
+        for view in spread([view for view in views if readable(view)], settings.views):
+            try:
+                picture = read(view, settings.picture_px)
+            except GssegError:  # Who learns from it says what is wrong with it.
+                continue
+            if picture is not None:
+                shown.append(picture)
+        if shown:
+            return shown
+    return []
+
+
+def agreement(
+    scene: GaussianScene, shown: Sequence[Shown], settings: AlignSettings, device: str = "cpu"
+) -> Agreement | None:
+    """Compare a scene with views, at least one, each from its own camera; None if there is none."""
+    if not shown:
+        return None
+    rendered = [render(scene, view.camera, device) for view in shown]
+    scores = np.array([[view.score(picture) for view in shown] for picture in rendered])
+    score, own = float(np.diag(scores).mean()), np.eye(len(shown), dtype=bool)
+    turned = float(np.mean([view.upside_down().score(picture) for view, picture in zip(shown, rendered, strict=True)]))
+    # Of a robot that stands still all views are the same, and of an endless floor both ways up.
+    chance = min(turned, float(scores[~own].mean())) if len(shown) > 1 else turned
+    photos = shown[0].labels is None
+    disagrees, agrees = settings.photo_margins if photos else settings.mask_margins
+    verdict = True if score - chance >= agrees else False if score - chance < disagrees else None
+    return Agreement("photos" if photos else "masks", len(shown), score, chance, verdict)
+
+
+def render(scene: GaussianScene, camera: Camera, device: str = "cpu") -> Rendered:
+    """Render a scene for comparison with what views show."""
+    operator = make_operator(scene, camera, device)
+    codes = np.column_stack([scene.colors(camera.center), depths(scene, camera)])
+    image, left_over = operator.blend(codes)
+    colours, coverage = image[..., :3], np.maximum(1 - left_over, _NEAREST)
+    light = _edges(colours @ LUMINANCE)
+    depth = np.minimum(_gradient(np.log(np.maximum(image[..., 3] / coverage, _NEAREST))), 1)
+    colour = np.sqrt(np.sqrt(sum(_gradient(colours[..., i]) ** 2 for i in range(3))))
+    both = sum(edges / max(float(edges.std()), 1e-6) for edges in (colour, np.sqrt(depth)))
+    return Rendered(np.stack([light, both]).astype(np.float32), colours)
+
+
+def _photo(view: View, picture_px: int) -> Shown | None:
+    photo = read_photo(view)
+    if photo is None:
+        return None
+    window = _Window.of(view.camera, picture_px)
+    light = window.cut(Image.fromarray(photo).convert("L"), Image.Resampling.BILINEAR)
+    return Shown(window.camera, window.seen, _edges(light.astype(np.float32) / 255))
+
+
+def _mask(view: View, picture_px: int) -> Shown:
+    labels = view.read_labels()
+    window = _Window.of(view.camera, picture_px)
+    outlines = np.zeros(labels.shape, np.float32)
+    outlines[1:] = labels[1:] != labels[:-1]
+    outlines[:, 1:] = np.maximum(outlines[:, 1:], labels[:, 1:] != labels[:, :-1])
+    edges = window.cut(Image.fromarray(outlines), Image.Resampling.BILINEAR)
+    regions = window.cut(Image.fromarray(labels), Image.Resampling.NEAREST)
+    return Shown(window.camera, window.seen, ndimage.gaussian_filter(edges, 1), np.where(window.seen, regions, UNKNOWN))
+
+
+class _Window(NamedTuple):
+    """The square about the principal point that holds the whole image of a camera."""
+
+    camera: Camera  # sees the square
+    box: tuple[float, float, float, float]  # left, top, right, bottom in the image, px
+    seen: np.ndarray  # (S, S) bool: pixels whose edges come from the image alone
+
+    @classmethod
+    def of(cls, camera: Camera, side: int) -> _Window:
+        """Make the window of `side` x `side` px."""
+        focal, principal, size = camera.K[[0, 1], [0, 1]], camera.K[:2, 2], np.array([camera.width, camera.height])
+        reach = float((np.maximum(principal, size - principal) / focal).max())  # tangent of half the field of view
+        corners = principal - reach * focal, principal + reach * focal
+        K = np.array([[side / 2 / reach, 0, side / 2], [0, side / 2 / reach, side / 2], [0, 0, 1]])
+        centres = (np.arange(side)[:, None] + 0.5) / side * (corners[1] - corners[0]) + corners[0]  # (S, 2)
+        margin = _EDGE_PX * 2 * reach * focal / side
+        columns, rows = ((centres > margin) & (centres < size - margin)).T
+        seen = rows[:, None] & columns[None]
+        return cls(replace(camera, width=side, height=side, K=K), (*corners[0], *corners[1]), seen)
+
+    def cut(self, image: Image.Image, resampling: Image.Resampling) -> np.ndarray:
+        """Cut the square out of the camera's image, (S, S); black where it shows nothing."""
+        shrunk = max(1, int((self.box[2] - self.box[0]) / self.camera.width))
+        if resampling == Image.Resampling.NEAREST or shrunk == 1:
+            shrunk = 1
+        else:
+            image = image.reduce(shrunk)
+        box = tuple(edge / shrunk for edge in self.box)
+        size = self.camera.width, self.camera.height
+        return np.asarray(image.transform(size, Image.Transform.EXTENT, box, resampling))
+
+
+def _edges(picture: np.ndarray) -> np.ndarray:  # (S, S)
+    """Edges of a picture, the square root of the gradient, so that a few strong ones are not all that counts."""
+    edges: np.ndarray = np.sqrt(_gradient(picture))
+    return edges
+
+
+def _gradient(picture: np.ndarray) -> np.ndarray:  # (S, S)
+    gradient: np.ndarray = ndimage.gaussian_gradient_magnitude(picture, 1.0)
+    return gradient
+
+
+def _correlation(first: np.ndarray, second: np.ndarray) -> float:  # (P,), (P,)
+    """Normalised cross correlation, -1 to 1; 0 where one of the two is flat."""
+    if not first.size:
+        return 0.0
+    first, second = first - first.mean(), second - second.mean()
+    size = float(np.sqrt((first @ first) * (second @ second)))
+    return float(first @ second) / size if size > 1e-9 else 0.0
+
+
+def _explained(colours: np.ndarray, labels: np.ndarray) -> float:  # (P, 3), (P,)
+    """Share of the variance of colours that lies between regions, 0 to 1."""
+    _, regions, counts = np.unique(labels, return_inverse=True, return_counts=True)
+    offsets = colours - (colours.mean(axis=0) if len(colours) else 0)
+    total = float((offsets**2).sum())
+    sums = np.stack([np.bincount(regions, offsets[:, i], len(counts)) for i in range(3)])
+    return float((sums**2 / counts).sum()) / total if total > 1e-6 else 0.0

@@ -1,0 +1,90 @@
+"""Features of photos and of renderings, and which are of the same point; by COLMAP's SIFT.
+
+A feature of a rendering has a place in the scene, where its pixel's depth says. So a match with a photo ties a pixel
+of that photo to a point of the scene.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gsseg_core.align.agreement import LUMINANCE
+from gsseg_core.align.settings import AlignSettings
+from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.depth import COVERED, depths
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
+
+_LENGTH = 128  # of a descriptor
+
+
+class Features(NamedTuple):
+    """Features of a picture; of a rendering, with their points."""
+
+    pixels: np.ndarray  # (M, 2) float64: column, row
+    descriptors: np.ndarray  # (M, 128) float32, of length 1
+    points: np.ndarray | None = None  # (M, 3) float64: in the scene
+
+
+class Extractor:
+    """COLMAP's SIFT on the CPU, which is the same from run to run."""
+
+    def __init__(self, settings: AlignSettings) -> None:
+        import pycolmap
+
+        pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, 1)  # It tells each time that it was made.
+        options = pycolmap.FeatureExtractionOptions()
+        options.use_gpu, options.num_threads = False, 1
+        options.sift.max_num_features = settings.features
+        self._sift: Any = pycolmap.FeatureExtractor.create(options, device=pycolmap.Device.cpu)
+
+    def photo(self, photo: np.ndarray) -> Features:  # (H, W) float32, 0 to 1
+        """Find the features of a picture in grey."""
+        keypoints, descriptors = self._sift.extract_from_uint8_array(np.rint(255 * photo.clip(0, 1)).astype(np.uint8))
+        pixels = np.array([(point.x, point.y) for point in keypoints]).reshape(-1, 2)
+        described = np.asarray(descriptors.data, np.float32).reshape(len(pixels), _LENGTH)
+        return Features(pixels, described / np.maximum(np.linalg.norm(described, axis=1, keepdims=True), 1e-6))
+
+    def rendering(self, scene: GaussianScene, camera: Camera, device: str = "cpu") -> Features:
+        """Render a scene, and find the features with their points; those at the edge of nothing are left out."""
+        codes = np.column_stack([scene.colors(camera.center) @ LUMINANCE, depths(scene, camera)])
+        image, left_over = make_operator(scene, camera, device).blend(codes)
+        found = self.photo(image[..., 0])
+        column, row = np.clip(found.pixels.astype(int), 0, (camera.width - 1, camera.height - 1)).T
+        coverage = 1 - left_over[row, column]
+        solid = coverage > COVERED
+        pixels, depth = found.pixels[solid], image[row, column, 1][solid] / coverage[solid]
+        rays = np.column_stack([(pixels - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]], np.ones(len(pixels))])
+        points = (rays * depth[:, None] - camera.world_to_camera[:3, 3]) @ camera.world_to_camera[:3, :3]
+        return Features(pixels, found.descriptors[solid], points)
+
+
+def matches(photo: Features, rendering: Features, ratio: float, within_px: float = np.inf) -> np.ndarray:
+    """Match features that are each other's nearest, and nearer than `ratio` times the second: pairs (P, 2).
+
+    With `within_px`, a feature is looked for only so far from its own place.
+    """
+    if min(len(photo.pixels), len(rendering.pixels)) < 2:
+        return np.zeros((0, 2), int)
+    alike = photo.descriptors @ rendering.descriptors.T
+    if np.isfinite(within_px):
+        apart = np.linalg.norm(photo.pixels[:, None] - rendering.pixels[None], axis=2)
+        alike = np.where(apart <= within_px, alike, -1)
+    rows, best = np.arange(len(alike)), alike.argmax(axis=1)
+    first = alike[rows, best]
+    mutual = alike.argmax(axis=0)[best] == rows
+    alike[rows, best] = -1
+    # Of unit vectors, the squared distance is 2 - 2 times their product.
+    kept = mutual & (first > 0) & (1 - first < ratio**2 * (1 - alike.max(axis=1)))
+    return np.column_stack([rows[kept], best[kept]])
+
+
+def at_most(camera: Camera, longer_px: int) -> Camera:
+    """Shrink a camera's picture so that its longer side is at most so many px."""
+    shrunk = min(1.0, longer_px / max(camera.width, camera.height))
+    size = np.maximum(np.rint(shrunk * np.array([camera.width, camera.height])), 1).astype(int)
+    K = np.diag([*(size / (camera.width, camera.height)), 1]) @ camera.K
+    return replace(camera, width=int(size[0]), height=int(size[1]), K=K)

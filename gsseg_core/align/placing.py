@@ -1,0 +1,269 @@
+"""Cameras of a dataset put where they are in a scene: by nerfstudio's own file, as it is there, or as it is found."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from gsseg_core.align.agreement import Agreement, Shown, agreement, look_at
+from gsseg_core.align.alignment import Alignment
+from gsseg_core.align.conventions import find_convention
+from gsseg_core.align.settings import AlignSettings
+from gsseg_core.data.camera_files import frame_of_training
+from gsseg_core.data.camera_formats.dataparser import DATAPARSER
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View, spread
+from gsseg_core.errors import AlignmentError, CameraFileError
+from gsseg_core.files.input_files import is_there
+from gsseg_core.progress import Progress, silent
+from gsseg_core.scene.gaussian_scene import GaussianScene
+
+_CLOSE_PX = 1.0  # photos and renderings that are nearer than this are as they should be
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """An alignment, and how well the scene agrees with the views through it.
+
+    Attributes
+    ----------
+    alignment : Alignment
+        Where the cameras are.
+    agreement : Agreement
+        Of the scene, with what the cameras show there.
+    before : Agreement
+        With the cameras where they were.
+    offset_px : float, optional
+        Median distance of features of the photos from those of renderings, px of the photos at 480 px or less; None
+        without photos.
+    """
+
+    alignment: Alignment
+    agreement: Agreement
+    before: Agreement
+    offset_px: float | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Give it as `report.json` does."""
+        return {**self.alignment.as_dict(), "offset_px": self.offset_px, "found": self.alignment.parts}
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A dataset whose cameras are in the frame of a scene, as far as it is known.
+
+    Attributes
+    ----------
+    dataset : Dataset
+        Its cameras moved.
+    dataparser : pathlib.Path or None
+        The file of nerfstudio that said where to, if there was one.
+    found : Found or None
+        What was found, if that was asked for.
+    agreement : Agreement or None
+        Of scene and views, where it was looked at and views show anything.
+    """
+
+    dataset: Dataset
+    dataparser: Path | None = None
+    found: Found | None = None
+    agreement: Agreement | None = None
+
+    @property
+    def fits(self) -> bool:
+        """Whether nothing had to be found: the cameras were where they should be."""
+        return bool(self.agreement and self.agreement.agrees and not (self.found and self.found.alignment.parts))
+
+    def describe(self) -> str:
+        """Say what was found, for people."""
+        lines = [] if self.dataparser is None else [f"moved to the frame of nerfstudio's training by {self.dataparser}"]
+        if self.found is None:
+            return "\n".join([*lines, f"agreement: {self.agreement or 'no view shows anything'}"])
+        if parts := self.found.alignment.parts:
+            lines += [f"not aligned as it is ({self.found.before}); aligned by what --align does:"]
+            lines += [f"  - {part}" for part in parts]
+        lines += [f"aligned: {self.found.agreement}"]
+        if self.found.offset_px is not None:
+            lines += [f"photos and renderings are {self.found.offset_px:.2f} px apart (median of their features)"]
+        return "\n".join(lines)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Give it as `report.json` does."""
+        return {
+            "dataparser": None if self.dataparser is None else str(self.dataparser),
+            "agreement": None if self.agreement is None else vars(self.agreement),
+            "alignment": None if self.found is None else self.found.as_dict(),
+        }
+
+
+def place(
+    scene: GaussianScene,
+    dataset: Dataset,
+    *,
+    align: bool = False,
+    check: bool = False,
+    dataparser: str | os.PathLike[str] | None = None,
+    device: str = "cpu",
+    progress: Progress = silent,
+) -> Placed:
+    """Put the cameras of a dataset where they are in a scene.
+
+    Parameters
+    ----------
+    scene : GaussianScene
+        The scene.
+    dataset : Dataset
+        Its views, with photos or masks where these are needed.
+    align : bool
+        Find where the cameras are; else they stay where they are.
+    check : bool
+        Compare the scene with a few views.
+    dataparser : path, optional
+        nerfstudio's `dataparser_transforms.json`, which lies beside the trained config. If it lies beside the scene or
+        in the dataset, it is found.
+    device : str
+        As for `make_operator`.
+    progress : Progress
+        Told how far it is.
+
+    Raises
+    ------
+    AlignmentError
+        It cannot be found where the cameras are.
+    CameraFileError, PoseError
+        The file of nerfstudio is broken, or says nothing of cameras of this format.
+    """
+    settings, file = AlignSettings(), None
+    if found := _frame_of_training(scene, dataset, dataparser):
+        file, similarity = found
+        dataset = dataset.moved(similarity.camera)
+    views = dataset.views("train") or dataset.views()
+    if align:
+        aligned = find_alignment(scene, views, settings, device, progress)
+        return Placed(dataset.moved(aligned.alignment.camera), file, aligned, aligned.agreement)
+    return Placed(dataset, file, None, agreement(scene, look_at(views, settings), settings, device) if check else None)
+
+
+def find_alignment(
+    scene: GaussianScene,
+    views: Sequence[View],
+    settings: AlignSettings | None = None,
+    device: str = "cpu",
+    progress: Progress = silent,
+) -> Found:
+    """Find where cameras are in a scene, from what their photos show or, without photos, their masks.
+
+    First as they are, then by conventions, and at last, with photos, by a similarity.
+
+    Raises
+    ------
+    AlignmentError
+        Nothing agrees.
+    """
+    settings = settings or AlignSettings()
+    shown = look_at(views, settings)
+    before = agreement(scene, shown, settings, device)
+    if before is None:
+        raise AlignmentError(
+            "alignment: no view has a photo or a mask; expected some, to see where cameras are by them"
+        )
+    if before.agrees:
+        return _closer(scene, views, shown, Found(Alignment(), before, before), settings, device)
+    alignment = Alignment(find_convention(scene, shown, settings, device, progress))
+    if (reached := _through(scene, shown, alignment, settings, device)).agrees:
+        return _closer(scene, views, shown, Found(alignment, reached, before), settings, device)
+    if before.compared == "masks":
+        raise AlignmentError(
+            f"alignment: no convention of axes has scene and masks agree ({reached} at best); expected photos of the "
+            "views in images/, by which scale, rotation and translation can be found, too"
+        )
+    return _registered(scene, views, shown, before, settings, device, progress)
+
+
+def _registered(
+    scene: GaussianScene,
+    views: Sequence[View],
+    shown: Sequence[Shown],
+    before: Agreement,
+    settings: AlignSettings,
+    device: str,
+    progress: Progress,
+) -> Found:
+    """Find a similarity by the photos."""
+    from gsseg_core.align.features import Extractor
+    from gsseg_core.align.refinement import offset_px, refined
+    from gsseg_core.align.registration import candidates, read_photos
+
+    extractor = Extractor(settings)
+    photos = read_photos(views, extractor, settings)
+    for guess in candidates(scene, photos, extractor, settings, device, progress):
+        alignment = refined(scene, photos, guess, extractor, settings, device)
+        reached = _through(scene, shown, alignment, settings, device)
+        if reached.agrees:
+            progress("look for photos in the scene", settings.virtual_views, settings.virtual_views)
+            few = spread(photos, settings.views)
+            return Found(alignment, reached, before, offset_px(scene, few, alignment, extractor, settings, device))
+    raise AlignmentError(
+        f"alignment: no place in the scene looks as the {len(photos)} photos do; expected photos of this scene, with "
+        "structure, and poses that differ from the scene's by a convention, a scale, a rotation and a translation"
+    )
+
+
+def _closer(
+    scene: GaussianScene,
+    views: Sequence[View],
+    shown: Sequence[Shown],
+    found: Found,
+    settings: AlignSettings,
+    device: str,
+) -> Found:
+    """Fit what is about right to the photos, if there are any and they are not yet close to the renderings."""
+    if found.agreement.compared != "photos":
+        return found
+    from gsseg_core.align.features import Extractor
+    from gsseg_core.align.refinement import offset_px, refined
+    from gsseg_core.align.registration import read_photos
+
+    extractor = Extractor(settings)
+    photos = read_photos(views, extractor, settings)
+    few = spread(photos, settings.views)
+    offset = offset_px(scene, few, found.alignment, extractor, settings, device)
+    if offset is None or offset <= _CLOSE_PX:
+        return replace(found, offset_px=offset)
+    alignment = refined(scene, photos, found.alignment, extractor, settings, device)
+    closer = offset_px(scene, few, alignment, extractor, settings, device)
+    if closer is None or closer >= offset:
+        return replace(found, offset_px=offset)
+    return Found(alignment, _through(scene, shown, alignment, settings, device), found.before, closer)
+
+
+def _through(
+    scene: GaussianScene, shown: Sequence[Shown], alignment: Alignment, settings: AlignSettings, device: str
+) -> Agreement:
+    """Compare a scene with views whose cameras are moved."""
+    moved = [replace(view, camera=alignment.camera(view.camera)) for view in shown]
+    compared = agreement(scene, moved, settings, device)
+    assert compared is not None  # since there are views
+    return compared
+
+
+def _frame_of_training(
+    scene: GaussianScene, dataset: Dataset, given: str | os.PathLike[str] | None
+) -> tuple[Path, Any] | None:
+    """Find nerfstudio's file, and the similarity that it states; None if there is none, or none is needed."""
+    folders = [] if scene.path is None else [scene.path.parent]
+    paths = [folder / DATAPARSER for folder in (*folders, dataset.root)] if given is None else [Path(given)]
+    for path in paths:
+        if given is None and not is_there(path, CameraFileError):
+            continue
+        similarity = frame_of_training(dataset.root, path)
+        if similarity is not None:
+            return path, similarity
+        if given is not None:
+            raise CameraFileError(
+                f"{path}: says nothing of the cameras of {dataset.root}; expected cameras that nerfstudio trains from"
+            )
+    return None

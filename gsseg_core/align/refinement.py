@@ -1,0 +1,115 @@
+"""The last pixels of a similarity: renderings from moved cameras are matched with their photos, and the rest is fitted.
+
+From nearly the right place a rendering looks as its photo, so hundreds of features match in each, and all photos
+together determine seven numbers: a rotation, a translation and a scale, by least squares over all reprojection errors.
+Large errors count by their size, not its square, since matches may be wrong and surfaces of a scene badly trained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from gsseg_core.align.alignment import Alignment
+from gsseg_core.align.features import Extractor, matches
+from gsseg_core.align.registration import Photo
+from gsseg_core.align.settings import AlignSettings
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.similarity import Similarity
+
+_SEARCH_PX = (40.0, 12.0, 6.0)  # how far from its place a feature is looked for, in each step
+_LEAST = 20  # matches from which seven numbers are fitted
+
+
+class _Ties(NamedTuple):
+    """Pixels of photos with their points in the scene."""
+
+    rotations: np.ndarray  # (P, 3, 3): of the photo's camera, world to camera
+    translations: np.ndarray  # (P, 3)
+    lenses: np.ndarray  # (P, 4): fx, fy, cx, cy
+    pixels: np.ndarray  # (P, 2)
+    points: np.ndarray  # (P, 3)
+
+    def errors(self, points: np.ndarray) -> np.ndarray:  # (P, 3)
+        """Reprojection errors of points, (P, 2), in px."""
+        local = np.einsum("pij,pj->pi", self.rotations, points) + self.translations
+        depth = np.maximum(local[:, 2:], 1e-9)
+        errors: np.ndarray = local[:, :2] / depth * self.lenses[:, :2] + self.lenses[:, 2:] - self.pixels
+        return errors
+
+
+def refined(
+    scene: GaussianScene,
+    photos: Sequence[Photo],
+    alignment: Alignment,
+    extractor: Extractor,
+    settings: AlignSettings,
+    device: str = "cpu",
+) -> Alignment:
+    """Fit the similarity of an alignment to all photos; where hardly anything matches, it is returned as it was."""
+    for step in range(settings.refinements):
+        within = _SEARCH_PX[min(step, len(_SEARCH_PX) - 1)]
+        ties = _ties(scene, photos, alignment, extractor, settings, within, device)
+        if len(ties.pixels) < _LEAST:
+            return alignment
+        alignment = Alignment(alignment.convention, _fit(ties).inverse().after(alignment.similarity))
+    return alignment
+
+
+def offset_px(
+    scene: GaussianScene,
+    photos: Sequence[Photo],
+    alignment: Alignment,
+    extractor: Extractor,
+    settings: AlignSettings,
+    device: str = "cpu",
+) -> float | None:
+    """How far photos and renderings are apart, in px of the photos as matched: median over the features of both."""
+    ties = _ties(scene, photos, alignment, extractor, settings, _SEARCH_PX[0], device)
+    return float(np.median(np.linalg.norm(ties.errors(ties.points), axis=1))) if len(ties.pixels) >= _LEAST else None
+
+
+def _ties(
+    scene: GaussianScene,
+    photos: Sequence[Photo],
+    alignment: Alignment,
+    extractor: Extractor,
+    settings: AlignSettings,
+    within_px: float,
+    device: str,
+) -> _Ties:
+    """Match each photo with what the scene looks like from its camera."""
+    rows = []
+    for camera, features in photos:
+        moved = alignment.camera(camera)
+        rendering = extractor.rendering(scene, moved, device)
+        pairs = matches(features, rendering, settings.ratio, within_px)
+        if len(pairs) == 0 or rendering.points is None:
+            continue
+        pose = moved.world_to_camera
+        lens = np.array([moved.fx, moved.fy, moved.cx, moved.cy])
+        repeated = (np.repeat(each[None], len(pairs), axis=0) for each in (pose[:3, :3], pose[:3, 3], lens))
+        rows.append((*repeated, features.pixels[pairs[:, 0]], rendering.points[pairs[:, 1]]))
+    if not rows:
+        return _Ties(*(np.zeros((0, *shape)) for shape in ((3, 3), (3,), (4,), (2,), (3,))))
+    return _Ties(*(np.concatenate(column) for column in zip(*rows, strict=True)))
+
+
+def _fit(ties: _Ties) -> Similarity:
+    """Fit the similarity that moves points of the scene to where the cameras see their pixels."""
+    middle = np.median(ties.points, axis=0)
+    size = max(float(np.median(np.abs(ties.points - middle))), 1e-9)
+
+    def similarity(values: np.ndarray) -> Similarity:  # (7,)
+        rotation, scale = Rotation.from_rotvec(values[:3]).as_matrix(), float(np.exp(values[6]))
+        return Similarity(scale, rotation, middle + size * values[3:6] - scale * rotation @ middle)
+
+    fitted = least_squares(
+        lambda values: ties.errors(similarity(values).points(ties.points)).ravel(),
+        np.zeros(7), loss="soft_l1", f_scale=1.0,
+    )  # fmt: skip
+    return similarity(fitted.x)

@@ -1,0 +1,176 @@
+"""Where photos were taken in a scene of which nothing is known: neither its scale, nor where up is.
+
+The scene is rendered from places all around and inside it, and features of each rendering are matched with those of
+some photos. Matches tie pixels to points of the scene, which is what the camera's pose follows from (RANSAC over three
+points, as COLMAP does it). One photo that is located so is enough for a start: rendered from its place, the scene looks
+like it, and so matches its neighbours, too. Two poses with the dataset's own make a similarity: the rotation is what
+turns cameras of the dataset into those that were found, the scale what brings their centres as far apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations, product
+from typing import NamedTuple
+
+import numpy as np
+from PIL import Image
+
+from gsseg_core.align.alignment import Alignment
+from gsseg_core.align.conventions import AXIS_ROTATIONS, Convention
+from gsseg_core.align.features import Extractor, Features, at_most, matches
+from gsseg_core.align.settings import AlignSettings
+from gsseg_core.data.photos import read_photo
+from gsseg_core.data.view import View, spread
+from gsseg_core.progress import Progress, silent
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.similarity import Similarity
+
+_SHELLS = (1.6, 1.0, 0.0, 2.5)  # radii of the scene at which it is looked at from outside; 0: from inside
+_SOLID = 0.3  # opacity from which on a Gaussian counts for the size of the scene
+_TURN_DEGREES, _SHIFT = 5.0, 0.1  # by which located cameras may miss those of one similarity; of the extent of centres
+
+
+class Photo(NamedTuple):
+    """A photo to be located: its camera as the dataset has it, shrunk to what is matched, and its features."""
+
+    camera: Camera
+    features: Features
+
+
+class Located(NamedTuple):
+    """A camera where its photo was found to be taken, and how many matches say so."""
+
+    camera: Camera
+    matches: int
+
+
+def read_photos(views: Sequence[View], extractor: Extractor, settings: AlignSettings) -> list[Photo]:
+    """Read some photos, spread evenly over those that there are, with their features."""
+    photos = []
+    for view in spread([view for view in views if view.image_path is not None], settings.photos):
+        taken = read_photo(view)
+        if taken is not None:
+            camera = at_most(view.camera, settings.photo_px)
+            grey = Image.fromarray(taken).convert("L").resize((camera.width, camera.height), Image.Resampling.BOX)
+            photos.append(Photo(camera, extractor.photo(np.asarray(grey, np.float32) / 255)))
+    return photos
+
+
+def candidates(
+    scene: GaussianScene,
+    photos: Sequence[Photo],
+    extractor: Extractor,
+    settings: AlignSettings,
+    device: str = "cpu",
+    progress: Progress = silent,
+) -> Iterator[Alignment]:
+    """Guess alignments, each from other photos than the last; most guesses are right, to a few px."""
+    if len(photos) < 2:
+        return
+    for done, camera in enumerate(virtual_cameras(scene, photos[0].camera, settings.virtual_views)):
+        progress("look for photos in the scene", done, settings.virtual_views)
+        found = locate(photos, extractor.rendering(scene, camera, device), settings)
+        for _ in range(2):  # from where the surest one was taken, the scene looks like it
+            if not found:
+                break
+            surest = max(found.values(), key=lambda located: located.matches)
+            found = locate(photos, extractor.rendering(scene, surest.camera, device), settings)
+        if len(found) > 1 and (guess := fit_poses(photos, found)) is not None:
+            yield guess
+    progress("look for photos in the scene", settings.virtual_views, settings.virtual_views)
+
+
+def virtual_cameras(scene: GaussianScene, like: Camera, count: int) -> Iterator[Camera]:
+    """Place cameras with the lens of another one around a scene and inside, some of each kind in turn."""
+    solid = scene.means[scene.opacities > _SOLID] if (scene.opacities > _SOLID).any() else scene.means
+    low, middle, high = np.percentile(solid, (5, 50, 95), axis=0).astype(np.float64)
+    radius = max(float(np.linalg.norm(high - low)) / 2, 1e-9)
+    rng = np.random.default_rng(0)
+    for i in range(count):
+        shell = _SHELLS[i % len(_SHELLS)]
+        away, up = rng.normal(size=(2, 3))
+        away /= np.linalg.norm(away)
+        place = middle + shell * radius * away if shell else rng.uniform(low, high)
+        right = np.cross(away, up)
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3, :3] = right, np.cross(-away, right), -away
+        pose[:3, 3] = -pose[:3, :3] @ place
+        yield replace(like, world_to_camera=pose)
+
+
+def locate(photos: Sequence[Photo], rendering: Features, settings: AlignSettings) -> dict[int, Located]:
+    """Locate photos, by their numbers, of which the rendering shows enough."""
+    import pycolmap
+
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.max_error = settings.reprojection_px
+    options.ransac.random_seed = 0
+    options.ransac.max_num_trials = 2000
+    found = {}
+    for number, (camera, features) in enumerate(photos):
+        pairs = matches(features, rendering, settings.ratio)
+        if len(pairs) < settings.matches or rendering.points is None:
+            continue
+        lens = pycolmap.Camera(
+            model="PINHOLE", width=camera.width, height=camera.height,
+            params=[camera.fx, camera.fy, camera.cx, camera.cy],
+        )  # fmt: skip
+        pixels, points = features.pixels[pairs[:, 0]], rendering.points[pairs[:, 1]]
+        pose = pycolmap.estimate_and_refine_absolute_pose(pixels, points, lens, options)
+        if pose is not None and pose["num_inliers"] >= settings.matches:
+            matrix = np.vstack([pose["cam_from_world"].matrix(), (0, 0, 0, 1)])
+            found[number] = Located(replace(camera, world_to_camera=matrix), int(pose["num_inliers"]))
+    return found
+
+
+def fit_poses(photos: Sequence[Photo], found: Mapping[int, Located]) -> Alignment | None:
+    """Find the alignment that brings most cameras of a dataset to where their photos were located; None if under two.
+
+    Poses may be inverted, and cameras have any axes; where several conventions do equally well, the plainest is taken.
+    """
+    best, most = None, 1
+    located = _Poses.of([each.camera for each in found.values()])
+    for inverted, axes in product((False, True), AXIS_ROTATIONS):
+        convention = Convention(inverted, camera_axes=axes)
+        given = _Poses.of([convention.camera(photos[number].camera) for number in found])
+        for first, second in combinations(range(len(found)), 2):
+            similarity = _between(given, located, first, second)
+            fitting = 0 if similarity is None else _fitting(similarity, given, located)
+            if similarity is not None and fitting > most:
+                best, most = Alignment(convention, similarity), fitting
+    return best
+
+
+class _Poses(NamedTuple):
+    """Poses of cameras, camera-to-world."""
+
+    rotations: np.ndarray  # (P, 3, 3)
+    centers: np.ndarray  # (P, 3)
+
+    @classmethod
+    def of(cls, cameras: Sequence[Camera]) -> _Poses:
+        rotations = np.stack([camera.world_to_camera[:3, :3].T for camera in cameras])
+        return cls(rotations, np.stack([camera.center for camera in cameras]))
+
+
+def _between(given: _Poses, located: _Poses, first: int, second: int) -> Similarity | None:
+    """Find the similarity that takes two cameras to where they were located; None if they are in one place."""
+    span, wider = (float(np.linalg.norm(poses.centers[first] - poses.centers[second])) for poses in (given, located))
+    if min(span, wider) < 1e-9:
+        return None
+    scale, rotation = wider / span, located.rotations[first] @ given.rotations[first].T
+    middle, found_middle = ((poses.centers[first] + poses.centers[second]) / 2 for poses in (given, located))
+    return Similarity(scale, rotation, found_middle - scale * rotation @ middle)
+
+
+def _fitting(similarity: Similarity, given: _Poses, located: _Poses) -> int:
+    """Count the cameras that a similarity takes to about where they were located."""
+    extent = float(np.ptp(located.centers, axis=0).max())
+    near = np.linalg.norm(similarity.points(given.centers) - located.centers, axis=1) <= _SHIFT * extent
+    turned = similarity.rotation @ given.rotations
+    cosines = (np.einsum("pij,pij->p", turned, located.rotations) - 1) / 2
+    return int((near & (cosines >= np.cos(np.radians(_TURN_DEGREES)))).sum())

@@ -1,0 +1,225 @@
+"""Alignment: cameras in another frame than the scene are noticed, and put where they are."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from gsseg_core.align.agreement import agreement, look_at, render
+from gsseg_core.align.conventions import AXIS_ROTATIONS, OPENGL, Convention
+from gsseg_core.align.features import Features
+from gsseg_core.align.placing import find_alignment, place
+from gsseg_core.align.registration import Located, Photo, fit_poses
+from gsseg_core.align.settings import AlignSettings
+from gsseg_core.cli.main import main
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import spread
+from gsseg_core.errors import AlignmentError
+from gsseg_core.export.view_pictures import background_image
+from gsseg_core.raster.backends import make_operator
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.similarity import Similarity
+
+SETTINGS = AlignSettings()
+DISTURBED = Similarity(2.7, Rotation.from_rotvec([0.5, 2.0, -1.0]).as_matrix(), np.array([3.0, -1.0, 4.0]))
+PHOTOS = 8
+
+
+@pytest.fixture(scope="module")
+def demo(demo_run: Path) -> Path:
+    return demo_run / "scene"
+
+
+@pytest.fixture(scope="module")
+def scene(demo: Path) -> GaussianScene:
+    return GaussianScene.load(demo / "scene.ply")
+
+
+@pytest.fixture(scope="module")
+def with_photos(demo: Path, scene: GaussianScene, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The demo with photos of some views, a quarter brighter than they would be rendered."""
+    folder = tmp_path_factory.mktemp("photos")
+    for name in ("cameras.json", "classes.json"):
+        shutil.copy(demo / name, folder)
+    (folder / "images").mkdir()
+    cameras = spread(Dataset(demo).cameras, PHOTOS)
+    for camera in cameras:
+        image = background_image(scene, make_operator(scene, camera)).astype(float)
+        Image.fromarray((1.25 * image).clip(0, 255).astype(np.uint8)).save(folder / f"images/{camera.name}.png")
+    train = [camera.name for camera in cameras]
+    (folder / "split.json").write_text(json.dumps({"train": train, "test": []}))
+    return folder
+
+
+def poses_apart(first: Dataset, second: Dataset) -> float:
+    pairs = zip(first.cameras, second.cameras, strict=True)
+    return max(float(np.abs(a.world_to_camera - b.world_to_camera).max()) for a, b in pairs)
+
+
+def pixels_apart(scene: GaussianScene, first: Dataset, second: Dataset) -> float:
+    """Largest over views of the median distance in px of where points of the scene are seen."""
+    apart = []
+    for a, b in zip(first.cameras, second.cameras, strict=True):
+        pixels = a.project(scene.means[::50])[0]
+        inside = ((pixels >= 0) & (pixels < (a.width, a.height))).all(axis=1)
+        offsets = np.linalg.norm(pixels[inside] - b.project(scene.means[::50][inside])[0], axis=1)
+        apart.append(float(np.nanmedian(offsets)))
+    return max(apart)
+
+
+def test_cameras_that_fit_are_said_to_fit_by_masks_and_by_photos(
+    demo: Path, with_photos: Path, scene: GaussianScene
+) -> None:
+    for folder, compared in ((demo, "masks"), (with_photos, "photos")):
+        found = place(scene, Dataset(folder), check=True).agreement
+        assert found is not None and found.agrees and found.compared == compared
+
+
+@pytest.mark.parametrize("folder", ["demo", "with_photos"])
+def test_cameras_of_another_frame_are_said_not_to_fit(
+    folder: str, scene: GaussianScene, request: pytest.FixtureRequest
+) -> None:
+    dataset = Dataset(request.getfixturevalue(folder)).moved(DISTURBED.camera)
+    found = place(scene, dataset, check=True).agreement
+    assert found is not None and found.agrees is False
+
+
+def test_real_scenes_are_never_said_not_to_fit(real_data: Path) -> None:
+    for name in ("fern", "kitchen_table", "replica_apartment", "shelf", "workbench"):
+        scene, dataset = GaussianScene.load(real_data / name / "scene.ply"), Dataset(real_data / name, "labels_noisy")
+        views = dataset.views("train")
+        for shown in (views, [replace(view, image_path=None) for view in views if view.has_mask]):
+            found = agreement(scene, look_at(shown, SETTINGS), SETTINGS)
+            assert found is None or found.agrees, (name, found)
+
+
+def test_views_that_show_nothing_are_not_judged(demo: Path, scene: GaussianScene) -> None:
+    assert place(scene, Dataset(demo, "no_such_folder"), check=True).agreement is None
+    with pytest.raises(AlignmentError, match="no view has a photo or a mask"):
+        place(scene, Dataset(demo, "no_such_folder"), align=True)
+
+
+def test_turning_a_picture_is_turning_its_camera(demo: Path, scene: GaussianScene) -> None:
+    camera = look_at(Dataset(demo).views(), SETTINGS)[0].camera
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    for quarters in range(4):
+        turned = Convention(camera_axes=np.linalg.matrix_power(quarter, quarters)).camera(camera)
+        expected = render(scene, turned).colours
+        np.testing.assert_allclose(render(scene, camera).turned(quarters).colours, expected, atol=2e-3)
+
+
+def test_the_conventions_are_the_24_rotations_from_axes_to_axes() -> None:
+    assert len({axes.tobytes() for axes in AXIS_ROTATIONS}) == 24
+    assert all(np.allclose(axes @ axes.T, np.eye(3)) and np.linalg.det(axes) > 0.5 for axes in AXIS_ROTATIONS)
+    assert Convention().parts == []
+
+
+@pytest.mark.parametrize(
+    ("folder", "convention"),
+    [
+        ("demo", Convention(camera_axes=OPENGL)),
+        ("with_photos", Convention(inverted=True, world_axes=AXIS_ROTATIONS[17])),
+    ],
+)
+def test_conventions_are_found_exactly(
+    folder: str, convention: Convention, scene: GaussianScene, request: pytest.FixtureRequest
+) -> None:
+    true = Dataset(request.getfixturevalue(folder))
+    placed = place(scene, true.moved(convention.camera), align=True)
+    assert placed.agreement is not None and placed.agreement.agrees and not placed.fits
+    assert poses_apart(placed.dataset, true) < 1e-9
+    assert "not aligned as it is" in placed.describe() and "aligned: " in placed.describe()
+
+
+@pytest.mark.parametrize(
+    "convention", [Convention(), Convention(camera_axes=OPENGL), Convention(True, camera_axes=AXIS_ROTATIONS[7])]
+)
+def test_poses_of_located_photos_make_a_similarity_whatever_axes_cameras_have_and_a_wrong_one_does_no_harm(
+    demo: Path, convention: Convention
+) -> None:
+    true = spread(Dataset(demo).cameras, 6)
+    nothing = Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
+    photos = [Photo(convention.camera(DISTURBED.camera(camera)), nothing) for camera in true]
+    found = {number: Located(camera, 20) for number, camera in enumerate(true)}
+    found[2] = Located(DISTURBED.camera(true[2]), 20)
+    alignment = fit_poses(photos, found)
+    assert alignment is not None
+    for photo, camera in zip(photos, true, strict=True):
+        np.testing.assert_allclose(alignment.camera(photo.camera).world_to_camera, camera.world_to_camera, atol=1e-6)
+
+
+def test_a_similarity_of_a_real_scene_is_found_to_a_fraction_of_a_pixel(real_data: Path) -> None:
+    scene, true = GaussianScene.load(real_data / "kitchen_table/scene.ply"), Dataset(real_data / "kitchen_table")
+    moved = true.moved(DISTURBED.camera)
+    settings = replace(SETTINGS, views=3, photos=8, survivors=0.01, picture_px=64)
+    found = find_alignment(scene, moved.views("train"), settings)
+    assert found.alignment.similarity.scale == pytest.approx(1 / DISTURBED.scale, rel=1e-2)
+    assert pixels_apart(scene, moved.moved(found.alignment.camera), true) < 1
+    assert found.offset_px is not None and found.offset_px < 1
+
+
+def test_what_is_a_little_off_is_brought_closer(with_photos: Path, scene: GaussianScene) -> None:
+    true = Dataset(with_photos)
+    nudge = Similarity(1.0, Rotation.from_rotvec([0.01, 0, 0]).as_matrix(), np.zeros(3))
+    placed = place(scene, true.moved(nudge.camera), align=True)
+    assert pixels_apart(scene, true.moved(nudge.camera), true) > 2
+    assert pixels_apart(scene, placed.dataset, true) < 1
+
+
+def test_without_photos_a_similarity_is_refused_with_the_way_out(demo: Path, scene: GaussianScene) -> None:
+    quick = replace(SETTINGS, views=2, survivors=0.01, picture_px=48)
+    with pytest.raises(AlignmentError, match="expected photos of the views in images/"):
+        find_alignment(scene, Dataset(demo).moved(DISTURBED.camera).views("train"), quick)
+
+
+def write_moved(source: Path, target: Path, move: Callable[[Camera], Camera]) -> Path:
+    """Copy a dataset with links, its cameras moved."""
+    target.mkdir()
+    for path in source.iterdir():
+        if path.name != "cameras.json":
+            (target / path.name).symlink_to(path)
+    entries = json.loads((source / "cameras.json").read_text())
+    for entry, camera in zip(entries, Dataset(source).cameras, strict=True):
+        moved = move(camera)
+        entry |= {"position": moved.center.tolist(), "rotation": moved.world_to_camera[:3, :3].T.tolist()}
+    (target / "cameras.json").write_text(json.dumps(entries))
+    return target
+
+
+def test_doctor_says_what_makes_cameras_fit_and_whether_they_did(
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    turned = write_moved(demo, tmp_path / "turned", Convention(camera_axes=OPENGL).camera)
+    assert main(["doctor", str(demo), "--scene", str(demo / "scene.ply"), "--quiet"]) == 0
+    assert capsys.readouterr().out.startswith("aligned: ")
+    assert main(["doctor", str(turned), "--scene", str(demo / "scene.ply"), "--quiet"]) == 2
+    assert "as in OpenGL" in capsys.readouterr().out
+    assert main(["doctor", "--scene", str(demo / "scene.ply")]) == 2
+    assert "expected a dataset, too" in capsys.readouterr().err
+
+
+def test_segment_warns_in_one_line_of_cameras_that_do_not_fit_and_align_mends_it(
+    demo: Path, demo_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    turned = write_moved(demo, tmp_path / "turned", Convention(world_axes=AXIS_ROTATIONS[9]).camera)
+    lost = write_moved(demo, tmp_path / "lost", DISTURBED.camera)
+    scene = str(demo / "scene.ply")
+    quick = ["--quiet", "--learner", "votes", "--views", "4", "--no-knn", "--no-filter", "--out", str(tmp_path / "out")]
+    assert main(["segment", scene, "--data", str(lost), *quick]) == 0
+    assert capsys.readouterr().err.count("try --align") == 1
+    assert json.loads((tmp_path / "out/report.json").read_text())["frame"]["agreement"]["agrees"] is False
+
+    assert main(["segment", scene, "--data", str(turned), *quick, "--align"]) == 0
+    assert capsys.readouterr().err == ""
+    frame = json.loads((tmp_path / "out/report.json").read_text())["frame"]
+    assert frame["agreement"]["agrees"] is True
+    np.testing.assert_allclose(frame["alignment"]["world_axes"], AXIS_ROTATIONS[9].T)
