@@ -10,7 +10,7 @@ import numpy.typing as npt
 from gsseg_core.errors import SceneFileError
 from gsseg_core.scene.ply import read_elements
 from gsseg_core.scene.quaternions import from_smallest_three
-from gsseg_core.scene.vertices import REST_COUNTS, ReadScene, dc_of, logits, pack_vertices, rest_names
+from gsseg_core.scene.vertices import REST_COUNTS, ReadScene, dc_of, logits, pack_in_blocks, pack_vertices, rest_names
 
 _BLOCK = 256
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -38,25 +38,37 @@ def read_compressed_ply(path: Path, within: Path | None = None) -> ReadScene:
     n = len(vertices)
     if len(chunks) != -(-n // _BLOCK):
         raise SceneFileError(f"{path}: has {len(chunks):,} chunks for {n:,} vertices; expected {-(-n // _BLOCK):,}")
+    sh = elements.get("sh")
+    if sh is not None and len(sh) != n:
+        raise SceneFileError(f"{path}: has SH of {len(sh):,} Gaussians for {n:,} vertices; expected as many")
     try:
-        position, rotation, scale, color = (vertices[name].astype(np.uint32, casting="safe") for name in _PACKED)
-        rgba = np.stack([_fraction(color, shift, 8) for shift in (24, 16, 8, 0)], axis=1)
-        rgb = (
-            _between(chunks, "min_{}", "max_{}", "rgb", rgba[:, :3])
-            if "min_r" in (chunks.dtype.names or ())
-            else rgba[:, :3]
-        )
-        packed = pack_vertices(
-            _between(chunks, "min_{}", "max_{}", "xyz", _three(position)),
-            _rotations(rotation),
-            _between(chunks, "min_scale_{}", "max_scale_{}", "xyz", _three(scale)),
-            logits(rgba[:, 3]),
-            dc_of(rgb),
-            _rest(elements.get("sh"), n),
+        packed = pack_in_blocks(
+            n,
+            lambda block: _pack(chunks[block.start // _BLOCK :], vertices[block], None if sh is None else sh[block]),
         )
     except (ValueError, TypeError) as error:
         raise SceneFileError(f"{path}: not a compressed PLY ({error}); expected one of PlayCanvas") from error
     return ReadScene(packed)
+
+
+def _pack(
+    chunks: npt.NDArray[np.void],  # (C,) extremes of 256 Gaussians each
+    vertices: npt.NDArray[np.void],  # (N,)
+    sh: npt.NDArray[np.void] | None,  # (N,)
+) -> npt.NDArray[np.void]:
+    position, rotation, scale, color = (vertices[name].astype(np.uint32, casting="safe") for name in _PACKED)
+    rgba = np.stack([_fraction(color, shift, 8) for shift in (24, 16, 8, 0)], axis=1)
+    rgb = rgba[:, :3]
+    if "min_r" in (chunks.dtype.names or ()):
+        rgb = _between(chunks, "min_{}", "max_{}", "rgb", rgb)
+    return pack_vertices(
+        _between(chunks, "min_{}", "max_{}", "xyz", _three(position)),
+        _rotations(rotation),
+        _between(chunks, "min_scale_{}", "max_scale_{}", "xyz", _three(scale)),
+        logits(rgba[:, 3]),
+        dc_of(rgb),
+        _rest(sh, len(vertices)),
+    )
 
 
 def _fraction(bits: npt.NDArray[np.uint32], shift: int, count: int) -> npt.NDArray[np.float32]:
@@ -76,8 +88,8 @@ def _between(
     """Place fractions between the extremes of their chunks."""
     out = np.empty_like(fractions)
     for i, axis in enumerate(axes):
-        least = chunks[low.format(axis)].repeat(_BLOCK)[: len(fractions)]
-        most = chunks[high.format(axis)].repeat(_BLOCK)[: len(fractions)]
+        used = -(-len(fractions) // _BLOCK)
+        least, most = (chunks[name.format(axis)][:used].repeat(_BLOCK)[: len(fractions)] for name in (low, high))
         with np.errstate(all="ignore"):  # What is NaN or infinite is reported by the scene.
             out[:, i] = least * (1 - fractions[:, i]) + most * fractions[:, i]
     return out
