@@ -9,9 +9,10 @@ of all sets that it is in, is the label's likelihood, and all that learning asks
     pl(c) = m_c + r [c in A].
 
 The segmenter's *vocabulary* is what it can answer: the classes that have a mass, and "none of these" if some label says
-so. Confusion matrices have a column for each word of it, so they do not grow with the number of prototypes. Votes go to
-the classes that a label names, m_c; the rest is a vote for no class, but counts against those that were looked for and
-not found, m_c - r [c in S].
+so. Confusion matrices have a column for each word of it, so they do not grow with the number of prototypes. A label
+that has lost its name is a word of its own: no vote for any class, but its pixels still belong together, and the
+confusion matrix tells which class they are of. Votes go to the classes that a label names, m_c; the rest is a vote for
+no class, but counts against those that were looked for and not found, m_c - r [c in S].
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ class LabelEvidence:
     classes: np.ndarray  # (C,) int32: those that some label names
     mass: np.ndarray | None = None  # (L, C) float32, of each class under each label
     supervised: np.ndarray | None = None  # (S,) int32
+    nameless: np.ndarray | None = None  # (L,) bool: labels that are words of their own; None if there is none
 
     @cached_property
     def rest(self) -> np.ndarray:
@@ -67,21 +69,33 @@ class LabelEvidence:
             return np.ones(len(self.rest), bool)
         return np.asarray(self.mass.any(axis=1))
 
-    def without(self, labels: np.ndarray) -> LabelEvidence:  # (L,) bool
-        """Return the evidence without that of these labels, of a mask in which all classes were looked for."""
+    def without_names(self, labels: np.ndarray) -> LabelEvidence:  # (L,) bool
+        """Make these labels words of their own, of a mask that `is_certain`; `named` still tells what they were."""
         mass = np.eye(len(self.classes), dtype=np.float32) if self.mass is None else self.mass
-        return LabelEvidence(self.classes, np.where(labels[:, None], np.float32(0), mass))
+        return LabelEvidence(self.classes, mass, nameless=labels)
+
+    @cached_property
+    def former_words(self) -> np.ndarray:
+        """Word that each nameless label was before, (V,) int64: its position in the vocabulary."""
+        return np.searchsorted(self.classes, self.named()[self.nameless] if self.nameless is not None else [])
 
     @property
     def vocabulary(self) -> np.ndarray:
-        """Words that the segmenter uses, (W,) int32: classes, then `UNKNOWN` (-1) for "none of these" if it occurs."""
-        return np.append(self.classes, np.int32(UNKNOWN)) if self.has_none_of_these else self.classes
+        """Words that the segmenter uses, (W,) int32: classes, then `UNKNOWN` (-1) for each other one.
+
+        Those are "none of these", if it occurs, or the nameless labels in their order.
+        """
+        others = len(self.former_words) + self.has_none_of_these
+        return np.append(self.classes, np.full(others, UNKNOWN, np.int32))
 
     @cached_property
     def word_plausibility(self) -> np.ndarray | None:
         """Plausibility of each word under each label, (L, W) float32; None where label l is word l."""
         if self.mass is None:
             return None
+        if self.nameless is not None:
+            own = np.eye(len(self.mass), dtype=np.float32)[:, self.nameless]
+            return np.column_stack([np.where(self.nameless[:, None], np.float32(0), self.mass), own])
         if self.supervised is None:
             return np.asarray(self.mass + self.rest[:, None])
         return np.column_stack([self.mass, self.rest]) if self.has_none_of_these else self.mass
@@ -95,6 +109,8 @@ class LabelEvidence:
         votes[:, np.searchsorted(self.concerned, self.classes)] = self.mass
         if self.supervised is not None:
             votes -= self.rest[:, None].astype(np.float64)
+        if self.nameless is not None:
+            votes[self.nameless] = 0
         rows = CSRRows.from_dense(votes)
         return CSRRows(rows.indptr, self.concerned[rows.indices].astype(np.uint32), rows.data)
 

@@ -75,7 +75,7 @@ def assert_same(one: Learner, other: Learner) -> None:
         assert list(one.error_models_) == list(other.error_models_)
         for name, model in one.error_models_.items():
             np.testing.assert_array_equal(model.confusion, other.error_models_[name].confusion)
-            np.testing.assert_array_equal(model.evidence.informative, other.error_models_[name].evidence.informative)
+            np.testing.assert_array_equal(model.evidence.nameless, other.error_models_[name].evidence.nameless)
 
 
 @contextmanager

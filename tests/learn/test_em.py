@@ -27,6 +27,7 @@ from threadpoolctl import threadpool_limits
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
+from gsseg_core.learn.em.confusion_model import PART_PRIOR
 from gsseg_core.learn.em.em_kernels import GRADIENT_UNIT, ViewPairs, accumulate, m_step, predicted_gain
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings, codes_without
 from gsseg_core.learn.em.rejected_regions import SMALLEST
@@ -42,42 +43,59 @@ def slow_em(
 ) -> tuple[np.ndarray, list[float], dict[str, np.ndarray]]:
     """Readable twin of `EMLearner.fit`, with W as dense matrices in float64: codes, objectives, confusions R."""
     n, K, o = len(scene), NUM_CLASSES, settings.outliers
-    seen = []
-    used = without_rejected_regions(scene, views, settings) if settings.errors else views
-    for view, before in zip(used, views, strict=True):
-        operator, y = make_operator(scene, view.camera), view.read_labels().ravel()
+    seen, formers = [], []
+    words = rejected_regions(scene, views, settings) if settings.errors else [view.read_labels() for view in views]
+    for view, word in zip(views, words, strict=True):
+        operator, y = make_operator(scene, view.camera), word.ravel()
         entries = operator.weights()
         W = np.zeros((y.size, n))
         W[entries.pixels, entries.gaussians] = entries.weights
         rest = operator.transmittance().ravel().astype(np.float64)
-        classes = np.unique(before.read_labels()[before.read_labels() >= 0])
-        onehot = (y[:, None] == classes).astype(np.float64)
+        classes = np.unique(view.read_labels()[view.read_labels() >= 0])
+        parts = np.unique(y[y >= K])  # rejected regions, each a word of its own
+        onehot = (y[:, None] == np.append(classes, parts)).astype(np.float64)
         known = y >= 0
         seen.append((W[known], rest[known], onehot[known], classes))
+        formers.append([view.read_labels().ravel()[(y == part).argmax()] for part in parts])
 
     votes = np.zeros((n, K))
     for W, _, onehot, classes in seen:
-        votes[:, classes] += W.T @ onehot
+        votes[:, classes] += W.T @ onehot[:, : len(classes)]
     distances = np.linalg.norm(scene.means[:, None].astype(np.float64) - scene.means, axis=2)
     np.fill_diagonal(distances, np.inf)
     nearest = np.argsort(distances, axis=1)[:, : settings.prior_k]
     prior = settings.prior_weight * scaled(scaled(votes)[nearest].mean(axis=1))
     q = scaled(votes + prior)
 
+    def estimated(v: int, counts: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+        """Confusions of one view from counts of classes and words, with the priors."""
+        classes, R = seen[v][3], np.empty_like(counts)
+        places = [int(np.flatnonzero(classes == former)[0]) for former in formers[v]]
+        named = counts[:, : len(classes)].copy()
+        for part, word in enumerate(places, len(classes)):
+            named[:, word] += counts[:, part]
+        total = named + np.eye(K)[:, classes] * rights[v]
+        R[:, : len(classes)] = scaled(total)
+        whole = R.copy()
+        for part, word in enumerate(places, len(classes)):
+            share = counts[:, part].sum() / named[:, word].sum()
+            share = (counts[:, part] + PART_PRIOR * share) / (named[:, word] + PART_PRIOR)
+            R[:, part] = whole[:, word] * share
+            R[:, word] -= R[:, part]
+        return np.where(total.any(axis=1, keepdims=True), R, otherwise)
+
     confusions, rights = [], []
-    for W, _, onehot, classes in seen:
-        diagonal, own = np.eye(K)[:, classes], W.T @ onehot
-        others = votes.copy()
-        others[:, classes] -= own
+    for v, (W, _, onehot, classes) in enumerate(seen):
+        own, others = W.T @ onehot, votes.copy()
+        others[:, classes] -= own[:, : len(classes)]
         counts = scaled(scaled(np.maximum(others, 0)) ** settings.majority).T @ own
-        right = settings.error_prior * counts[classes].sum(axis=1)
-        flat = np.full((K, len(classes)), 1 / len(classes))
-        confusions.append(scaled(counts + diagonal * right, flat) if settings.errors else diagonal)
-        rights.append(right)
+        rights.append(settings.error_prior * counts[classes].sum(axis=1))
+        flat = np.full(counts.shape, 1 / onehot.shape[1])
+        confusions.append(estimated(v, counts, flat) if settings.errors else np.eye(K)[:, classes])
 
     def one_over_p(v: int, codes: np.ndarray) -> np.ndarray:
-        W, rest, onehot, classes = seen[v]
-        C = (1 - o) * confusions[v] + o / len(classes)
+        W, rest, onehot, _ = seen[v]
+        C = (1 - o) * confusions[v] + o / onehot.shape[1]
         p = ((W @ codes + rest[:, None] * np.eye(K)[0]) @ C * onehot).sum(axis=1)
         return onehot / p[:, None]
 
@@ -87,23 +105,22 @@ def slow_em(
             shares = [one_over_p(v, q) for v in range(len(seen))]
             objective = (prior[counted] * np.log(q[counted])).sum() - sum(np.log(s.max(axis=1)).sum() for s in shares)
             objectives.append(objective / sum(len(onehot) for _, _, onehot, _ in seen))
-            gradient = [W.T @ s @ ((1 - o) * R + o / len(c)).T
-                     for (W, _, _, c), s, R in zip(seen, shares, confusions, strict=True)]  # fmt: skip
+            gradient = [W.T @ s @ ((1 - o) * R + o / R.shape[1]).T
+                     for (W, _, _, _), s, R in zip(seen, shares, confusions, strict=True)]  # fmt: skip
             if step == steps - 1 and r < len(rounds) - 1:
-                for v, (W, rest, _, classes) in enumerate(seen):
+                for v, (W, rest, _, _) in enumerate(seen):
                     without = scaled(q * (sum(gradient) - gradient[v]) + prior)
                     share = one_over_p(v, without)
                     counts = without.T @ (W.T @ share)
                     counts[0] += rest @ share
-                    diagonal = np.eye(K)[:, classes]
-                    confusions[v] = scaled((1 - o) * confusions[v] * counts + diagonal * rights[v], confusions[v])
+                    confusions[v] = estimated(v, (1 - o) * confusions[v] * counts, confusions[v])
             q = scaled(q * sum(gradient) + prior)
     q[~votes.any(axis=1)] = 0
     return q, objectives, {view.name: R for view, R in zip(views, confusions, strict=True)}
 
 
-def without_rejected_regions(scene: GaussianScene, views: list[View], settings: EMSettings) -> list[View]:
-    """Make pixels of rejected regions unknown, as the equations have it."""
+def rejected_regions(scene: GaussianScene, views: list[View], settings: EMSettings) -> list[np.ndarray]:
+    """Labels of each view with a number of its own, from `NUM_CLASSES` on, for each rejected region."""
     weights, regions, onehots = [], [], []
     for view in views:
         entries, labels = make_operator(scene, view.camera).weights(), view.read_labels()
@@ -114,15 +131,17 @@ def without_rejected_regions(scene: GaussianScene, views: list[View], settings: 
         onehots.append(onehot)
         regions.append(slow_regions(labels))
     votes = sum(W.T @ onehot for W, onehot in zip(weights, onehots, strict=True))
-    used = []
+    words = []
     for view, W, onehot, (of_pixel, classes) in zip(views, weights, onehots, regions, strict=True):
         others = scaled(np.maximum(votes - W.T @ onehot, 0))
         inside = (of_pixel.reshape(-1, 1) == np.arange(len(classes))).astype(np.float64)
         counts = others.T @ (W.T @ inside)
-        rejected = counts[classes, np.arange(len(classes))] < settings.least_agreement * counts.sum(axis=0)
-        hidden = np.append(rejected, False)[of_pixel]
-        used.append(View.from_arrays(view.camera, np.where(hidden, -1, view.read_labels())))
-    return used
+        word = view.read_labels()
+        for region, label in enumerate(classes):
+            if counts[label, region] < settings.least_agreement * counts[:, region].sum():
+                word[of_pixel == region] = NUM_CLASSES + region
+        words.append(word)
+    return words
 
 
 def slow_regions(
@@ -172,9 +191,8 @@ def test_steps_agree_with_a_slow_twin_written_from_the_equations(changes: dict[s
     settings = EMSettings(**changes, prior_k=9)
     learner = taught(EMLearner(SCENE, NUM_CLASSES, settings), views).fit()
     assert learner.rounds_ == rounds
-    assert learner.error_models_[views[1].name].evidence.informative.all() != (
-        settings.errors and settings.least_agreement > 0
-    )
+    rejects = settings.errors and settings.least_agreement > 0
+    assert (learner.rejected_share(views[1]) > 0) == rejects
     codes, objectives, confusions = slow_em(SCENE, views, settings, rounds)
     # Where a Gaussian shows in a trace of a pixel only, its votes are rounded to whole units.
     firm = learner._votes.sum(axis=1) > 2**14

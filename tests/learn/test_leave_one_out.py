@@ -58,7 +58,7 @@ def test_counts_by_the_others_are_those_of_a_slow_twin(seed: int, power: float, 
     learner, observation = observed(views, views[1].name)
     shape = learner._votes.shape
     votes = learner._votes + rng.integers(0, int(UNITS), shape) * (rng.random(shape) < 0.2)
-    evidence = observation.evidence.without(rng.random(len(observation.classes)) < 0.3)
+    evidence = observation.evidence.without_names(rng.random(len(observation.classes)) < 0.3)
     found = leave_one_out_counts(CSRRows.from_dense(votes), observation, POSSIBLE, evidence, power, most)
     np.testing.assert_allclose(found, slow_count(votes, observation, evidence, power, most), rtol=1e-4, atol=1e-4)
 

@@ -1,4 +1,4 @@
-"""Regions of masks: what is connected, and what is not heard since the other views speak against it."""
+"""Regions of masks: what is connected, and which lose their label since the other views contradict it."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_of_very_many_regions_the_largest_stand_alone() -> None:
 def test_what_one_view_alone_claims_against_all_others_is_rejected() -> None:
     views = clean_views(8)
     clean = taught(EMLearner(SCENE, NUM_CLASSES), views).fit()
-    assert all(model.evidence.informative.all() for model in clean.error_models_.values())
+    assert not any(clean.rejected_share(view) for view in views)
     cluttered = [with_clutter(view, 1 + i % 3) for i, view in enumerate(views)]
     naive, learner = (
         taught(EMLearner(SCENE, NUM_CLASSES, EMSettings(least_agreement=least)), cluttered).fit()
@@ -78,8 +78,9 @@ def test_what_one_view_alone_claims_against_all_others_is_rejected() -> None:
     for view in cluttered:
         evidence = learner.error_models_[view.name].evidence
         labels = split_regions(view.read_seen()).labels
-        assert not evidence.informative[labels[-1, 0]]
-        assert (~evidence.informative).sum() == 1
+        assert evidence.nameless is not None and evidence.nameless[labels[-1, 0]]
+        assert evidence.nameless.sum() == 1
+        assert learner.rejected_share(view) == pytest.approx((labels == labels[-1, 0]).mean(), rel=0.1)
     assert mean_iou(learner) > mean_iou(naive)
     assert mean_iou(learner) > mean_iou(clean) - 0.01
 
@@ -111,9 +112,23 @@ def test_a_region_is_rejected_only_where_the_others_saw_enough_of_it(seen: float
     np.testing.assert_array_equal(rejected, expected)
 
 
+def test_a_region_without_its_label_still_tells_what_its_pixels_are() -> None:
+    views = clean_views(6)
+    labels = views[2].read_labels()
+    views[2] = View.from_arrays(views[2].camera, np.where(labels == 1, 3, labels))
+    learner = taught(EMLearner(SCENE, NUM_CLASSES), views).fit()
+    model = learner.error_models_[views[2].name]
+    assert model.evidence.nameless is not None and model.evidence.nameless.sum() == 1
+    (word,) = np.flatnonzero(model.classes == UNKNOWN)
+    assert model.confusion[1].argmax() == word
+    assert (model.confusion[[0, 2, 3], word] < 0.5 * model.confusion[1, word]).all()
+    np.testing.assert_allclose(model.confusion.sum(axis=1), 1, atol=1e-5)
+
+
 def test_regions_of_a_single_view_are_never_rejected() -> None:
-    learner = taught(EMLearner(SCENE, NUM_CLASSES), [with_clutter(clean_views(1)[0])]).fit()
-    assert all(model.evidence.informative.all() for model in learner.error_models_.values())
+    view = with_clutter(clean_views(1)[0])
+    learner = taught(EMLearner(SCENE, NUM_CLASSES), [view]).fit()
+    assert learner.rejected_share(view) == 0
     assert learner.observed_.any()
 
 
@@ -124,8 +139,8 @@ def test_labels_of_soft_and_partial_masks_are_never_rejected() -> None:
     views[0] = View.from_probabilities(views[0].camera, chances)
     odd = with_clutter(views[1]).read_labels()
     views[1] = View.from_arrays(views[1].camera, np.where(odd == 3, 3, 0), supervised=[3])
-    models = taught(EMLearner(SCENE, NUM_CLASSES), views).fit().error_models_
-    assert all(model.evidence.informative.all() for model in models.values())
+    learner = taught(EMLearner(SCENE, NUM_CLASSES), views).fit()
+    assert not any(learner.rejected_share(view) for view in views[:2])
 
 
 def test_views_come_and_go_exactly_with_regions_too() -> None:

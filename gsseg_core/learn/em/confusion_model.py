@@ -8,6 +8,9 @@ import numpy as np
 
 from gsseg_core.data.label_evidence import LabelEvidence
 
+PART_PRIOR = 300.0
+"""Pixels of each class under a word that part into those that lost the name and the rest as all pixels of it do."""
+
 
 @dataclass
 class ErrorModel:
@@ -73,9 +76,21 @@ class ErrorModel:
         return expected
 
     def m_step(self, counts: np.ndarray) -> None:
-        """Set the confusion matrix to its maximiser for expected counts, (K, W) px; rows without any count stay."""
+        """Set the confusion matrix to its maximiser for expected counts, (K, W) px; rows without any count stay.
+
+        A nameless label is a part of what its former word was, so that an object that goes by another's name is known
+        by all of its parts: C[k, part] = C[k, word] P(part | k, word), the latter with a prior of `PART_PRIOR` px.
+        """
+        former = self.evidence.former_words
         counts = counts.astype(np.float64)
-        counts[self.evidence.correct_words(len(counts))] += self.pseudo_counts
-        total = counts.sum(axis=1, keepdims=True)
+        named, parts = np.split(counts, [counts.shape[1] - len(former)], axis=1)
+        np.add.at(named.T, former, parts.T)
+        share = parts.sum(axis=0) / np.maximum(named.sum(axis=0)[former], 1e-9)
+        share = (parts + PART_PRIOR * share) / (named[:, former] + PART_PRIOR)
+        named[self.evidence.correct_words(len(counts))] += self.pseudo_counts
+        total = named.sum(axis=1, keepdims=True)
         shown = total[:, 0] > 0
-        self.confusion[shown] = counts[shown] / total[shown]
+        words = named[shown] / total[shown]
+        parts = words[:, former] * share[shown]
+        np.subtract.at(words.T, former, parts.T)
+        self.confusion[shown] = np.column_stack([words, parts])

@@ -15,7 +15,7 @@ label y in view v given class k:
   probabilities that were fitted to a mask agree with its errors.
 
 Before the first step, the boundaries of each mask are aligned with edges of the scene (`boundary_alignment`), and
-regions that the votes of all other views contradict are rejected (`rejected_regions`).
+regions whose label the votes of all other views contradict lose it (`rejected_regions`).
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ class EMSettings:
         Boundaries of a plain mask may be this many px too far in or out, and are moved to edges of the scene; see
         `gsseg_core.learn.em.boundary_alignment`. 0 switches this off.
     least_agreement : float
-        A region of a mask is rejected if less than this share of it has its label by the votes of the other views; see
-        `gsseg_core.learn.em.rejected_regions`. 0 switches this off.
+        The label of a region of a mask is rejected if less than this share of the region has it by the votes of the
+        other views; see `gsseg_core.learn.em.rejected_regions`. 0 switches this off.
     majority : float
         The first error models are counted from the votes' probabilities to this power: above 1, majorities stand out.
     error_prior : float
@@ -248,7 +248,7 @@ class EMLearner(Learner):
     def rejected_share(self, view: View) -> float:
         """Share of a view's labelled pixels that lie in rejected regions."""
         evidence, areas = self.error_models_[view.name].evidence, self.observation(view.name).areas
-        return float(areas[~evidence.informative].sum() / areas.sum())
+        return 0.0 if evidence.nameless is None else float(areas[evidence.nameless].sum() / areas.sum())
 
     def _used_labels(self, seen: SeenLabels, operator: ViewOperator) -> SeenLabels:
         """Align boundaries of a plain mask with edges, and give each region a label if regions may be rejected."""
@@ -277,7 +277,7 @@ class EMLearner(Learner):
             labels = find_rejected(votes, observation, self._possible(), self.settings.least_agreement)
             if labels.any():
                 rejected[name] = labels
-                rejected_votes = observation.evidence.without(~labels).votes
+                rejected_votes = observation.evidence.without_names(~labels).votes
                 total, pairs = votes.with_data(remaining), ViewPairs.of(observation)
                 subtract_votes(total, pairs, observation.votes(), rejected_votes)
         return -remaining, rejected
@@ -301,7 +301,7 @@ class EMLearner(Learner):
                 models[name] = ErrorModel.without_errors(evidence, self.num_classes, outliers, observation.num_pixels)
                 continue
             if name in rejected:
-                evidence = evidence.without(rejected[name])
+                evidence = evidence.without_names(rejected[name])
             pixels = int(observation.areas[evidence.informative].sum())
             counts = leave_one_out_counts(votes, observation, self._possible(), evidence, settings.majority)
             models[name] = ErrorModel.from_counts(evidence, counts, settings.error_prior, outliers, pixels)

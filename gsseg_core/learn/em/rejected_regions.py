@@ -3,7 +3,8 @@
 Most errors of a segmenter sit in one place: a blob of clutter, an object under another's id, a whole bad frame. The
 confusion matrix of a view, the same all over it, does not model them. So each *region* of a mask, connected pixels of
 one label, is tested against the votes of all other views. Where they saw enough of it, and next to nothing of that has
-its label, its pixels count as unknown. docs/method.md has the reasons.
+its label, the label is rejected. The pixels still belong together, so the region becomes a word of its own in the
+view's vocabulary, of which the confusion matrix tells what it means. docs/method.md has the reasons.
 """
 
 from __future__ import annotations
