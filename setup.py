@@ -48,7 +48,7 @@ setup(
         "numpy>=2.0",
         "pillow>=10.1",
         "plyfile>=1.0",
-        "pycolmap>=3.11",
+        "pycolmap>=4.2",
         "scipy>=1.13",
         "shtab>=1.8",
         "torch>=2.3",
