@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from small_scenes import NAMES, NUM_CLASSES, OUT_OF_SIGHT, balls_on_a_table, clean_views, ring, taught
 
-from gsseg_core import segmentation
 from gsseg_core.errors import StateFileError, StateMismatchError, WriteError
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.backends import make_operator
@@ -121,11 +120,11 @@ def test_a_failed_save_leaves_the_earlier_file_whole(tmp_path: Path, monkeypatch
     refined().save(path)
     before = path.read_bytes()
 
-    def disk_full(file: object, **arrays: object) -> None:
+    def disk_full(file: object, *arguments: object, **settings: object) -> None:
         file.write(b"half of ")  # type: ignore[attr-defined]
         raise OSError(28, os.strerror(28))
 
-    monkeypatch.setattr(segmentation.np, "savez_compressed", disk_full)
+    monkeypatch.setattr(np.lib.format, "write_array", disk_full)
     with pytest.raises(WriteError, match="No space left"):
         refined().save(path)
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]

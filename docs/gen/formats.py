@@ -11,8 +11,18 @@ from pathlib import Path
 from gsseg_core.data.camera_formats.table import CAMERA_FORMATS
 from gsseg_core.data.mask_formats.table import MASK_FORMATS
 from gsseg_core.scene.lens import LENS_MODELS
+from gsseg_core.scene.scene_formats import SCENE_FORMATS
 
 PAGE = Path(__file__).parents[2] / "docs/formats.md"
+
+
+def scenes() -> str:
+    """Table the formats of scenes, and what each keeps of a Gaussian."""
+    rows = [
+        f"| {known.name} | {', '.join(f'`{suffix}`' for suffix in known.suffixes)} | {known.keeps} |"
+        for known in SCENE_FORMATS
+    ]
+    return "\n".join(["| format | files | what it keeps |", "|---|---|---|", *rows])
 
 
 def masks() -> str:
@@ -37,7 +47,7 @@ def cameras() -> str:
     return "\n".join(["| format | recognised by |", "|---|---|", *rows])
 
 
-TABLES = {"masks": masks, "cameras": cameras, "lenses": lenses}
+TABLES = {"scenes": scenes, "masks": masks, "cameras": cameras, "lenses": lenses}
 
 
 def page() -> str:

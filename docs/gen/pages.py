@@ -80,15 +80,6 @@ def _formats() -> str:
     return "\n".join(["| what | format | recognised by |", "|---|---|---|", *scenes, *cameras, *masks, ""])
 
 
-def scenes_read() -> str:
-    """Make the table of docs/formats.md: what gsseg opens as a scene, and what each format keeps of a Gaussian."""
-    rows = [
-        f"| {known.name} | {', '.join(f'`{suffix}`' for suffix in known.suffixes)} | {known.keeps} |"
-        for known in SCENE_FORMATS
-    ]
-    return "\n".join(["| format | files | what it keeps |", "|---|---|---|", *rows])
-
-
 def ros_interfaces() -> str:
     """Make the page of the ROS interfaces from the comments of the .msg, .srv and .action files."""
     folder = REPOSITORY / "msg_defs"

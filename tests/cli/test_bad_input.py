@@ -179,7 +179,7 @@ def test_a_full_disk_is_one_clear_line_and_the_earlier_results_stay_whole(
 
     monkeypatch.setattr(atomic.os, "fsync", disk_full)
     assert main(segment(place)) == 2
-    assert_one_line(capsys.readouterr().err, "segmentation.npz: cannot be written (No space left on device)")
+    assert_one_line(capsys.readouterr().err, ": cannot be written (No space left on device); what was there before is")
     assert contents(place / "out") == before
 
 

@@ -14,8 +14,8 @@ from PIL import Image
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN, write_mask
+from gsseg_core.data.photos import read_photo
 from gsseg_core.errors import IntrinsicsError, MaskSizeError
-from gsseg_core.report.pictures import _read_photo
 
 MARK = 3
 
@@ -34,7 +34,7 @@ def write_image_of_point(root: Path, name: str) -> None:
 def assert_point_is_seen(root: Path) -> None:
     seen = 0
     for view in Dataset(root).views("train"):
-        labels, photo = view.read_labels(), _read_photo(view)
+        labels, photo = view.read_labels(), read_photo(view)
         assert photo is not None and photo.shape == (*labels.shape, 3)
         uv, depth = view.camera.project([POINT])
         if depth[0] > 0 and ((uv >= 0) & (uv < (view.camera.width, view.camera.height))).all():
