@@ -94,7 +94,7 @@ def test_a_label_map_may_be_yaml(tmp_path: Path) -> None:
     (tmp_path / "map.yaml").write_text("chair: seat\n5: ~\nstool: ignore\n")
     dataset = Dataset(tmp_path, label_map=tmp_path / "map.yaml")
     assert dataset.class_names == {0: "background", 1: "seat"}
-    for bomb in ("a: &a [1]\nb: [*a, *a]", "? [1]\n: b", "{" * 5000, "1.5: a", "a: 2026-01-01"):
+    for bomb in ("a: &a [1]\nb: [*a, *a]", "? [1]\n: b", "{" * 1500, "1.5: a", "a: 2026-01-01"):
         (tmp_path / "map.yaml").write_text(bomb)
         with pytest.raises(LabelMapError):
             Dataset(tmp_path, label_map=tmp_path / "map.yaml")
