@@ -156,7 +156,7 @@ def find_alignment(
 ) -> Found:
     """Find where cameras are in a scene, from what their photos show or, without photos, their masks.
 
-    First as they are, then by conventions, and at last, with photos, by a similarity.
+    First as they are, if photos tell, then by conventions, and at last, with photos, by a similarity.
 
     Raises
     ------
@@ -170,12 +170,14 @@ def find_alignment(
         raise AlignmentError(
             "alignment: no view has a photo or a mask; expected some, to see where cameras are by them"
         )
-    if before.agrees:
+    photos = before.compared == "photos"
+    # Masks say less than photos do: on a shelf, regions may lie well enough from a wrong side, too.
+    if before.agrees and photos:
         return _closer(scene, views, shown, Found(Alignment(), before, before), settings, device)
     alignment = Alignment(find_convention(scene, shown, settings, device, progress))
     if (reached := _through(scene, shown, alignment, settings, device)).agrees:
         return _closer(scene, views, shown, Found(alignment, reached, before), settings, device)
-    if before.compared == "masks":
+    if not photos:
         raise AlignmentError(
             f"alignment: no convention of axes has scene and masks agree ({reached} at best); expected photos of the "
             "views in images/, by which scale, rotation and translation can be found, too"
