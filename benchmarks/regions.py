@@ -1,10 +1,10 @@
-"""Tell what it brings that regions of a mask are not heard if the other views speak against them, and from which share.
+"""Tell what it brings that regions of a mask lose a label that the other views contradict, and from which share on.
 
     python benchmarks/regions.py        # on $GSSEG_DATA, default ../shared/data, and on the demo scene
 
 Printed are mIoU in the test views and the seconds that `fit` takes, for several values of `EMSettings.least_agreement`;
-with 0 all regions are heard. Wrong masks are drawn from several seeds: what becomes of a few small objects is a matter
-of luck, and one draw tells little.
+with 0 all regions keep theirs. Wrong masks are drawn from several seeds: what becomes of a few small objects is a
+matter of luck, and one draw tells little.
 """
 
 from __future__ import annotations

@@ -212,7 +212,7 @@ class Learner(ABC):
         return Strongest.of(self.predict_without(view)).labels()
 
     def rejected_share(self, view: View) -> float:
-        """Share of a view's labelled pixels that `fit` has not used, in [0, 1]."""
+        """Share of a view's labelled pixels whose label `fit` has not used, in [0, 1]."""
         return 0.0
 
     def save(self, path: str | os.PathLike[str]) -> None:

@@ -131,7 +131,7 @@ def reliability_report(checks: Iterable[ViewCheck], class_names: Mapping[int, st
     -------
     list of dict
         `name`; `reliability` in [0, 1], None where there is no prediction; `num_pixels` with a label; `unheard`,
-        the share of them from which nothing was learnt; `confusions`, largest first: `true`, the class that the others
+        the share of them whose label was rejected; `confusions`, largest first: `true`, the class that the others
         predict, `seen` as, and the `share` of the view's checked pixels.
     """
 
