@@ -27,7 +27,7 @@ from gsseg_core.data.photos import read_photo
 from gsseg_core.data.view import View, spread
 from gsseg_core.errors import GssegError
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.raster.depth import depths
+from gsseg_core.raster.depth import colours_and_depth
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -152,9 +152,7 @@ def agreement(
 
 def render(scene: GaussianScene, camera: Camera, device: str = "cpu") -> Rendered:
     """Render a scene for comparison with what views show."""
-    operator = make_operator(scene, camera, device)
-    codes = np.column_stack([scene.colors(camera.center), depths(scene, camera)])
-    image, left_over = operator.blend(codes)
+    image, left_over = colours_and_depth(scene, make_operator(scene, camera, device))
     colours, coverage = image[..., :3], np.maximum(1 - left_over, _NEAREST)
     light = _edges(colours @ LUMINANCE)
     depth = np.minimum(_gradient(np.log(np.maximum(image[..., 3] / coverage, _NEAREST))), 1)

@@ -14,7 +14,7 @@ import numpy as np
 from gsseg_core.align.agreement import LUMINANCE
 from gsseg_core.align.settings import AlignSettings
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.raster.depth import COVERED, depths
+from gsseg_core.raster.depth import COVERED, colours_and_depth
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -50,13 +50,12 @@ class Extractor:
 
     def rendering(self, scene: GaussianScene, camera: Camera, device: str = "cpu") -> Features:
         """Render a scene, and find the features with their points; those at the edge of nothing are left out."""
-        codes = np.column_stack([scene.colors(camera.center) @ LUMINANCE, depths(scene, camera)])
-        image, left_over = make_operator(scene, camera, device).blend(codes)
-        found = self.photo(image[..., 0])
+        image, left_over = colours_and_depth(scene, make_operator(scene, camera, device))
+        found = self.photo(image[..., :3] @ LUMINANCE)
         column, row = np.clip(found.pixels.astype(int), 0, (camera.width - 1, camera.height - 1)).T
         coverage = 1 - left_over[row, column]
         solid = coverage > COVERED
-        pixels, depth = found.pixels[solid], image[row, column, 1][solid] / coverage[solid]
+        pixels, depth = found.pixels[solid], image[row, column, 3][solid] / coverage[solid]
         rays = np.column_stack([(pixels - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]], np.ones(len(pixels))])
         points = (rays * depth[:, None] - camera.world_to_camera[:3, 3]) @ camera.world_to_camera[:3, :3]
         return Features(pixels, found.descriptors[solid], points)

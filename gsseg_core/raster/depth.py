@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsseg_core.raster.view_operator import ViewOperator
+from gsseg_core.raster.view_operator import Blended, ViewOperator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -30,6 +30,14 @@ def surface(scene: GaussianScene, operator: ViewOperator) -> Surface:
     coverage = 1 - left_over
     depth = np.divide(image[..., 0], coverage, out=np.full_like(coverage, np.inf), where=coverage > _EMPTY)
     return Surface(coverage, depth)
+
+
+def colours_and_depth(scene: GaussianScene, operator: ViewOperator) -> Blended:
+    """Blend the colours of a scene and the depths of its centres into a view: (H, W, 4) float32, and what is left."""
+    codes, seen = np.zeros((len(scene), 4), np.float32), np.sort(operator.ids)  # once through memory
+    codes[seen, :3] = scene.colors(operator.camera.center, seen)
+    codes[seen, 3] = depths(scene, operator.camera, seen)
+    return operator.blend(codes)
 
 
 def depths(scene: GaussianScene, camera: Camera, ids: np.ndarray | None = None) -> np.ndarray:

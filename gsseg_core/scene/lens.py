@@ -80,6 +80,8 @@ LENS_MODELS = (
 )
 """All models that are read; ROS lists the coefficients in this order, the files of others name them."""
 
+MODELS_BY_NAME = {model.name: model for model in LENS_MODELS}
+
 
 @dataclass(frozen=True)
 class Lens:

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lens_cases import MODELS
 from PIL import Image
 from small_scenes import HEIGHT, WIDTH, balls_on_a_table, look_at, ring, true_labels, write_dataset
 
@@ -15,9 +14,9 @@ from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.files.json_files import write_json
-from gsseg_core.scene.lens import Lens
+from gsseg_core.scene.lens import MODELS_BY_NAME, Lens
 
-LENS = Lens(MODELS["OPENCV"], WIDTH, HEIGHT, (55.0, 55.0), (WIDTH / 2, HEIGHT / 2), (-0.2, 0.03))
+LENS = Lens(MODELS_BY_NAME["OPENCV"], WIDTH, HEIGHT, (55.0, 55.0), (WIDTH / 2, HEIGHT / 2), (-0.2, 0.03))
 
 
 @pytest.fixture(scope="module")

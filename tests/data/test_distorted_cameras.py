@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 from camera_folders import POINT, WORLD_TO_CAMERA, assert_refused, transforms, write_colmap, write_json
-from lens_cases import COEFFICIENTS, HEIGHT, MODELS, WIDTH, colmap_camera, colmap_params
+from lens_cases import COEFFICIENTS, HEIGHT, WIDTH, colmap_camera, colmap_params
 from PIL import Image
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN, write_mask
 from gsseg_core.data.photos import read_photo
 from gsseg_core.errors import IntrinsicsError, MaskSizeError
+from gsseg_core.scene.lens import MODELS_BY_NAME
 
 MARK = 3
 
@@ -55,7 +56,7 @@ def test_a_point_of_a_colmap_image_is_at_its_place_in_the_view(tmp_path: Path, n
 
 
 def of_nerfstudio(name: str) -> dict[str, Any]:
-    params, names = colmap_params(name), MODELS[name].coefficients
+    params, names = colmap_params(name), MODELS_BY_NAME[name].coefficients
     coefficients = dict(zip(names, COEFFICIENTS[name], strict=False))
     content = {"camera_model": name, "w": WIDTH, "h": HEIGHT, **coefficients}
     if name == "EQUIRECTANGULAR":

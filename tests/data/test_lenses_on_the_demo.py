@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lens_cases import COEFFICIENTS, MODELS
+from lens_cases import COEFFICIENTS
 
 from gsseg_core.data.camera_files import read_cameras
 from gsseg_core.data.dataset import Dataset
@@ -19,7 +19,7 @@ from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.settings import UNREFINED
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.scene.lens import Lens, Projection
+from gsseg_core.scene.lens import MODELS_BY_NAME, Lens, Projection
 from gsseg_core.segmentation import Segmentation
 
 WIDTH, HEIGHT, FOCAL = 200, 150, 175.0
@@ -40,10 +40,10 @@ def cast(parts: list[Part], lens: Lens, camera: Camera) -> np.ndarray:
 
 
 def lens_of_demo(name: str) -> Lens:
-    if MODELS[name].projection is Projection.PANORAMA:
-        return Lens(MODELS[name], 960, 480)
+    if MODELS_BY_NAME[name].projection is Projection.PANORAMA:
+        return Lens(MODELS_BY_NAME[name], 960, 480)
     middle = (WIDTH / 2, HEIGHT / 2)
-    return Lens(MODELS[name], WIDTH, HEIGHT, (FOCAL, FOCAL), middle, COEFFICIENTS.get(name, ()))
+    return Lens(MODELS_BY_NAME[name], WIDTH, HEIGHT, (FOCAL, FOCAL), middle, COEFFICIENTS.get(name, ()))
 
 
 def write_dataset(root: Path, lens: Lens, cameras: list[Camera], parts: list[Part]) -> None:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pycolmap
 
-from gsseg_core.scene.lens import LENS_MODELS, Lens
+from gsseg_core.scene.lens import MODELS_BY_NAME, Lens
 
-MODELS = {model.name: model for model in LENS_MODELS}
 WIDTH, HEIGHT = 320, 240
 COEFFICIENTS: dict[str, tuple[float, ...]] = {
     "SIMPLE_RADIAL": (-0.15,),
@@ -37,10 +36,10 @@ def colmap_params(name: str) -> list[float]:
 def lens(name: str) -> Lens:
     """The lens as gsseg has it."""
     if name == "EQUIRECTANGULAR":
-        return Lens(MODELS[name], WIDTH, HEIGHT)
+        return Lens(MODELS_BY_NAME[name], WIDTH, HEIGHT)
     params, coefficients = colmap_params(name), COEFFICIENTS[name]
     *focal, cx, cy = params[: len(params) - len(coefficients)]
-    return Lens(MODELS[name], WIDTH, HEIGHT, (focal[0], focal[-1]), (cx, cy), coefficients)
+    return Lens(MODELS_BY_NAME[name], WIDTH, HEIGHT, (focal[0], focal[-1]), (cx, cy), coefficients)
 
 
 def colmap_camera(name: str) -> pycolmap.Camera:

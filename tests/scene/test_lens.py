@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from lens_cases import COEFFICIENTS, MODELS, colmap_camera, lens, rays_within
+from lens_cases import COEFFICIENTS, colmap_camera, lens, rays_within
 
 from gsseg_core.errors import IntrinsicsError
-from gsseg_core.scene.lens import LENS_MODELS, Lens, Projection
+from gsseg_core.scene.lens import LENS_MODELS, MODELS_BY_NAME, Lens, Projection
 
 
 def of(name: str, *coefficients: float, focal: tuple[float, float] = (150.0, 150.0)) -> Lens:
-    return Lens(MODELS[name], 320, 240, focal, (160.0, 120.0), coefficients)
+    return Lens(MODELS_BY_NAME[name], 320, 240, focal, (160.0, 120.0), coefficients)
 
 
 @pytest.mark.parametrize("name", COEFFICIENTS)
@@ -73,11 +73,11 @@ def test_every_model_is_named_once_and_ros_knows_three() -> None:
 
 
 def test_coefficients_are_put_in_order_and_strange_ones_are_refused_by_name() -> None:
-    assert MODELS["OPENCV"].order({"p1": 3.0, "k1": 1.0, "k6": 0.0}) == (1.0, 0.0, 3.0, 0.0, 0.0, 0.0)
+    assert MODELS_BY_NAME["OPENCV"].order({"p1": 3.0, "k1": 1.0, "k6": 0.0}) == (1.0, 0.0, 3.0, 0.0, 0.0, 0.0)
     with pytest.raises(IntrinsicsError, match=r"RADIAL: has p1 = 0\.1; expected k1, k2"):
-        MODELS["RADIAL"].order({"p1": 0.1})
+        MODELS_BY_NAME["RADIAL"].order({"p1": 0.1})
     with pytest.raises(IntrinsicsError, match=r"PINHOLE: has k1 = 0\.1; expected no coefficient"):
-        MODELS["PINHOLE"].order({"k1": 0.1})
+        MODELS_BY_NAME["PINHOLE"].order({"k1": 0.1})
 
 
 @pytest.mark.parametrize(
@@ -110,4 +110,4 @@ def test_a_lens_that_cannot_be_undone_is_refused(name: str, coefficients: tuple[
 )
 def test_impossible_intrinsics_are_refused(size: tuple[int, int], focal: tuple[float, float], found: str) -> None:
     with pytest.raises(IntrinsicsError, match=found):
-        Lens(MODELS["SIMPLE_RADIAL"], *size, focal, (160.0, 120.0), (-0.15,))
+        Lens(MODELS_BY_NAME["SIMPLE_RADIAL"], *size, focal, (160.0, 120.0), (-0.15,))

@@ -6,11 +6,11 @@ import pickle
 
 import numpy as np
 import pytest
-from lens_cases import COEFFICIENTS, HEIGHT, MODELS, WIDTH, lens
+from lens_cases import COEFFICIENTS, HEIGHT, WIDTH, lens
 
 from gsseg_core.errors import IntrinsicsError
 from gsseg_core.scene.camera import undistorted_camera
-from gsseg_core.scene.lens import Lens
+from gsseg_core.scene.lens import MODELS_BY_NAME, Lens
 from gsseg_core.scene.undistortion import GROWTH, Undistortion, undistortions
 
 OUTSIDE = -1
@@ -48,12 +48,12 @@ def test_the_middle_stays_as_it_is_and_next_to_nothing_of_a_view_is_unknown(name
 
 
 def test_a_view_of_a_fisheye_that_sees_behind_itself_ends_at_120_degrees() -> None:
-    (view,) = undistortions(Lens(MODELS["FISHEYE"], 400, 400, (100.0, 100.0), (200.0, 200.0)))
+    (view,) = undistortions(Lens(MODELS_BY_NAME["FISHEYE"], 400, 400, (100.0, 100.0), (200.0, 200.0)))
     assert (view.width, view.height) == (2 * 173, 2 * 173)  # 100 tan(60 degrees)
 
 
 def test_the_six_faces_of_a_panorama_show_every_direction_once() -> None:
-    views = undistortions(Lens(MODELS["EQUIRECTANGULAR"], 400, 200))
+    views = undistortions(Lens(MODELS_BY_NAME["EQUIRECTANGULAR"], 400, 200))
     assert [view.face for view in views] == ["front", "right", "back", "left", "up", "down"]
     solid_angle = 0.0
     for view in views:
@@ -80,7 +80,9 @@ def test_a_panorama_is_named_by_face_and_its_image_by_its_stem() -> None:
 def test_a_photo_is_interpolated_and_black_outside() -> None:
     columns, rows = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     ramp = np.stack([columns / 2, rows, np.full_like(rows, 200)], axis=-1).astype(np.uint8)
-    (view,) = undistortions(Lens(MODELS["SIMPLE_RADIAL"], WIDTH, HEIGHT, (150.0, 150.0), (160.0, 120.0), (0.1,)))
+    (view,) = undistortions(
+        Lens(MODELS_BY_NAME["SIMPLE_RADIAL"], WIDTH, HEIGHT, (150.0, 150.0), (160.0, 120.0), (0.1,))
+    )
     photo, landed = view.photo(ramp), view.lens.project(rays_of(view))
     outside = view.sample(rows, OUTSIDE) == OUTSIDE
     assert outside[0, 0] and not photo[outside].any()
@@ -101,6 +103,8 @@ def test_the_map_of_a_lens_is_made_once_for_all_its_views() -> None:
 def test_a_lens_whose_view_would_be_of_an_absurd_size_is_refused() -> None:
     for coefficient, focal in ((1e9, 150.0), (-0.15, 1.0)):
         with pytest.raises(IntrinsicsError, match="is it calibrated for"):
-            undistortions(Lens(MODELS["SIMPLE_RADIAL"], WIDTH, HEIGHT, (focal, focal), (160.0, 120.0), (coefficient,)))
+            undistortions(
+                Lens(MODELS_BY_NAME["SIMPLE_RADIAL"], WIDTH, HEIGHT, (focal, focal), (160.0, 120.0), (coefficient,))
+            )
     with pytest.raises(IntrinsicsError, match="face of a panorama of 67108864 x 1 pixels"):
-        undistortions(Lens(MODELS["EQUIRECTANGULAR"], 2**26, 1))
+        undistortions(Lens(MODELS_BY_NAME["EQUIRECTANGULAR"], 2**26, 1))

@@ -15,13 +15,12 @@ from gsseg_core.data.camera_formats.entries import Intrinsics, cameras_of, stem_
 from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError
 from gsseg_core.files.input_files import is_there, open_input, reason
 from gsseg_core.scene.camera import Camera
-from gsseg_core.scene.lens import LENS_MODELS
+from gsseg_core.scene.lens import MODELS_BY_NAME
 from gsseg_core.text import clipped
 
 if TYPE_CHECKING:
     import pycolmap
 
-_MODELS = {model.name: model for model in LENS_MODELS}
 _LEAST_CAMERA = 40
 """Bytes of a camera in a binary model, of two parameters."""
 
@@ -46,15 +45,15 @@ def read_colmap(path: Path, within: Path | None) -> list[Camera]:
 
 def _intrinsics(where: str, camera: pycolmap.Camera) -> Intrinsics:
     """Read the lens of a COLMAP camera."""
-    if camera.model_name not in _MODELS:
+    if camera.model_name not in MODELS_BY_NAME:
         raise IntrinsicsError(
             f"{where}: camera is {clipped(camera.model_name)} ({clipped(camera.params_info)}); expected one of "
-            f"{', '.join(_MODELS)}: undistort the images first"
+            f"{', '.join(MODELS_BY_NAME)}: undistort the images first"
         )
     params = dict(zip(camera.params_info.replace(" ", "").split(","), camera.params.tolist(), strict=True))
     fx = params.get("f", params.get("fx", 1.0))
     focal, principal = (fx, params.get("fy", fx)), (params.get("cx", 0.0), params.get("cy", 0.0))
-    model = _MODELS[camera.model_name]
+    model = MODELS_BY_NAME[camera.model_name]
     params["k1"] = params.get("k1", params.get("k", 0.0))
     coefficients = {name: params[name] for name in model.coefficients if name in params}
     return Intrinsics(model, (camera.width, camera.height), focal, principal, coefficients)

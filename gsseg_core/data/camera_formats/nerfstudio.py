@@ -11,11 +11,10 @@ from gsseg_core.data.camera_formats.entries import Entry, Intrinsics, cameras_of
 from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError
 from gsseg_core.files.json_files import read_object
 from gsseg_core.scene.camera import Camera
-from gsseg_core.scene.lens import LENS_MODELS, Projection
+from gsseg_core.scene.lens import LENS_MODELS, MODELS_BY_NAME, Projection
 from gsseg_core.text import clipped
 
-_MODELS = {model.name: model for model in LENS_MODELS}
-_BROWN = _MODELS["OPENCV"]
+_BROWN = MODELS_BY_NAME["OPENCV"]
 _COEFFICIENTS = sorted({name for model in LENS_MODELS for name in model.coefficients})
 
 
@@ -38,9 +37,9 @@ def read_nerfstudio(path: Path, within: Path | None) -> list[Camera]:
 def _intrinsics(entry: Entry) -> Intrinsics:
     """Read the lens of a frame; as in nerfstudio, a camera model without distortion may have it all the same."""
     where, name = entry.where, str(entry.fields.get("camera_model", "OPENCV")).upper()
-    model = _MODELS.get("OPENCV_FISHEYE" if entry.fields.get("is_fisheye") else name, _BROWN)
-    if name not in _MODELS and name != "PERSPECTIVE":
-        known = ", ".join(_MODELS)
+    model = MODELS_BY_NAME.get("OPENCV_FISHEYE" if entry.fields.get("is_fisheye") else name, _BROWN)
+    if name not in MODELS_BY_NAME and name != "PERSPECTIVE":
+        known = ", ".join(MODELS_BY_NAME)
         raise IntrinsicsError(f"{where}: camera model is {clipped(name)}; expected {known}: undistort the images first")
     if model.projection is Projection.PERSPECTIVE and not model.rational:
         model = _BROWN
