@@ -253,7 +253,7 @@ def cloud(
         row_step=_CLOUD_POINT.itemsize * count,
         is_dense=True,
     )
-    message.data = _byte_array(records)
+    message.data = byte_array(records)
     return message
 
 
@@ -288,6 +288,13 @@ def arrays_from_cloud(message: PointCloud2, topic: str = "cloud") -> CloudArrays
         records["label"].astype(np.int32),
         records["confidence"].astype(np.float32),
     )
+
+
+def byte_array(values: npt.NDArray[Any], kind: str = "B") -> array.array[int]:
+    """Copy the bytes of numbers into an `array.array` of a kind, which rclpy takes over as a whole."""
+    data = array.array(kind)
+    data.frombytes(np.ascontiguousarray(values).view(np.uint8).data if values.size else b"")
+    return data
 
 
 def topic_tokens(class_names: Mapping[int, str]) -> dict[int, str]:
@@ -343,11 +350,5 @@ def _image(values: npt.NDArray[Any], encoding: str, header: Header) -> Image:
     height, width = values.shape[:2]
     step = values[0].nbytes if height else 0
     message = Image(header=header, height=height, width=width, encoding=encoding, is_bigendian=0, step=step)
-    message.data = _byte_array(values)
+    message.data = byte_array(values)
     return message
-
-
-def _byte_array(values: npt.NDArray[Any]) -> array.array[int]:
-    data = array.array("B")
-    data.frombytes(np.ascontiguousarray(values).view(np.uint8).data if values.size else b"")
-    return data

@@ -161,14 +161,25 @@ def read_object_mask(path: str | os.PathLike[str], label: int | None = None) -> 
     MaskFormatError
         The file is no label image, or nothing in it is the object.
     """
-    labels = read_mask(path).labels
+    return object_mask(read_mask(path).labels, label, str(Path(path)))
+
+
+def object_mask(
+    labels: np.ndarray,  # (H, W) int
+    label: int | None,
+    source: str,
+) -> np.ndarray:
+    """Make labels for `pick_mask` of the labels of an image, as `read_object_mask` does of a file's.
+
+    `source` is what messages call the image.
+    """
     if label is None and not (labels > 0).any():
         labels = np.where(labels == UNKNOWN, 1, labels)
     chosen = labels > 0 if label is None else labels == label
     if not chosen.any():
         there = np.unique(labels[labels != UNKNOWN]).tolist()
         wanted = "a label above 0" if label is None else f"the label {label}"
-        raise MaskFormatError(f"{Path(path)}: holds the labels {str(there)[1:-1][:60]}; expected pixels with {wanted}")
+        raise MaskFormatError(f"{source}: holds the labels {str(there)[1:-1][:60]}; expected pixels with {wanted}")
     return np.where(chosen, 1, np.where(labels == UNKNOWN, UNKNOWN, 0)).astype(np.int32)
 
 

@@ -5,6 +5,7 @@ from gsseg_ros.client.results import (
     LearnResult,
     LoadedScene,
     LoadedState,
+    PickedObject,
     RenderedView,
     SavedState,
     SegmentedObject,
@@ -15,6 +16,6 @@ from gsseg_ros.client.segmentation_client import SegmentationClient
 from gsseg_ros.errors import NodeUnavailableError, SegmentationError
 
 __all__ = [
-    "Exported", "LearnResult", "LoadedScene", "LoadedState", "NodeUnavailableError", "RenderedView", "SavedState",
-    "SegmentResult", "SegmentationClient", "SegmentationError", "SegmentedObject", "Viewpoint",
+    "Exported", "LearnResult", "LoadedScene", "LoadedState", "NodeUnavailableError", "PickedObject", "RenderedView",
+    "SavedState", "SegmentResult", "SegmentationClient", "SegmentationError", "SegmentedObject", "Viewpoint",
 ]  # fmt: skip

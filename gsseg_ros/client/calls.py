@@ -168,3 +168,9 @@ def checked(answer: Any) -> Any:
 def class_names(classes: Sequence[str | int]) -> list[str]:
     """Write classes, or a single one, as a request names them."""
     return [classes] if isinstance(classes, str) else [str(name) for name in classes]
+
+
+def refinement(refine: bool | str, filter: bool) -> dict[str, Any]:
+    """Write how to refine as the fields of a request: `refine` may name what comes after KNN clustering."""
+    step = refine if isinstance(refine, str) else ""
+    return {"skip_refinement": not refine, "skip_filter": not filter, "refine": step}

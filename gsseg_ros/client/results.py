@@ -181,6 +181,31 @@ class LearnResult(Timed):
 
 
 @dataclass(frozen=True, eq=False)
+class PickedObject:
+    """One object of M Gaussians that a view shows.
+
+    Attributes
+    ----------
+    indices : (M,) int64
+        Its Gaussians in the scene's file, from 0, ascending.
+    points : (M, 3) float32
+        Their centres in the map frame, metres.
+    confidence : (M,) float32
+        How sure it is that each belongs to the object, 0.5 to 1.
+    oriented_box : OrientedBox or None
+        The box that it fills, in the map frame, metres; None where M is 0.
+    seconds : dict of str to float
+        Seconds of every stage in the node.
+    """
+
+    indices: npt.NDArray[np.int64]
+    points: npt.NDArray[np.float32]
+    confidence: npt.NDArray[np.float32]
+    oriented_box: OrientedBox | None
+    seconds: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
 class RenderedView:
     """Labels, confidences and overlay rendered from a viewpoint.
 

@@ -9,51 +9,44 @@ with SegmentationClient() as client:
 
 from __future__ import annotations
 
-import contextlib
 import os
-import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Point
 from gsseg_msgs.action import Learn
-from gsseg_msgs.srv import Export, LoadScene, LoadState, RenderView, Reset, SaveState, Segment
+from gsseg_msgs.srv import Export, LoadScene, LoadState, Pick, RenderView, Reset, SaveState, Segment
 from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import GetState
 from rclpy.action import ActionClient
 from rclpy.context import Context
-from sensor_msgs.msg import PointCloud2
 
-from gsseg_ros.client.calls import Calls, LearnGoal, class_names
+from gsseg_ros.client.answers import picked_object, rendered_view, segment_result
+from gsseg_ros.client.calls import Calls, LearnGoal, class_names, refinement
 from gsseg_ros.client.results import (
     Exported,
     LearnResult,
     LoadedScene,
     LoadedState,
+    PickedObject,
     RenderedView,
     SavedState,
     SegmentResult,
     Viewpoint,
-    seconds_of,
 )
+from gsseg_ros.client.run_clouds import RunClouds
 from gsseg_ros.client.spinner import Spinner
-from gsseg_ros.conversions import (
-    array_from_point,
-    arrays_from_cloud,
-    labels_from_image,
-    picture_from_image,
-    stamp_ns,
-    viewpoint_messages,
-)
+from gsseg_ros.conversions import array_from_point, arrays_from_cloud, mask_image, viewpoint_messages
 from gsseg_ros.errors import NodeUnavailableError
-from gsseg_ros.object_messages import box_from_object
-from gsseg_ros.qos import all_clouds
 
 _SERVICES = {
-    Segment: "segment", RenderView: "render_view", LoadScene: "load_scene", SaveState: "save_state",
+    Segment: "segment", Pick: "pick", RenderView: "render_view", LoadScene: "load_scene", SaveState: "save_state",
     LoadState: "load_state", Export: "export", Reset: "reset", GetState: "get_state",
 }  # fmt: skip
 
@@ -96,10 +89,7 @@ class SegmentationClient:
         # not heard of yet is lost; so once it has told its state, none is.
         self._learn: Any = ActionClient(node, Learn, f"{self._name}/learn")
         self._clients = {kind: node.create_client(kind, f"{self._name}/{name}") for kind, name in _SERVICES.items()}
-        self._clouds: dict[int, PointCloud2] = {}
-        self._awaiting_clouds = 0
-        self._lock = threading.Lock()
-        self._cloud_topic = node.create_subscription(PointCloud2, f"{self._name}/cloud", self._on_cloud, all_clouds())
+        self._clouds = RunClouds(self._spinner, f"{self._name}/cloud")
         self._diagnostics: Any = None
         self._statuses: deque[Any] = deque(maxlen=10)
         self._learning: set[LearnGoal] = set()
@@ -195,6 +185,8 @@ class SegmentationClient:
         max_steps: int = 0,
         on_feedback: Callable[[str, int, int, float], object] | None = None,
         *,
+        labels: str | os.PathLike[str] = "",
+        label_map: str | os.PathLike[str] = "",
         timeout: float = 3600.0,
     ) -> LearnResult:
         """Learn class probabilities. Ctrl-C, an error in `on_feedback`, or running out of time cancels it.
@@ -211,6 +203,9 @@ class SegmentationClient:
             Stop after this many steps; 0: when it converges.
         on_feedback : callable, optional
             Called in this thread with stage, done, total, loss (nats per pixel, NaN at first), ten times a second.
+        labels, label_map : path
+            The dataset's masks, plain or soft, and what renames their classes, as for `gsseg segment`; by default its
+            folder labels, as they are.
         timeout : float
             Seconds.
 
@@ -223,8 +218,9 @@ class SegmentationClient:
             if not 0 <= count < 2**32:
                 raise ValueError(f"{name} is {count}; expected a whole number from 0")
         goal = Learn.Goal(
-            dataset_path=os.fspath(dataset_path), learner=learner, num_views=int(num_views), max_steps=int(max_steps)
-        )
+            dataset_path=os.fspath(dataset_path), learner=learner, num_views=int(num_views), max_steps=int(max_steps),
+            labels=os.fspath(labels), label_map=os.fspath(label_map),
+        )  # fmt: skip
         deadline = time.monotonic() + timeout
         self._calls.find(self._learn.server_is_ready, f"action {self._name}/learn", timeout)
         running = LearnGoal(self._calls, self._learn, goal)
@@ -252,9 +248,10 @@ class SegmentationClient:
         self,
         classes: Sequence[str | int] = (),
         min_confidence: float = 0.0,
-        refine: bool = True,
+        refine: bool | str = True,
         filter: bool = True,
         viewpoint: Viewpoint | None = None,
+        publish: bool = True,
         *,
         timeout: float = 60.0,
     ) -> SegmentResult:
@@ -263,37 +260,69 @@ class SegmentationClient:
         Parameters
         ----------
         classes : sequence of str or int
-            Names or numbers of the classes wanted; by default all.
+            Names or numbers of the classes wanted; by default all. What is published has all classes.
         min_confidence : float
             Leave out Gaussians less sure than this, 0 to 1.
-        refine, filter : bool
-            Whether codes are refined by their neighbours, and whether outliers are then removed; `export` cuts objects
-            to their silhouettes instead.
+        refine : bool or str
+            Whether codes are refined by their neighbours, and what comes after that: "paper", outliers are removed, as
+            by default, or "carve", objects are cut to their silhouettes, as `export` does by default.
+        filter : bool
+            Whether anything comes after that.
         viewpoint : Viewpoint, optional
             Where to draw a label image from, too.
+        publish : bool
+            False: the answer is for this caller alone, and no topic of the node changes.
         timeout : float
             Seconds.
         """
         deadline = time.monotonic() + timeout
         request = Segment.Request(
-            classes=class_names(classes), min_confidence=float(min_confidence), skip_refinement=not refine,
-            skip_filter=not filter,
+            classes=class_names(classes), min_confidence=float(min_confidence), publish_nothing=not publish,
+            **refinement(refine, filter),
         )  # fmt: skip
         if viewpoint is not None:
             request.viewpoint_pose, request.viewpoint_camera = viewpoint_messages(viewpoint.camera)
-        with self._keeping_clouds():
+        with self._clouds.kept():
             answer = self._call(Segment, request, timeout)
-            while (message := self._cloud_of(stamp_ns(answer.report.header.stamp), deadline)) is None:
+            cloud = None if publish else answer.cloud
+            while cloud is None and (cloud := self._clouds.of_run(answer.report.header, deadline)) is None:
                 answer = self._call(Segment, request, deadline - time.monotonic())
-            cloud = arrays_from_cloud(message)
-        labels = labels_from_image(answer.label_image, "label_image") if viewpoint is not None else None
-        boxes = {thing.id: box_from_object(thing) for thing in answer.objects}
-        return SegmentResult(cloud.points, cloud.labels, cloud.confidence, cloud.rgb, answer.report, labels, boxes)
+        return segment_result(answer, arrays_from_cloud(cloud))
+
+    def pick(
+        self,
+        viewpoint: Viewpoint,
+        mask: npt.NDArray[np.integer[Any]] | None = None,  # (H, W)
+        inside: Sequence[tuple[float, float]] = (),
+        outside: Sequence[tuple[float, float]] = (),
+        *,
+        timeout: float = 60.0,
+    ) -> PickedObject:
+        """Get one object that is shown in one view, by a mask or by points; needs nothing learnt, and changes nothing.
+
+        Parameters
+        ----------
+        viewpoint : Viewpoint
+            The view, without distortion.
+        mask : (H, W) int, optional
+            1 where the object is, 0 where not, -1 where nothing is said.
+        inside, outside : sequences of (column, row)
+            In place of a mask: pixels of the object, and pixels that are not of it.
+        timeout : float
+            Seconds.
+        """
+        pose, info = viewpoint_messages(viewpoint.camera)
+        request = Pick.Request(viewpoint_pose=pose, viewpoint_camera=info)
+        if mask is not None:
+            request.mask = mask_image(mask, info.header, 16)
+        for name, pixels in (("inside", inside), ("outside", outside)):
+            setattr(request, name, [Point(x=float(column), y=float(row)) for column, row in pixels])
+        return picked_object(self._call(Pick, request, timeout))
 
     def render_view(
         self,
         viewpoint: Viewpoint,
-        refine: bool = True,
+        refine: bool | str = True,
         filter: bool = True,
         with_confidence: bool = False,
         with_overlay: bool = False,
@@ -305,18 +334,12 @@ class SegmentationClient:
         request = RenderView.Request(
             viewpoint_pose=pose,
             viewpoint_camera=info,
-            skip_refinement=not refine,
-            skip_filter=not filter,
             with_confidence=with_confidence,
             with_overlay=with_overlay,
+            **refinement(refine, filter),
         )
         answer = self._call(RenderView, request, timeout)
-        return RenderedView(
-            labels_from_image(answer.label_image, "label_image"),
-            picture_from_image(answer.confidence_image, "confidence_image") if with_confidence else None,
-            picture_from_image(answer.overlay_image, "overlay_image") if with_overlay else None,
-            seconds_of(answer.stages),
-        )
+        return rendered_view(answer)
 
     def load_scene(self, path: str | os.PathLike[str] = "", *, timeout: float = 120.0) -> LoadedScene:
         """Load another scene, and forget all views and what was learnt; by default the node's `scene_path` again."""
@@ -339,21 +362,25 @@ class SegmentationClient:
         directory: str | os.PathLike[str] = "",
         classes: Sequence[str | int] = (),
         min_confidence: float = 0.0,
-        refine: bool = True,
+        refine: bool | str = True,
         filter: bool = True,
+        format: str = "",
+        collision: str = "",
         *,
         timeout: float = 120.0,
     ) -> Exported:
         """Write segmentation.npz, one PLY per class, and report.json; by default to gsseg_export in `data_root`.
 
-        The node's parameter `export_format` has it write the classes in another format than PLY.
+        `format` and `collision` are those of `gsseg segment`; by default as the node's parameter `export_format` says,
+        without meshes. Objects are cut to their silhouettes unless `refine` is "paper".
         """
         request = Export.Request(
             directory=os.fspath(directory),
             classes=class_names(classes),
             min_confidence=float(min_confidence),
-            skip_refinement=not refine,
-            skip_filter=not filter,
+            format=format,
+            collision=collision,
+            **refinement(refine, filter),
         )
         answer = self._call(Export, request, timeout)
         folder = Path(answer.directory)
@@ -365,33 +392,6 @@ class SegmentationClient:
 
     def _call(self, kind: Any, request: Any, timeout: float) -> Any:
         return self._calls.call(self._clients[kind], request, timeout)
-
-    @contextlib.contextmanager
-    def _keeping_clouds(self) -> Iterator[None]:
-        with self._lock:
-            self._awaiting_clouds += 1
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._awaiting_clouds -= 1
-                if not self._awaiting_clouds:
-                    self._clouds.clear()
-
-    def _cloud_of(self, stamp: int, deadline: float) -> PointCloud2 | None:
-        """Wait for the cloud of a run; None if that of a later one has come, so that this one was not published."""
-        if not self._spinner.wait_for(lambda: max([*self._clouds, -1]) >= stamp, deadline - time.monotonic()):
-            raise NodeUnavailableError(
-                f"{self._cloud_topic.topic_name}: segment was answered, but its cloud did not come in time "
-                f"({self._cloud_topic.get_publisher_count()} publishers, {len(self._clouds)} other clouds); did "
-                "another request replace it, or does a qos_override make it best effort or volatile?"
-            )
-        return self._clouds.get(stamp)
-
-    def _on_cloud(self, message: PointCloud2) -> None:
-        with self._lock:
-            if self._awaiting_clouds:
-                self._clouds[stamp_ns(message.header.stamp)] = message
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         self._statuses.extend(status for status in message.status if status.name == self._name)

@@ -89,8 +89,9 @@ class LearnAction:
         dataset = None
         if request.dataset_path:
             with run.watch.stage("load"):
-                folder = self._workspace.existing(request.dataset_path)
-                dataset = Dataset(folder, within=self._workspace.root)
+                dataset = self._dataset(request)
+        elif request.labels or request.label_map:
+            raise InvalidRequestError("labels and label_map are those of a dataset; expected dataset_path beside them")
         outcome = session.learn(
             learner,
             dataset,
@@ -102,6 +103,19 @@ class LearnAction:
         self._workspace.number(run)
         result.num_steps, result.converged, result.loss = outcome.num_steps, outcome.converged, outcome.loss
         result.report = self._report(session, outcome, run)
+
+    def _dataset(self, request: Learn.Goal) -> Dataset:
+        """Open the dataset of a goal; raises `InvalidRequestError` where its ids are no classes."""
+        workspace = self._workspace
+        folder = workspace.existing(request.dataset_path)
+        labels, label_map = (workspace.existing_in(folder, path) for path in (request.labels, request.label_map))
+        dataset = Dataset(folder, labels or "labels", label_map=label_map, within=workspace.root)
+        if dataset.masks is not None and dataset.masks.per_view:
+            raise InvalidRequestError(
+                f"{labels}: ids hold in their own view only, as {dataset.masks.format} has them; expected masks whose "
+                "ids mean the same in every view (gsseg segment learns from the others)"
+            )
+        return dataset
 
     def _report(self, session: LiveSession, outcome: Outcome, run: Run) -> SegmentationReport:
         settings = self._workspace.settings

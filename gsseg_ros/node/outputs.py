@@ -35,9 +35,8 @@ _POLL = 0.002  # s, between two looks at whether a cloud has arrived
 class Outputs:
     """Publishes clouds, objects, report and overlay. Its methods may be called from any thread.
 
-    A cloud that is latched always belongs to the last run: a class that this run was not asked for gets an empty one. A
-    class has a topic while it has Gaussians in the last run; the names that were announced have theirs all the time.
-    Once closed, nothing is published.
+    A cloud that is latched always belongs to the last run, of all classes. A class has a topic while it has Gaussians
+    in the last run; the names that were announced have theirs all the time. Once closed, nothing is published.
 
     Attributes
     ----------
@@ -101,7 +100,7 @@ class Outputs:
             yield newest
 
     def publish_clouds(self, selection: Selection, header: Header) -> None:
-        """Publish one cloud per class that was asked for, empty ones for all others, and that of all objects."""
+        """Publish one cloud per class, empty ones for those that are no more, and that of all objects."""
         tokens = topic_tokens(selection.result.class_names)
         kept = self._announced | {tokens[k] for k in selection.present}
         with self._lock:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -47,6 +47,12 @@ class Selection:
     chosen: Sequence[int]
     min_confidence: float
     similarity: Similarity
+
+    @cached_property
+    def of_all_classes(self) -> Selection:
+        """The same without a choice of classes."""
+        everything = sorted(self.result.class_names)
+        return self if list(self.chosen) == everything else replace(self, chosen=everything)
 
     @cached_property
     def indices(self) -> dict[int, np.ndarray]:

@@ -11,21 +11,26 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gsseg_msgs.srv import Export, LoadScene, LoadState, RenderView, Reset, SaveState, Segment
+from gsseg_msgs.srv import Export, LoadScene, LoadState, Pick, RenderView, Reset, SaveState, Segment
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.lifecycle import LifecycleNode
+from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
 from gsseg_core.errors import GssegError
-from gsseg_core.export.class_files import write_classes
+from gsseg_core.export.class_files import mesh_file_name, write_classes
+from gsseg_core.export.collision import check_collision, collision_meshes
 from gsseg_core.export.summary import RunReport
 from gsseg_core.files.json_files import write_json
 from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.scene.scene_writers import check_format
 from gsseg_core.text import one_line
+from gsseg_ros.camera_infos import is_rectified
 from gsseg_ros.errors import InvalidRequestError, error_code
 from gsseg_ros.node.jobs import Turns
 from gsseg_ros.node.output_folders import pinned_folder, require_own_folder, staged_export
 from gsseg_ros.node.outputs import Outputs
+from gsseg_ros.node.picking import fill_answer, pick_object
 from gsseg_ros.node.reports import Selection, empty_report, finish, report_message, stage_timings
 from gsseg_ros.node.viewpoints import Lookup, draw, viewpoint
 from gsseg_ros.node.workspace import Run, Workspace, checked_confidence, chosen_classes
@@ -33,6 +38,9 @@ from gsseg_ros.object_messages import point_message
 from gsseg_ros.qos import requests
 
 STATE_FILE, EXPORT_FOLDER = "gsseg_state.npz", "gsseg_export"
+
+PAPER, CARVE = "paper", "carve"
+"""What a request may ask for after KNN clustering."""
 
 AT_WORK, WAITING = 2, 4
 """Most long requests that work at a time, and that wait besides; each holds a thread of the executor."""
@@ -89,16 +97,24 @@ def describe(error: Exception) -> str:
 def refinement(request: Any, workspace: Workspace) -> RefineSettings:
     """Refinement as a request asks for it, with the node's k and beta.
 
-    Files are made to be kept, and worth the seconds that carving takes; what is asked for while the robot moves is not.
+    Files are made to be kept, and worth the seconds that carving takes; what is asked for while the robot moves is not,
+    unless the request says so.
+
+    Raises
+    ------
+    InvalidRequestError
+        There is no such refinement.
     """
-    settings, carve = workspace.settings, isinstance(request, Export.Request)
-    outer = not (request.skip_refinement or request.skip_filter)
+    settings, default = workspace.settings, CARVE if isinstance(request, Export.Request) else PAPER
+    if request.refine not in ("", PAPER, CARVE):
+        raise InvalidRequestError(f"refine is '{request.refine[:60]}'; expected {PAPER}, {CARVE}, or nothing")
+    outer = None if request.skip_refinement or request.skip_filter else request.refine or default
     return RefineSettings(
         k=settings.k,
         beta=settings.beta,
         cluster=not request.skip_refinement,
-        filter=outer and not carve,
-        carve=outer and carve,
+        filter=outer == PAPER,
+        carve=outer == CARVE,
     )
 
 
@@ -131,6 +147,7 @@ class Services:
         group = ReentrantCallbackGroup()
         for interface, name, handler in (
             (Segment, "segment", self.segment),
+            (Pick, "pick", self.pick),
             (RenderView, "render_view", self.render_view),
             (LoadScene, "load_scene", self.load_scene),
             (SaveState, "save_state", self.save_state),
@@ -143,32 +160,58 @@ class Services:
     @answered
     @in_turn
     def segment(self, request: Segment.Request, response: Segment.Response) -> None:
-        """Segment the scene, publish clouds and objects, and draw the viewpoint if there is one."""
+        """Segment the scene, answer with what was asked for, and publish all classes, unless that is not wanted."""
         settings, outputs = self.workspace.settings, self._outputs()
         with self.workspace.run("segment") as run:
-            drawing = None
+            overlay = Image()
             selection, refine = self._select(request, run)
             self.workspace.number(run)
             if request.viewpoint_camera.width:
                 camera = viewpoint(request, settings, self._lookup())
                 header = Header(stamp=run.stamp, frame_id=request.viewpoint_camera.header.frame_id)
                 with run.watch.stage("render"):
-                    drawing = draw(selection, camera, header, with_overlay=outputs.wants_overlay)
-                response.label_image = drawing.labels
+                    with_overlay = outputs.wants_overlay and not request.publish_nothing
+                    drawing = draw(selection, camera, header, with_overlay=with_overlay)
+                response.label_image, overlay = drawing.labels, drawing.overlay
+            header = self._header(run)
+            if request.publish_nothing:
+                response.cloud = selection.objects_cloud(header)
+                with run.watch.stage("boxes"):
+                    response.objects = selection.objects(header, run.revision).objects
+                response.report = finish(report_message(run, selection, refine, settings.map_frame), run)
+                return
+            everything = selection.of_all_classes
             with outputs.turn(run.revision, lambda: self.workspace.holds(run)) as newest:
                 if newest:
                     with run.watch.stage("publish"):
-                        outputs.publish_clouds(selection, self._header(run))
+                        outputs.publish_clouds(everything, header)
                 with run.watch.stage("boxes"):
-                    objects = selection.objects(self._header(run), run.revision)
-                response.objects = objects.objects
-                topics = outputs.topics(selection.result.class_names)
-                response.report = finish(report_message(run, selection, refine, settings.map_frame, topics), run)
+                    objects = everything.objects(header, run.revision)
+                topics = outputs.topics(everything.result.class_names)
+                report = finish(report_message(run, everything, refine, settings.map_frame, topics), run)
                 if newest:
                     outputs.publish_objects(objects)
-                    if drawing is not None and drawing.overlay.width:
-                        outputs.publish_overlay(drawing.overlay)
-                    outputs.publish_report(response.report)
+                    if overlay.width:
+                        outputs.publish_overlay(overlay)
+                    outputs.publish_report(report)
+            # What is published is serialised by now.
+            report.classes = [summary for summary in report.classes if summary.class_id in selection.chosen]
+            response.report = report
+            response.objects = [thing for thing in objects.objects if thing.id in selection.chosen]
+
+    @answered
+    @in_turn
+    def pick(self, request: Pick.Request, response: Pick.Response) -> None:
+        """Pick one object of one view."""
+        workspace, topics = self.workspace, [self.node.resolve_topic_name(name) for name in ("mask", "camera_info")]
+        rectified = is_rectified(workspace.settings.rectified, *topics)
+        with workspace.run("pick") as run:
+            with run.watch.stage("pick"):
+                picked = pick_object(request, workspace, self._lookup(), rectified=rectified)
+            run.stamp = self.node.get_clock().now().to_msg()
+            with run.watch.stage("boxes"):
+                fill_answer(response, picked, request.name, workspace, self._header(run))
+            response.stages = stage_timings(run)
 
     @answered
     @in_turn
@@ -237,6 +280,9 @@ class Services:
     def export(self, request: Export.Request, response: Export.Response) -> None:
         """Write the files that the command line writes."""
         directory, settings = self.workspace.path(request.directory, EXPORT_FOLDER), self.workspace.settings
+        scene_format, collision = request.format or settings.export_format, request.collision or None
+        check_format(scene_format)
+        check_collision(collision)
         require_own_folder(directory, "segment")  # Before the work, and again below.
         with self.workspace.run("export") as run:
             selection, refine = self._select(request, run)
@@ -245,23 +291,31 @@ class Services:
             result = selection.result.selected(selection.chosen, selection.min_confidence)
             with run.watch.stage("write"), staged_export(directory, self.workspace.root) as staged:
                 result.save(staged.folder / "segmentation.npz", staged.id)
-                files = write_classes(
-                    session.scene, result, staged.folder / "classes", staged.id, settings.export_format
-                )
+                meshes = collision_meshes(session.scene, result, collision) if collision else {}
+                classes = staged.folder / "classes"
+                files = write_classes(session.scene, result, classes, staged.id, scene_format, meshes)
                 names = {k: str(path.relative_to(staged.folder)) for k, path in files.items()}
+                mesh_names = {k: f"classes/{mesh_file_name(k, result.class_names[k])}" for k in meshes}
                 report = finish(report_message(run, selection, refine, settings.map_frame), run)
                 content = RunReport.of(
                     session.scene,
                     result,
                     views={"used": report.num_views, "rejected": dict(Counter(session.rejected) + run.dropped)},
-                    settings={"learner": report.learner, "device": settings.device, "refine": asdict(refine)},
+                    settings={
+                        "learner": report.learner,
+                        "device": settings.device,
+                        "refine": asdict(refine),
+                        "scene_format": scene_format,
+                        "collision": collision,
+                    },
                     seconds=run.watch.seconds,
                     files=names,
+                    meshes=mesh_names,
                     run=staged.id,
                 )
                 write_json(staged.folder / "report.json", content.as_dict())
         response.report = finish(report, run)
-        unique = dict.fromkeys(names.values())  # One file may hold all classes.
+        unique = dict.fromkeys([*names.values(), *mesh_names.values()])  # One file may hold all classes.
         response.directory, response.files = str(directory), ["segmentation.npz", *unique, "report.json"]
 
     @answered

@@ -52,26 +52,40 @@ def viewpoint(request: Any, settings: Settings, lookup: Lookup | None) -> Camera
     NoTransformError
         The pose is in a frame that is not the map and cannot be looked up.
     """
-    pose, info = request.viewpoint_pose, request.viewpoint_camera
+    info = request.viewpoint_camera
     try:
         require_size(info, settings.max_pixels, "viewpoint_camera")
-        matrix = matrix_from_pose(pose.pose, "viewpoint_pose")
-        frame = pose.header.frame_id
-        if frame and frame != settings.map_frame:
-            found = lookup(frame, stamp_ns(pose.header.stamp)) if lookup is not None else None
-            if found is None:
-                raise NoTransformError(
-                    f"viewpoint_pose: frame_id is '{frame}', and there is no transform from it to "
-                    f"'{settings.map_frame}'; expected '{settings.map_frame}', or pose_source tf and a known frame"
-                )
-            matrix = found @ matrix
+        matrix = viewpoint_pose(request, settings, lookup)
         return camera_from_messages("viewpoint", info, matrix, settings.scene_to_map, "viewpoint_camera")
     except (PoseError, IntrinsicsError, TooManyPixelsError) as error:
         raise ViewpointError(str(error)) from error
 
 
+def viewpoint_pose(request: Any, settings: Settings, lookup: Lookup | None) -> npt.NDArray[np.float64]:
+    """Read the pose (4, 4) of the optical frame in the map, in metres, of the viewpoint of a request.
+
+    Raises
+    ------
+    PoseError
+        It is none.
+    NoTransformError
+        It is in a frame that is not the map and cannot be looked up.
+    """
+    pose = request.viewpoint_pose
+    matrix, frame = matrix_from_pose(pose.pose, "viewpoint_pose"), pose.header.frame_id
+    if not frame or frame == settings.map_frame:
+        return matrix
+    found = lookup(frame, stamp_ns(pose.header.stamp)) if lookup is not None else None
+    if found is None:
+        raise NoTransformError(
+            f"viewpoint_pose: frame_id is '{frame}', and there is no transform from it to '{settings.map_frame}'; "
+            f"expected '{settings.map_frame}', or pose_source tf and a known frame"
+        )
+    return found @ matrix
+
+
 def draw(selection: Selection, camera: Camera, header: Header, *, with_overlay: bool = False) -> Drawing:
-    """Draw the labels of a view; classes that were not asked for are drawn as background."""
+    """Draw the labels of a view: classes that were not asked for as background, but in the overlay as they are."""
     session = selection.session
     operator = make_operator(session.scene, camera, session.device)
     seen = selection.result.render(operator)
@@ -79,5 +93,5 @@ def draw(selection: Selection, camera: Camera, header: Header, *, with_overlay: 
     picture = Image()
     if with_overlay:
         colors = palette(selection.result.num_classes)
-        picture = rgb_image(overlay(background_image(session.scene, operator), labels, colors), header)
+        picture = rgb_image(overlay(background_image(session.scene, operator), seen.labels, colors), header)
     return Drawing(label_image(labels, header), confidence_image(np.minimum(seen.confidence, 1.0), header), picture)

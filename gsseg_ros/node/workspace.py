@@ -285,6 +285,19 @@ class Workspace:
             raise MissingFileError(f"{path}: is neither a file nor a folder, and reading it might never end")
         return path
 
+    def existing_in(self, folder: Path, request: str) -> Path | None:
+        """Resolve a path of a request that lies in a folder, or else below data_root; None for none.
+
+        Raises
+        ------
+        PathNotAllowedError, MissingFileError
+            As `existing` does.
+        """
+        if not request:
+            return None
+        inside = self.path(str(folder / request))
+        return self.existing(str(inside) if os.path.exists(inside) else request)
+
 
 def chosen_classes(request: Any, class_names: Mapping[int, str]) -> list[int]:
     """Ids of the classes that a request asks for, ascending; all if it names none.

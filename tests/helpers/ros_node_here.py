@@ -38,7 +38,9 @@ class NodeHere:
 
     def __init__(self, ros: Ros, parameters: Mapping[str, Any]) -> None:
         self.stamp = 1000 * SECOND
-        values = {name: value if isinstance(value, list | int) else str(value) for name, value in parameters.items()}
+        values = {
+            name: value if isinstance(value, list | int | float) else str(value) for name, value in parameters.items()
+        }
         self.node = SegmentNode(
             context=ros.context,
             use_global_arguments=False,

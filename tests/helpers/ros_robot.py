@@ -20,7 +20,7 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from gsseg_msgs.action import Learn
-from gsseg_msgs.srv import Export, LoadScene, LoadState, RenderView, Reset, SaveState, Segment
+from gsseg_msgs.srv import Export, LoadScene, LoadState, Pick, RenderView, Reset, SaveState, Segment
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
@@ -40,7 +40,7 @@ from gsseg_ros.frames import Similarity
 
 KINDS = {"mask": Image, "camera_info": CameraInfo, "pose": PoseStamped, "odometry": Odometry, "image": Image}
 SERVICES = {
-    "segment": Segment, "render_view": RenderView, "load_scene": LoadScene, "save_state": SaveState,
+    "segment": Segment, "pick": Pick, "render_view": RenderView, "load_scene": LoadScene, "save_state": SaveState,
     "load_state": LoadState, "export": Export, "reset": Reset, "change_state": ChangeState,
     "describe_parameters": DescribeParameters, "get_parameters": GetParameters, "list_parameters": ListParameters,
     "set_parameters": SetParameters, "get_state": GetState,

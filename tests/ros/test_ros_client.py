@@ -96,10 +96,33 @@ def test_only_the_classes_asked_for_come_by_name_or_number(learnt: Place) -> Non
     assert len(client.segment(["background"]).points) == 0
 
 
+def test_an_answer_for_one_caller_is_what_would_be_published(learnt: Place) -> None:
+    published = learnt.client.segment(["box", 1])
+    alone = learnt.client.segment(["box", 1], publish=False)
+    np.testing.assert_array_equal(alone.points, published.points)
+    np.testing.assert_array_equal(alone.labels, published.labels)
+    assert list(alone.objects) == ["red ball", "box"] and "publish" not in alone.seconds
+
+
+def test_an_object_is_picked_by_a_mask_or_by_points_of_a_view(learnt: Place) -> None:
+    _, truth = balls_on_a_table()
+    view = learnt.views[0]
+    labels = (view.read_labels() == 1).astype(np.int32)
+    place = Viewpoint.of(view.camera)
+    picked = learnt.client.pick(place, labels)
+    assert (truth[picked.indices] == 1).mean() > 0.9 and len(picked.points) == len(picked.indices)
+    assert picked.oriented_box is not None and (picked.confidence >= 0.5).all() and "pick" in picked.seconds
+    rows, columns = np.nonzero(labels)
+    clicked = learnt.client.pick(place, inside=[(np.median(columns), np.median(rows))])
+    assert np.isin(picked.indices, clicked.indices).mean() > 0.5
+    assert failure(lambda: learnt.client.pick(place)).name == "INVALID_REQUEST"
+
+
 def test_threshold_and_refinement_are_as_asked_for(learnt: Place) -> None:
     everything, sure = learnt.client.segment(refine=False), learnt.client.segment(refine=False, min_confidence=0.95)
     assert everything.report.k == 0 and not everything.report.filtered
     assert 0 < len(sure.points) < len(everything.points) and sure.confidence.min() >= np.float32(0.95)
+    assert failure(lambda: learnt.client.segment(refine="sand")).name == "INVALID_REQUEST"
     unfiltered = learnt.client.segment(filter=False).report
     assert unfiltered.k > 0 and not unfiltered.filtered
 

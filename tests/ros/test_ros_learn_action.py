@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mask_writers import sam_json
 from ros_datasets import copied, write_long_dataset
 from ros_helpers import Ros
 from ros_robot import CLASSES, Goal, Robot, assert_same, private_ros, renamed
@@ -153,6 +154,31 @@ def test_it_learns_from_the_train_views_of_a_dataset_folder(robot: Robot, scene:
     assert result.report.num_views == len(views) == 4
     assert "load" in {stage.name for stage in result.report.stages}
     assert_learnt(robot, expected(scene, views))
+
+
+def test_a_goal_chooses_the_masks_which_may_be_soft_and_a_label_map(
+    robot: Robot, scene: GaussianScene, root: Path
+) -> None:
+    robot.done("reset")
+    (root / "data/soft").mkdir(exist_ok=True)
+    for view in Dataset(root / "data").views("all"):
+        sure = 0.9 * np.eye(len(CLASSES), dtype=np.float32)[view.read_labels()] + 0.1 / len(CLASSES)
+        np.savez(root / "data/soft" / f"{view.name}.npz", probabilities=np.moveaxis(sure, -1, 0))
+    (root / "no_ball.json").write_text('{"red ball": null}')
+    status, result = robot.learn(dataset_path="data", labels="soft", label_map="no_ball.json")
+    assert status == GoalStatus.STATUS_SUCCEEDED, result.error_msg
+    views = Dataset(root / "data", "soft", label_map=root / "no_ball.json").views("train")
+    assert_learnt(robot, expected(scene, views))
+    assert result.report.classes[1].num_gaussians == 0 < result.report.classes[2].num_gaussians
+
+
+def test_masks_whose_ids_hold_in_their_own_view_are_no_classes_to_learn(robot: Robot, root: Path) -> None:
+    labels = {view.name: view.read_labels() for view in Dataset(root / "data").views("all")}
+    (root / "sam").mkdir()
+    masks = sam_json(root / "sam", labels, {})
+    status, result = robot.learn(dataset_path="data", labels=str(masks.relative_to(root)))
+    assert (status, result.error_code) == (GoalStatus.STATUS_ABORTED, Learn.Result.INVALID_REQUEST)
+    assert "ids hold in their own view only" in result.error_msg
 
 
 def test_views_that_come_after_a_learn_from_a_folder_are_kept_and_do_not_disturb_it(

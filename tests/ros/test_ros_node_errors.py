@@ -20,14 +20,14 @@ from small_scenes import build, clean_views
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from action_msgs.msg import GoalStatus
-from geometry_msgs.msg import Pose, PoseStamped, Quaternion
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 
 from gsseg_ros.errors import PathNotAllowedError
 from gsseg_ros.node.parameters import DECLARATIONS, Settings
 from gsseg_ros.node.workspace import Workspace
 
 INTERFACES = {name: SERVICES[name].Response for name in (
-    "segment", "render_view", "load_scene", "save_state", "load_state", "export", "reset",
+    "segment", "pick", "render_view", "load_scene", "save_state", "load_state", "export", "reset",
 )} | {"learn": Learn.Result}  # fmt: skip
 
 
@@ -80,6 +80,11 @@ def nowhere(frame: str = "", **changes: Any) -> dict[str, Any]:
     return fields
 
 
+SKY = nowhere() | {"inside": [Point()]}
+"""A click at the edge of a view, beside the table."""
+
+LARGE = nowhere(width=4000, height=4000) | {"inside": [Point()]}
+
 NOT_BELOW = "is not below data_root; expected one below"
 CASES = [
     Case("segment", "NOT_ACTIVE", "idle", "the node is not active"),
@@ -91,8 +96,17 @@ CASES = [
     Case("segment", "INVALID_VIEWPOINT", "main", "expected zeros: what is", nowhere(d=[0.1, 0.0, 0.0, 0.0, 0.0])),
     Case("segment", "NO_TRANSFORM", "main", "frame_id is 'odom'", nowhere("odom")),
     Case("segment", "UNKNOWN", "starved", "unexpected MemoryError"),
+    Case("pick", "NOT_ACTIVE", "idle", "the node is not active"),
+    Case("pick", "BUSY", "crowded", "too many requests"),
+    Case("pick", "INVALID_REQUEST", "main", "expected a mask, or points inside", nowhere()),
+    Case("pick", "NO_SCENE", "bare", "no scene is loaded"),
+    Case("pick", "NO_VIEWS", "main", "no Gaussian is seen at row 0, column 0", SKY),
+    Case("pick", "INVALID_VIEWPOINT", "main", "viewpoint_", {"inside": [Point()]}),
+    Case("pick", "NO_TRANSFORM", "main", "frame_id is 'odom'", nowhere("odom") | {"inside": [Point()]}),
+    Case("pick", "UNKNOWN", "starved", "unexpected MemoryError", LARGE),
     Case("render_view", "NOT_ACTIVE", "idle", "the node is not active"),
     Case("render_view", "BUSY", "crowded", "too many requests"),
+    Case("render_view", "INVALID_REQUEST", "main", "refine is 'sand'", nowhere() | {"refine": "sand"}),
     Case("render_view", "NO_SCENE", "bare", "no scene is loaded"),
     Case("render_view", "NO_CODES", "fresh", "expected at least one posed mask"),
     Case("render_view", "INVALID_VIEWPOINT", "main", "viewpoint_", {}),
@@ -145,6 +159,12 @@ CASES = [
     Case("learn", "UNKNOWN", "starved", "unexpected MemoryError"),
 ]  # fmt: skip
 MORE_CASES = [
+    Case("export", "INVALID_REQUEST", "main", "format is 'obj'; expected one of ply", {"format": "obj"}),
+    Case("export", "INVALID_REQUEST", "main", "collision is 'box'; expected one of hull", {"collision": "box"}),
+    Case("learn", "INVALID_REQUEST", "main", "expected dataset_path beside them", {"labels": "soft"}),
+    Case("learn", "PATH_NOT_ALLOWED", "main", NOT_BELOW, {"dataset_path": "data", "labels": "../../outside.ply"}),
+    Case("learn", "FILE_NOT_FOUND", "main", "soft: does not exist", {"dataset_path": "data", "labels": "soft"}),
+    Case("learn", "FILE_NOT_FOUND", "main", "map.json: does not ex", {"dataset_path": "data", "label_map": "map.json"}),
     Case("load_state", "FILE_NOT_FOUND", "main", "a\\nb: does not exist", {"path": "a\nb"}),
     Case("load_scene", "FILE_NOT_FOUND", "main", "x: does not exist", {"path": "x" * 5000}),
     Case("export", "WRITE_FAILED", "main", "name too long", {"directory": "x" * 300}),

@@ -17,7 +17,7 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 from action_msgs.msg import GoalStatus
 from gsseg_msgs.action import Learn
 
-REQUESTS = ("segment", "render_view", "load_scene", "save_state", "load_state", "export", "reset")
+REQUESTS = ("segment", "pick", "render_view", "load_scene", "save_state", "load_state", "export", "reset")
 
 
 @pytest.fixture(scope="module")

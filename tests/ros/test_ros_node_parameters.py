@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -163,6 +164,18 @@ def test_classes_are_exported_in_the_format_that_is_set(robot: Robot, name: str,
         assert all((folder / file).is_file() for file in exported.files)
     finally:
         robot.set("export_format", "ply")
+
+
+def test_a_request_chooses_the_format_and_meshes_to_collide_with(robot: Robot) -> None:
+    robot.brought_to("active")
+    robot.fuse(clean_views(4))
+    folder = robot.out("meshes")
+    exported = robot.done("export", directory=str(folder), format="glb", collision="hull", classes=["box"])
+    assert exported.files == ["segmentation.npz", "classes/3_box.glb", "classes/3_box.obj", "report.json"]
+    report = json.loads((folder / "report.json").read_text())
+    assert report["settings"]["scene_format"] == "glb" and report["settings"]["collision"] == "hull"
+    assert [entry.get("collision") for entry in report["classes"]] == [None, None, None, "classes/3_box.obj"]
+    assert robot.get("export_format") == "ply"
 
 
 def test_k_and_beta_take_effect_at_once(robot: Robot) -> None:

@@ -15,13 +15,13 @@ from small_scenes import NAMES, clean_views
 from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.export.view_pictures import background_image
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.refine.settings import PAPER
+from gsseg_core.refine.settings import PAPER, RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
-from gsseg_msgs.msg import SegmentationReport
+from gsseg_msgs.msg import ObjectArray, SegmentationReport
 from sensor_msgs.msg import Image, PointCloud2
 
 from gsseg_ros.conversions import arrays_from_cloud, labels_from_image
@@ -168,14 +168,48 @@ def test_every_output_of_one_run_carries_the_same_stamp_and_later_runs_have_larg
     assert stamps == sorted(set(stamps))
 
 
-def test_an_empty_cloud_clears_that_of_a_class_that_was_not_asked_for(robot: Robot) -> None:
-    robot.done("segment")
-    report = robot.done("segment", classes=["box"]).report
+def test_what_one_caller_asks_for_is_in_the_answer_and_topics_have_all_classes(robot: Robot) -> None:
+    everything = robot.done("segment").report
+    response = robot.done("segment", classes=["box"])
+    assert counts(response.report) == {"box": counts(everything)["box"]}
+    assert [thing.name for thing in response.objects] == ["box"]
     clouds = latched_clouds(robot)
-    assert {topic: cloud.width for topic, cloud in clouds.items() if cloud.width} == {
-        "cloud": counts(report)["box"], "classes/box": counts(report)["box"],
-    }  # fmt: skip
-    assert all(cloud.header.stamp == report.header.stamp for cloud in clouds.values())
+    assert [clouds[f"classes/{token}"].width for token in TOKENS] == list(counts(everything).values())
+    assert clouds["cloud"].width == everything.num_objects
+    assert all(cloud.header.stamp == response.report.header.stamp for cloud in clouds.values())
+    report, objects = robot.latched((SegmentationReport, "report"), (ObjectArray, "objects"))
+    assert (report.revision, counts(report)) == (response.report.revision, counts(everything))
+    assert [thing.name for thing in objects.objects] == CLASSES[1:]
+
+
+def test_an_answer_for_one_caller_has_its_cloud_and_changes_no_topic(robot: Robot) -> None:
+    published = robot.done("segment")
+    before = latched_clouds(robot)
+    response = robot.done("segment", classes=["box", "red ball"], publish_nothing=True)
+    cloud = arrays_from_cloud(response.cloud)
+    assert response.cloud.header == response.report.header
+    assert np.bincount(cloud.labels, minlength=4).tolist() == [
+        0,
+        *(counts(response.report).get(k, 0) for k in CLASSES[1:]),
+    ]
+    assert [thing.name for thing in response.objects] == ["red ball", "box"]
+    assert {summary.topic for summary in response.report.classes} == {""}
+    assert published.cloud.width == 0
+    robot.done("render_view", **viewpoint(clean_views(1)[0]))  # Whatever had been published would have come by now.
+    assert latched_clouds(robot) == before
+    assert robot.latched((SegmentationReport, "report")) == [published.report]
+
+
+def test_carving_can_be_asked_for_and_the_papers_filter_in_exports(robot: Robot, scene: GaussianScene) -> None:
+    session = core_session(scene, clean_views(6))
+    carved = session.segmentation(RefineSettings()).counts().tolist()
+    assert list(counts(robot.done("segment", refine="carve").report).values()) == carved
+    exported = robot.exported(robot.out("paper"), refine="paper")
+    assert exported.counts().tolist() == refined(scene).counts().tolist() != carved
+    for service in ("segment", "render_view", "export"):
+        response = robot.ask(service, refine="sand", **(viewpoint(clean_views(1)[0]) if service != "export" else {}))
+        assert response.error_code == type(response).INVALID_REQUEST
+        assert response.error_msg == "refine is 'sand'; expected paper, carve, or nothing"
 
 
 def test_reset_forgets_views_and_codes_and_clears_the_clouds(robot: Robot) -> None:

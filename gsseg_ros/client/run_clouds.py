@@ -1,0 +1,69 @@
+"""Keeps the clouds of runs that a client has asked for, until it has found its own among them."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Iterator
+
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
+
+from gsseg_ros.client.spinner import Spinner
+from gsseg_ros.conversions import stamp_ns
+from gsseg_ros.errors import NodeUnavailableError
+from gsseg_ros.qos import all_clouds
+
+
+class RunClouds:
+    """Listens to a node's `~/cloud`; its methods may be called from several threads.
+
+    Parameters
+    ----------
+    spinner : Spinner
+        Whose node listens.
+    topic : str
+        Full name of the topic.
+    """
+
+    def __init__(self, spinner: Spinner, topic: str) -> None:
+        self._spinner, self._lock = spinner, threading.Lock()
+        self._clouds: dict[int, PointCloud2] = {}  # by stamp [ns]
+        self._awaiting = 0
+        self._topic = spinner.node.create_subscription(PointCloud2, topic, self._on_cloud, all_clouds())
+
+    @contextlib.contextmanager
+    def kept(self) -> Iterator[None]:
+        """Keep all clouds that come during the body."""
+        with self._lock:
+            self._awaiting += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._awaiting -= 1
+                if not self._awaiting:
+                    self._clouds.clear()
+
+    def of_run(self, header: Header, deadline: float) -> PointCloud2 | None:
+        """Wait for the cloud of a run, by the header of its report; None if that of a later one has come instead.
+
+        Raises
+        ------
+        NodeUnavailableError
+            Neither has come by the deadline (s, `time.monotonic`).
+        """
+        stamp = stamp_ns(header.stamp)
+        if not self._spinner.wait_for(lambda: max([*self._clouds, -1]) >= stamp, deadline - time.monotonic()):
+            raise NodeUnavailableError(
+                f"{self._topic.topic_name}: segment was answered, but its cloud did not come in time "
+                f"({self._topic.get_publisher_count()} publishers, {len(self._clouds)} other clouds); did "
+                "another request replace it, or does a qos_override make it best effort or volatile?"
+            )
+        return self._clouds.get(stamp)
+
+    def _on_cloud(self, message: PointCloud2) -> None:
+        with self._lock:
+            if self._awaiting:
+                self._clouds[stamp_ns(message.header.stamp)] = message

@@ -1,0 +1,113 @@
+"""Picks one object of the scene from a mask of one view, or from points in it, as a request has them."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from gsseg_msgs.msg import Object
+from gsseg_msgs.srv import Pick as PickService
+from std_msgs.msg import ColorRGBA, Header
+
+from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.view import View
+from gsseg_core.errors import IntrinsicsError, MaskFormatError, MaskSizeError, PoseError
+from gsseg_core.export.pictures import palette
+from gsseg_core.objects.oriented_boxes import class_box
+from gsseg_core.scene.camera import Camera
+from gsseg_ros.camera_infos import camera_of_image
+from gsseg_ros.conversions import byte_array, cloud, labels_from_image
+from gsseg_ros.errors import InvalidRequestError, TooManyPixelsError, ViewpointError
+from gsseg_ros.node.size_limits import require_size
+from gsseg_ros.node.viewpoints import Lookup, viewpoint_pose
+from gsseg_ros.node.workspace import Workspace
+from gsseg_ros.object_messages import object_message
+
+if TYPE_CHECKING:
+    from gsseg_core.objects.pick import Pick
+
+OBJECT = 1
+"""Label of the object in the answer's cloud, and its id; 0 would be the background."""
+
+MOST_POINTS = 1000
+"""Points of one kind that a request may give."""
+
+
+def pick_object(request: PickService.Request, workspace: Workspace, lookup: Lookup | None, *, rectified: bool) -> Pick:
+    """Pick the object that a request shows; `rectified` says what its mask and its points are of.
+
+    Raises
+    ------
+    InvalidRequestError
+        The mask or the points cannot be used, or there are both or neither.
+    ViewpointError, NoTransformError
+        The view cannot be used.
+    NoSceneError
+        No scene is loaded.
+    NoUsableViewsError
+        The view does not show both the object and what is not it.
+    """
+    from gsseg_core.objects.pick import pick_clicks, pick_mask  # A node starts without the SciPy that it needs.
+
+    session, inside, outside = workspace.session, request.inside, request.outside
+    if bool(request.mask.width) == bool(inside or outside):
+        raise InvalidRequestError("mask and points: found both or neither; expected a mask, or points inside")
+    camera = _camera(request, workspace, lookup, rectified=rectified)
+    if request.mask.width:
+        return pick_mask(session.scene, View.from_arrays(camera, _labels(request, camera)), device=session.device)
+    if camera.undistortion is not None:
+        raise ViewpointError(
+            "viewpoint_camera: d is of a lens that distorts; expected points in a rectified image, and zeros, or a mask"
+        )
+    clicks = [_pixels(points, name) for points, name in ((inside, "inside"), (outside, "outside"))]
+    return pick_clicks(session.scene, camera, *clicks, device=session.device)
+
+
+def fill_answer(response: PickService.Response, picked: Pick, name: str, workspace: Workspace, header: Header) -> None:
+    """Fill in indices, cloud and object of what was picked."""
+    scene, place, index = workspace.session.scene, workspace.settings.scene_to_map, picked.ids
+    confidence, color = picked.membership[index], palette(OBJECT + 1)[OBJECT]
+    points, rgb = place.points_to_map(scene.means[index]), np.tile(color, (len(index), 1))
+    response.indices = byte_array(index.astype(np.uint32), "I")
+    response.cloud = cloud(header, points, rgb, np.full(len(index), OBJECT), confidence)
+    response.object = Object(name=name or "object")
+    if len(index):
+        red, green, blue = (float(part) / 255 for part in color)
+        box = place.box_to_map(class_box(scene, index, confidence))
+        shade = ColorRGBA(r=red, g=green, b=blue, a=1.0)
+        response.object = object_message(OBJECT, name or "object", shade, confidence, box)
+
+
+def _camera(request: PickService.Request, workspace: Workspace, lookup: Lookup | None, *, rectified: bool) -> Camera:
+    """Make the scene's camera of the view, of the size of the mask if there is one."""
+    settings, info, mask = workspace.settings, request.viewpoint_camera, request.mask
+    size = (mask.width, mask.height) if mask.width else (info.width, info.height)
+    try:
+        for message, what in ((info, "viewpoint_camera"), (mask, "mask")):
+            require_size(message, settings.max_pixels, what)
+        if not info.width or not info.height:
+            raise IntrinsicsError(f"viewpoint_camera: is {info.width} x {info.height} pixels; expected at least 1 x 1")
+        pose = settings.scene_to_map.world_to_camera(viewpoint_pose(request, settings, lookup))
+        return camera_of_image("viewpoint", info, size, pose, "mask", "viewpoint_camera", rectified=rectified)
+    except (PoseError, IntrinsicsError, MaskSizeError, TooManyPixelsError) as error:
+        raise ViewpointError(str(error)) from error
+
+
+def _labels(request: PickService.Request, camera: Camera) -> npt.NDArray[np.int32]:
+    """Read the mask of a request as labels of the object (1), of what is not it (0), and of pixels not spoken of."""
+    from gsseg_core.objects.pick import object_mask
+
+    try:
+        labels = object_mask(labels_from_image(request.mask, "mask"), request.label or None, "mask")
+    except MaskFormatError as error:
+        raise InvalidRequestError(str(error)) from error
+    return labels if camera.undistortion is None else camera.undistortion.sample(labels, UNKNOWN)
+
+
+def _pixels(points: Any, name: str) -> list[tuple[int, int]]:
+    """Row and column of the pixels that points lie in."""
+    if len(points) > MOST_POINTS or not all(math.isfinite(point.x) and math.isfinite(point.y) for point in points):
+        raise InvalidRequestError(f"{name}: found {len(points)} points; expected {MOST_POINTS} at most, all finite")
+    return [(math.floor(point.y), math.floor(point.x)) for point in points]
