@@ -31,11 +31,12 @@ _UNIT_TOLERANCE = 1e-3
 _LONGEST_TOKEN = 64  # The full name of a topic must stay below 256 characters.
 
 # Type of a pixel, and its value for "unknown".
-_MASK_ENCODINGS: dict[str, tuple[npt.DTypeLike, int]] = {
+MASK_ENCODINGS: dict[str, tuple[npt.DTypeLike, int]] = {
     "mono8": (np.uint8, 2**8 - 1),
     "8UC1": (np.uint8, 2**8 - 1),
     "mono16": (np.uint16, 2**16 - 1),
     "16UC1": (np.uint16, 2**16 - 1),
+    "16SC1": (np.int16, UNKNOWN),
     "32SC1": (np.int32, UNKNOWN),
 }
 
@@ -80,20 +81,22 @@ def stamp_message(ns: int) -> Time:
 def labels_from_image(message: Image, topic: str) -> npt.NDArray[np.int32]:
     """Read the labels (H, W) of a mask message, `UNKNOWN` (-1) where a pixel has none.
 
-    Encodings are mono8 and 8UC1 (255 is unknown), mono16 and 16UC1 (65535) and 32SC1 (-1), of either byte order, with
-    rows of any `step`.
+    Encodings are mono8 and 8UC1 (255 is unknown), mono16 and 16UC1 (65535), 16SC1 (whatever is negative) and 32SC1
+    (-1), of either byte order, with rows of any `step`.
 
     Raises
     ------
     MaskFormatError
         Another encoding, a size of zero, data too short, or a label out of range.
     """
-    if message.encoding not in _MASK_ENCODINGS:
-        expected = ", ".join(_MASK_ENCODINGS)
+    if message.encoding not in MASK_ENCODINGS:
+        expected = ", ".join(MASK_ENCODINGS)
         raise MaskFormatError(f"{topic}: encoding is '{message.encoding}'; expected labels as one of {expected}")
-    kind, unknown = _MASK_ENCODINGS[message.encoding]
-    labels = _pixels(message, np.dtype(kind), topic).astype(np.int32)
+    kind, unknown = MASK_ENCODINGS[message.encoding]
+    labels = pixels_of(message, np.dtype(kind), topic).astype(np.int32)
     labels[labels == unknown] = UNKNOWN
+    if message.encoding == "16SC1":  # semantic_inference's default_id, -1 unless configured, is of no class.
+        np.maximum(labels, UNKNOWN, out=labels)
     low, high = int(labels.min()), int(labels.max())
     if low < UNKNOWN or high > MAX_LABEL:
         raise MaskFormatError(f"{topic}: labels are {low} to {high}; expected {UNKNOWN} (unknown) to {MAX_LABEL}")
@@ -112,8 +115,29 @@ def picture_from_image(message: Image, topic: str) -> npt.NDArray[Any]:
         expected = ", ".join(_PICTURE_ENCODINGS)
         raise MaskFormatError(f"{topic}: encoding is '{message.encoding}'; expected one of {expected}")
     kind, channels = _PICTURE_ENCODINGS[message.encoding]
-    pixels = _pixels(message, np.dtype(kind), topic, channels)
+    pixels = pixels_of(message, np.dtype(kind), topic, channels)
     return pixels.reshape(message.height, message.width, channels) if channels > 1 else pixels
+
+
+def pixels_of(message: Image, kind: np.dtype[Any], topic: str, channels: int = 1) -> npt.NDArray[Any]:
+    """Read the numbers (H, W * channels) of an image, of either byte order, with rows of any `step`.
+
+    Raises
+    ------
+    MaskFormatError
+        A size of zero, or data too short.
+    """
+    width, height, step = message.width, message.height, message.step
+    if width < 1 or height < 1:
+        raise MaskFormatError(f"{topic}: image is {width} x {height} pixels; expected at least 1 x 1")
+    row = width * channels * kind.itemsize
+    if step < row or len(message.data) < height * step:
+        raise MaskFormatError(
+            f"{topic}: {len(message.data)} bytes with a step of {step}; expected {height} rows of {width} pixels "
+            f"of {message.encoding}, thus a step of at least {row} and height * step bytes"
+        )
+    rows = np.frombuffer(message.data, np.uint8, height * step).reshape(height, step)[:, :row]
+    return np.ascontiguousarray(rows).view(kind.newbyteorder(">" if message.is_bigendian else "<"))
 
 
 def matrix_from_pose(pose: Pose, topic: str) -> npt.NDArray[np.float64]:
@@ -171,7 +195,7 @@ def mask_image(
     if low < UNKNOWN or high >= unknown:
         raise MaskFormatError(f"mask image: labels are {low} to {high}; {bits} bits hold {UNKNOWN} to {unknown - 1}")
     values = np.where(labels == UNKNOWN, unknown, labels).astype(f"<u{bits // 8}")
-    return _image(values, f"mono{bits}", header)
+    return plain_image(values, f"mono{bits}", header)
 
 
 def label_image(
@@ -187,7 +211,7 @@ def rgb_image(
     header: Header,
 ) -> Image:
     """Write a picture (H, W, 3) uint8 as rgb8."""
-    return _image(pixels, "rgb8", header)
+    return plain_image(pixels, "rgb8", header)
 
 
 def confidence_image(
@@ -195,7 +219,20 @@ def confidence_image(
     header: Header,
 ) -> Image:
     """Write confidences (H, W), 0 to 1, as 32FC1."""
-    return _image(confidence.astype("<f4"), "32FC1", header)
+    return plain_image(confidence.astype("<f4"), "32FC1", header)
+
+
+def plain_image(
+    values: npt.NDArray[Any],  # (H, W) or (H, W, C), of the type that the encoding says, in little-endian order
+    encoding: str,
+    header: Header,
+) -> Image:
+    """Write pixels as an image of an encoding."""
+    height, width = values.shape[:2]
+    step = values[0].nbytes if height else 0
+    message = Image(header=header, height=height, width=width, encoding=encoding, is_bigendian=0, step=step)
+    message.data = byte_array(values)
+    return message
 
 
 def camera_info(camera: Camera, header: Header) -> CameraInfo:
@@ -319,20 +356,6 @@ def _token(name: str, number: int) -> str:
     return f"class_{token}" if token[0].isdigit() else token
 
 
-def _pixels(message: Image, kind: np.dtype[Any], topic: str, channels: int = 1) -> npt.NDArray[Any]:
-    width, height, step = message.width, message.height, message.step
-    if width < 1 or height < 1:
-        raise MaskFormatError(f"{topic}: image is {width} x {height} pixels; expected at least 1 x 1")
-    row = width * channels * kind.itemsize
-    if step < row or len(message.data) < height * step:
-        raise MaskFormatError(
-            f"{topic}: {len(message.data)} bytes with a step of {step}; expected {height} rows of {width} pixels "
-            f"of {message.encoding}, thus a step of at least {row} and height * step bytes"
-        )
-    rows = np.frombuffer(message.data, np.uint8, height * step).reshape(height, step)[:, :row]
-    return np.ascontiguousarray(rows).view(kind.newbyteorder(">" if message.is_bigendian else "<"))
-
-
 def _matrix(position: Any, orientation: Any, topic: str) -> npt.NDArray[np.float64]:
     place = (position.x, position.y, position.z)
     q = (orientation.x, orientation.y, orientation.z, orientation.w)
@@ -344,11 +367,3 @@ def _matrix(position: Any, orientation: Any, topic: str) -> npt.NDArray[np.float
     if abs(norm - 1) > _UNIT_TOLERANCE:
         raise PoseError(f"{topic}: orientation {q} has length {norm:.6g}; expected a quaternion of length 1")
     return rigid(rotation_from_quaternion(*q), place)
-
-
-def _image(values: npt.NDArray[Any], encoding: str, header: Header) -> Image:
-    height, width = values.shape[:2]
-    step = values[0].nbytes if height else 0
-    message = Image(header=header, height=height, width=width, encoding=encoding, is_bigendian=0, step=step)
-    message.data = byte_array(values)
-    return message

@@ -74,11 +74,7 @@ def mask_header(path: str | os.PathLike[str], within: Path | None = None) -> Mas
             header = file.read(26)
     except OSError as error:
         raise MaskFormatError(f"{path}: cannot be read ({reason(error)}); expected a label image") from error
-    if len(header) < 26 or not header.startswith(b"\x89PNG\r\n\x1a\n"):
-        raise MaskFormatError(f"{path}: not a PNG; expected a one-channel 8- or 16-bit PNG of labels")
-    # The header chunk comes first: 8 bytes of signature, 8 of chunk, width, height, bit depth, colour type.
-    width, height = struct.unpack(">II", header[16:24])
-    depth, kind = header[24], _PNG_KINDS.get(header[25], "unknown")
+    kind, depth, width, height = png_header(header, str(path))
     if kind != "palette" and (kind != "gray" or depth not in (8, 16)):
         fix = "; a photo is no mask, and of ids drawn in colours save the ids themselves" if "RGB" in kind else ""
         raise MaskFormatError(
@@ -86,6 +82,24 @@ def mask_header(path: str | os.PathLike[str], within: Path | None = None) -> Mas
         )
     check_pixels(width, height, str(path), MaskFormatError)
     return MaskHeader(8 if kind == "palette" else depth, width, height)
+
+
+class PngHeader(NamedTuple):
+    """What the header of a PNG says: gray, RGB, palette, gray + alpha or RGBA; bits per channel; size in pixels."""
+
+    kind: str
+    depth: int
+    width: int
+    height: int
+
+
+def png_header(start: bytes, source: str) -> PngHeader:
+    """Read the header of a PNG from its first 26 bytes, or raise `MaskFormatError` if they are not those of one."""
+    if len(start) < 26 or not start.startswith(b"\x89PNG\r\n\x1a\n"):
+        raise MaskFormatError(f"{source}: not a PNG; expected a one-channel 8- or 16-bit PNG of labels")
+    # The header chunk comes first: 8 bytes of signature, 8 of chunk, width, height, bit depth, colour type.
+    width, height = struct.unpack(">II", start[16:24])
+    return PngHeader(_PNG_KINDS.get(start[25], "unknown"), start[24], width, height)
 
 
 def write_mask(

@@ -9,17 +9,18 @@ from typing import Any
 from rclpy.callback_groups import CallbackGroup
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage, Image
 
 from gsseg_ros.conversions import stamp_ns
 from gsseg_ros.node.live_outputs import LiveOutputs
+from gsseg_ros.node.masks.compressed import compressed_topic
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.pairing import Pairing, PoseSource
 from gsseg_ros.qos import clear_overrides, sensor_data
 
 
 class CameraImages:
-    """Listens to `image` while `~/overlay` has subscribers, and finds pose and camera of each picture.
+    """Listens to `image`, or `image/compressed`, while `~/overlay` has subscribers, and finds pose and camera of each.
 
     Parameters
     ----------
@@ -33,6 +34,8 @@ class CameraImages:
         Of the pictures alone; that of the masks is emptied when time is set back, and so is this one.
     group : CallbackGroup
         Of the other inputs.
+    compressed : bool
+        Whether pictures are compressed.
 
     Raises
     ------
@@ -46,9 +49,19 @@ class CameraImages:
     """
 
     def __init__(
-        self, node: LifecycleNode, outputs: Outputs, live: LiveOutputs, poses: PoseSource, group: CallbackGroup
+        self,
+        node: LifecycleNode,
+        outputs: Outputs,
+        live: LiveOutputs,
+        poses: PoseSource,
+        group: CallbackGroup,
+        *,
+        compressed: bool = False,
     ) -> None:
         self._node, self._outputs, self._live, self._group = node, outputs, live, group
+        self._kind, self._topic = Image, node.resolve_topic_name("image")
+        if compressed:
+            self._kind, self._topic = CompressedImage, compressed_topic(node, "image")
         self.pairing = Pairing(poses)
         self._subscription: Any = None
         self._lock, self._closed = threading.Lock(), False
@@ -72,10 +85,10 @@ class CameraImages:
 
     def _listen(self, wanted: bool) -> None:
         if wanted and self._subscription is None:
-            with clear_overrides("image"):
+            with clear_overrides(self._topic):
                 self._subscription = self._node.create_subscription(
-                    Image,
-                    "image",
+                    self._kind,
+                    self._topic,
                     self._arrived,
                     sensor_data(),
                     callback_group=self._group,
@@ -85,9 +98,8 @@ class CameraImages:
             self._node.destroy_subscription(self._subscription)
             self._subscription = None
 
-    def _arrived(self, message: Image) -> None:
-        topic = self._node.resolve_topic_name("image")
-        self.pairing.add_mask(stamp_ns(message.header.stamp), (topic, message), message.header.frame_id)
+    def _arrived(self, message: Any) -> None:
+        self.pairing.add_mask(stamp_ns(message.header.stamp), (self._topic, message), message.header.frame_id)
         self._hand_over()
 
     def _hand_over(self) -> None:

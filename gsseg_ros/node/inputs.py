@@ -17,23 +17,23 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, PoseError
 from gsseg_core.live.results import SCENE_CHANGED, Rejection
 from gsseg_ros.camera_infos import camera_of_image, is_rectified
-from gsseg_ros.conversions import labels_from_image, matrix_from_pose, stamp_ns
+from gsseg_ros.conversions import matrix_from_pose, stamp_ns
 from gsseg_ros.errors import NoSceneError, TooManyPixelsError
 from gsseg_ros.node.camera_images import CameraImages
 from gsseg_ros.node.complaints import LIVE, PERIOD, REFUSED_POSE, Complaints
 from gsseg_ros.node.jobs import Worker
 from gsseg_ros.node.live_outputs import LiveOutputs
+from gsseg_ros.node.masks.compressed import compressed_topic
+from gsseg_ros.node.masks.reader import MaskReader
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.pairing import ExactPoses, InterpolatedPoses, Paired, Pairing, PoseSource
 from gsseg_ros.node.sim_time import on_set_back
-from gsseg_ros.node.size_limits import require_size
 from gsseg_ros.node.tf_poses import TfPoses
 from gsseg_ros.node.workspace import Workspace
 from gsseg_ros.qos import clear_overrides, sensor_data
@@ -110,10 +110,14 @@ class Inputs:
             lambda _, message: self._complaints.add(LIVE, message),
         )
         built.callback(self.live.close)
-        self._images = CameraImages(node, outputs, self.live, self.tf or type(poses)(), self._group)
+        compressed = settings.image_transport == "compressed"
+        self._images = CameraImages(
+            node, outputs, self.live, self.tf or type(poses)(), self._group, compressed=compressed
+        )
         built.callback(self._images.close)
+        self._masks = MaskReader(settings)
         wanted: list[tuple[Any, str, Callable[[str, Any], None]]] = [
-            (Image, "mask", self._on_mask),
+            (CompressedImage if settings.mask_transport == "compressed" else Image, "mask", self._on_mask),
             (CameraInfo, "camera_info", self._on_camera_info),
         ]
         if settings.pose_source == "topic":
@@ -138,7 +142,8 @@ class Inputs:
         """Count the publishers of an input."""
         return int(self._node.count_publishers(topic))
 
-    def _listen(self, kind: Any, topic: str, callback: Callable[[str, Any], None]) -> Any:
+    def _listen(self, kind: Any, role: str, callback: Callable[[str, Any], None]) -> Any:
+        topic = compressed_topic(self._node, role) if kind is CompressedImage else role
         subscription: Any = None
 
         def arrived(message: Any) -> None:
@@ -158,12 +163,12 @@ class Inputs:
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             )
         self.arrivals[subscription.topic_name] = (0, self.started)
-        self.roles[subscription.topic_name] = topic
+        self.roles[subscription.topic_name] = role
         policies = f"{quality.reliability.short_key}, {quality.durability.short_key}"
         self.policies[subscription.topic_name] = policies.replace("_", " ")
         return subscription
 
-    def _on_mask(self, topic: str, message: Image) -> None:
+    def _on_mask(self, topic: str, message: Any) -> None:
         stamp, era = stamp_ns(message.header.stamp), self._workspace.era
         self.pairing.add_mask(stamp, (topic, message), message.header.frame_id, era)
 
@@ -236,7 +241,6 @@ class Inputs:
             rejection = Rejection("unexpected", str(error))
         if rejection is None:
             self.accepted += 1
-            self.live.fused(paired)
             return
         self._count_rejected(rejection.reason)
         self.explained[rejection.reason] = rejection.message
@@ -248,17 +252,16 @@ class Inputs:
             return Rejection(SCENE_CHANGED, f"mask {paired.name} came before the scene was loaded or reset")
         session = workspace.session
         (topic, mask), (info_topic, info) = paired.mask, paired.camera_info
-        require_size(mask, workspace.settings.max_pixels, topic)
-        labels = labels_from_image(mask, topic)
+        seen = self._masks.read(mask, topic)
         settings, pose = workspace.settings, paired.pose
         if settings.pose_source == "odometry":
             pose = pose @ settings.camera_in_base
-        size, rectified = (mask.width, mask.height), is_rectified(settings.rectified, topic, info_topic)
+        size, rectified = seen.labels.shape[::-1], is_rectified(settings.rectified, topic, info_topic)
         pose = settings.scene_to_map.world_to_camera(pose)
         camera = camera_of_image(paired.name, info, size, pose, topic, info_topic, rectified=rectified)
         if size != (info.width, info.height):
             self._say_once(
-                f"{topic}: masks are {mask.width} x {mask.height} pixels, {info_topic} says {info.width} x "
+                f"{topic}: masks are {size[0]} x {size[1]} pixels, {info_topic} says {info.width} x "
                 f"{info.height}: its intrinsics are scaled"
             )
         if camera.undistortion is not None:
@@ -266,8 +269,11 @@ class Inputs:
                 f"{info_topic}: the lens is distorted ({info.distortion_model}): masks are undistorted; if they are of "
                 "rectified images, set the parameter rectified to true"
             )
-            labels = camera.undistortion.sample(labels, UNKNOWN)
-        return session.fuse(View.from_arrays(camera, labels), paired.era)
+            seen = seen.undistorted(camera.undistortion)
+        rejection = session.fuse(View.from_seen(camera, seen), paired.era)
+        if rejection is None:
+            self.live.fused(paired, camera)
+        return rejection
 
     def _say_once(self, message: str) -> None:
         if message not in self._said:

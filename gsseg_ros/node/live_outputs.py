@@ -13,17 +13,21 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from builtin_interfaces.msg import Time
+from sensor_msgs.msg import CompressedImage
 from std_msgs.msg import Header
 
 from gsseg_core.errors import GssegError
 from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.settings import UNREFINED
+from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.camera_infos import camera_of_image, is_rectified
 from gsseg_ros.color_images import color_from_image
 from gsseg_ros.conversions import rgb_image
+from gsseg_ros.node.masks.compressed import decompress_picture
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.pairing import Paired
 from gsseg_ros.node.reports import Selection
@@ -70,7 +74,7 @@ class LiveOutputs:
         self._workspace, self._outputs = workspace, outputs
         self._busy, self._now, self._complain = busy, now, complain
         self._changed = threading.Condition()
-        self._picture: tuple[Paired, bool] | None = None
+        self._picture: tuple[Paired, Camera | None] | None = None
         self._objects_due = False
         self._news: int | None = None  # `objects_count` when the newest view came whose objects nobody has been told
         self._stopping = False
@@ -79,16 +83,16 @@ class LiveOutputs:
         self._thread = threading.Thread(target=self._run, name="live outputs", daemon=True)
         self._thread.start()
 
-    def fused(self, paired: Paired) -> None:
-        """Take note of a mask that has been fused; it is drawn if no camera image came lately."""
+    def fused(self, paired: Paired, camera: Camera) -> None:
+        """Take note of a mask that has been fused; what its camera sees is drawn if no camera image came lately."""
         self._news = self._outputs.objects_count
         if time.monotonic() - self._last_image > IMAGE_SILENCE:
-            self._show(paired, with_image=False)
+            self._show(paired, camera)
 
     def image(self, paired: Paired) -> None:
         """Take in a camera image with its pose, in the place of the mask."""
         self._last_image = time.monotonic()
-        self._show(paired, with_image=True)
+        self._show(paired, None)
 
     def tick(self) -> None:
         """See whether objects are due; call it some ten times a second.
@@ -111,10 +115,10 @@ class LiveOutputs:
             self._changed.notify()
         self._thread.join(timeout_s)
 
-    def _show(self, paired: Paired, with_image: bool) -> None:
+    def _show(self, paired: Paired, camera: Camera | None) -> None:
         if self._outputs.wants_overlay:
             with self._changed:
-                self._picture = (paired, with_image)
+                self._picture = (paired, camera)
                 self._changed.notify()
 
     def _run(self) -> None:
@@ -141,30 +145,36 @@ class LiveOutputs:
         except Exception as error:  # Nothing that is only to be looked at may end the thread.
             self._complain("live", f"overlay or objects: unexpected {type(error).__name__}: {error}")
 
-    def _draw(self, paired: Paired, with_image: bool) -> None:
-        session, settings = self._workspace.session, self._workspace.settings
+    def _draw(self, paired: Paired, camera: Camera | None) -> None:
+        session, header = self._workspace.session, paired.mask[1].header
         era = session.era
         if not session.has_codes:
             return
+        photo = None
+        if camera is None:
+            camera, photo = self._photo(paired)
+        result = self._current()
+        colors = palette(result.num_classes)
+        labels = result.render(make_operator(session.scene, camera, session.device)).labels
+        picture = colors[labels] if photo is None else overlay(photo, labels, colors)
+        header = Header(stamp=header.stamp, frame_id=header.frame_id)
+        # A reset meanwhile has cleared the overlay.
+        self._outputs.publish_overlay(rgb_image(picture, header), lambda: self._workspace.era is era)
+
+    def _photo(self, paired: Paired) -> tuple[Camera, npt.NDArray[np.uint8]]:
+        """Find camera and pixels (H, W, 3) of a camera image, undistorted where its lens is distorted."""
+        settings = self._workspace.settings
         (topic, image), (info_topic, info) = paired.mask, paired.camera_info
+        if isinstance(image, CompressedImage):
+            image = decompress_picture(image, topic, settings.max_pixels)
         for message, source in ((image, topic), (info, info_topic)):
             require_size(message, settings.max_pixels, source)
         pose = paired.pose @ settings.camera_in_base if settings.pose_source == "odometry" else paired.pose
         size, rectified = (image.width, image.height), is_rectified(settings.rectified, topic, info_topic)
         pose = settings.scene_to_map.world_to_camera(pose)
         camera = camera_of_image(paired.name, info, size, pose, topic, info_topic, rectified=rectified)
-        result = self._current()
-        colors = palette(result.num_classes)
-        labels = result.render(make_operator(session.scene, camera, session.device)).labels
-        picture = colors[labels]
-        if with_image:
-            photo = color_from_image(image, topic)
-            if camera.undistortion is not None:
-                photo = camera.undistortion.sample(photo, 0)
-            picture = overlay(photo, labels, colors)
-        header = Header(stamp=image.header.stamp, frame_id=image.header.frame_id)
-        # A reset meanwhile has cleared the overlay.
-        self._outputs.publish_overlay(rgb_image(picture, header), lambda: self._workspace.era is era)
+        photo = color_from_image(image, topic)
+        return camera, photo if camera.undistortion is None else camera.undistortion.sample(photo, 0)
 
     def _publish_objects(self) -> None:
         session, settings = self._workspace.session, self._workspace.settings

@@ -23,9 +23,15 @@ from gsseg_core.refine.settings import MAX_K, RefineSettings
 from gsseg_core.scene.scene_writers import DEFAULT, SCENE_WRITERS, check_format
 from gsseg_ros.camera_infos import AUTO, RECTIFIED
 from gsseg_ros.frames import Similarity, pose_from_parameters
+from gsseg_ros.node.masks.compressed import TRANSPORTS
+from gsseg_ros.node.masks.palette import Palette
 
 POSE_SOURCES = ("topic", "odometry", "tf")
 IDS = ("given", PER_VIEW)
+_CHOICES = {
+    "pose_source": POSE_SOURCES, "ids": IDS, "rectified": RECTIFIED, "mask_transport": TRANSPORTS,
+    "image_transport": TRANSPORTS,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -95,6 +101,22 @@ DECLARATIONS = (
         "what the labels of a mask are: given, the numbers of the classes; per-view, numbers that hold in their own "
         "mask only, as automatic mask generators give, so that objects are found and named by the node",
     ),
+    Declaration(
+        "palette",
+        [],
+        "colours of masks in rgb8 or bgr8, such as '#0080ff', the index being the label; a mask with another colour is "
+        "rejected",
+    ),
+    Declaration(
+        "mask_transport",
+        "raw",
+        f"how masks are sent: {', '.join(TRANSPORTS)} (PNG on mask/compressed, as image_transport names it)",
+    ),
+    Declaration(
+        "image_transport",
+        "raw",
+        f"how camera images are sent: {', '.join(TRANSPORTS)} (JPEG or PNG on image/compressed)",
+    ),
     Declaration("pose_source", "topic", f"where the camera's pose comes from: {', '.join(POSE_SOURCES)}"),
     Declaration(
         "rectified",
@@ -158,6 +180,9 @@ class Settings:
     max_pixels: int
     class_names: tuple[str, ...]
     ids: str
+    palette: Palette | None
+    mask_transport: str
+    image_transport: str
     pose_source: str
     rectified: str
     map_frame: str
@@ -174,7 +199,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Validate."""
-        for name, allowed in (("pose_source", POSE_SOURCES), ("ids", IDS), ("rectified", RECTIFIED)):
+        for name, allowed in _CHOICES.items():
             if getattr(self, name) not in allowed:
                 raise SettingsError(f"parameter {name} is '{getattr(self, name)}'; expected {', '.join(allowed)}")
         try:
@@ -211,6 +236,7 @@ class Settings:
             plain[name] = os.path.expanduser(plain[name])
         plain["rectified"] = str(plain["rectified"]).lower()  # Both true and "true", as YAML and shells have it.
         plain["class_names"] = tuple(values["class_names"] or ())
+        plain["palette"] = Palette(values["palette"]) if values["palette"] else None
         return cls(**plain, scene_to_map=similarity, camera_in_base=camera)
 
     @classmethod

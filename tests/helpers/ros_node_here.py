@@ -75,10 +75,14 @@ class NodeHere:
             used.append(stamp)
             self.stamp = max(self.stamp, stamp + STEP)
             sent = messages(view, stamp)
-            for topic in topics:
-                getattr(self.inputs, f"_on_{topic}")(topic, sent[topic])
-                self.inputs._hand_over()
+            self.hand({topic: sent[topic] for topic in topics})
         return used
+
+    def hand(self, sent: Mapping[str, Any]) -> None:
+        """Hand it messages by the name of their input."""
+        for topic, message in sent.items():
+            getattr(self.inputs, f"_on_{topic}")(topic, message)
+            self.inputs._hand_over()
 
     def fuse(self, views: list[View]) -> None:
         """Hand it some views, and wait until they are fused."""

@@ -81,7 +81,7 @@ def test_a_label_that_does_not_fit_is_not_written() -> None:
 def test_a_mask_of_another_encoding_is_refused(encoding: str) -> None:
     message = refusal(MaskFormatError, labels_from_image, image(np.zeros((2, 3), np.uint8), encoding), "/some/topic")
     assert f"'{encoding}'" in message
-    assert "mono8, 8UC1, mono16, 16UC1, 32SC1" in message
+    assert "mono8, 8UC1, mono16, 16UC1, 16SC1, 32SC1" in message
 
 
 @pytest.mark.parametrize(("width", "height"), [(0, 2), (3, 0), (0, 0)])

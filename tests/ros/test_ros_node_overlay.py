@@ -203,6 +203,9 @@ def live() -> Iterator[tuple[LiveOutputs, Shown, dict[str, bool]]]:
     live.close()
 
 
+CAMERA = clean_views(1)[0].camera
+
+
 def paired(second: int) -> Paired:
     view = clean_views(1)[0]
     sent = messages(view, second * 1_000_000_000)
@@ -214,10 +217,10 @@ def test_whoever_fuses_never_waits_for_a_picture_and_only_the_newest_is_drawn(
     live: tuple[LiveOutputs, Shown, dict[str, bool]],
 ) -> None:
     outputs, shown, _ = live
-    outputs.fused(paired(1))
+    outputs.fused(paired(1), CAMERA)
     wait_until(lambda: shown.stamps, "the first picture, which is then stuck")
     for second in range(2, 50):
-        outputs.fused(paired(second))  # Would hang here.
+        outputs.fused(paired(second), CAMERA)  # Would hang here.
     assert shown.stamps == [1]
     shown.go_on.set()
     wait_until(lambda: len(shown.stamps) == 2, "the next picture")
@@ -231,8 +234,8 @@ def test_nothing_is_drawn_while_masks_wait(
     outputs, shown, state = live
     shown.go_on.set()
     state["busy"] = True
-    outputs.fused(paired(1))
-    outputs.fused(paired(2))
+    outputs.fused(paired(1), CAMERA)
+    outputs.fused(paired(2), CAMERA)
     time.sleep(0.5)
     assert shown.stamps == []
     state["busy"] = False
@@ -247,10 +250,10 @@ def test_a_picture_is_drawn_within_a_second_though_masks_never_cease_to_wait(
     shown.go_on.set()
     state["busy"] = True
     begun = time.monotonic()
-    outputs.fused(paired(1))
+    outputs.fused(paired(1), CAMERA)
     wait_until(lambda: shown.stamps, "the picture, in spite of the masks")
     assert time.monotonic() - begun >= 0.9, "the masks go first, for a while"
-    outputs.fused(paired(2))
+    outputs.fused(paired(2), CAMERA)
     wait_until(lambda: shown.stamps == [1, 2], "the next one")
 
 
@@ -259,7 +262,7 @@ def test_a_picture_that_was_begun_before_a_reset_is_not_published_after_it(
 ) -> None:
     outputs, shown, _ = live
     shown.go_on.set()
-    outputs.fused(paired(1))
+    outputs.fused(paired(1), CAMERA)
     wait_until(lambda: shown.wanted, "a picture")
     assert shown.wanted[0]()
     outputs._workspace.era = object()

@@ -18,8 +18,9 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_ros.client import SegmentationClient
 from gsseg_ros.client.view_source import RosSource
 
-# Of the kinds of pose source one is there at a time, a clock only with use_sim_time, and images while they are shown.
-ONE_OF = {"/pose", "/odometry", "/tf", "/tf_static", "/clock", "/image"}
+# Of the kinds of pose source and of transports one is there at a time, a clock only with use_sim_time, and images while
+# they are shown.
+ONE_OF = {"/pose", "/odometry", "/tf", "/tf_static", "/clock", "/image", "/image/compressed", "/mask/compressed"}
 
 
 def listed(kind: str, permission: str, node: str = "gsseg") -> set[str]:
