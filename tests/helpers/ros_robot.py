@@ -255,9 +255,9 @@ class Robot:
         return bool(result.successful), str(result.reason)
 
     def get(self, name: str) -> Any:
-        """Value of a parameter."""
-        (value,) = self.ask("get_parameters", names=[name]).values
-        return parameter_value_to_python(value)
+        """Value of a parameter; rclpy has none for an empty list, which has no type."""
+        values = self.ask("get_parameters", names=[name]).values
+        return parameter_value_to_python(values[0]) if values else []
 
     # Views
 

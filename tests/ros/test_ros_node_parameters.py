@@ -68,6 +68,12 @@ STEMS = ("0_background", "1_red_ball", "2_cup_mug", "3_box")
         ("pose_source", "gps", "parameter pose_source is 'gps'; expected topic, odometry, tf"),
         ("device", "tpu", "parameter device is 'tpu'; expected cpu, cuda (the first GPU) or cuda:1 and so on"),
         ("device", "cuda:x", "parameter device is 'cuda:x'"),
+        (
+            "palette",
+            ["#000000", "red"],
+            "parameter palette: label 1 has the colour 'red'; expected one such as",
+        ),
+        ("mask_transport", "zip", "parameter mask_transport is 'zip'; expected raw, compressed"),
         ("export_format", "obj", "parameter export_format is 'obj'; expected one of ply, compressed-ply, spz"),
         ("rectified", "maybe", "parameter rectified is 'maybe'; expected auto, true, false"),
         ("ids", "mine", "parameter ids is 'mine'; expected given, per-view"),
