@@ -35,6 +35,7 @@ from gsseg_core.scene.vertices import (
 _ANY = float(np.finfo(np.float32).max)
 _MAX_LOGIT = 16.0
 _MAX_LOG_SCALE = 40.0
+_AT_ONCE = 1 << 18  # numbers that fit into the cache of a processor
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,12 +148,13 @@ class GaussianScene:
         if len(vertices) == 0:
             raise EmptySceneError(f"{source}: holds no Gaussian (0 vertices); expected at least one")
         means, opacities, log_scales, quats = (columns(vertices, names) for names in (MEANS, OPACITY, SCALES, QUATS))
-        for values, what in ((opacities, "opacities"), (log_scales, "scales"), (quats, "rotations")):
-            _check_finite(values, what, source, _ANY)
-        for values, what in ((means, "positions"), (columns(vertices, sh_names), "SH coefficients")):
-            _check_finite(values, what, source, LIMITS.max_value)
+        if not _all_within(vertices, min(_ANY, LIMITS.max_value)):
+            for values, what in ((opacities, "opacities"), (log_scales, "scales"), (quats, "rotations")):
+                _check_finite(values, what, source, _ANY)
+            for values, what in ((means, "positions"), (columns(vertices, sh_names), "SH coefficients")):
+                _check_finite(values, what, source, LIMITS.max_value)
 
-        lengths = np.linalg.norm(quats.astype(np.float64), axis=1, keepdims=True)
+        lengths = _lengths(quats)
         zero = np.flatnonzero(lengths == 0)
         if zero.size:
             raise SceneValueError(
@@ -254,6 +256,23 @@ def _check_properties(vertices: npt.NDArray[np.void], source: str) -> tuple[str,
             f"{source}: has {count} properties f_rest_*; expected {expected} (SH degree 0, 1, 2, 3), numbered from 0"
         )
     return DC + rest
+
+
+def _all_within(vertices: npt.NDArray[np.void], most: float) -> bool:  # (N,)
+    """Tell of vertices that are floats side by side whether none is larger than `most`; of others say no."""
+    plain = [(name, np.float32) for name in vertices.dtype.names or ()]
+    if not vertices.flags.c_contiguous or vertices.dtype != np.dtype(plain):
+        return False
+    values = vertices.view(np.float32)
+    blocks = (values[start : start + _AT_ONCE] for start in range(0, len(values), _AT_ONCE))
+    return all(block.min() >= -most and block.max() <= most for block in blocks)
+
+
+def _lengths(quats: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:  # (N, 4)
+    """Lengths (N, 1) of quaternions."""
+    w, x, y, z = quats.T.astype(np.float64)
+    lengths: npt.NDArray[np.float64] = np.sqrt(w * w + x * x + y * y + z * z)[:, None]
+    return lengths
 
 
 def _check_finite(values: npt.NDArray[np.float32], what: str, source: str, most: float) -> None:  # (N, C)

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.scene import spherical_harmonics
-from gsseg_core.scene.vertices import MEANS, QUATS, SCALES, columns, rest_names
+from gsseg_core.scene.vertices import MEANS, QUATS, REST_COUNTS, SCALES, columns, rest_names
 
 
 def move(
@@ -19,23 +19,21 @@ def move(
 
     What `pack_vertices` returned is changed, positions to colours. Raises nothing: what is NaN stays NaN.
     """
-    signs = np.diag(turn)
-    mirrored = not (turn - np.diag(signs)).any()  # Axes that only change their sign need no product of matrices.
+    names = rest_names(sum(name.startswith("f_rest_") for name in vertices.dtype.names or ()))
+    harmonics = spherical_harmonics.turned(turn, REST_COUNTS.index(len(names)))[1:, 1:]
     with np.errstate(all="ignore"):
-        means: npt.NDArray[np.floating] = columns(vertices, MEANS)
-        quats: npt.NDArray[np.floating] = columns(vertices, QUATS)
-        _put(vertices, MEANS, scale * (means * signs if mirrored else means @ turn.T) + np.asarray(shift))
+        _put(vertices, MEANS, scale * (columns(vertices, MEANS) @ turn.T) + np.asarray(shift))
         if scale != 1:
             _put(vertices, SCALES, columns(vertices, SCALES) + np.log(scale))
-        if mirrored:
-            quats = quats * np.array([1, signs[1] * signs[2], signs[0] * signs[2], signs[0] * signs[1]], np.float32)
-        else:
-            # A Gaussian is its own mirror image through its centre, so a mirror is half a turn of it.
-            quats = _product(_quaternion(turn if np.linalg.det(turn) > 0 else -turn), quats)
-        _put(vertices, QUATS, quats)
-        names = rest_names(sum(name.startswith("f_rest_") for name in vertices.dtype.names or ()))
+        if not (turn - np.diag(np.diag(turn))).any():  # Axes that only change their sign need no product of matrices.
+            _change_signs(vertices, np.diag(turn), names, np.diag(harmonics))
+            return
+        # A Gaussian is its own mirror image through its centre, so a mirror is half a turn of it.
+        rotation = _quaternion(turn if np.linalg.det(turn) > 0 else -turn)
+        _put(vertices, QUATS, _product(rotation, columns(vertices, QUATS)))
         if names:
-            _turn_harmonics(columns(vertices, names).reshape(len(vertices), 3, -1), turn, mirrored)
+            rest = columns(vertices, names).reshape(len(vertices), 3, -1)
+            rest[:] = rest @ harmonics.T.astype(np.float32)
 
 
 def _put(vertices: npt.NDArray[np.void], names: tuple[str, ...], values: npt.NDArray[np.floating]) -> None:
@@ -43,17 +41,19 @@ def _put(vertices: npt.NDArray[np.void], names: tuple[str, ...], values: npt.NDA
         vertices[name] = column
 
 
-def _turn_harmonics(
-    rest: npt.NDArray[np.float32],  # (N, 3, B)
-    turn: npt.NDArray[np.float64],
-    mirrored: bool,
+def _change_signs(
+    vertices: npt.NDArray[np.void],  # (N,)
+    axes: npt.NDArray[np.float64],  # (3,) 1 or -1
+    names: tuple[str, ...],  # of 3 B coefficients of SH
+    harmonics: npt.NDArray[np.float64],  # (B,) 1 or -1
 ) -> None:
-    """Turn coefficients of SH above degree 0 in place, band by band."""
-    matrix = spherical_harmonics.turned(turn, round(np.sqrt(rest.shape[2] + 1)) - 1)[1:, 1:]
-    if mirrored:
-        rest *= np.diag(matrix).astype(np.float32)
-    else:
-        rest[:] = rest @ matrix.T.astype(np.float32)
+    """Change signs of rotations and SH in place, as axes that change theirs do: all properties in one product."""
+    order = list(vertices.dtype.names or ())
+    signs = np.ones(len(order), np.float32)
+    signs[[order.index(name) for name in QUATS[1:]]] = axes[[1, 0, 0]] * axes[[2, 2, 1]]
+    signs[[order.index(name) for name in names]] = np.tile(harmonics, 3)
+    table = vertices.view(np.float32).reshape(len(vertices), -1)
+    table *= signs
 
 
 def _quaternion(turn: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:  # (3, 3)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import gzip
 import math
 import struct
-from collections.abc import Iterator
-from io import BufferedReader
+from collections.abc import Callable, Iterator
+from io import BufferedReader, BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +28,6 @@ _HEADER_4 = 32  # from version 4 on; the offset of the table of streams follows 
 _ANTIALIASED, _EXTENSIONS = 1, 2
 _COORDINATE_SYSTEM = 0xADBE0003
 _LOGITS = logits(np.arange(256) / 255).astype(np.float32)
-_HARMONICS = (np.arange(256, dtype=np.float32) - 128) / 128
 _COLOR_SCALE = 0.15  # of coefficients of degree 0, so that colours beyond [0, 1] fit
 # The axes of the file, by the number that the extension SPZ_ADOBE_coordinate_system says; 0 and none mean RUB.
 _SYSTEMS = (
@@ -37,6 +36,9 @@ _SYSTEMS = (
 )  # fmt: skip
 # Each direction in the axes of a PLY: right, down, front.
 _AXES = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
+
+Read = Callable[[int], bytes]
+"""Reads so many bytes of an attribute, or fewer where it ends."""
 
 
 class _Header(NamedTuple):
@@ -48,10 +50,9 @@ class _Header(NamedTuple):
 
     @property
     def sizes(self) -> list[int]:
-        """Bytes of positions, alphas, colours, scales, rotations and SH."""
+        """Bytes of the position, alpha, colour, scales, rotation and SH of a Gaussian."""
         position, rotation = (6 if self.version == 1 else 9), (4 if self.version >= 3 else 3)
-        per_gaussian = (position, 1, 3, 3, rotation, 3 * ((self.degree + 1) ** 2 - 1))
-        return [self.gaussians * size for size in per_gaussian]
+        return [position, 1, 3, 3, rotation, 3 * ((self.degree + 1) ** 2 - 1)]
 
 
 def is_spz(head: bytes) -> bool:
@@ -79,14 +80,23 @@ def decode_spz(file: Any, path: Path) -> ReadScene:
     magic = file.read(4)
     file.seek(0)
     if magic.startswith(_GZIP):
-        header, system, packed = _inflate(file)
+        header, system, readers = _inflate(file)
     elif magic == _MAGIC:
-        header, system, packed = _streams(file, path)
+        header, system, readers = _streams(file, path)
     else:
         raise ValueError("it starts neither with NGSP nor as gzip does")
-    parts = [np.frombuffer(part, np.uint8).reshape(header.gaussians, -1) for part in packed]
+    count, (*before, of_sh) = header.gaussians, header.sizes
+    parts = [_rows(next(readers), count, size) for size in before]
     turn = None if system == "RDF" else np.array([_AXES[letter] for letter in system], np.float64).T
-    vertices = pack_in_blocks(header.gaussians, lambda block: _pack(header, [part[block] for part in parts], turn))
+    read_sh = next(readers)
+
+    def pack(block: slice) -> npt.NDArray[np.void]:
+        # SH, two thirds of all bytes, come last and are inflated as they are packed.
+        sh = _rows(read_sh, len(parts[0][block]), of_sh)
+        return _pack(header, [*(part[block] for part in parts), sh], turn)
+
+    vertices = pack_in_blocks(count, pack)
+    next(readers, None)
     remarks = [f"SH above degree {MAX_DEGREE} are left out"] if header.degree > MAX_DEGREE else []
     if header.flags & _ANTIALIASED:
         remarks.append("trained with antialiasing, which is left out")
@@ -108,33 +118,37 @@ def _header(content: bytes) -> _Header:
     return _Header(version, count, degree, bits, flags)
 
 
-def _inflate(file: Any) -> tuple[_Header, str, Iterator[bytes]]:
-    """Inflate what gzip packed, versions 1 to 3: no more of it than the header asks for."""
+def _rows(read: Read, count: int, size: int) -> npt.NDArray[np.uint8]:
+    """Read an attribute of some Gaussians, (count, size)."""
+    content = read(count * size)
+    check_size(len(content), count * size, "data")
+    return np.frombuffer(content, np.uint8).reshape(count, size)
+
+
+def _inflate(file: Any) -> tuple[_Header, str, Iterator[Read]]:
+    """Inflate what gzip packed, versions 1 to 3: readers of attributes, each to be read before the next is taken."""
     stream = gzip.GzipFile(fileobj=file)
     header = _header(stream.read(_HEADER.size))
     if header.version > 3:
         raise UnfitError(f"is SPZ of version {header.version} under gzip; expected 1 to 3")
     # Deflate packs a thousand bytes into one at best: a small file cannot hold what it claims.
-    check_size(1032 * file.seek(0, 2), sum(header.sizes), f"{header.gaussians:,} Gaussians")
+    check_size(1032 * file.seek(0, 2), header.gaussians * sum(header.sizes), f"{header.gaussians:,} Gaussians")
     file.seek(0)
     stream = gzip.GzipFile(fileobj=file)
     stream.read(_HEADER.size)
     if header.flags & _EXTENSIONS:
         raise UnfitError("has extensions under gzip; expected them in version 4 alone")
 
-    def parts() -> Iterator[bytes]:
-        for size in header.sizes:
-            part = stream.read(size)
-            check_size(len(part), size, "data")
-            yield part
+    def readers() -> Iterator[Read]:
+        yield from [stream.read] * len(header.sizes)
         if stream.read(1):  # Only at the end the checksum is compared.
             raise UnfitError(f"holds more than {header.gaussians:,} Gaussians, as many as its header says")
 
-    return header, "RUB", parts()
+    return header, "RUB", readers()
 
 
-def _streams(file: BufferedReader, path: Path) -> tuple[_Header, str, Iterator[bytes]]:
-    """Take the streams of version 4 apart, each under zstd; those of no bytes are left out of the file."""
+def _streams(file: BufferedReader, path: Path) -> tuple[_Header, str, Iterator[Read]]:
+    """Take the streams of version 4 apart, as `_inflate` does; those of no bytes are left out of the file."""
     try:
         from zstandard import ZstdDecompressor, ZstdError
     except ImportError as error:
@@ -145,7 +159,7 @@ def _streams(file: BufferedReader, path: Path) -> tuple[_Header, str, Iterator[b
     header = _header(content)
     check_size(len(content), _HEADER_4, "header")
     count, table = content[15], int.from_bytes(content[16:20], "little")
-    wanted = [size for size in header.sizes if size]
+    wanted = [header.gaussians * size for size in header.sizes if header.gaussians * size]
     if header.version < 4 or not _HEADER_4 <= table <= 1 << 20 or count != len(wanted):
         raise UnfitError(f"has {count} streams in version {header.version}; expected {len(wanted)}, and version 4")
     system = _axes_said(file.read(table - _HEADER_4)) if header.flags & _EXTENSIONS else "RUB"
@@ -154,21 +168,22 @@ def _streams(file: BufferedReader, path: Path) -> tuple[_Header, str, Iterator[b
     if list(sizes[1::2]) != wanted:
         raise UnfitError(f"has streams of {sizes[1::2]} bytes; expected {wanted} for its Gaussians")
 
-    def parts() -> Iterator[bytes]:
-        packed = iter(sizes[::2])
-        for size in header.sizes:
-            if not size:
-                yield b""
-                continue
-            content = file.read(min(next(packed), 2 * size + (1 << 20)))  # Zstd makes nothing much larger.
+    def reader(packed: int, size: int) -> Read:
+        content = file.read(min(packed, 2 * size + (1 << 20)))  # Zstd makes nothing much larger.
+        stream = ZstdDecompressor().stream_reader(content)
+
+        def read(count: int) -> bytes:
             try:
-                part = ZstdDecompressor().stream_reader(content).read(size)
+                found: bytes = stream.read(count)
             except ZstdError as error:
                 raise ValueError(str(error)) from error
-            check_size(len(part), size, "data")
-            yield part
+            return found
 
-    return header, system, parts()
+        return read
+
+    streams = iter(zip(sizes[::2], wanted, strict=True))
+    every = (reader(*next(streams)) if header.gaussians * size else BytesIO().read for size in header.sizes)
+    return header, system, every
 
 
 def _axes_said(extensions: bytes) -> str:
@@ -197,11 +212,19 @@ def _pack(
         scale / np.float32(16) - np.float32(10),
         _LOGITS[alpha[:, 0]],
         (color / np.float32(255) - np.float32(0.5)) / np.float32(_COLOR_SCALE),
-        _HARMONICS[sh.reshape(len(sh), -1, 3)[:, :coefficients]] if coefficients else None,
+        _harmonics(sh, coefficients) if coefficients else None,
     )
     if turn is not None:
         move(vertices, turn)
     return vertices
+
+
+def _harmonics(packed: npt.NDArray[np.uint8], coefficients: int) -> npt.NDArray[np.float32]:  # (N, 3 B)
+    """Coefficients (N, B, 3) of SH above degree 0, the first B of those in the file: bytes of which 128 is 0."""
+    # Sorted by colour while they are bytes, as a PLY has them: a quarter of what floats would move.
+    by_color = packed.reshape(len(packed), -1, 3)[:, :coefficients].transpose(0, 2, 1) ^ np.uint8(128)
+    values: npt.NDArray[np.float32] = np.ascontiguousarray(by_color).view(np.int8) * np.float32(1 / 128)
+    return values.transpose(0, 2, 1)
 
 
 def _positions(packed: npt.NDArray[np.uint8], header: _Header) -> npt.NDArray[np.floating]:
