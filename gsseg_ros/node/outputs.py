@@ -60,6 +60,7 @@ class Outputs:
             self._overlay = self._overridable(Image, "~/overlay")
             self._objects = self._overridable(ObjectArray, "~/objects")
             self._markers = self._overridable(MarkerArray, "~/object_markers")
+            self._detections = self._vision_publisher()
         except Exception:
             self.close()
             raise
@@ -71,8 +72,9 @@ class Outputs:
 
     @property
     def wants_objects(self) -> bool:
-        """Whether anybody listens to `~/objects` or `~/object_markers`."""
-        return self._heard(self._objects, self._markers)
+        """Whether anybody listens to `~/objects`, `~/object_markers` or `~/detections_3d`."""
+        detections = [self._detections[0]] if self._detections else []
+        return self._heard(self._objects, self._markers, *detections)
 
     def announce(self, class_names: Mapping[int, str]) -> None:
         """Make a topic for every class, so that subscribers find it before its first cloud."""
@@ -127,6 +129,9 @@ class Outputs:
             self.objects_count += 1
             self._objects.publish(objects)
             self._markers.publish(object_markers(objects))
+            if self._detections is not None:
+                publisher, detections_of = self._detections
+                publisher.publish(detections_of(objects))
             return True
 
     def publish_report(self, report: SegmentationReport) -> None:
@@ -191,6 +196,14 @@ class Outputs:
         with clear_overrides(topic):
             self._always.append(self._node.create_publisher(kind, topic, latched(), qos_overriding_options=overridable))
         return self._always[-1]
+
+    def _vision_publisher(self) -> tuple[Publisher, Callable[[ObjectArray], Any]] | None:
+        """Make `~/detections_3d`, and what makes its messages of objects, where vision_msgs is installed."""
+        try:
+            from gsseg_ros.vision_messages import Detection3DArray, detections_of
+        except ImportError:
+            return None
+        return self._overridable(Detection3DArray, "~/detections_3d"), detections_of
 
     def _class(self, token: str) -> Publisher:
         if token not in self._classes:

@@ -169,17 +169,17 @@ def test_parameters_file_has_every_parameter_at_its_default() -> None:
     from gsseg_ros.node.parameters import DECLARATIONS
 
     file = yaml.safe_load((ROOT / "config" / "segment_node.yaml").read_text())
-    assert list(file) == ["/**/gsseg"]
-    assert list(file["/**/gsseg"]) == ["ros__parameters"]
-    in_file = _flat(file["/**/gsseg"]["ros__parameters"])
+    assert list(file) == ["/**"]
+    assert list(file["/**"]) == ["ros__parameters"]
+    in_file = _flat(file["/**"]["ros__parameters"])
     declared = {declaration.name: declaration.default for declaration in DECLARATIONS}
     assert in_file == declared
     # 1 and 1.0 are equal to Python but not to ROS.
     assert {name: type(value) for name, value in in_file.items()} == {n: type(v) for n, v in declared.items()}
 
 
-@pytest.mark.parametrize("namespace", ["", "/robot"])
-def test_a_node_accepts_the_parameters_file_as_it_stands(namespace: str) -> None:
+@pytest.mark.parametrize(("name", "namespace"), [("gsseg", ""), ("front", "/robot")])
+def test_a_node_accepts_the_parameters_file_as_it_stands(name: str, namespace: str) -> None:
     from ros_helpers import Context, Node, next_domain
 
     from gsseg_ros.node import parameters
@@ -188,7 +188,7 @@ def test_a_node_accepts_the_parameters_file_as_it_stands(namespace: str) -> None
     file = str(ROOT / "config" / "segment_node.yaml")
     context.init(args=["--ros-args", "--params-file", file], domain_id=next_domain())
     try:
-        node = Node("gsseg", namespace=namespace, context=context)
+        node = Node(name, namespace=namespace, context=context)
         parameters.declare(node)
         settings = parameters.Settings.read(node)
         node.destroy_node()
@@ -264,7 +264,7 @@ def test_rviz_shows_latched_topics_of_the_node_in_the_map_frame() -> None:
     topics = {"Objects": "cloud", "Objects by label": "cloud", "Object boxes": "object_markers", "Overlay": "overlay"}
     for name, topic in topics.items():
         asked = displays[name]["Topic"]
-        assert asked["Value"] == f"/gsseg/{topic}"
+        assert asked["Value"] == f"gsseg/{topic}", "relative: in the namespace that RViz is started in"
         assert (asked["Durability Policy"], asked["Reliability Policy"]) == ("Transient Local", "Reliable")
     assert displays["Objects"]["Color Transformer"] == "RGB8"
     assert (displays["Objects by label"]["Color Transformer"], displays["Objects by label"]["Channel Name"]) == (

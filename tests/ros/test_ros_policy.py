@@ -18,9 +18,12 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_ros.client import SegmentationClient
 from gsseg_ros.client.view_source import RosSource
 
-# Of the kinds of pose source and of transports one is there at a time, a clock only with use_sim_time, and images while
-# they are shown.
-ONE_OF = {"/pose", "/odometry", "/tf", "/tf_static", "/clock", "/image", "/image/compressed", "/mask/compressed"}
+# Of the kinds of pose source and of transports one is there at a time, a clock only with use_sim_time, images while
+# they are shown, and detections only where vision_msgs is installed.
+ONE_OF = {
+    "/pose", "/odometry", "/tf", "/tf_static", "/clock", "/image", "/image/compressed", "/mask/compressed",
+    "/gsseg/detections_3d",
+}  # fmt: skip
 
 
 def listed(kind: str, permission: str, node: str = "gsseg") -> set[str]:
