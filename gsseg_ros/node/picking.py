@@ -18,8 +18,10 @@ from gsseg_core.export.pictures import palette
 from gsseg_core.objects.oriented_boxes import class_box
 from gsseg_core.scene.camera import Camera
 from gsseg_ros.camera_infos import camera_of_image
-from gsseg_ros.conversions import byte_array, cloud, labels_from_image
+from gsseg_ros.conversions import byte_array, cloud
 from gsseg_ros.errors import InvalidRequestError, TooManyPixelsError, ViewpointError
+from gsseg_ros.node.masks.reader import MaskReader
+from gsseg_ros.node.parameters import Settings
 from gsseg_ros.node.size_limits import require_size
 from gsseg_ros.node.viewpoints import Lookup, viewpoint_pose
 from gsseg_ros.node.workspace import Workspace
@@ -56,7 +58,9 @@ def pick_object(request: PickService.Request, workspace: Workspace, lookup: Look
         raise InvalidRequestError("mask and points: found both or neither; expected a mask, or points inside")
     camera = _camera(request, workspace, lookup, rectified=rectified)
     if request.mask.width:
-        return pick_mask(session.scene, View.from_arrays(camera, _labels(request, camera)), device=session.device)
+        return pick_mask(
+            session.scene, View.from_arrays(camera, _labels(request, camera, workspace.settings)), device=session.device
+        )
     if camera.undistortion is not None:
         raise ViewpointError(
             "viewpoint_camera: d is of a lens that distorts; expected points in a rectified image, and zeros, or a mask"
@@ -95,12 +99,13 @@ def _camera(request: PickService.Request, workspace: Workspace, lookup: Lookup |
         raise ViewpointError(str(error)) from error
 
 
-def _labels(request: PickService.Request, camera: Camera) -> npt.NDArray[np.int32]:
+def _labels(request: PickService.Request, camera: Camera, settings: Settings) -> npt.NDArray[np.int32]:
     """Read the mask of a request as labels of the object (1), of what is not it (0), and of pixels not spoken of."""
     from gsseg_core.objects.pick import object_mask
 
     try:
-        labels = object_mask(labels_from_image(request.mask, "mask"), request.label or None, "mask")
+        seen = MaskReader(settings).read(request.mask, "mask")
+        labels = object_mask(seen.named(), request.label or None, "mask")
     except MaskFormatError as error:
         raise InvalidRequestError(str(error)) from error
     return labels if camera.undistortion is None else camera.undistortion.sample(labels, UNKNOWN)

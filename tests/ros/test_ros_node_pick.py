@@ -84,6 +84,15 @@ def test_in_a_mask_of_black_and_white_white_is_the_object(here: NodeHere) -> Non
     assert here.done("pick", **mask_of(view, -labels)).indices == here.done("pick", **mask_of(view, labels)).indices
 
 
+def test_a_soft_mask_is_what_it_names_in_each_pixel(here: NodeHere) -> None:
+    view = clean_views(1)[0]
+    labels = (view.read_labels() == BALL).astype(np.int32)
+    soft = mask_of(view, labels)
+    values = np.stack([0.2 + 0.6 * (1 - labels), 0.2 + 0.6 * labels], axis=-1).astype("<f4")
+    soft["mask"].encoding, soft["mask"].step, soft["mask"].data = "32FC2", values[0].nbytes, values.tobytes()
+    assert here.done("pick", **soft).indices == here.done("pick", **mask_of(view, labels)).indices
+
+
 def test_points_give_what_clicks_in_the_same_pixels_give(here: NodeHere, scene: GaussianScene) -> None:
     view = clean_views(1)[0]
     inside, outside = middle_of(view, BALL), (40, 5)
