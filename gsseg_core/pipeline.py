@@ -284,7 +284,7 @@ def _assess(learner: Learner, class_names: Mapping[int, str], watch: Stopwatch, 
     checks, checker, reliability = None, None, {}
     if learner.checks_masks:
         with watch.stage("check views"):
-            checker = MaskChecker(learner, progress)
+            checker = MaskChecker(learner)
             checks = checker.check_all(progress)
             reliability = {"reliability": reliability_report(checks, class_names)}
     with watch.stage("calibrate"):

@@ -14,7 +14,7 @@ import numpy as np
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.export.pictures import contact_sheet, legend, overlay, palette, save_png
-from gsseg_core.learn.mask_reliability import ViewCheck, worst_views
+from gsseg_core.learn.mask_reliability import WORST, ViewCheck, worst_views
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -124,7 +124,12 @@ def write_overview(
 
 
 def draw_worst_views(
-    scene: GaussianScene, views: Mapping[str, View], checks: Sequence[ViewCheck], count: int = 4, *, device: str = "cpu"
+    scene: GaussianScene,
+    views: Mapping[str, View],
+    checks: Sequence[ViewCheck],
+    count: int = WORST,
+    *,
+    device: str = "cpu",
 ) -> np.ndarray:
     """Draw the worst views: the mask, what the other views predict, and in red where the two differ; (H, W, 3) uint8.
 

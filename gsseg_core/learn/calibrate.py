@@ -33,7 +33,7 @@ def calibrate(learner: Learner, checker: MaskChecker | None = None, progress: Pr
 
     A checker of this learner may be at hand: what it has rendered is not rendered again.
     """
-    views, checker, samples = spread(list(learner.views.values()), VIEWS), checker or MaskChecker(learner, progress), []
+    views, checker, samples = spread(list(learner.views.values()), VIEWS), checker or MaskChecker(learner), []
     for done, view in enumerate(views):
         progress("calibrate", done, len(views))
         samples.append(checker.sample(view))

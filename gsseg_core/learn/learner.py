@@ -194,22 +194,20 @@ class Learner(ABC):
             There is no view.
         """
 
-    def prepare_predictions(self, progress: Progress = silent) -> None:  # noqa: B027 - most need nothing
-        """Compute what `predict_without` needs of all views; it does so itself, without progress, if it has to."""
-
-    def predict_without(self, view: View) -> np.ndarray:
+    def predict_without(self, view: View, only_labelled: bool = False) -> np.ndarray:
         """Blend into a view the probabilities learnt without its mask, as far as `leaves_out`: (H, W, K) float32.
 
-        After `fit`, for one of its views; nothing of the learner changes. Rows sum to less where little is known.
+        After `fit`, for one of its views; nothing of the learner changes. Rows sum to less where little is known. If
+        only pixels with a label are wanted, others may have any value, and it may take less time.
         """
         return self._blend_codes(self.codes_, view)
 
-    def classes_without(self, view: View) -> np.ndarray:
+    def classes_without(self, view: View, only_labelled: bool = False) -> np.ndarray:
         """Tell the class of each pixel of a view by `predict_without`, (H, W) int32; `UNKNOWN` where little is known.
 
         That is, where most of a ray ends on Gaussians that only this view has seen.
         """
-        return Strongest.of(self.predict_without(view)).labels()
+        return Strongest.of(self.predict_without(view, only_labelled)).labels()
 
     def rejected_share(self, view: View) -> float:
         """Share of a view's labelled pixels whose label `fit` has not used, in [0, 1]."""

@@ -17,11 +17,13 @@ import numpy as np
 
 from gsseg_core.data.class_names import class_name
 from gsseg_core.data.label_evidence import LabelEvidence
-from gsseg_core.data.label_images import PackedLabels
+from gsseg_core.data.label_images import UNKNOWN, PackedLabels
 from gsseg_core.data.view import View, spread
 from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.learn.temperature import VIEWS, Sample, sample_pixels
 from gsseg_core.raster.view_operator import Strongest
+
+WORST = 4  # views that are trusted least, as pictures show them
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,50 +80,76 @@ class MaskChecker:
     ----------
     learner : Learner
         After `fit`. It must not learn on while this is in use.
-    progress : callable, optional
-        Told of every view.
     """
 
-    def __init__(self, learner: Learner, progress: Progress = silent) -> None:
+    def __init__(self, learner: Learner) -> None:
         self.learner = learner
         self._sampled = {view.name for view in spread(list(learner.views.values()), VIEWS)}
         self._samples: dict[str, Sample] = {}
-        learner.prepare_predictions(progress)
 
     def sample(self, view: View) -> Sample:
         """Take pixels of a view's mask with their predicted probabilities, to fit the temperature to."""
         if view.name not in self._samples:
-            self._samples[view.name] = sample_pixels(self.learner.predict_without(view), view.read_labels())
+            self._sample(view, self.learner.predict_without(view, only_labelled=True))
         return self._samples[view.name]
 
     def check_all(self, progress: Progress = silent) -> list[ViewCheck]:
         """Compare all masks with their predictions, in the order of the views.
 
-        A prediction is unknown where most of a ray ends on Gaussians that only this view has seen.
+        A prediction is unknown where most of a ray ends on Gaussians that only this view has seen; and, but for the
+        `shown_views`, where the mask says nothing.
         """
-        checks, learner = [], self.learner
-        for done, view in enumerate(learner.views.values()):
-            progress("check views", done, len(learner.views))
-            if view.name in self._sampled:  # which needs the probabilities, not the classes alone
-                image = learner.predict_without(view)
-                self._samples[view.name] = sample_pixels(image, view.read_labels())
-                predicted = Strongest.of(image).labels()
-            else:
-                predicted = learner.classes_without(view)
-            check = compare_mask(view, predicted, learner.num_classes)
-            checks.append(replace(check, rejected=learner.rejected_share(view)))
-        progress("check views", len(learner.views), len(learner.views))
-        return checks
+        views = self.learner.views
+        checks = {}
+        for done, view in enumerate(views.values()):
+            progress("check views", done, len(views))
+            checks[view.name] = self._check(view)
+        for check in shown_views(list(checks.values())):
+            if check.num_pixels < views[check.name].camera.width * views[check.name].camera.height:
+                everywhere = PackedLabels(self.learner.classes_without(views[check.name]))
+                checks[check.name] = replace(check, predicted=everywhere)
+        progress("check views", len(views), len(views))
+        return list(checks.values())
+
+    def _check(self, view: View) -> ViewCheck:
+        """Compare a view's mask with what is predicted where it says something."""
+        learner = self.learner
+        if view.name in self._sampled:  # which needs the probabilities, not the classes alone
+            image = learner.predict_without(view, only_labelled=True)
+            self._sample(view, image)
+            predicted = Strongest.of(image).labels()
+        else:
+            predicted = learner.classes_without(view, only_labelled=True)
+        predicted[view.read_seen().labels < 0] = UNKNOWN
+        check = compare_mask(view, predicted, learner.num_classes)
+        return replace(check, rejected=learner.rejected_share(view))
+
+    def _sample(self, view: View, image: np.ndarray) -> None:  # (H, W, K)
+        self._samples[view.name] = sample_pixels(image, view.read_labels())
 
 
 def check_views(learner: Learner, progress: Progress = silent) -> list[ViewCheck]:
     """Compare each view's mask with what the other views predict, in the order of the views; see `MaskChecker`."""
-    return MaskChecker(learner, progress).check_all(progress)
+    return MaskChecker(learner).check_all(progress)
 
 
 def worst_views(checks: Iterable[ViewCheck], count: int | None = None) -> list[ViewCheck]:
     """Sort views by reliability, the worst first; those that nothing is known of come last. All, or so many at most."""
     return sorted(checks, key=lambda check: (not check.checked, check.reliability))[:count]
+
+
+def ranked_examples(checks: Iterable[ViewCheck]) -> list[tuple[str, ViewCheck]]:
+    """Choose the worst, the median and the best view by reliability; fewer if there are fewer."""
+    ranked = [check for check in worst_views(checks) if check.checked]
+    places = {0: "worst", len(ranked) // 2: "median", len(ranked) - 1: "best"}
+    return [(what, ranked[place]) for place, what in sorted(places.items()) if ranked]
+
+
+def shown_views(checks: Iterable[ViewCheck]) -> list[ViewCheck]:
+    """Choose the views whose masks and predictions are shown to people."""
+    shown = {check.name: check for check in worst_views(checks, WORST)}
+    shown |= {check.name: check for _, check in ranked_examples(checks)}
+    return list(shown.values())
 
 
 def reliability_report(checks: Iterable[ViewCheck], class_names: Mapping[int, str]) -> list[dict[str, Any]]:

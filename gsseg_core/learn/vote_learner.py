@@ -23,6 +23,6 @@ class VoteLearner(Learner):
         self.observed_ = np.asarray(self.codes_.any(axis=1))
         return self
 
-    def predict_without(self, view: View) -> np.ndarray:
+    def predict_without(self, view: View, only_labelled: bool = False) -> np.ndarray:
         """Blend into a view the votes of all others as probabilities, (H, W, K) float32; exact, by subtraction."""
         return self._blend_codes(self.vote_codes_without(view.name), view)

@@ -274,6 +274,10 @@ class GsplatObservation(Observation):
         held = (self._visible, self.ids, self.start, self.labels, self._votes)
         return self._operator.nbytes + self._labels.nbytes + sum(array.nbytes for array in held)
 
+    def operator(self, camera: Camera, num_gaussians: int) -> GsplatOperator:
+        """Give the operator that it was observed with."""
+        return self._operator
+
     def votes(self) -> np.ndarray:
         """Weights summed by pair, (P,) float32."""
         return self._votes

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numba as nb
 import numpy as np
@@ -13,7 +13,11 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence, vote_units
 from gsseg_core.errors import SceneValueError
 from gsseg_core.raster.constants import AHEAD
+from gsseg_core.scene.camera import Camera
 from gsseg_core.simd import prefetch
+
+if TYPE_CHECKING:
+    from gsseg_core.raster.view_operator import ViewOperator
 
 
 class VoteShares(NamedTuple):
@@ -89,6 +93,13 @@ class Observation(ABC):
         out = np.zeros((len(self.ids), len(self.classes)), values.dtype)
         out[self.rows, self.labels] = values
         return out
+
+    @abstractmethod
+    def operator(self, camera: Camera, num_gaussians: int) -> ViewOperator:
+        """Make the operator of the view again, to blend codes: what pixels without a label show has no meaning.
+
+        Nothing is projected. Camera and number of Gaussians are those of the operator that it was observed with.
+        """
 
     @abstractmethod
     def votes(self) -> np.ndarray:

@@ -129,7 +129,7 @@ class _ObjectViews:
             yield shown, self._kept.get(number) or self._project(shown)
 
     def _project(self, shown: Silhouette) -> ObjectsAlone:
-        operator = shown.operator or TileOperator(self._scene, shown.camera)  # on the CPU, which alone tells reasons
+        operator = shown.operator or TileOperator.of(self._scene, shown.camera)  # on the CPU, which alone tells reasons
         return operator.objects_alone(self._labels)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsseg_core.data.view import View
-from gsseg_core.learn.mask_reliability import ViewCheck, worst_views
+from gsseg_core.learn.mask_reliability import ViewCheck, ranked_examples
 from gsseg_core.metrics import iou
 from gsseg_core.text import counted
 
@@ -64,11 +64,7 @@ class Evidence:
 
     def examples(self) -> list[tuple[str, ViewCheck]]:
         """Choose the worst, the median and the best view by reliability; fewer if there are fewer."""
-        ranked = [check for check in worst_views(self.checks) if check.checked]
-        if not ranked:
-            return []
-        places = {0: "worst", len(ranked) // 2: "median", len(ranked) - 1: "best"}
-        return [(what, ranked[place]) for place, what in sorted(places.items())]
+        return ranked_examples(self.checks)
 
 
 def class_ious(confusion: np.ndarray) -> np.ndarray:

@@ -20,7 +20,6 @@ regions whose label the votes of all other views contradict lose it (`rejected_r
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -144,7 +143,7 @@ class EMLearner(Learner):
         super().__init__(scene, num_classes, device=device, memory_budget=memory_budget)
         self.settings = settings or EMSettings()
         self.error_models_: dict[str, ErrorModel] = {}
-        self._leave_one_out: tuple[CSRRows, np.ndarray] | None = None  # probabilities, and gradient of all views there
+        self._last_step: tuple[CSRRows, np.ndarray] | None = None  # probabilities before it, and gradient of all views
 
     @classmethod
     def default_settings(cls, max_steps: int | None, seed: int) -> tuple[EMSettings]:
@@ -170,7 +169,7 @@ class EMLearner(Learner):
         """Alternate E and M steps until a step can gain no more than the tolerance."""
         settings = self.settings
         self._begin()
-        self._leave_one_out = None
+        self._last_step = None
         votes, tick = CSRRows.from_dense(self._votes), partial(progress, "em", 0, settings.max_steps)
         rejected: dict[str, np.ndarray] = {}
         if settings.rejects_regions:
@@ -197,11 +196,13 @@ class EMLearner(Learner):
             last_round = len(rounds) > settings.refits or not settings.errors
             tolerance = settings.tolerance * (1 if last_round else REFIT_FACTOR) * pixels
             small = kernels.predicted_gain(codes, gradient, prior.data) < tolerance
-            if small and not last_round:
+            self.converged_ = small and last_round
+            if self.converged_ or len(history) == settings.max_steps:
+                self._last_step = codes.with_data(codes.data.copy()), gradient
+            elif small:
                 self._refit_error_models(codes, gradient, prior.data, models, tick)
                 rounds.append(0)
             kernels.m_step(codes, gradient, prior.data)
-            self.converged_ = small and last_round
             if self.converged_:
                 break
         progress("em", settings.max_steps, settings.max_steps)
@@ -209,41 +210,35 @@ class EMLearner(Learner):
         self._finish()
         return self
 
-    def prepare_predictions(self, progress: Progress = silent) -> None:
-        """Run the E-step at the fitted probabilities, from which `predict_without` takes one view's part away."""
-        codes, total, done = CSRRows.from_dense(self.codes_), len(self.views), itertools.count()
-
-        def tick() -> None:
-            progress("sum up views", min(next(done), total - 1), total)
-
-        self._leave_one_out = codes, self._e_step(codes, self.error_models_, tick)[0]
-        progress("sum up views", total, total)
-
-    def predict_without(self, view: View) -> np.ndarray:
-        """Blend into a view the probabilities after one more step without its mask, (H, W, K) float32.
+    def predict_without(self, view: View, only_labelled: bool = False) -> np.ndarray:
+        """Blend into a view the probabilities of a last step without its mask, (H, W, K) float32.
 
         The spatial prior is left out, too, so rows sum to less where no other view has seen anything.
         """
-        codes, operator = self._codes_without(view), make_operator(self.scene, view.camera, self.device)
+        codes, operator = self._codes_without(view), self._operator(view, only_labelled)
         image, left_over = operator.blend_rows(codes, self.num_classes)
         if (codes.indices == 0).any():
             image[..., 0] += left_over
         return image
 
-    def classes_without(self, view: View) -> np.ndarray:
+    def classes_without(self, view: View, only_labelled: bool = False) -> np.ndarray:
         """Tell the class of each pixel by `predict_without`, without an image of all classes."""
-        codes, operator = self._codes_without(view), make_operator(self.scene, view.camera, self.device)
+        codes, operator = self._codes_without(view), self._operator(view, only_labelled)
         return operator.strongest(codes, self.num_classes, bool((codes.indices == 0).any())).labels()
 
     def _codes_without(self, view: View) -> CSRRows:
-        """Take one more step without a view's mask: all codes, N rows."""
-        if self._leave_one_out is None:
-            self.prepare_predictions()
-        assert self._leave_one_out is not None
-        codes, gradient = self._leave_one_out
+        """Take the last step of `fit` once more, without a view's mask: all codes, N rows."""
+        assert self._last_step is not None, "expected fit() first"
+        codes, gradient = self._last_step
         observation, no_prior = self.observation(view.name), np.zeros_like(codes.data)
         stepped = codes_without(observation, self.error_models_[view.name], codes, gradient, no_prior)
         return codes.with_rows(observation.ids[observation.order], stepped)
+
+    def _operator(self, view: View, only_labelled: bool) -> ViewOperator:
+        """Make the operator of a view, or take what its labelled pixels see from where it is kept."""
+        if only_labelled:
+            return self.observation(view.name).operator(view.camera, len(self.scene))
+        return make_operator(self.scene, view.camera, self.device)
 
     def rejected_share(self, view: View) -> float:
         """Share of a view's labelled pixels that lie in rejected regions."""

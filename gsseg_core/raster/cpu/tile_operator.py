@@ -31,12 +31,14 @@ class TileOperator(ViewOperator):
     of them have the very same geometry and different codes.
     """
 
-    def __init__(self, scene: GaussianScene, camera: Camera) -> None:
-        self.camera = camera
-        self.num_gaussians = len(scene)
+    def __init__(self, camera: Camera, num_gaussians: int, ids: np.ndarray, tiles: Tiles) -> None:  # ids (M,)
+        self.camera, self.num_gaussians, self.ids, self._tiles = camera, num_gaussians, ids, tiles
+
+    @classmethod
+    def of(cls, scene: GaussianScene, camera: Camera) -> TileOperator:
+        """Project a scene, and sort what can be seen into tiles."""
         projected = project(scene, camera)
-        self.ids = projected.ids
-        self._tiles = assign(projected, camera.width, camera.height)
+        return cls(camera, len(scene), projected.ids, assign(projected, camera.width, camera.height))
 
     def footprints(self) -> np.ndarray:
         """Sum of the alphas of each of `ids` over an endless image, (M,)."""
@@ -109,7 +111,7 @@ class TileOperator(ViewOperator):
 def view_operator(scene: GaussianScene, camera: Camera, device: str) -> TileOperator:
     """Make the operator of a view on the CPU, the only device of this name."""
     del device
-    return TileOperator(scene, camera)
+    return TileOperator.of(scene, camera)
 
 
 class TileObservation(Observation):
@@ -157,6 +159,10 @@ class TileObservation(Observation):
                 self._slot_start, self._pair, *self._mask)  # fmt: skip
         # The ids once more for `order`; and what `shares` was asked last, and answered.
         return sum(array.nbytes for array in held) + self.ids.nbytes + 2 * self._votes.nbytes
+
+    def operator(self, camera: Camera, num_gaussians: int) -> TileOperator:
+        """Make an operator of the Gaussians that labelled pixels see."""
+        return TileOperator(camera, num_gaussians, self.ids, self._tiles)
 
     def votes(self) -> np.ndarray:
         """Weights summed by pair, (P,) float32."""
