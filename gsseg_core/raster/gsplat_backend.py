@@ -262,7 +262,8 @@ class GsplatObservation(Observation):
         for k in chunks(len(classes)):
             votes[:, k] = operator.carry_back(self._one_hot(k)).cpu().numpy()
         seen = votes > 0
-        self._visible = np.flatnonzero(seen.any(axis=1))
+        visible = np.flatnonzero(seen.any(axis=1))
+        self._visible = visible[np.argsort(operator.ids[visible])]
         self.ids, seen = operator.ids[self._visible], seen[self._visible]
         self.start = starts(seen.sum(axis=1))
         self.labels = seen.nonzero()[1].astype(np.int32)

@@ -41,7 +41,8 @@ class Observation(ABC):
     name : str
         Of the view.
     ids : (M,) int32
-        Gaussians that some labelled pixel sees, as indices in the scene.
+        Gaussians that some labelled pixel sees, as indices in the scene, ascending: whoever goes through them goes
+        through memory once.
     start : (M + 1,) int64
         Pairs of ids[m] are start[m] to start[m + 1].
     labels : (P,) int32
@@ -75,13 +76,6 @@ class Observation(ABC):
     def evidence(self) -> LabelEvidence:
         """What the labels say of the classes."""
         return LabelEvidence(self.classes)
-
-    @cached_property
-    def order(self) -> np.ndarray:
-        """Places in `ids` in the order of the scene, (M,) int32: whoever goes by it goes through memory once."""
-        place = np.full(int(self.ids.max(initial=-1)) + 1, -1, np.int32)
-        place[self.ids] = np.arange(len(self.ids), dtype=np.int32)
-        return place[place >= 0]
 
     @property
     def rows(self) -> np.ndarray:
@@ -141,7 +135,7 @@ class Observation(ABC):
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def add_votes(
-    total: np.ndarray, ids: np.ndarray,  # (N, K) int64, added to; (M,) int32, distinct
+    total: np.ndarray, ids: np.ndarray,  # (N, K) int64, added to; (M,) int32, ascending
     start: np.ndarray, labels: np.ndarray,  # (M + 1,); (P,) int32: label of each pair
     label_votes: CSRRows, votes: np.ndarray,  # L rows, float64: what a pixel of each label votes; (P,) float32
     units: float, sign: int,  # per vote; a power of 2

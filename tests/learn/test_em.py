@@ -313,7 +313,7 @@ def test_codes_without_a_view_are_a_step_with_the_gains_of_all_the_others() -> N
         others, _ = learner._e_step(codes, {other: models[other] for other in models if other != name}, lambda: None)
         expected = codes.with_data(codes.data.copy())
         m_step(expected, others, prior)
-        seen = expected.take(observation.ids[observation.order])
+        seen = expected.take(observation.ids)
         found = codes_without(observation, models[name], codes, gradient, prior)
         np.testing.assert_array_equal(found.indptr, seen.indptr)
         np.testing.assert_array_equal(found.indices, seen.indices)
@@ -323,7 +323,7 @@ def test_codes_without_a_view_are_a_step_with_the_gains_of_all_the_others() -> N
 def test_what_was_all_but_ruled_out_does_not_overflow_the_sums() -> None:
     codes = CSRRows(np.array([0, 2]), np.array([0, 1], np.uint32), np.full(2, 0.5, np.float32))
     gradient, one = np.zeros(2, np.int64), np.zeros(1, np.int32)
-    pairs = ViewPairs(one, one, start=np.array([0, 1]), labels=one)
+    pairs = ViewPairs(one, start=np.array([0, 1]), labels=one)
     share, likelihood = np.array([1e30], np.float32), np.array([[1.0, 1e-30]], np.float32)
     for _ in range(255):
         accumulate(codes.with_data(gradient), pairs, likelihood, share)

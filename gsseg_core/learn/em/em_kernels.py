@@ -40,12 +40,11 @@ class ViewPairs(NamedTuple):
 
     Attributes
     ----------
-    order, ids : (M,) int32
+    ids : (M,) int32
     start : (M + 1,) int64
     labels : (P,) int32
     """
 
-    order: np.ndarray
     ids: np.ndarray
     start: np.ndarray
     labels: np.ndarray
@@ -53,7 +52,7 @@ class ViewPairs(NamedTuple):
     @classmethod
     def of(cls, observation: Observation) -> ViewPairs:
         """Take the pairs of an observation."""
-        return cls(observation.order, observation.ids, observation.start, observation.labels)
+        return cls(observation.ids, observation.start, observation.labels)
 
 
 @intrinsic
@@ -73,10 +72,9 @@ def rounded_to_units(_: Any, __: Any) -> Any:
 def pair_likelihood(codes: CSRRows, pairs: ViewPairs, likelihood: np.ndarray) -> np.ndarray:
     """Likelihood of the label of each (Gaussian, label) pair, codes[i] . likelihood[y]: (P,) float32."""
     indptr, classes, data = codes
-    order, ids, start, labels = pairs
+    ids, start, labels = pairs
     out = np.empty(labels.shape[0], np.float32)
-    for i in nb.prange(order.shape[0]):
-        m = order[i]
+    for m in nb.prange(ids.shape[0]):
         row = slice(indptr[ids[m]], indptr[ids[m] + 1])
         code, which = data[row], classes[row]
         for s in range(start[m], start[m + 1]):
@@ -91,9 +89,8 @@ def pair_likelihood(codes: CSRRows, pairs: ViewPairs, likelihood: np.ndarray) ->
 def accumulate(gradient: CSRRows, pairs: ViewPairs, likelihood: np.ndarray, shares: np.ndarray) -> None:
     """Add one view's term to the gradient: sum over a Gaussian's pairs of share times likelihood of the label."""
     indptr, classes, data = gradient
-    order, ids, start, labels = pairs
-    for i in nb.prange(order.shape[0]):
-        m = order[i]
+    ids, start, labels = pairs
+    for m in nb.prange(ids.shape[0]):
         row = slice(indptr[ids[m]], indptr[ids[m] + 1])
         entries, which = data[row], classes[row]
         for s in range(start[m], start[m + 1]):
@@ -144,16 +141,15 @@ def m_step_without_view(
 ) -> None:  # fmt: skip
     """M-step of the M Gaussians that a view sees, with the gradient less what `accumulate` added for this view.
 
-    Written are the classes and the entries of `stepped`, M rows in the order of `pairs.order`.
+    Written are the classes and the entries of `stepped`, M rows.
     """
     indptr, classes, data = codes
-    order, ids, start, labels = pairs
+    ids, start, labels = pairs
     out_indptr, out_classes, out = stepped
-    for i in nb.prange(order.shape[0]):
-        m = order[i]
+    for m in nb.prange(ids.shape[0]):
         first, total = indptr[ids[m]], np.float32(0.0)
-        for j in range(out_indptr[i + 1] - out_indptr[i]):
-            z, k = out_indptr[i] + j, classes[first + j]
+        for j in range(out_indptr[m + 1] - out_indptr[m]):
+            z, k = out_indptr[m] + j, classes[first + j]
             remaining = gradient[first + j]
             for s in range(start[m], start[m + 1]):
                 remaining -= rounded_to_units(shares[s] * likelihood[labels[s], k])
@@ -161,7 +157,7 @@ def m_step_without_view(
             out[z] = data[first + j] * (np.float32(remaining) * _GRADIENT_UNIT) + prior[first + j]
             total += out[z]
         if total > 0:
-            for z in range(out_indptr[i], out_indptr[i + 1]):
+            for z in range(out_indptr[m], out_indptr[m + 1]):
                 out[z] /= total
 
 
@@ -169,16 +165,15 @@ def m_step_without_view(
 def confusion_counts(
     codes: CSRRows, pairs: ViewPairs, shares: np.ndarray, num_classes: int, num_labels: int
 ) -> np.ndarray:
-    """Sum over the pairs of codes[i] times share, by class and label, (K, L) float64; row i is of `pairs.order[i]`."""
+    """Sum over the pairs of codes[m] times share, by class and label, (K, L) float64; row m is of `pairs.ids[m]`."""
     indptr, classes, data = codes
-    order, _, start, labels = pairs
+    ids, start, labels = pairs
     parts = np.zeros((BLOCKS, num_classes, num_labels))
     for block in nb.prange(BLOCKS):
         part = parts[block]
-        for i in range(order.shape[0] * block // BLOCKS, order.shape[0] * (block + 1) // BLOCKS):
-            m = order[i]
+        for m in range(ids.shape[0] * block // BLOCKS, ids.shape[0] * (block + 1) // BLOCKS):
             for s in range(start[m], start[m + 1]):
-                for z in range(indptr[i], indptr[i + 1]):
+                for z in range(indptr[m], indptr[m + 1]):
                     part[classes[z], labels[s]] += shares[s] * data[z]
     counts: np.ndarray = parts.sum(axis=0)
     return counts

@@ -232,7 +232,7 @@ class EMLearner(Learner):
         codes, gradient = self._last_step
         observation, no_prior = self.observation(view.name), np.zeros_like(codes.data)
         stepped = codes_without(observation, self.error_models_[view.name], codes, gradient, no_prior)
-        return codes.with_rows(observation.ids[observation.order], stepped)
+        return codes.with_rows(observation.ids, stepped)
 
     def _operator(self, view: View, only_labelled: bool) -> ViewOperator:
         """Make the operator of a view, or take what its labelled pixels see from where it is kept."""
@@ -329,11 +329,9 @@ class EMLearner(Learner):
             tick()
             model, pairs = models[name], ViewPairs.of(observation)
             without = codes_without(observation, model, codes, gradient, prior)
-            # Rows of `without` are in the order of the scene, so a Gaussian's row is its place in that order.
-            place = np.empty_like(pairs.order)
-            place[pairs.order] = np.arange(len(place), dtype=np.int32)
+            rows = np.arange(len(pairs.ids), dtype=np.int32)
             likelihood, _ = model.by_label
-            said = kernels.pair_likelihood(without, pairs._replace(ids=place), likelihood)
+            said = kernels.pair_likelihood(without, pairs._replace(ids=rows), likelihood)
             shares = observation.shares(said, likelihood[:, 0])
             counts = kernels.confusion_counts(without, pairs, shares.pairs, self.num_classes, len(likelihood))
             counts[0] += shares.rest
@@ -353,13 +351,13 @@ class EMLearner(Learner):
 def codes_without(
     observation: Observation, model: ErrorModel, codes: CSRRows, gradient: np.ndarray, prior: np.ndarray
 ) -> CSRRows:
-    """Take an M-step without one view: probabilities of the M Gaussians that it sees, in the order of the scene.
+    """Take an M-step without one view: probabilities of the M Gaussians that it sees.
 
     The gradient is that of all views at these codes and models; see `gsseg_core.learn.em.em_kernels` for the arrays.
     """
     (likelihood, used), pairs = model.by_label, ViewPairs.of(observation)
     shares = observation.shares(kernels.pair_likelihood(codes, pairs, likelihood), likelihood[:, 0])
-    indptr = starts(np.diff(codes.indptr)[pairs.ids[pairs.order]])
+    indptr = starts(np.diff(codes.indptr)[pairs.ids])
     stepped = CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], np.float32))
     kernels.m_step_without_view(codes, gradient, prior, pairs, used, shares.pairs, stepped)
     return stepped

@@ -36,9 +36,8 @@ def subtract_votes(total: CSRRows, pairs: ViewPairs, own: np.ndarray, label_vote
     Of the view are `Observation.votes`, (P,) float32, and `LabelEvidence.votes`, L rows of float64.
     """
     indptr, classes, data = total
-    order, ids, start, labels = pairs
-    for i in nb.prange(order.shape[0]):
-        m = order[i]
+    ids, start, labels = pairs
+    for m in nb.prange(ids.shape[0]):
         row, seen = slice(indptr[ids[m]], indptr[ids[m] + 1]), slice(start[m], start[m + 1])
         _subtract_row(classes[row], data[row], labels[seen], own[seen], label_votes)
 
@@ -79,15 +78,14 @@ def _count(
     Here `possible` are the ids that are classes, ascending; other arrays are those of `subtract_votes`.
     """
     indptr, classes, data = votes
-    order, ids, start, labels = pairs
+    ids, start, labels = pairs
     parts = np.zeros((BLOCKS, num_classes, label_votes.indptr.shape[0] - 1))
     for block in nb.prange(BLOCKS):
         part = parts[block]
         which, remaining = np.empty(num_classes + 1, np.uint32), np.empty(num_classes + 1, np.int64)
         kept_which, kept_votes = np.empty_like(which), np.empty_like(remaining)
         codes = np.empty(num_classes + 1, np.float32)
-        for i in range(order.shape[0] * block // BLOCKS, order.shape[0] * (block + 1) // BLOCKS):
-            m = order[i]
+        for m in range(ids.shape[0] * block // BLOCKS, ids.shape[0] * (block + 1) // BLOCKS):
             first, count = indptr[ids[m]], indptr[ids[m] + 1] - indptr[ids[m]]
             for z in range(count):
                 which[z], remaining[z] = classes[first + z], data[first + z]

@@ -117,7 +117,7 @@ def view_operator(scene: GaussianScene, camera: Camera, device: str) -> TileOper
 class TileObservation(Observation):
     """W of one view, cut down to the Gaussians that its labelled pixels see; remade from them in every product.
 
-    Holds about 48 bytes per Gaussian that is seen and 18 per tile in which it is.
+    Holds about 56 bytes per Gaussian that is seen and 18 per tile in which it is.
     """
 
     def __init__(self, name: str, ids: np.ndarray, tiles: Tiles, lifted: Lifted) -> None:  # ids (M,)
@@ -139,9 +139,15 @@ class TileObservation(Observation):
         before = np.cumsum(found, axis=0) - found
         label_pairs.renumber(entries, before[:, 0])
         label_pairs.renumber(self._pair, before[:, 1])
-        seen = _joined(gaussians, chunks, found[:, 0])
-        self.ids, self.start = ids[seen], starts(_joined(label_counts, chunks, found[:, 0]))
-        self.labels, self._votes = _joined(labels, capacity, found[:, 1]), _joined(votes, capacity, found[:, 1])
+        seen, counts = _joined(gaussians, chunks, found[:, 0]), _joined(label_counts, chunks, found[:, 0])
+        # Blending goes through them nearest first, learning in the order of the scene, in which all views meet.
+        self._nearest_first: np.ndarray = ids[seen]
+        order, first = _ascending(self._nearest_first), starts(counts)
+        self.ids, self.start = self._nearest_first[order], starts(counts[order])
+        pairs = np.repeat(first[order] - self.start[:-1], counts[order]) + np.arange(self.start[-1])
+        self._number = pairs.astype(np.int32)  # of each pair, in `_pair`
+        self.labels = _joined(labels, capacity, found[:, 1])[pairs]
+        self._votes: np.ndarray = _joined(votes, capacity, found[:, 1])[pairs]
         table, none = label_pairs.take(tiles.table, seen), np.empty(0, np.int64)
         self._tiles = tiles._replace(
             table=table, start=start, entries=entries, gaussian_start=none, gaussian_entries=none.astype(np.int32)
@@ -155,14 +161,14 @@ class TileObservation(Observation):
     @property
     def nbytes(self) -> int:
         """Memory that it holds, in bytes."""
-        held = (self.ids, self.start, self.labels, self._votes, *self._tiles[4:], self._blocks, self._records,
-                self._slot_start, self._pair, *self._mask)  # fmt: skip
-        # The ids once more for `order`; and what `shares` was asked last, and answered.
-        return sum(array.nbytes for array in held) + self.ids.nbytes + 2 * self._votes.nbytes
+        held = (self.ids, self._nearest_first, self._number, self.start, self.labels, self._votes, *self._tiles[4:],
+                self._blocks, self._records, self._slot_start, self._pair, *self._mask)  # fmt: skip
+        # And what `shares` was asked last, and answered.
+        return sum(array.nbytes for array in held) + 2 * self._votes.nbytes
 
     def operator(self, camera: Camera, num_gaussians: int) -> TileOperator:
         """Make an operator of the Gaussians that labelled pixels see."""
-        return TileOperator(camera, num_gaussians, self.ids, self._tiles)
+        return TileOperator(camera, num_gaussians, self._nearest_first, self._tiles)
 
     def votes(self) -> np.ndarray:
         """Weights summed by pair, (P,) float32."""
@@ -171,15 +177,23 @@ class TileObservation(Observation):
     def _shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares:
         if self._answered is not None and all(map(np.array_equal, self._answered[:2], (likelihood, rest))):
             return self._answered[2]  # a refit begins with what the last step asked
-        slots = self._slot_start, self._pair
+        slots, numbered = (self._slot_start, self._pair), np.empty_like(likelihood)
+        numbered[self._number] = likelihood
         logs, left_over, sums = label_pairs.share(
-            self._tiles, self._mask, self._blocks, self._records, *slots, likelihood, rest
+            self._tiles, self._mask, self._blocks, self._records, *slots, numbered, rest
         )
-        pairs = label_pairs.add_up(*slots, sums, len(likelihood)).sum(axis=0)
+        pairs = label_pairs.add_up(*slots, sums, len(likelihood)).sum(axis=0)[self._number]
         total = np.bincount(self._mask.present, weights=left_over, minlength=len(rest))
         shares = VoteShares(pairs, total, float(logs.sum()))
         self._answered = likelihood.copy(), rest.copy(), shares
         return shares
+
+
+def _ascending(ids: np.ndarray) -> np.ndarray:  # (M,) int32, distinct
+    """Give the places of ids in their order, (M,) int32: as argsort does, in a tenth of the time."""
+    place = np.full(int(ids.max(initial=-1)) + 1, -1, np.int32)
+    place[ids] = np.arange(len(ids), dtype=np.int32)
+    return place[place >= 0]
 
 
 def _joined(
