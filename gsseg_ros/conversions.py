@@ -43,7 +43,7 @@ MASK_ENCODINGS: dict[str, tuple[npt.DTypeLike, int]] = {
 # Type of a channel, and how many.
 _PICTURE_ENCODINGS: dict[str, tuple[npt.DTypeLike, int]] = {
     "rgb8": (np.uint8, 3), "bgr8": (np.uint8, 3), "rgba8": (np.uint8, 4), "bgra8": (np.uint8, 4),
-    "mono8": (np.uint8, 1), "32FC1": (np.float32, 1),
+    "mono8": (np.uint8, 1), "16UC1": (np.uint16, 1), "32FC1": (np.float32, 1),
 }  # fmt: skip
 
 # Field, its type in the message, its type here. RViz and PCL want 0x00RRGGBB in the bits of a float.
@@ -104,7 +104,7 @@ def labels_from_image(message: Image, topic: str) -> npt.NDArray[np.int32]:
 
 
 def picture_from_image(message: Image, topic: str) -> npt.NDArray[Any]:
-    """Read a picture as it is: (H, W) or (H, W, C), uint8, or float32 where the encoding is 32FC1.
+    """Read a picture as it is: (H, W) or (H, W, C), uint8, or uint16 and float32 as 16UC1 and 32FC1 are.
 
     Raises
     ------

@@ -72,6 +72,10 @@ class TooManyPixelsError(GssegError):
     """An image or a camera is larger than the parameter max_pixels allows."""
 
 
+class DepthImageError(GssegError):
+    """A depth image does not belong to its mask, or is broken."""
+
+
 class MissingFileError(GssegError):
     """A file or folder of a request does not exist."""
 

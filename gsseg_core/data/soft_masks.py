@@ -56,7 +56,14 @@ class SeenLabels(NamedTuple):
 
     def undistorted(self, undistortion: Undistortion) -> SeenLabels:
         """Make the mask of a pinhole view of the one drawn on its image, by nearest pixels; `UNKNOWN` outside it."""
-        labels = undistortion.sample(self.labels, UNKNOWN)
+        return self._of(undistortion.sample(self.labels, UNKNOWN))
+
+    def hidden(self, pixels: npt.NDArray[np.bool_]) -> SeenLabels:
+        """Make some pixels (H, W) unknown."""
+        return self._of(np.where(pixels, np.int32(UNKNOWN), self.labels))
+
+    def _of(self, labels: npt.NDArray[np.int32]) -> SeenLabels:
+        """Replace the labels by some of these, among which not every prototype need be left."""
         if self.evidence is None or self.evidence.mass is None:
             return SeenLabels(labels, self.evidence)
         return _tidied(labels, self.evidence.classes, self.evidence.mass, self.evidence.supervised, None)

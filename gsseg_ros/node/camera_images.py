@@ -1,4 +1,4 @@
-"""Subscribes to the camera's pictures, which are large, only while the overlay has subscribers."""
+"""Subscribes to a camera's pictures, which are large, only while its overlay has subscribers."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CompressedImage, Image
 
 from gsseg_ros.conversions import stamp_ns
+from gsseg_ros.node.camera_streams import CameraStreams
 from gsseg_ros.node.live_outputs import LiveOutputs
 from gsseg_ros.node.masks.compressed import compressed_topic
 from gsseg_ros.node.outputs import Outputs
-from gsseg_ros.node.pairing import Pairing, PoseSource
+from gsseg_ros.node.pairing import Pairing
 from gsseg_ros.qos import clear_overrides, sensor_data
 
 
 class CameraImages:
-    """Listens to `image`, or `image/compressed`, while `~/overlay` has subscribers, and finds pose and camera of each.
+    """Listens to a camera's `image`, or `image/compressed`, while its overlay has subscribers, and finds their poses.
 
     Parameters
     ----------
@@ -30,8 +31,8 @@ class CameraImages:
         Knows who looks.
     live : LiveOutputs
         Gets the pictures.
-    poses : PoseSource
-        Of the pictures alone; that of the masks is emptied when time is set back, and so is this one.
+    camera : CameraStreams
+        Whose pictures; it hands over every camera_info and every pose.
     group : CallbackGroup
         Of the other inputs.
     compressed : bool
@@ -45,7 +46,8 @@ class CameraImages:
     Attributes
     ----------
     pairing : Pairing
-        Wants every camera_info and every pose, and pairs pictures as masks are paired: at exactly their stamp.
+        Pairs pictures as masks are paired, with poses of its own: those of masks are forgotten when their time is set
+        back, and these when that of the pictures is.
     """
 
     def __init__(
@@ -53,16 +55,17 @@ class CameraImages:
         node: LifecycleNode,
         outputs: Outputs,
         live: LiveOutputs,
-        poses: PoseSource,
+        camera: CameraStreams,
         group: CallbackGroup,
         *,
         compressed: bool = False,
     ) -> None:
         self._node, self._outputs, self._live, self._group = node, outputs, live, group
-        self._kind, self._topic = Image, node.resolve_topic_name("image")
+        self._camera, self._kind, self._topic = camera.name, Image, node.resolve_topic_name(camera.topic("image"))
         if compressed:
-            self._kind, self._topic = CompressedImage, compressed_topic(node, "image")
-        self.pairing = Pairing(poses)
+            self._kind, self._topic = CompressedImage, compressed_topic(node, camera.topic("image"))
+        self.pairing = Pairing(camera.poses(), stream=camera.name)
+        camera.share(self.pairing)
         self._subscription: Any = None
         self._lock, self._closed = threading.Lock(), False
         self._listen(True)  # Only to have an override that cannot be used refused now, and not when somebody looks.
@@ -73,7 +76,7 @@ class CameraImages:
         with self._lock:
             if self._closed:
                 return
-            self._listen(self._outputs.wants_overlay)
+            self._listen(self._outputs.wants_overlay(self._camera))
         self.pairing.expire(time.monotonic())
         self._hand_over()
 

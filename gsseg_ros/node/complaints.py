@@ -9,14 +9,14 @@ from dataclasses import dataclass
 
 PERIOD = 5.0  # s
 
-MISSING = {role: f"no data on {role}" for role in ("mask", "camera_info", "pose", "odometry")}
+MISSING = {role: f"no data on {role}" for role in ("mask", "camera_info", "depth", "pose", "odometry")}
 """Kinds of complaint: an input that is silent."""
 
 REFUSED_POSE, TIME_JUMP, CLOCK, LIVE, OTHER = "refused pose", "time set back", "no clock", "overlay or objects", "other"
 
 REASONS = (
-    "no_pose", "no_camera_info", "repeated_stamp", "several_cameras", "time_jump", "queue_full", "no_scene",
-    "mask_format", "size_mismatch", "unknown_label", "bad_pose", "bad_camera_info", "all_pixels_unknown",
+    "no_pose", "no_camera_info", "no_depth", "repeated_stamp", "several_cameras", "time_jump", "queue_full", "no_scene",
+    "mask_format", "size_mismatch", "unknown_label", "bad_pose", "bad_camera_info", "bad_depth", "all_pixels_unknown",
     "sees_no_Gaussian", "no_mask", "too_large", "scene_changed", "unusable", "unexpected",
 )  # fmt: skip
 """Kinds of complaint: why a mask became no view."""

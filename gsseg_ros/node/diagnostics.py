@@ -26,23 +26,24 @@ _HINTS = {
     "camera_info": "remap it to the rectified camera's camera_info (--ros-args -r camera_info:=...)",
     "pose": "expected geometry_msgs/PoseStamped of the camera's optical frame, at the stamps of the masks; "
     "other sources: parameter pose_source",
+    "depth": "expected sensor_msgs/Image with depths of the camera's image (--ros-args -r depth:=...), or the "
+    "parameter depth_gating to be false",
     "odometry": "expected nav_msgs/Odometry; is it remapped (--ros-args -r odometry:=...)?",
 }
 
 
 def rejections(inputs: Inputs) -> dict[str, int]:
     """Count the masks that did not become views, by reason, from arrival to fusion."""
-    counts = Counter(inputs.pairing.dropped) + Counter(inputs.rejected)
-    if inputs.worker.dropped:
-        counts["queue_full"] += inputs.worker.dropped
-    return dict(sorted(counts.items()))
+    return dict(sorted((Counter(inputs.dropped) + Counter(inputs.rejected)).items()))
 
 
 def missing_inputs(inputs: Inputs) -> dict[str, str]:
     """Explain what to check for each input that was silent for five seconds; by its role, such as "mask"."""
-    now, complaints = time.monotonic(), {}
-    for topic, (count, last) in inputs.arrivals.items():
-        silence, role = now - last, inputs.roles[topic]
+    now = time.monotonic()
+    complaints: dict[str, str] = {}
+    for topic, role in inputs.roles.items():
+        count, last = inputs.arrivals[topic]
+        silence = now - last
         if silence < PERIOD:
             continue
         publishers = inputs.publishers_of(topic)
@@ -56,7 +57,8 @@ def missing_inputs(inputs: Inputs) -> dict[str, str]:
             hint = f"{count} came before, and it still has {found}"
         else:
             hint = f"nobody publishes it: {_HINTS[role]}"
-        complaints[role] = f"no data on {topic} for {silence:.0f} s; {hint}"
+        line = f"no data on {topic} for {silence:.0f} s; {hint}"
+        complaints[role] = f"{complaints[role]}; {line}" if role in complaints else line  # Of several cameras.
     return complaints
 
 
@@ -64,13 +66,15 @@ def why_dropped(inputs: Inputs, reason: str) -> str:
     """Explain why masks are dropped before they are fused, and what to check; empty for other reasons."""
     return {
         "no_pose": f"no pose with their stamp came within a second{_pose_problem(inputs)}; expected mask and pose to "
-        "carry the stamp of the same image, from the same clock (use_sim_time?)",
+        "carry the stamp of the same image, from the same clock (use_sim_time?), or the parameter pose_tolerance",
         "no_camera_info": f"no camera_info with their stamp came within a second{_frame_problem(inputs)}; expected "
         "mask and camera_info to carry the stamp of the same image, from the same clock (use_sim_time?)",
+        "no_depth": "no depth image with their stamp came within a second; expected depth with the stamp of the mask's "
+        "image, or the parameter depth_gating to be false",
         "repeated_stamp": "a mask with their stamp and frame_id came before; expected every image once: is the "
         "segmenter, or a bag, running twice?",
         "several_cameras": "masks of several cameras (frame_id) carry one stamp, and their poses do not say whose they "
-        "are; expected the parameter pose_source to be tf, or a node for each camera",
+        "are; expected the parameter pose_source to be tf, or cameras to name them, each with topics of its own",
         "time_jump": "they are from before time was set back; expected so only for a moment, then check the clocks",
         "queue_full": "they come faster than they are fused; expected a lower rate or smaller masks (the parameter "
         "queue_size says how many may wait)",
@@ -90,9 +94,13 @@ def complain(complaints: Complaints, inputs: Inputs | None, clock_problem: str) 
 
 
 def _complain_of_losses(complaints: Complaints, inputs: Inputs) -> None:
-    jumps, logged = inputs.pairing.time_jumps, inputs.logged
+    pairing, logged = (
+        max((camera.pairing for camera in inputs.cameras.values()), key=lambda p: p.time_jumps),
+        inputs.logged,
+    )
+    jumps = pairing.time_jumps
     if jumps > logged[TIME_JUMP] and complaints.due(TIME_JUMP):
-        before, after = (stamp / 1e9 for stamp in inputs.pairing.last_jump)
+        before, after = (stamp / 1e9 for stamp in pairing.last_jump)
         times = f" {jumps - logged[TIME_JUMP]} times, the last time" * (jumps - logged[TIME_JUMP] > 1)
         complaints.add(
             TIME_JUMP,
@@ -115,10 +123,12 @@ def _pose_problem(inputs: Inputs) -> str:
 
 
 def _frame_problem(inputs: Inputs) -> str:
-    mask, infos = inputs.pairing.unmatched_frame, inputs.pairing.camera_frames
-    if mask in infos or not infos or "" in infos:
-        return ""
-    return f" (masks have the frame_id '{mask}', camera_infos have {', '.join(map(repr, infos))}: expected the same)"
+    for camera in inputs.cameras.values():
+        mask, infos = camera.pairing.unmatched_frame, camera.pairing.camera_frames
+        if infos and not {mask, ""} & set(infos):
+            known = ", ".join(map(repr, infos))
+            return f" (masks have the frame_id '{mask}', camera_infos have {known}: expected the same)"
+    return ""
 
 
 def diagnostic_array(
@@ -211,12 +221,20 @@ def _input_values(inputs: Inputs) -> dict[str, object]:
         values[f"{topic} received"] = count
         values[f"{topic} age [s]"] = f"{now - last:.1f}" if count else "never"
     values["views accepted"] = inputs.accepted
+    values.update(
+        {f"views accepted of {camera.name}": camera.accepted for camera in inputs.cameras.values() if camera.name}
+    )
+    if inputs.gated:
+        values["views gated by depth"] = inputs.gated["views"]
+        values["pixels with a measured depth"] = inputs.gated["measured"]
+        values["pixels unknown by depth"] = inputs.gated["contradicted"]
     for reason, count in rejections(inputs).items():
         values[f"rejected {reason}"] = count
-    values["masks waiting for pose or camera_info"] = inputs.pairing.waiting
+    pairings = [camera.pairing for camera in inputs.cameras.values()]
+    values["masks waiting for pose or camera_info"] = sum(pairing.waiting for pairing in pairings)
     values["masks waiting to be fused"] = inputs.worker.waiting
     values["queue drops"] = inputs.worker.dropped
     values["poses refused"] = inputs.refused_poses
-    values["out of order"] = inputs.pairing.out_of_order
-    values["time jumps"] = inputs.pairing.time_jumps
+    values["out of order"] = sum(pairing.out_of_order for pairing in pairings)
+    values["time jumps"] = max(pairing.time_jumps for pairing in pairings)
     return values

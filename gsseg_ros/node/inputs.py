@@ -1,4 +1,4 @@
-"""Subscribes to masks, camera_infos and poses, pairs them by stamp and camera, and fuses them in a thread."""
+"""Listens to the streams of all cameras, and fuses the masks that they pair, in a thread."""
 
 from __future__ import annotations
 
@@ -8,31 +8,31 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from typing import Any
 
-from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.lifecycle import LifecycleNode
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CompressedImage
 
 from gsseg_core.data.view import View
-from gsseg_core.errors import GssegError, PoseError
+from gsseg_core.errors import GssegError
 from gsseg_core.live.results import SCENE_CHANGED, Rejection
 from gsseg_ros.camera_infos import camera_of_image, is_rectified
-from gsseg_ros.conversions import matrix_from_pose, stamp_ns
-from gsseg_ros.errors import NoSceneError, TooManyPixelsError
+from gsseg_ros.errors import DepthImageError, NoSceneError, TooManyPixelsError
 from gsseg_ros.node.camera_images import CameraImages
+from gsseg_ros.node.camera_streams import CameraStreams
 from gsseg_ros.node.complaints import LIVE, PERIOD, REFUSED_POSE, Complaints
+from gsseg_ros.node.depth_images import gate_by_image
 from gsseg_ros.node.jobs import Worker
 from gsseg_ros.node.live_outputs import LiveOutputs
 from gsseg_ros.node.masks.compressed import compressed_topic
 from gsseg_ros.node.masks.reader import MaskReader
 from gsseg_ros.node.outputs import Outputs
-from gsseg_ros.node.pairing import ExactPoses, InterpolatedPoses, Paired, Pairing, PoseSource
+from gsseg_ros.node.pairing import Paired
 from gsseg_ros.node.sim_time import on_set_back
 from gsseg_ros.node.tf_poses import TfPoses
 from gsseg_ros.node.workspace import Workspace
@@ -46,10 +46,12 @@ class Inputs:
 
     Attributes
     ----------
+    cameras : dict of str to CameraStreams
+        Those of the parameter cameras, by name; "" if there is only one.
     arrivals : dict of str to (int, float)
         By full name of the topic: messages so far, and when the last one came (s, `time.monotonic`).
     roles : dict of str to str
-        By full name of the topic: what it is, such as "mask".
+        By full name of the topic: what it is, such as "mask"; of those only that have to be there.
     accepted : int
         Views that were fused.
     rejected : Counter of str
@@ -61,6 +63,8 @@ class Inputs:
         What `gsseg_ros.node.diagnostics` counted lately, and when (s, `time.monotonic`).
     logged : Counter of str
         How many of these it has named in the log.
+    gated : Counter of str
+        "views" that were held against depth images, and their pixels: "measured", and "contradicted" by what was.
     refused_poses : int
         Poses that could not be used.
     last_refusal : (float, str)
@@ -75,6 +79,7 @@ class Inputs:
         self.rejected: Counter[str] = Counter()
         self.explained: dict[str, str] = {}
         self._counting = threading.Lock()
+        self.gated: Counter[str] = Counter()
         self.refused_poses = 0
         self.last_refusal = (-PERIOD, "")
         self.arrivals: dict[str, tuple[int, float]] = {}
@@ -94,12 +99,16 @@ class Inputs:
         """Begin to listen; the stack takes away what was made, at the end or where the next step fails."""
         node, workspace = self._node, self._workspace
         settings = workspace.settings
-        self.tf = TfPoses(node, settings.map_frame) if settings.pose_source == "tf" else None
-        poses: PoseSource = self.tf or (InterpolatedPoses() if settings.pose_source == "odometry" else ExactPoses())
+        if settings.pose_source == "tf":
+            self.tf: TfPoses | None = TfPoses(node, settings.map_frame)
+        else:
+            self.tf = TfPoses.if_here(node, settings.map_frame)
         if self.tf is not None:
             built.callback(self.tf.close)
-        # A simulator's stamps repeat, and views of an earlier activation may come back with a saved state.
-        self.pairing = Pairing(poses, prefix=f"{secrets.token_hex(4)}_")
+        if self.tf is not None and settings.pose_source in ("tf", "auto"):
+            self.tf.listen()
+        elif settings.pose_source == "auto":
+            node.get_logger().info("pose_source is auto, and tf2_ros cannot be imported: poses come from topics alone")
         self.worker: Worker[Paired] = Worker(self._fuse, settings.queue_size)
         built.callback(self.worker.stop)
         self.live = LiveOutputs(
@@ -110,22 +119,21 @@ class Inputs:
             lambda _, message: self._complaints.add(LIVE, message),
         )
         built.callback(self.live.close)
-        compressed = settings.image_transport == "compressed"
-        self._images = CameraImages(
-            node, outputs, self.live, self.tf or type(poses)(), self._group, compressed=compressed
-        )
-        built.callback(self._images.close)
-        self._masks = MaskReader(settings)
-        wanted: list[tuple[Any, str, Callable[[str, Any], None]]] = [
-            (CompressedImage if settings.mask_transport == "compressed" else Image, "mask", self._on_mask),
-            (CameraInfo, "camera_info", self._on_camera_info),
-        ]
-        if settings.pose_source == "topic":
-            wanted.append((PoseStamped, "pose", self._on_pose))
-        elif settings.pose_source == "odometry":
-            wanted.append((Odometry, "odometry", self._on_odometry))
-        for kind, topic, callback in wanted:
-            built.callback(node.destroy_subscription, self._listen(kind, topic, callback))
+        self._masks, compressed = MaskReader(settings), settings.image_transport == "compressed"
+        self.cameras: dict[str, CameraStreams] = {}
+        self._images: list[CameraImages] = []
+        # A simulator's stamps repeat, and views of an earlier activation may come back with a saved state.
+        activation = secrets.token_hex(4)
+        for name in settings.cameras or ("",):
+            prefix = f"{activation}_{name}_" if name else f"{activation}_"
+            camera = CameraStreams(
+                name, settings, self.tf, prefix=prefix, listen=partial(self._listen, built),
+                refuse_pose=self._refuse_pose, era=lambda: workspace.era,
+            )  # fmt: skip
+            images = CameraImages(node, outputs, self.live, camera, self._group, compressed=compressed)
+            built.callback(images.close)
+            self.cameras[name] = camera
+            self._images.append(images)
         # Not by /clock, which may stand still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         timer = node.create_timer(EXPIRE_PERIOD, self._expire, callback_group=self._group, clock=steady)
@@ -142,8 +150,16 @@ class Inputs:
         """Count the publishers of an input."""
         return int(self._node.count_publishers(topic))
 
-    def _listen(self, kind: Any, role: str, callback: Callable[[str, Any], None]) -> Any:
-        topic = compressed_topic(self._node, role) if kind is CompressedImage else role
+    def _listen(
+        self,
+        built: ExitStack,
+        kind: Any,
+        role: str,
+        topic: str,
+        callback: Callable[[str, Any], None],
+        required: bool = True,
+    ) -> None:
+        topic = compressed_topic(self._node, topic) if kind is CompressedImage else topic
         subscription: Any = None
 
         def arrived(message: Any) -> None:
@@ -163,65 +179,52 @@ class Inputs:
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             )
         self.arrivals[subscription.topic_name] = (0, self.started)
-        self.roles[subscription.topic_name] = role
+        if required:
+            self.roles[subscription.topic_name] = role
         policies = f"{quality.reliability.short_key}, {quality.durability.short_key}"
         self.policies[subscription.topic_name] = policies.replace("_", " ")
-        return subscription
+        built.callback(self._node.destroy_subscription, subscription)
 
-    def _on_mask(self, topic: str, message: Any) -> None:
-        stamp, era = stamp_ns(message.header.stamp), self._workspace.era
-        self.pairing.add_mask(stamp, (topic, message), message.header.frame_id, era)
-
-    def _on_camera_info(self, topic: str, message: CameraInfo) -> None:
-        for pairing in (self.pairing, self._images.pairing):
-            pairing.add_camera_info(stamp_ns(message.header.stamp), (topic, message), message.header.frame_id)
-
-    def _on_pose(self, topic: str, message: PoseStamped) -> None:
-        self._add_pose(topic, message.header, message.pose)
-
-    def _on_odometry(self, topic: str, message: Odometry) -> None:
-        self._add_pose(topic, message.header, message.pose.pose)
-
-    def _add_pose(self, topic: str, header: Any, pose: Any) -> None:
-        map_frame = self._workspace.settings.map_frame
-        try:
-            if header.frame_id not in ("", map_frame):
-                raise PoseError(
-                    f"{topic}: frame_id is '{header.frame_id}'; expected '{map_frame}', the parameter map_frame"
-                )
-            matrix = matrix_from_pose(pose, topic)
-        except PoseError as error:
-            self.refused_poses += 1
-            self.last_refusal = (time.monotonic(), str(error))
-            self._complaints.add(REFUSED_POSE, str(error))
-            return
-        for pairing in (self.pairing, self._images.pairing):
-            pairing.add_pose(stamp_ns(header.stamp), matrix)
+    def _refuse_pose(self, why: str) -> None:
+        self.refused_poses += 1
+        self.last_refusal = (time.monotonic(), why)
+        self._complaints.add(REFUSED_POSE, why)
 
     def _set_back(self, stamp: int) -> None:
-        for pairing in (self.pairing, self._images.pairing):
-            pairing.set_back(stamp)
+        for camera in self.cameras.values():
+            camera.set_back(stamp)
         if self.tf is not None:  # It may hold what the pairings, without a mask, have not asked for.
             self.tf.clear()
         self._hand_over()
 
     def _expire(self) -> None:
-        self.pairing.expire(time.monotonic())
+        for camera in self.cameras.values():
+            camera.expire()
         self._hand_over()
-        self._images.tick()
+        for images in self._images:
+            images.tick()
         self.live.tick()
 
     def _hand_over(self) -> None:
-        for paired in self.pairing.take():
-            self.worker.submit(paired)
-        dropped = Counter(self.pairing.dropped)
-        dropped["queue_full"] = self.worker.dropped
+        for camera in self.cameras.values():
+            for paired in camera.pairing.take():
+                self.worker.submit(paired)
+        dropped = self.dropped
         self._workspace.dropped.update(dropped - self._told)
         self._told = dropped
 
+    @property
+    def dropped(self) -> Counter[str]:
+        """Masks that were dropped before they came to be fused, by reason."""
+        dropped = sum((camera.pairing.dropped for camera in self.cameras.values()), Counter[str]())
+        if self.worker.dropped:
+            dropped["queue_full"] = self.worker.dropped
+        return dropped
+
     def _forget_waiting(self) -> None:
         """Drop the masks that wait; the session knows those on their way to it by their era."""
-        self._count_rejected(SCENE_CHANGED, self.pairing.clear() + self.worker.clear())
+        waiting = sum(camera.pairing.clear() for camera in self.cameras.values())
+        self._count_rejected(SCENE_CHANGED, waiting + self.worker.clear())
 
     def _count_rejected(self, reason: str, count: int = 1) -> None:
         with self._counting:
@@ -234,6 +237,8 @@ class Inputs:
             rejection = Rejection("no_scene", str(error))
         except TooManyPixelsError as error:
             rejection = self._workspace.session.reject(Rejection("too_large", str(error)))
+        except DepthImageError as error:
+            rejection = self._workspace.session.reject(Rejection("bad_depth", str(error)))
         except GssegError as error:
             rejection = self._workspace.session.reject(Rejection.of(error))
         except Exception as error:
@@ -241,6 +246,7 @@ class Inputs:
             rejection = Rejection("unexpected", str(error))
         if rejection is None:
             self.accepted += 1
+            self.cameras[paired.stream].accepted += 1
             return
         self._count_rejected(rejection.reason)
         self.explained[rejection.reason] = rejection.message
@@ -253,11 +259,9 @@ class Inputs:
         session = workspace.session
         (topic, mask), (info_topic, info) = paired.mask, paired.camera_info
         seen = self._masks.read(mask, topic)
-        settings, pose = workspace.settings, paired.pose
-        if settings.pose_source == "odometry":
-            pose = pose @ settings.camera_in_base
+        settings = workspace.settings
         size, rectified = seen.labels.shape[::-1], is_rectified(settings.rectified, topic, info_topic)
-        pose = settings.scene_to_map.world_to_camera(pose)
+        pose = settings.scene_to_map.world_to_camera(paired.pose)
         camera = camera_of_image(paired.name, info, size, pose, topic, info_topic, rectified=rectified)
         if size != (info.width, info.height):
             self._say_once(
@@ -270,10 +274,23 @@ class Inputs:
                 "rectified images, set the parameter rectified to true"
             )
             seen = seen.undistorted(camera.undistortion)
-        rejection = session.fuse(View.from_seen(camera, seen), paired.era)
+        view = View.from_seen(camera, seen)
+        if paired.depth is not None:
+            view = self._gated(view, paired)
+        rejection = session.fuse(view, paired.era)
         if rejection is None:
             self.live.fused(paired, camera)
         return rejection
+
+    def _gated(self, view: View, paired: Paired) -> View:
+        """Make those pixels of a view unknown that its depth image contradicts, and count them."""
+        (topic, depth), settings = paired.depth, self._workspace.settings
+        frame_id = paired.mask[1].header.frame_id
+        gated = gate_by_image(self._workspace.session, view, depth, topic, frame_id, settings)
+        self.gated["views"] += 1
+        self.gated["measured"] += int(gated.measured.sum())
+        self.gated["contradicted"] += int(gated.contradicted.sum())
+        return gated.view
 
     def _say_once(self, message: str) -> None:
         if message not in self._said:

@@ -74,24 +74,25 @@ class LiveOutputs:
         self._workspace, self._outputs = workspace, outputs
         self._busy, self._now, self._complain = busy, now, complain
         self._changed = threading.Condition()
-        self._picture: tuple[Paired, Camera | None] | None = None
+        self._pictures: dict[str, tuple[Paired, Camera | None]] = {}  # By stream.
         self._objects_due = False
         self._news: int | None = None  # `objects_count` when the newest view came whose objects nobody has been told
         self._stopping = False
         self._segmentation: tuple[tuple[object, int], float, Segmentation] | None = None
-        self._last_image = self._last_objects = -np.inf
+        self._last_image: dict[str, float] = {}
+        self._last_objects = -np.inf
         self._thread = threading.Thread(target=self._run, name="live outputs", daemon=True)
         self._thread.start()
 
     def fused(self, paired: Paired, camera: Camera) -> None:
-        """Take note of a mask that has been fused; what its camera sees is drawn if no camera image came lately."""
+        """Take note of a mask that has been fused; what its camera sees is drawn if no image of it came lately."""
         self._news = self._outputs.objects_count
-        if time.monotonic() - self._last_image > IMAGE_SILENCE:
+        if time.monotonic() - self._last_image.get(paired.stream, -np.inf) > IMAGE_SILENCE:
             self._show(paired, camera)
 
     def image(self, paired: Paired) -> None:
         """Take in a camera image with its pose, in the place of the mask."""
-        self._last_image = time.monotonic()
+        self._last_image[paired.stream] = time.monotonic()
         self._show(paired, None)
 
     def tick(self) -> None:
@@ -116,23 +117,23 @@ class LiveOutputs:
         self._thread.join(timeout_s)
 
     def _show(self, paired: Paired, camera: Camera | None) -> None:
-        if self._outputs.wants_overlay:
+        if self._outputs.wants_overlay(paired.stream):
             with self._changed:
-                self._picture = (paired, camera)
+                self._pictures[paired.stream] = (paired, camera)
                 self._changed.notify()
 
     def _run(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._picture or self._objects_due or self._stopping)
+                self._changed.wait_for(lambda: self._pictures or self._objects_due or self._stopping)
                 latest = time.monotonic() + POSTPONED_SECONDS
                 while self._busy() and not self._stopping and time.monotonic() < latest:
                     self._changed.wait(_PAUSE)
                 if self._stopping:
                     return
-                picture, self._picture = self._picture, None
+                pictures, self._pictures = self._pictures, {}
                 objects_due, self._objects_due = self._objects_due, False
-            if picture is not None:
+            for picture in pictures.values():
                 self._guarded(self._draw, *picture)
             if objects_due:
                 self._guarded(self._publish_objects)
@@ -159,7 +160,7 @@ class LiveOutputs:
         picture = colors[labels] if photo is None else overlay(photo, labels, colors)
         header = Header(stamp=header.stamp, frame_id=header.frame_id)
         # A reset meanwhile has cleared the overlay.
-        self._outputs.publish_overlay(rgb_image(picture, header), lambda: self._workspace.era is era)
+        self._outputs.publish_overlay(rgb_image(picture, header), lambda: self._workspace.era is era, paired.stream)
 
     def _photo(self, paired: Paired) -> tuple[Camera, npt.NDArray[np.uint8]]:
         """Find camera and pixels (H, W, 3) of a camera image, undistorted where its lens is distorted."""
@@ -169,9 +170,8 @@ class LiveOutputs:
             image = decompress_picture(image, topic, settings.max_pixels)
         for message, source in ((image, topic), (info, info_topic)):
             require_size(message, settings.max_pixels, source)
-        pose = paired.pose @ settings.camera_in_base if settings.pose_source == "odometry" else paired.pose
         size, rectified = (image.width, image.height), is_rectified(settings.rectified, topic, info_topic)
-        pose = settings.scene_to_map.world_to_camera(pose)
+        pose = settings.scene_to_map.world_to_camera(paired.pose)
         camera = camera_of_image(paired.name, info, size, pose, topic, info_topic, rectified=rectified)
         photo = color_from_image(image, topic)
         return camera, photo if camera.undistortion is None else camera.undistortion.sample(photo, 0)

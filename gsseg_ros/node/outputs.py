@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -38,13 +38,20 @@ class Outputs:
     A cloud that is latched always belongs to the last run, of all classes. A class has a topic while it has Gaussians
     in the last run; the names that were announced have theirs all the time. Once closed, nothing is published.
 
+    Parameters
+    ----------
+    node : LifecycleNode
+        Publishes.
+    cameras : sequence of str
+        Those that have an overlay of their own, `~/overlay/<camera>`.
+
     Attributes
     ----------
     objects_count : int
         How often objects were published.
     """
 
-    def __init__(self, node: LifecycleNode) -> None:
+    def __init__(self, node: LifecycleNode, cameras: Sequence[str] = ()) -> None:
         self._node = node
         self._lock = threading.RLock()
         self._revision, self._closed = 0, False
@@ -53,11 +60,12 @@ class Outputs:
         self._classes: dict[str, Publisher] = {}
         self._announced: set[str] = set()
         self._filled: set[str] = set()
-        self._shown = False  # whether an overlay is latched
+        self._shown: set[str] = set()  # Cameras that have an overlay latched.
         try:
             self._cloud = self._overridable(PointCloud2, "~/cloud")
             self._report = self._overridable(SegmentationReport, "~/report")
-            self._overlay = self._overridable(Image, "~/overlay")
+            self._overlays = {"": self._overridable(Image, "~/overlay")}
+            self._overlays |= {name: self._overridable(Image, f"~/overlay/{name}") for name in cameras}
             self._objects = self._overridable(ObjectArray, "~/objects")
             self._markers = self._overridable(MarkerArray, "~/object_markers")
             self._detections = self._vision_publisher()
@@ -65,10 +73,9 @@ class Outputs:
             self.close()
             raise
 
-    @property
-    def wants_overlay(self) -> bool:
-        """Whether anybody listens to `~/overlay`."""
-        return self._heard(self._overlay)
+    def wants_overlay(self, camera: str = "") -> bool:
+        """Whether anybody listens to the overlay of a camera, or to `~/overlay`."""
+        return self._heard(self._overlays[camera])
 
     @property
     def wants_objects(self) -> bool:
@@ -140,12 +147,12 @@ class Outputs:
             if not self._closed:
                 self._report.publish(report)
 
-    def publish_overlay(self, image: Image, wanted: Callable[[], bool] = lambda: True) -> None:
-        """Publish a picture, if it still is `wanted` when its turn has come."""
+    def publish_overlay(self, image: Image, wanted: Callable[[], bool] = lambda: True, camera: str = "") -> None:
+        """Publish a picture of a camera, or on `~/overlay`, if it still is `wanted` when its turn has come."""
         with self._lock:
             if not self._closed and wanted():
-                self._overlay.publish(image)
-                self._shown = True
+                self._overlays[camera].publish(image)
+                self._shown.add(camera)
 
     def clear(self, report: SegmentationReport) -> None:
         """Replace all that is latched: clouds, objects and overlay by empty ones, the report by this one."""
@@ -158,9 +165,9 @@ class Outputs:
             self._filled = set()
             self._take_away(self._classes.keys() - self._announced, _Flow())
             self._cloud.publish(_empty(header))
-            if self._shown:
-                self._overlay.publish(Image(header=header))
-                self._shown = False
+            for camera in self._shown:
+                self._overlays[camera].publish(Image(header=header))
+            self._shown.clear()
             self._report.publish(report)
 
     def close(self) -> None:

@@ -1,53 +1,32 @@
-"""Pairs every mask with the camera_info and the pose that belong to its stamp and its camera.
+"""Pairs every mask with the camera_info, the pose and the depth image that belong to its stamp and its camera.
 
-Stamps are whole nanoseconds. The three inputs come in any order; a mask waits for its pose, a pose is never replaced by
+Stamps are whole nanoseconds. The inputs come in any order; a mask waits for its pose, a pose is never replaced by
 "the latest". Nothing here knows ROS: messages are passed through unread.
 """
 
 from __future__ import annotations
 
 import threading
-from bisect import bisect_left, insort
+from bisect import bisect_left
 from collections import Counter
 from dataclasses import dataclass
-from typing import Any, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import Any, NamedTuple, TypeAlias
 
-import numpy as np
-import numpy.typing as npt
+from gsseg_ros.node.history import History
+from gsseg_ros.node.pose_sources import GivenPose, MessagePoses, Pose, PoseSource
+from gsseg_ros.node.timeline import MASK, SECOND, Message, Timeline
 
-from gsseg_ros.frames import interpolate
-from gsseg_ros.node.timeline import BEHIND_NS, MASK, SECOND, Message, Timeline
-
-Pose: TypeAlias = npt.NDArray[np.float64]  # (4, 4)
-T = TypeVar("T")
 _Key: TypeAlias = tuple[int, str]  # stamp and frame_id
 
-_POSES_KEPT = 2000  # At 200 Hz, those of ten seconds.
 _CAMERA_INFOS_KEPT = 600  # Of each camera; at 60 Hz, those of ten seconds.
 _STAMPS_KEPT = 1000
 _CAMERAS_KEPT = 16
 _UNCLEAR_NS = 10 * SECOND
-
-
-class PoseSource(Protocol):
-    """Source of the poses of the camera in the map."""
-
-    @property
-    def knows_frames(self) -> bool:
-        """Whether it tells cameras apart, by the frame_id of their masks."""
-
-    def at(self, stamp: int, frame_id: str = "") -> Pose | None:
-        """Pose (4, 4) at exactly `stamp` of the camera whose masks carry `frame_id`; None if it is not known (yet)."""
-
-    def too_late(self, stamp: int) -> bool:
-        """Whether no pose for `stamp` can come any more."""
-
-    def clear(self) -> None:
-        """Forget everything: time was set back."""
+_DEPTH_BYTES = 64 << 20  # At 30 Hz, VGA and 16 bit, those of three seconds.
 
 
 class Paired(NamedTuple):
-    """A mask with the camera_info and the pose that belong to it."""
+    """A mask with all that belongs to it."""
 
     name: str  # Unique: the pairing's prefix, the epoch, the stamp, and at one stamp the number of the camera.
     stamp: int
@@ -55,6 +34,8 @@ class Paired(NamedTuple):
     camera_info: Any
     pose: Pose  # (4, 4) camera in the map
     era: object = None  # As it was given with the mask.
+    depth: Any = None  # If the pairing was to wait for it.
+    stream: str = ""  # As it was given to the pairing.
 
 
 @dataclass(frozen=True)
@@ -67,62 +48,13 @@ class PairingSettings:
         Seconds of wall clock that a mask waits for its pose and camera_info.
     max_waiting : int
         Masks that wait at the same time; one more, and the oldest has to go.
+    with_depth : bool
+        Whether a mask waits for the depth image of exactly its stamp, too.
     """
 
     wait_s: float = 1.0
     max_waiting: int = 30
-
-
-class ExactPoses:
-    """Poses that were measured for the masks themselves: only that of exactly a mask's stamp will do."""
-
-    knows_frames = False
-
-    def __init__(self) -> None:
-        self._poses: _History[Pose] = _History(_POSES_KEPT)
-
-    def add(self, stamp: int, matrix: Pose) -> None:
-        """Keep the pose (4, 4) of a stamp; of two with the same stamp the first stays."""
-        self._poses.add(stamp, matrix)
-
-    def at(self, stamp: int, frame_id: str = "") -> Pose | None:
-        """Pose (4, 4) of exactly `stamp`, whatever the frame; None if it is not there."""
-        return self._poses.values.get(stamp)
-
-    def too_late(self, stamp: int) -> bool:
-        """Whether the poses have gone on from `stamp` by more than they come out of order."""
-        return bool(self._poses.stamps) and self._poses.stamps[-1] >= stamp + BEHIND_NS
-
-    def clear(self) -> None:
-        """Forget all poses."""
-        self._poses.clear()
-
-
-class InterpolatedPoses(ExactPoses):
-    """Poses of an odometry, which runs at its own rate: between the two that bracket a mask's stamp.
-
-    Parameters
-    ----------
-    max_gap_s : float
-        The two may be so many seconds apart.
-    """
-
-    def __init__(self, max_gap_s: float = 0.2) -> None:
-        super().__init__()
-        self._max_gap_ns = round(max_gap_s * SECOND)
-
-    def at(self, stamp: int, frame_id: str = "") -> Pose | None:
-        """Pose (4, 4) at `stamp`, whatever the frame; None without poses before and after it that are close enough."""
-        exact = super().at(stamp)
-        stamps = self._poses.stamps
-        after = bisect_left(stamps, stamp)
-        if exact is not None or not 0 < after < len(stamps):
-            return exact
-        earlier, later = stamps[after - 1], stamps[after]
-        if later - earlier > self._max_gap_ns:
-            return None
-        share = (stamp - earlier) / (later - earlier)
-        return interpolate(self._poses.values[earlier], self._poses.values[later], share)
+    with_depth: bool = False
 
 
 class Pairing:
@@ -134,23 +66,26 @@ class Pairing:
     Every mask comes out of `take`, or is counted in `dropped`, or still waits.
 
     Poses that come from messages do not say of which camera they are. So when masks of two cameras carry one stamp, and
-    the poses are not from a source that knows frames, none is paired until ten seconds (of stamps) later.
+    the poses are not from a source that knows frames, none is paired until ten seconds (of stamps) later. A source that
+    may know them is asked for a pose that is this camera's for certain.
 
     What is late and what shows that time was set back is said in `gsseg_ros.node.timeline.Timeline`.
 
     Parameters
     ----------
     poses : PoseSource
-        `ExactPoses`, `InterpolatedPoses` or `gsseg_ros.node.tf_poses.TfPoses`.
+        One of `gsseg_ros.node.pose_sources`, or `gsseg_ros.node.tf_poses.TfPoses`.
     settings : PairingSettings
         Limits on the masks that wait.
     prefix : str
         What the names of all pairs begin with: epochs and stamps of another pairing may be the same.
+    stream : str
+        What comes out with every pair: which camera's it is.
 
     Attributes
     ----------
     dropped : Counter
-        Masks not paired, by reason: "no_pose", "no_camera_info", "repeated_stamp" (and the same frame_id),
+        Masks not paired, by reason: "no_pose", "no_camera_info", "no_depth", "repeated_stamp" (and the same frame_id),
         "several_cameras" (whose poses cannot be told apart), and "time_jump" for one from before time was set back that
         came after it.
     out_of_order : int
@@ -162,18 +97,21 @@ class Pairing:
         The frame_id of the last mask that was dropped for want of a camera_info.
     """
 
-    def __init__(self, poses: PoseSource, settings: PairingSettings | None = None, prefix: str = "") -> None:
+    def __init__(
+        self, poses: PoseSource, settings: PairingSettings | None = None, prefix: str = "", stream: str = ""
+    ) -> None:
         self.dropped: Counter[str] = Counter()
         self.out_of_order = 0
         self.unmatched_frame = ""
         self._poses = poses
-        self._prefix = prefix
+        self._prefix, self._stream = prefix, stream
         self._settings = settings or PairingSettings()
         self._lock = threading.Lock()
         self._timeline = Timeline(self._settings.max_waiting, self._settings.wait_s)
-        self._camera_infos: dict[str, _History[Any]] = {}  # By frame_id, that last heard at the end.
-        self._seen: _History[list[str]] = _History(_STAMPS_KEPT)  # Frames of the masks of a stamp.
+        self._camera_infos: dict[str, History[Any]] = {}  # By frame_id, that last heard at the end.
+        self._seen: History[list[str]] = History(_STAMPS_KEPT)  # Frames of the masks of a stamp.
         self._unclear_until = 0  # Up to this stamp poses may be of another camera.
+        self._depths: History[Any] = History(_DEPTH_BYTES, lambda image: len(image[1].data))
         self._waiting: dict[_Key, _Waiting] = {}
         self._finished: list[Paired] = []
 
@@ -185,15 +123,15 @@ class Pairing:
         """Take in a camera_info whose header has this stamp and frame."""
         self._take_in(Message("camera_info", stamp, message, frame_id))
 
-    def add_pose(
-        self,
-        stamp: int,
-        matrix: Pose,  # (4, 4)
-    ) -> None:
-        """Take in a pose of the camera in the map; not for TF, which gets its poses by itself."""
-        if not isinstance(self._poses, ExactPoses):
+    def add_pose(self, stamp: int, given: GivenPose) -> None:
+        """Take in a pose; not for TF, which gets its poses by itself."""
+        if not isinstance(self._poses, MessagePoses):
             raise TypeError(f"{type(self._poses).__name__} takes no poses")
-        self._take_in(Message("pose", stamp, matrix))
+        self._take_in(Message("pose", stamp, given))
+
+    def add_depth(self, stamp: int, message: Any) -> None:
+        """Take in a depth image, the name of its topic and the message."""
+        self._take_in(Message("depth", stamp, message))
 
     def set_back(self, stamp: int) -> None:
         """Take in that the clock was set back to `stamp` (ns): nothing of a later time belongs to what comes now."""
@@ -264,7 +202,7 @@ class Pairing:
         if self._timeline.epoch > epoch:
             for waiting in sorted(self._waiting):
                 self._pair(waiting, last_chance=True, epoch=epoch)
-            for kept in (self._poses, self._camera_infos, self._seen):
+            for kept in (self._poses, self._camera_infos, self._seen, self._depths):
                 kept.clear()
             self._unclear_until = 0
         if self._timeline.lost_masks:
@@ -272,8 +210,10 @@ class Pairing:
         for stream, stamp, content, frame_id in messages:
             if stream == "camera_info":
                 self._add_camera_info(stamp, content, frame_id)
-            elif stream == "pose" and isinstance(self._poses, ExactPoses):
+            elif stream == "pose" and isinstance(self._poses, MessagePoses):
                 self._poses.add(stamp, content)
+            elif stream == "depth":
+                self._depths.add(stamp, content)
         for stream, stamp, content, frame_id in messages:
             if stream == MASK:
                 mask, era = content
@@ -292,12 +232,12 @@ class Pairing:
         self.out_of_order += bool(self._seen.stamps) and stamp < self._seen.stamps[-1]
         self._seen.add(stamp, frames)
         frames.append(frame_id)
-        if len(frames) > 1 and not self._poses.knows_frames:
+        if len(frames) > 1:
             self._unclear_until = max(self._unclear_until, stamp + _UNCLEAR_NS)
         self._waiting[stamp, frame_id] = _Waiting(mask, era, len(frames))
 
     def _add_camera_info(self, stamp: int, message: Any, frame_id: str) -> None:
-        infos = self._camera_infos.pop(frame_id, None) or _History(_CAMERA_INFOS_KEPT)
+        infos = self._camera_infos.pop(frame_id, None) or History(_CAMERA_INFOS_KEPT)
         self._camera_infos[frame_id] = infos
         if len(self._camera_infos) > _CAMERAS_KEPT:
             del self._camera_infos[next(iter(self._camera_infos))]
@@ -305,20 +245,23 @@ class Pairing:
 
     def _pair(self, key: _Key, last_chance: bool = False, epoch: int | None = None) -> None:
         waiting, (stamp, frame_id) = self._waiting[key], key
-        if waiting.pose is None:
-            waiting.pose = self._poses.at(stamp, frame_id)
-        info = self._camera_info(stamp, frame_id, last_chance)
-        if stamp < self._unclear_until:
+        several = stamp < self._unclear_until
+        if waiting.pose is None or several:
+            waiting.pose = self._poses.at(stamp, frame_id, last_chance, several)
+        info, depth = self._camera_info(stamp, frame_id, last_chance), self._depths.values.get(stamp)
+        if several and not self._poses.knows_frames:
             self.dropped["several_cameras"] += 1
-        elif waiting.pose is not None and info is not None:
+        elif waiting.pose is not None and info is not None and (depth or not self._settings.with_depth):
             name = f"{self._prefix}{self._timeline.epoch if epoch is None else epoch}_{stamp}"
             name += f"_{waiting.camera}" * (waiting.camera > 1)
-            self._finished.append(Paired(name, stamp, waiting.mask, info, waiting.pose, waiting.era))
+            paired = Paired(name, stamp, waiting.mask, info, waiting.pose, waiting.era, depth, self._stream)
+            self._finished.append(paired)
         elif waiting.pose is None and (last_chance or self._poses.too_late(stamp)):
             self.dropped["no_pose"] += 1
         elif last_chance:
-            self.dropped["no_camera_info"] += 1
-            self.unmatched_frame = frame_id
+            if info is None:
+                self.unmatched_frame = frame_id
+            self.dropped["no_camera_info" if info is None else "no_depth"] += 1
         else:
             return
         del self._waiting[key]
@@ -334,7 +277,7 @@ class Pairing:
             return infos.values[infos.stamps[after - 1]]
         return None
 
-    def _infos_of(self, frame_id: str) -> _History[Any] | None:
+    def _infos_of(self, frame_id: str) -> History[Any] | None:
         if not frame_id and len(self._camera_infos) == 1:
             return next(iter(self._camera_infos.values()))
         return self._camera_infos.get(frame_id) or self._camera_infos.get("")
@@ -347,24 +290,3 @@ class _Waiting:
     camera: int  # Among those with masks of this stamp, from 1.
     pose: Pose | None = None
     since: float | None = None
-
-
-class _History(Generic[T]):
-    """Values by stamp, those of the `capacity` newest stamps; `stamps` is sorted."""
-
-    def __init__(self, capacity: int) -> None:
-        self._capacity = capacity
-        self.stamps: list[int] = []
-        self.values: dict[int, T] = {}
-
-    def add(self, stamp: int, value: T) -> None:
-        if stamp in self.values:
-            return
-        insort(self.stamps, stamp)
-        self.values[stamp] = value
-        if len(self.stamps) > self._capacity:
-            del self.values[self.stamps.pop(0)]
-
-    def clear(self) -> None:
-        self.stamps.clear()
-        self.values.clear()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -19,6 +20,7 @@ from gsseg_core.data.label_images import PER_VIEW
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.raster.backends import devices, rasteriser_of
+from gsseg_core.raster.depth_gating import DepthTolerance
 from gsseg_core.refine.settings import MAX_K, RefineSettings
 from gsseg_core.scene.scene_writers import DEFAULT, SCENE_WRITERS, check_format
 from gsseg_ros.camera_infos import AUTO, RECTIFIED
@@ -26,12 +28,13 @@ from gsseg_ros.frames import Similarity, pose_from_parameters
 from gsseg_ros.node.masks.compressed import TRANSPORTS
 from gsseg_ros.node.masks.palette import Palette
 
-POSE_SOURCES = ("topic", "odometry", "tf")
+POSE_SOURCES = ("topic", "odometry", "tf", "auto")
 IDS = ("given", PER_VIEW)
 _CHOICES = {
     "pose_source": POSE_SOURCES, "ids": IDS, "rectified": RECTIFIED, "mask_transport": TRANSPORTS,
     "image_transport": TRANSPORTS,
 }  # fmt: skip
+_CAMERA = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*")  # Such that it may be part of the name of a topic.
 
 
 @dataclass(frozen=True)
@@ -117,7 +120,45 @@ DECLARATIONS = (
         "raw",
         f"how camera images are sent: {', '.join(TRANSPORTS)} (JPEG or PNG on image/compressed)",
     ),
-    Declaration("pose_source", "topic", f"where the camera's pose comes from: {', '.join(POSE_SOURCES)}"),
+    Declaration(
+        "cameras",
+        [],
+        "names of the cameras, whose topics begin with them, as front/mask; empty: one camera, with mask, camera_info "
+        "and so on",
+    ),
+    Declaration(
+        "pose_source",
+        "topic",
+        f"where the camera's pose comes from: {', '.join(POSE_SOURCES)}, which is TF first and else the topic",
+    ),
+    Declaration(
+        "pose_tolerance",
+        0.0,
+        "pose topics: how far a pose may lie before or after the mask's stamp; between two it is interpolated [s]",
+        0.0,
+        10.0,
+    ),
+    Declaration(
+        "depth_gating",
+        False,
+        "whether masks wait for the depth image of their stamp, and what lies elsewhere than the scene is unknown",
+    ),
+    Declaration(
+        "depth_tolerance.absolute",
+        DepthTolerance.absolute,
+        "depth_gating: how far a measured depth may be off, and a share of the depth besides [m]",
+        0.0,
+        1e6,
+        True,
+    ),
+    Declaration(
+        "depth_tolerance.relative",
+        DepthTolerance.relative,
+        "depth_gating: this share of the scene's depth [0..1]",
+        0.0,
+        1.0,
+        True,
+    ),
     Declaration(
         "rectified",
         AUTO,
@@ -183,7 +224,11 @@ class Settings:
     palette: Palette | None
     mask_transport: str
     image_transport: str
+    cameras: tuple[str, ...]
     pose_source: str
+    pose_tolerance: float
+    depth_gating: bool
+    depth_tolerance: DepthTolerance
     rectified: str
     map_frame: str
     max_views: int
@@ -215,6 +260,12 @@ class Settings:
                 f"parameter class_names gives {len(self.class_names)} names, but with ids '{PER_VIEW}' the node finds "
                 "the objects and names them itself; expected it to be empty"
             )
+        for name in self.cameras:
+            if not _CAMERA.fullmatch(name) or self.cameras.count(name) > 1:
+                raise SettingsError(
+                    f"parameter cameras: {name[:60]!r} is no name, or there twice; expected distinct names of letters, "
+                    "digits and single underscores that begin with a letter, such as front"
+                )
         if not self.map_frame:
             raise SettingsError("parameter map_frame is empty; expected the name of a frame, such as 'map'")
         for index, flaw in enumerate(map(flaw_of_class_name, self.class_names)):
@@ -235,9 +286,11 @@ class Settings:
         for name in ("scene_path", "data_root"):
             plain[name] = os.path.expanduser(plain[name])
         plain["rectified"] = str(plain["rectified"]).lower()  # Both true and "true", as YAML and shells have it.
-        plain["class_names"] = tuple(values["class_names"] or ())
+        for name in ("class_names", "cameras"):
+            plain[name] = tuple(values[name] or ())
         plain["palette"] = Palette(values["palette"]) if values["palette"] else None
-        return cls(**plain, scene_to_map=similarity, camera_in_base=camera)
+        tolerance = DepthTolerance(*(values[f"depth_tolerance.{part}"] for part in ("absolute", "relative")))
+        return cls(**plain, scene_to_map=similarity, camera_in_base=camera, depth_tolerance=tolerance)
 
     @classmethod
     def read(cls, node: Node, changed: Sequence[Parameter] = ()) -> Settings:

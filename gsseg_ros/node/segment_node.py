@@ -143,7 +143,7 @@ class SegmentNode(LifecycleNode):
         warm_up(settings.device, self.get_logger().info)
         if settings.scene_path:
             self.workspace.load_scene(*self.workspace.scene_path())
-        self._outputs = Outputs(self)
+        self._outputs = Outputs(self, settings.cameras)
         self._outputs.announce(settings.names_by_id)
         if self.workspace.has_scene:
             session = self.workspace.session

@@ -170,7 +170,7 @@ class Services:
                 camera = viewpoint(request, settings, self._lookup())
                 header = Header(stamp=run.stamp, frame_id=request.viewpoint_camera.header.frame_id)
                 with run.watch.stage("render"):
-                    with_overlay = outputs.wants_overlay and not request.publish_nothing
+                    with_overlay = outputs.wants_overlay() and not request.publish_nothing
                     drawing = draw(selection, camera, header, with_overlay=with_overlay)
                 response.label_image, overlay = drawing.labels, drawing.overlay
             header = self._header(run)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,8 @@ from gsseg_ros.conversions import matrix_from_transform
 
 class TfPoses:
     """Poses of the frames that masks are stamped with, looked up in TF at the mask's stamp, never the latest.
+
+    It listens from the first question on.
 
     Parameters
     ----------
@@ -48,10 +51,26 @@ class TfPoses:
         self.problem = ""
         self._map_frame = map_frame
         self._buffer = Buffer()
-        self._listener = TransformListener(self._buffer, node)
+        self._listening, self._listener = threading.Lock(), None
+        self._listen = lambda: TransformListener(self._buffer, node)
         self._time, self._not_found = Time, TransformException
 
-    def at(self, stamp: int, frame_id: str = "") -> npt.NDArray[np.float64] | None:
+    @classmethod
+    def if_here(cls, node: Any, map_frame: str) -> TfPoses | None:
+        """Make them; None where tf2_ros cannot be imported."""
+        try:
+            return cls(node, map_frame)
+        except SettingsError:
+            return None
+
+    def listen(self) -> None:
+        """Begin to listen, if it does not yet."""
+        with self._listening:
+            self._listener = self._listener or self._listen()
+
+    def at(
+        self, stamp: int, frame_id: str = "", last_chance: bool = False, several: bool = False
+    ) -> npt.NDArray[np.float64] | None:
         """Look up the pose (4, 4) of `frame_id` in the map frame at `stamp` (ns); None if TF does not know it (yet)."""
         if stamp <= 0 or not frame_id:
             # To TF a stamp of zero means "the latest", which belongs to another image.
@@ -59,11 +78,16 @@ class TfPoses:
             return None
         return self.look_up(frame_id, stamp)
 
-    def look_up(self, frame_id: str, stamp: int) -> npt.NDArray[np.float64] | None:
-        """Look up the pose (4, 4) of a frame at `stamp` (ns), 0 being the latest; None if TF does not know it."""
+    def look_up(self, frame_id: str, stamp: int, within: str = "") -> npt.NDArray[np.float64] | None:
+        """Look up the pose (4, 4) of a frame in another (unless named, the map) at `stamp` (ns), 0 being the latest.
+
+        Returns None if TF does not know it (yet).
+        """
+        within = within or self._map_frame
+        self.listen()
         try:
-            found = self._buffer.lookup_transform(self._map_frame, frame_id, self._time(nanoseconds=stamp))
-            pose = matrix_from_transform(found.transform, f"TF from '{frame_id}' to '{self._map_frame}'")
+            found = self._buffer.lookup_transform(within, frame_id, self._time(nanoseconds=stamp))
+            pose = matrix_from_transform(found.transform, f"TF from '{frame_id}' to '{within}'")
         except (self._not_found, GssegError) as error:
             self.problem = str(error)
             return None
@@ -80,4 +104,5 @@ class TfPoses:
 
     def close(self) -> None:
         """Stop listening."""
-        self._listener.unregister()
+        if self._listener is not None:
+            self._listener.unregister()

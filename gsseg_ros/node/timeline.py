@@ -17,7 +17,7 @@ MASK = "mask"
 class Message(NamedTuple):
     """A message of one stream, with its stamp, not yet parsed."""
 
-    stream: str  # "mask", "camera_info" or "pose"
+    stream: str  # "mask", "camera_info", "pose" or "depth"
     stamp: int  # ns
     content: Any
     frame_id: str = ""
@@ -32,8 +32,9 @@ class Timeline:
     - Late, by however much, if its stream goes on after it, or if two seconds have passed in which another stream went
       on. Late messages belong to the same time as the others.
     - The first of a time that was set back, if every stream is behind that was heard in this time (two at least); if
-      ten in a row of camera_info or of poses are behind, which are sent in order, while masks may come from several
-      segmenters of different speed; if nothing has gone on for a second; or if /clock was set back (`set_back`).
+      ten in a row of camera_info, poses or depth images are behind, which are sent in order, while masks may come from
+      several segmenters of different speed; if nothing has gone on for a second; or if /clock was set back
+      (`set_back`).
 
     While one is held, so are others that do not go on: a stream that repeats its stamps may be in the next round of a
     bag. Once time was set back, a stream may still bring stragglers from before: they go on from where the stream was,

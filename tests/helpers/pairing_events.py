@@ -8,6 +8,7 @@ import numpy as np
 
 from gsseg_ros.frames import rigid
 from gsseg_ros.node.pairing import Pairing
+from gsseg_ros.node.pose_sources import GivenPose
 
 MS = 1_000_000
 S = 1000 * MS
@@ -28,7 +29,7 @@ def send(pairing: Pairing, events: Iterable[Event]) -> None:
         elif kind == "info":
             pairing.add_camera_info(stamp, f"info {stamp}")
         else:
-            pairing.add_pose(stamp, pose(stamp / S))
+            pairing.add_pose(stamp, GivenPose(pose(stamp / S)))
 
 
 def at_all(stamps: Iterable[int]) -> list[Event]:

@@ -78,10 +78,10 @@ class NodeHere:
             self.hand({topic: sent[topic] for topic in topics})
         return used
 
-    def hand(self, sent: Mapping[str, Any]) -> None:
-        """Hand it messages by the name of their input."""
+    def hand(self, sent: Mapping[str, Any], camera: str = "") -> None:
+        """Hand it messages by the name of their input, of one of its cameras."""
         for topic, message in sent.items():
-            getattr(self.inputs, f"_on_{topic}")(topic, message)
+            getattr(self.inputs.cameras[camera], f"on_{topic}")(topic, message)
             self.inputs._hand_over()
 
     def fuse(self, views: list[View]) -> None:

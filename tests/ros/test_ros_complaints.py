@@ -148,10 +148,11 @@ class Hears:
     """Inputs with the counts that a test gives them, and their verdict."""
 
     def __init__(self, steady: Steady) -> None:
-        pairing = SimpleNamespace(dropped=Counter(), time_jumps=0, last_jump=(0, 0), out_of_order=0, waiting=0)
-        pairing.unmatched_frame, pairing.camera_frames = "left", ["right"]
+        self.pairing = SimpleNamespace(time_jumps=0, last_jump=(0, 0), out_of_order=0, waiting=0)
+        self.pairing.unmatched_frame, self.pairing.camera_frames = "left", ["right"]
         self.inputs: Any = SimpleNamespace(
-            pairing=pairing, rejected=Counter(), accepted=0, explained={}, worker=SimpleNamespace(dropped=0, waiting=0),
+            cameras={"": SimpleNamespace(name="", pairing=self.pairing)}, dropped=Counter(), gated=Counter(),
+            rejected=Counter(), accepted=0, explained={}, worker=SimpleNamespace(dropped=0, waiting=0),
             arrivals={}, roles={}, tf=None, last_refusal=(-100.0, ""), refused_poses=0, logged=Counter(),
             counted=deque([(steady.seconds, Counter())]),
         )  # fmt: skip
@@ -202,7 +203,7 @@ def test_the_level_says_whether_few_many_or_all_masks_are_refused(
     hears: Hears, accepted: int, refused: int, level: bytes
 ) -> None:
     hears.inputs.accepted = accepted
-    hears.inputs.pairing.dropped["no_pose"] = refused
+    hears.inputs.dropped["no_pose"] = refused
     assert hears.verdict()[0] == level
 
 
@@ -221,10 +222,7 @@ def test_every_way_to_lose_a_mask_is_in_the_verdict_and_in_the_log(
     steady: Steady, hears: Hears, reason: str, said: str
 ) -> None:
     def lose(count: int) -> None:
-        if reason == "queue_full":
-            hears.inputs.worker.dropped += count
-        else:
-            hears.inputs.pairing.dropped[reason] += count
+        hears.inputs.dropped[reason] += count
 
     lose(5)
     level, message = hears.verdict()
@@ -243,12 +241,12 @@ def test_every_way_to_lose_a_mask_is_in_the_verdict_and_in_the_log(
 def test_refused_poses_explain_masks_without_a_pose(steady: Steady, hears: Hears) -> None:
     hears.inputs.last_refusal = (steady.seconds, "/pose: position is (nan, 0, 0)")
     assert hears.verdict() == (DiagnosticStatus.WARN, "/pose: position is (nan, 0, 0)")
-    hears.inputs.pairing.dropped["no_pose"] = 1
+    hears.inputs.dropped["no_pose"] = 1
     assert "came within a second (/pose: position is (nan, 0, 0)); expected" in hears.verdict()[1]
 
 
 def test_time_that_was_set_back_is_logged_once(steady: Steady, hears: Hears) -> None:
-    hears.inputs.pairing.time_jumps, hears.inputs.pairing.last_jump = 1, (9 * SECOND, SECOND)
+    hears.pairing.time_jumps, hears.pairing.last_jump = 1, (9 * SECOND, SECOND)
     for _ in range(8):
         hears.verdict()
         steady.seconds += 1

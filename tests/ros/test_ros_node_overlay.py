@@ -171,7 +171,6 @@ def test_a_picture_of_another_encoding_is_refused() -> None:
 class Shown:
     """In the place of the outputs: takes its time to show a picture."""
 
-    wants_overlay = True
     wants_objects = False
     objects_count = 0
 
@@ -180,7 +179,10 @@ class Shown:
         self.wanted: list[Callable[[], bool]] = []
         self.go_on = threading.Event()
 
-    def publish_overlay(self, image: Image, wanted: Callable[[], bool]) -> None:
+    def wants_overlay(self, camera: str) -> bool:
+        return True
+
+    def publish_overlay(self, image: Image, wanted: Callable[[], bool], camera: str) -> None:
         self.wanted.append(wanted)
         self.stamps.append(image.header.stamp.sec)
         self.go_on.wait(60)
@@ -193,7 +195,7 @@ def live() -> Iterator[tuple[LiveOutputs, Shown, dict[str, bool]]]:
     for view in clean_views(2):
         session.fuse(view)
     similarity = Similarity(np.eye(3), np.zeros(3), 1.0)
-    settings = SimpleNamespace(pose_source="topic", rectified="auto", scene_to_map=similarity, max_pixels=1 << 24)
+    settings = SimpleNamespace(rectified="auto", scene_to_map=similarity, max_pixels=1 << 24)
     shown, state = Shown(), {"busy": False}
     workspace: Any = SimpleNamespace(session=session, settings=settings, era=session.era)
     outputs: Any = shown

@@ -123,7 +123,7 @@ def test_what_was_latched_of_before_is_replaced_by_empty_messages(here: NodeHere
     here.fuse(clean_views(2))
     here.done("save_state")
     heard = robot.ros.collect(Image, "/gsseg/overlay", 1)
-    robot.ros.wait_until(lambda: here.outputs.wants_overlay, "the node to know who looks")
+    robot.ros.wait_until(here.outputs.wants_overlay, "the node to know who looks")
     before = here.done("segment", **viewpoint(clean_views(1)[0])).report
     robot.ros.wait_until(lambda: heard, "the overlay")
     here.done(change)

@@ -171,8 +171,8 @@ def test_images_are_not_subscribed_to_again_by_a_timer_that_runs_while_listening
 ) -> None:
     assert node.trigger_configure() == node.trigger_activate() == SUCCESS
     assert node.inputs is not None and node._outputs is not None
-    images = node.inputs._images
-    monkeypatch.setattr(type(node._outputs), "wants_overlay", property(lambda _: True))
+    (images,) = node.inputs._images
+    monkeypatch.setattr(type(node._outputs), "wants_overlay", lambda *_: True)
     images.tick()
     assert any(subscription.topic_name == "/image" for subscription in node.subscriptions)
     assert node.trigger_deactivate() == SUCCESS

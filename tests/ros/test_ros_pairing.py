@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from pairing_events import MS, Event, S, at_all, expire, pose, send
 
 from gsseg_ros.frames import rigid
-from gsseg_ros.node.pairing import ExactPoses, InterpolatedPoses, Paired, Pairing, PairingSettings
+from gsseg_ros.node.pairing import Paired, Pairing, PairingSettings
+from gsseg_ros.node.pose_sources import GivenPose, InterpolatedPoses, MessagePoses
 
 
 def summary(paired: Iterable[Paired]) -> set[tuple[Any, ...]]:
@@ -37,7 +38,7 @@ def interleavings(draw: st.DrawFn) -> tuple[list[Event], list[Event]]:
 def test_any_interleaving_of_the_inputs_gives_the_same_pairs(orders: tuple[list[Event], ...], exact: bool) -> None:
     results = []
     for events in orders:
-        pairing = Pairing(ExactPoses() if exact else InterpolatedPoses())
+        pairing = Pairing(MessagePoses() if exact else InterpolatedPoses())
         send(pairing, events)
         expire(pairing)
         results.append((summary(pairing.take()), pairing.dropped))
@@ -54,7 +55,7 @@ def test_any_interleaving_of_the_inputs_gives_the_same_pairs(orders: tuple[list[
 
 
 def test_a_pair_holds_what_was_sent_for_its_stamp() -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     send(pairing, at_all([1 * S, 2 * S]))
     first, second = pairing.take()
     assert (first.stamp, first.mask, first.camera_info) == (1 * S, f"mask {1 * S}", f"info {1 * S}")
@@ -64,7 +65,7 @@ def test_a_pair_holds_what_was_sent_for_its_stamp() -> None:
 
 
 def test_a_mask_gets_the_pose_of_its_own_stamp_and_never_the_latest() -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     send(pairing, [("info", 1 * S), ("pose", 1 * S), ("mask", 1 * S + 1)])
     expire(pairing)
     assert pairing.take() == []
@@ -72,7 +73,7 @@ def test_a_mask_gets_the_pose_of_its_own_stamp_and_never_the_latest() -> None:
 
 
 def test_a_lost_pose_costs_its_mask_alone() -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     stamps = [1 * S + i * 100 * MS for i in range(20)]
     send(pairing, [event for event in at_all(stamps) if event != ("pose", stamps[3])])
     # A later pose by a second shows that the lost one will not come, before the mask's time is over.
@@ -81,13 +82,13 @@ def test_a_lost_pose_costs_its_mask_alone() -> None:
 
 
 def test_a_pose_out_of_order_still_finds_its_mask() -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     send(pairing, [("info", 1 * S), ("mask", 1 * S), ("pose", 1 * S + 900 * MS), ("pose", 1 * S)])
     assert [p.stamp for p in pairing.take()] == [1 * S]
 
 
 def test_without_its_own_camera_info_a_mask_takes_the_newest_earlier_one_once_a_later_one_is_there() -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     send(pairing, [("info", 1 * S), ("info", 2 * S), ("pose", 3 * S), ("mask", 3 * S)])
     assert pairing.take() == []
     send(pairing, [("info", 4 * S)])
@@ -95,7 +96,7 @@ def test_without_its_own_camera_info_a_mask_takes_the_newest_earlier_one_once_a_
 
 
 def test_without_a_later_camera_info_the_earlier_one_serves_when_the_time_is_over() -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     send(pairing, [("info", 1 * S), ("pose", 3 * S), ("mask", 3 * S)])
     pairing.expire(10.0)
     pairing.expire(10.9)
@@ -105,7 +106,7 @@ def test_without_a_later_camera_info_the_earlier_one_serves_when_the_time_is_ove
 
 
 def test_a_lost_camera_info_is_counted_as_such() -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     send(pairing, [("info", 4 * S), ("pose", 3 * S), ("mask", 3 * S)])
     expire(pairing)
     assert pairing.take() == []
@@ -113,19 +114,19 @@ def test_a_lost_camera_info_is_counted_as_such() -> None:
 
 
 def test_a_repeated_stamp_is_counted_and_ignored() -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     send(pairing, [*at_all([1 * S]), ("mask", 1 * S), ("mask", 2 * S), ("mask", 2 * S)])
     assert pairing.dropped == {"repeated_stamp": 2}
     send(pairing, at_all([2 * S]))
     assert [p.stamp for p in pairing.take()] == [1 * S, 2 * S]
 
 
-class CameraPoses(ExactPoses):
-    """Poses of cameras by frame_id, as TF has them: a pose's x is that of `ExactPoses`, its y tells the camera."""
+class CameraPoses(MessagePoses):
+    """Poses of cameras by frame_id, as TF has them: a pose's x is that of `MessagePoses`, its y tells the camera."""
 
     knows_frames = True
 
-    def at(self, stamp: int, frame_id: str = "") -> np.ndarray | None:
+    def at(self, stamp: int, frame_id: str = "", last_chance: bool = False, several: bool = False) -> np.ndarray | None:
         found = super().at(stamp)
         return None if found is None else rigid(np.eye(3), [found[0, 3], len(frame_id), 0])
 
@@ -138,7 +139,7 @@ def test_masks_of_synchronised_cameras_get_the_camera_info_and_the_pose_of_their
     for stamp in stamps:
         for kind, camera in data.draw(st.permutations(sent)):
             if kind == "pose":
-                pairing.add_pose(stamp, pose(stamp / S))
+                pairing.add_pose(stamp, GivenPose(pose(stamp / S)))
             else:
                 add = pairing.add_mask if kind == "mask" else pairing.add_camera_info
                 add(stamp, (camera, stamp), camera)
@@ -155,7 +156,7 @@ def test_masks_of_synchronised_cameras_get_the_camera_info_and_the_pose_of_their
 
 
 def test_masks_of_one_stamp_and_several_cameras_are_refused_where_poses_do_not_say_whose_they_are() -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     for frame in ("left", "right"):
         pairing.add_camera_info(1 * S, "info", frame)
         pairing.add_mask(1 * S, "mask", frame)
@@ -173,7 +174,7 @@ def test_masks_of_one_stamp_and_several_cameras_are_refused_where_poses_do_not_s
 def test_a_camera_info_of_another_camera_is_not_used_but_a_frame_may_be_left_out(
     mask: str, info: str, paired: int
 ) -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     pairing.add_camera_info(1 * S, "info", info)
     pairing.add_mask(1 * S, "mask", mask)
     send(pairing, [("pose", 1 * S)])
@@ -185,7 +186,7 @@ def test_a_camera_info_of_another_camera_is_not_used_but_a_frame_may_be_left_out
 
 
 def test_when_too_many_masks_wait_the_oldest_goes_and_is_counted() -> None:
-    pairing = Pairing(ExactPoses(), PairingSettings(max_waiting=3))
+    pairing = Pairing(MessagePoses(), PairingSettings(max_waiting=3))
     send(pairing, [("info", 1 * S)] + [("mask", 1 * S + i) for i in range(5)])
     assert pairing.waiting == 3
     assert pairing.dropped == {"no_pose": 2}
@@ -195,12 +196,12 @@ def test_when_too_many_masks_wait_the_oldest_goes_and_is_counted() -> None:
 
 def test_memory_stays_bounded_whatever_comes_alone() -> None:
     for kind in ("mask", "info", "pose"):
-        pairing = Pairing(ExactPoses())
+        pairing = Pairing(MessagePoses())
         send(pairing, [(kind, 1 * S + i * MS) for i in range(5000)])
         for i in range(5000):
             pairing.add_mask(9 * S + i // 50, "mask", f"camera {i}")
             pairing.add_camera_info(1 * S, "info", f"camera {i}")
-            pairing.add_pose(1 * S, pose(0))
+            pairing.add_pose(1 * S, GivenPose(pose(0)))
         infos = [history.values for history in pairing._camera_infos.values()]
         seen = list(pairing._seen.values.values())
         kept = [pairing._waiting, pairing._poses._poses.values, pairing._timeline._held, *infos, *seen]
@@ -208,7 +209,7 @@ def test_memory_stays_bounded_whatever_comes_alone() -> None:
 
 
 def test_of_two_threads_each_mask_is_paired_once() -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     stamps = [1 * S + i * MS for i in range(1000)]
     send(pairing, [("pose", stamp) for stamp in stamps] + [("info", 0), ("info", 9 * S)])
     halves = (stamps[::2], stamps[1::2])

@@ -8,18 +8,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pairing_events import MS, S, at_all, expire, pose, send
 
-from gsseg_ros.node.pairing import ExactPoses, Pairing, PairingSettings
+from gsseg_ros.node.pairing import Pairing, PairingSettings
+from gsseg_ros.node.pose_sources import MessagePoses
 
 
 def test_a_mask_out_of_order_by_less_than_a_second_is_paired_and_counted() -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     send(pairing, at_all([5 * S, 5 * S - 999 * MS]))
     assert [p.stamp for p in pairing.take()] == [5 * S, 5 * S - 999 * MS]
     assert (pairing.out_of_order, pairing.time_jumps) == (1, 0)
 
 
 def test_time_set_back_by_a_second_starts_afresh() -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     send(pairing, at_all([5 * S, 4 * S]))
     first, second = pairing.take()
     assert (pairing.time_jumps, pairing.out_of_order) == (1, 0)
@@ -28,7 +29,7 @@ def test_time_set_back_by_a_second_starts_afresh() -> None:
 
 @given(st.data())
 def test_a_bag_in_a_loop_is_paired_whole_each_time_under_names_of_its_own(data: st.DataObject) -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     stamps = [1 * S + i * 100 * MS for i in range(30)]
     for _ in range(3):
         for stamp in stamps:
@@ -41,7 +42,7 @@ def test_a_bag_in_a_loop_is_paired_whole_each_time_under_names_of_its_own(data: 
 
 
 def test_a_pose_from_before_time_was_set_back_is_not_used_after_it() -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     send(pairing, [*at_all([1 * S]), *at_all([9 * S])])
     send(pairing, [("mask", 1 * S), ("info", 1 * S), ("pose", 1 * S + 1)])
     expire(pairing)
@@ -51,7 +52,7 @@ def test_a_pose_from_before_time_was_set_back_is_not_used_after_it() -> None:
 
 
 def test_masks_that_wait_when_time_is_set_back_are_counted() -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     send(pairing, [("info", 9 * S), ("mask", 9 * S), ("pose", 8 * S)])
     send(pairing, [("mask", 1 * S), ("info", 1 * S), ("pose", 1 * S + 1)])
     assert pairing.dropped == {"no_pose": 1}
@@ -60,7 +61,7 @@ def test_masks_that_wait_when_time_is_set_back_are_counted() -> None:
 
 @pytest.mark.parametrize("late", [500 * MS, 1500 * MS, 5 * S])
 def test_a_late_mask_is_paired_with_what_belongs_to_it_and_is_no_time_jump(late: int) -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     stamps = [10 * S + i * 100 * MS for i in range(80)]
     missing = stamps[-1] - late
     send(pairing, [event for event in at_all(stamps) if event != ("mask", missing)])
@@ -81,7 +82,7 @@ def test_a_late_mask_is_paired_with_what_belongs_to_it_and_is_no_time_jump(late:
 
 
 def test_a_late_mask_after_which_no_other_comes_is_paired_two_seconds_later_while_other_streams_go_on() -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     stamps = [10 * S + i * 100 * MS for i in range(80)]
     send(pairing, [event for event in at_all(stamps) if event != ("mask", stamps[40])])
     pairing.take()
@@ -96,7 +97,7 @@ def test_a_late_mask_after_which_no_other_comes_is_paired_two_seconds_later_whil
 
 
 def test_a_second_of_silence_after_masks_that_are_behind_shows_that_time_was_set_back() -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     send(pairing, [*at_all([8 * S, 9 * S]), ("mask", 1 * S), ("pose", 1 * S)])
     pairing.expire(5.0)
     send(pairing, [("info", 10 * S)])  # Was under way.
@@ -110,7 +111,7 @@ def test_a_second_of_silence_after_masks_that_are_behind_shows_that_time_was_set
 
 
 def test_a_reset_is_seen_by_poses_alone_while_slow_masks_still_come_from_before_it() -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     stamps = [1 * S + i * 100 * MS for i in range(80)]
     send(pairing, at_all(stamps))
     pairing.take()
@@ -126,7 +127,7 @@ def test_a_reset_is_seen_by_poses_alone_while_slow_masks_still_come_from_before_
 
 
 def test_when_the_clock_is_set_back_nothing_of_a_later_time_is_used_any_more() -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     send(pairing, at_all([1 * S, 2 * S, 9 * S]))
     send(pairing, [("mask", 5 * S)])
     pairing.take()
@@ -140,7 +141,7 @@ def test_when_the_clock_is_set_back_nothing_of_a_later_time_is_used_any_more() -
 
 @pytest.mark.parametrize("clock_first", [True, False])
 def test_a_clock_and_streams_that_are_set_back_together_are_one_jump(clock_first: bool) -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     send(pairing, at_all([8 * S, 9 * S]))
     if clock_first:
         pairing.set_back(1 * S)
@@ -155,7 +156,7 @@ def test_a_clock_and_streams_that_are_set_back_together_are_one_jump(clock_first
 
 @pytest.mark.parametrize("kind", ["mask", "pose", "info"])
 def test_after_a_stamp_far_ahead_the_stream_is_paired_on(kind: str) -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     send(pairing, [*at_all([9 * S]), (kind, 9000 * S)])
     later = [9 * S + i * 100 * MS for i in range(1, 100)]
     for i, stamp in enumerate(later):
@@ -165,7 +166,7 @@ def test_after_a_stamp_far_ahead_the_stream_is_paired_on(kind: str) -> None:
 
 
 def test_stragglers_from_before_time_was_set_back_are_not_a_second_jump() -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     send(pairing, at_all([8 * S, 9 * S]))
     send(pairing, [("pose", 1 * S), ("mask", 10 * S), ("info", 10 * S), ("mask", 1 * S), ("info", 1 * S)])
     assert [p.stamp for p in pairing.take()] == [8 * S, 9 * S, 1 * S]
@@ -175,7 +176,7 @@ def test_stragglers_from_before_time_was_set_back_are_not_a_second_jump() -> Non
 
 @pytest.mark.parametrize("kind", ["mask", "pose", "info"])
 def test_a_single_wrong_stamp_does_not_stop_the_pairing(kind: str) -> None:
-    pairing = Pairing(ExactPoses(), PairingSettings(max_waiting=5))
+    pairing = Pairing(MessagePoses(), PairingSettings(max_waiting=5))
     send(pairing, at_all([9 * S]))
     send(pairing, [(kind, 0)])
     later = [9 * S + i * 100 * MS for i in range(1, 30)]
@@ -184,7 +185,7 @@ def test_a_single_wrong_stamp_does_not_stop_the_pairing(kind: str) -> None:
 
 
 def test_a_stream_that_ends_with_a_wrong_stamp_does_not_stop_the_others() -> None:
-    pairing = Pairing(ExactPoses(), PairingSettings(max_waiting=5))
+    pairing = Pairing(MessagePoses(), PairingSettings(max_waiting=5))
     send(pairing, [*at_all([9 * S]), ("info", 0)])
     later = [9 * S + i * 100 * MS for i in range(1, 30)]
     send(pairing, [(kind, stamp) for stamp in later for kind in ("mask", "pose")])
@@ -193,7 +194,7 @@ def test_a_stream_that_ends_with_a_wrong_stamp_does_not_stop_the_others() -> Non
 
 
 def test_a_rare_camera_info_belongs_to_each_round_of_a_loop() -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     stamps = [1 * S + i * 100 * MS for i in range(30)]
     for _ in range(3):
         send(pairing, [("mask", stamps[0]), ("pose", stamps[0]), ("info", stamps[0])])
@@ -204,7 +205,7 @@ def test_a_rare_camera_info_belongs_to_each_round_of_a_loop() -> None:
 
 
 def test_a_slow_stream_may_come_in_late_after_time_was_set_back() -> None:
-    pairing = Pairing(ExactPoses())
+    pairing = Pairing(MessagePoses())
     send(pairing, [*at_all([9 * S]), ("mask", 1 * S), ("pose", 1 * S), ("info", 3 * S), *at_all([3 * S + 1])])
     assert {p.camera_info for p in pairing.take()} >= {f"info {3 * S + 1}"}
     send(pairing, [("pose", 3 * S), ("mask", 3 * S)])

@@ -19,10 +19,10 @@ from gsseg_ros.client import SegmentationClient
 from gsseg_ros.client.view_source import RosSource
 
 # Of the kinds of pose source and of transports one is there at a time, a clock only with use_sim_time, images while
-# they are shown, and detections only where vision_msgs is installed.
+# they are shown, depth if it is asked for, and detections only where vision_msgs is installed.
 ONE_OF = {
     "/pose", "/odometry", "/tf", "/tf_static", "/clock", "/image", "/image/compressed", "/mask/compressed",
-    "/gsseg/detections_3d",
+    "/depth", "/gsseg/detections_3d",
 }  # fmt: skip
 
 

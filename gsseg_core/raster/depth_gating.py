@@ -1,0 +1,106 @@
+"""Depth gating: a mask's pixels count only where a depth camera saw the scene, and not what stood before it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.view import View
+from gsseg_core.errors import MaskSizeError, SettingsError
+from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.depth import COVERED, surface
+from gsseg_core.scene.gaussian_scene import GaussianScene
+
+
+@dataclass(frozen=True)
+class DepthTolerance:
+    """How far a measured depth may be from the scene's: `absolute + relative * depth`.
+
+    Attributes
+    ----------
+    absolute : float
+        In the units of the measured depth, such as metres.
+    relative : float
+        Share of the scene's depth.
+
+    Raises
+    ------
+    SettingsError
+        One of them is negative, NaN or infinite.
+    """
+
+    absolute: float = 0.1
+    relative: float = 0.05
+
+    def __post_init__(self) -> None:
+        """Validate."""
+        for name in ("absolute", "relative"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise SettingsError(f"depth_tolerance.{name} is {value:g}; expected 0 or more")
+
+
+class Gated(NamedTuple):
+    """A view without the pixels of its mask that a measured depth contradicts."""
+
+    view: View
+    contradicted: np.ndarray  # (H, W) bool: labelled, and measured elsewhere than the scene is
+    measured: np.ndarray  # (H, W) bool: where the depth says anything
+
+
+def gate_view(
+    scene: GaussianScene,
+    view: View,
+    depth: np.ndarray,  # (H, W)
+    tolerance: DepthTolerance | None = None,
+    *,
+    scale: float = 1.0,
+    device: str = "cpu",
+) -> Gated:
+    """Make those pixels of a view's mask unknown in which a depth camera measured something else than the scene.
+
+    What is nearer than the scene by more than the tolerance, as a person, hides it. What is farther shows that
+    something of the scene is gone; that counts only where the scene covers more than half of the ray, for through less
+    one sees what lies behind.
+
+    Parameters
+    ----------
+    scene : GaussianScene
+        What the view is of.
+    view : View
+        With a mask.
+    depth : (H, W) float
+        Measured along the optical axis, in the view's own pixels; zero, negative, NaN or infinite where nothing was
+        measured, which says nothing.
+    tolerance : DepthTolerance, optional
+        How far the two may be apart, in the units of `depth`.
+    scale : float
+        Units of `depth` per unit of the scene, such as metres.
+    device : str
+        Where the depth of the scene is rendered.
+
+    Raises
+    ------
+    MaskSizeError
+        The depth is not of the size of the view.
+    GssegError
+        The mask cannot be read.
+    """
+    camera, tolerance = view.camera, tolerance or DepthTolerance()
+    if depth.shape != (camera.height, camera.width):
+        raise MaskSizeError(
+            f"view '{camera.name}': depth has shape {depth.shape}; expected ({camera.height}, {camera.width})"
+        )
+    seen, measured = view.read_seen(), np.isfinite(depth) & (depth > 0)
+    coverage, rendered = surface(scene, make_operator(scene, camera, device))
+    # Rays that meet nothing of the scene have no depth to compare with.
+    compared = measured & np.isfinite(rendered) & (seen.labels != UNKNOWN)
+    expected = np.where(compared, rendered, 1).astype(np.float64) * scale
+    off = np.where(compared, depth, expected) - expected
+    margin = tolerance.absolute + tolerance.relative * expected
+    contradicted = (off < -margin) | ((off > margin) & (coverage > COVERED))
+    gated = View.from_seen(camera, seen.hidden(contradicted), view.class_names)
+    return Gated(replace(gated, image_path=view.image_path), contradicted, measured)

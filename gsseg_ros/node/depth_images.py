@@ -1,0 +1,93 @@
+"""Depth images beside masks: read, brought to the mask's pixels, and held against the scene."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from sensor_msgs.msg import Image
+
+from gsseg_core.data.view import View
+from gsseg_core.errors import GssegError, MaskFormatError
+from gsseg_core.live.session import LiveSession
+from gsseg_core.raster.depth_gating import Gated, gate_view
+from gsseg_ros.conversions import picture_from_image
+from gsseg_ros.errors import DepthImageError
+from gsseg_ros.node.parameters import Settings
+from gsseg_ros.node.size_limits import require_size
+
+_METRES = {"16UC1": 1e-3, "32FC1": 1.0}
+"""Of one unit of each encoding (REP 118)."""
+
+
+def gate_by_image(
+    session: LiveSession, view: View, message: Image, topic: str, frame_id: str, settings: Settings
+) -> Gated:
+    """Make those pixels of a view's mask unknown in which a depth image contradicts the scene.
+
+    Parameters
+    ----------
+    session : LiveSession
+        Of the scene.
+    view : View
+        With the mask, undistorted where its lens is distorted.
+    message : Image
+        Depth of the same image as the mask's, of the same size or another of the same proportions; of a raw image, it
+        is undistorted as the mask was.
+    topic, frame_id : str
+        Of the depth image; of the mask.
+    settings : Settings
+        The node's.
+
+    Raises
+    ------
+    DepthImageError
+        It is of another frame, encoding or shape, or broken.
+    """
+    try:
+        require_size(message, settings.max_pixels, topic)
+        if message.header.frame_id != frame_id and message.header.frame_id and frame_id:
+            raise MaskFormatError(
+                f"{topic}: frame_id is '{message.header.frame_id}', the mask's is '{frame_id}'; expected depth "
+                "registered to the camera of the masks, as depth_image_proc or the camera's driver makes it"
+            )
+        depth = _resized(depth_from_image(message, topic), *view.camera.image_size, topic)
+        if view.camera.undistortion is not None:
+            depth = view.camera.undistortion.sample(depth, 0)
+        scale = settings.scene_to_map.scale
+        return gate_view(session.scene, view, depth, settings.depth_tolerance, scale=scale, device=session.device)
+    except GssegError as error:
+        raise DepthImageError(str(error)) from error
+
+
+def depth_from_image(message: Image, topic: str) -> npt.NDArray[np.float32]:
+    """Read a depth image (H, W) in metres, sent as 16UC1 in millimetres or as 32FC1; 0 or NaN where there is none.
+
+    Raises
+    ------
+    MaskFormatError
+        Another encoding, a size of zero, or data too short.
+    """
+    if message.encoding not in _METRES:
+        expected = ", ".join(_METRES)
+        raise MaskFormatError(f"{topic}: encoding is '{message.encoding}'; expected depth as one of {expected}")
+    depth: npt.NDArray[np.float32] = picture_from_image(message, topic).astype(np.float32)
+    depth *= np.float32(_METRES[message.encoding])
+    return depth
+
+
+def _resized(
+    depth: npt.NDArray[np.float32],  # (H, W)
+    width: int,
+    height: int,
+    topic: str,
+) -> npt.NDArray[np.float32]:
+    """Take the nearest pixels of a depth image for one of another size (height, width)."""
+    rows, columns = depth.shape
+    if min(abs(columns - width * rows / height), abs(rows - height * columns / width)) >= 1:
+        raise MaskFormatError(
+            f"{topic}: image is {columns} x {rows} pixels; expected {width} x {height}, as masks are, or a size of the "
+            "same proportions"
+        )
+    row, column = ((np.arange(n) * 2 + 1) * m // (2 * n) for n, m in ((height, rows), (width, columns)))
+    resized: npt.NDArray[np.float32] = depth[row[:, None], column]
+    return resized

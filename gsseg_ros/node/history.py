@@ -1,0 +1,49 @@
+"""Values by stamp, the newest ones, for the inputs that wait for one another."""
+
+from __future__ import annotations
+
+from bisect import insort
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+
+class History(Generic[T]):
+    """Values by stamp, those of the newest stamps.
+
+    Parameters
+    ----------
+    capacity : int
+        Values that are kept, or what their sizes may add up to; the newest one is kept whatever its size.
+    size : callable
+        Size of a value; 1 unless given.
+
+    Attributes
+    ----------
+    stamps : list of int
+        Ascending.
+    values : dict of int
+        By stamp.
+    """
+
+    def __init__(self, capacity: int, size: Callable[[T], int] = lambda value: 1) -> None:
+        self._capacity, self._size, self._total = capacity, size, 0
+        self.stamps: list[int] = []
+        self.values: dict[int, T] = {}
+
+    def add(self, stamp: int, value: T) -> None:
+        """Keep the value of a stamp; of two with the same stamp the first stays."""
+        if stamp in self.values:
+            return
+        insort(self.stamps, stamp)
+        self.values[stamp] = value
+        self._total += self._size(value)
+        while self._total > self._capacity and len(self.stamps) > 1:
+            self._total -= self._size(self.values.pop(self.stamps.pop(0)))
+
+    def clear(self) -> None:
+        """Forget all values."""
+        self.stamps.clear()
+        self.values.clear()
+        self._total = 0

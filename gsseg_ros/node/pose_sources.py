@@ -1,0 +1,194 @@
+"""Poses of cameras at the stamps of their masks: of exactly that stamp, of those around it, or of TF first.
+
+Nothing here knows ROS; `gsseg_ros.node.tf_poses` has the poses that TF knows.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from dataclasses import dataclass, replace
+from typing import Protocol, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from gsseg_ros.frames import interpolate
+from gsseg_ros.node.history import History
+from gsseg_ros.node.timeline import BEHIND_NS, SECOND
+
+Pose: TypeAlias = npt.NDArray[np.float64]  # (4, 4)
+
+_POSES_KEPT = 2000  # At 200 Hz, those of ten seconds.
+
+
+@dataclass(frozen=True, eq=False)
+class GivenPose:
+    """A pose as a message gives it.
+
+    Attributes
+    ----------
+    matrix : ndarray (4, 4)
+        From the child frame to the frame, in metres.
+    frame_id : str
+        Frame that it is in; "" for the map.
+    child_frame_id : str
+        Frame whose pose it is; "" for one that is not named.
+    """
+
+    matrix: Pose
+    frame_id: str = ""
+    child_frame_id: str = ""
+
+
+class Frames(Protocol):
+    """Knowledge of how frames lie to each other."""
+
+    def camera_in_map(self, given: GivenPose, stamp: int, frame_id: str) -> Pose | None:
+        """Pose (4, 4) in the map of the camera `frame_id`, of a pose at `stamp`; None if it is not known (yet)."""
+
+
+class PoseSource(Protocol):
+    """Source of the poses of cameras in the map."""
+
+    @property
+    def knows_frames(self) -> bool:
+        """Whether it may tell cameras apart, by the frame_id of their masks."""
+
+    def at(self, stamp: int, frame_id: str = "", last_chance: bool = False, several: bool = False) -> Pose | None:
+        """Find the pose (4, 4) at `stamp` of the camera whose masks carry `frame_id`; None if not known (yet).
+
+        With `last_chance`, nothing more is waited for. With `several`, other cameras have masks of this stamp, and only
+        a pose will do that is known to be of this one.
+        """
+
+    def too_late(self, stamp: int) -> bool:
+        """Whether no pose for `stamp` can come any more."""
+
+    def clear(self) -> None:
+        """Forget everything: time was set back."""
+
+
+class MessagePoses:
+    """Poses from messages: that of exactly a mask's stamp, or those close enough to it.
+
+    Parameters
+    ----------
+    tolerance_s : float
+        Seconds that a pose may lie before or after the mask. Between one before and one after, it is interpolated;
+        where only one of them is as close, that one is taken.
+    frames : Frames, optional
+        Takes poses to the map and to the camera; without, they are those of cameras in the map.
+    """
+
+    def __init__(self, tolerance_s: float = 0.0, frames: Frames | None = None) -> None:
+        self._poses: History[GivenPose] = History(_POSES_KEPT)
+        self._tolerance_ns, self._frames = round(tolerance_s * SECOND), frames
+
+    @property
+    def knows_frames(self) -> bool:
+        """False: a message does not say of which camera it is."""
+        return False
+
+    def add(self, stamp: int, given: GivenPose) -> None:
+        """Keep the pose of a stamp; of two with the same stamp the first stays."""
+        self._poses.add(stamp, given)
+
+    def at(self, stamp: int, frame_id: str = "", last_chance: bool = False, several: bool = False) -> Pose | None:
+        """Find the pose (4, 4) as `PoseSource` says."""
+        given = self._given(stamp, last_chance)
+        if given is None or (several and not (self.knows_frames and given.child_frame_id and frame_id)):
+            return None
+        return given.matrix if self._frames is None else self._frames.camera_in_map(given, stamp, frame_id)
+
+    def too_late(self, stamp: int) -> bool:
+        """Whether the poses have gone on from `stamp` by more than they come out of order."""
+        went_on = bool(self._poses.stamps) and self._poses.stamps[-1] >= stamp + BEHIND_NS + self._tolerance_ns
+        return went_on and self._given(stamp, True) is None
+
+    def clear(self) -> None:
+        """Forget all poses."""
+        self._poses.clear()
+
+    def _given(self, stamp: int, last_chance: bool) -> GivenPose | None:
+        """Find the pose of a stamp, as messages gave it; None if it is not there (yet)."""
+        exact, stamps = self._poses.values.get(stamp), self._poses.stamps
+        after = bisect_left(stamps, stamp)
+        if exact is not None or not self._tolerance_ns or not (last_chance or after < len(stamps)):
+            return exact
+        near = [s for s in stamps[max(after - 1, 0) : after + 1] if abs(s - stamp) <= self._tolerance_ns]
+        if len(near) == 2:
+            return self._between(near[0], near[1], stamp)
+        return self._poses.values[near[0]] if near else None
+
+    def _between(self, earlier: int, later: int, stamp: int) -> GivenPose | None:
+        """Interpolate; None between poses in different frames, or of different ones."""
+        a, b = self._poses.values[earlier], self._poses.values[later]
+        if (a.frame_id, a.child_frame_id) != (b.frame_id, b.child_frame_id):
+            return None
+        return replace(a, matrix=interpolate(a.matrix, b.matrix, (stamp - earlier) / (later - earlier)))
+
+
+class InterpolatedPoses(MessagePoses):
+    """Poses of an odometry, which runs at its own rate: between the two that bracket a mask's stamp.
+
+    Parameters
+    ----------
+    max_gap_s : float
+        The two may be so many seconds apart.
+    frames : Frames, optional
+        As for `MessagePoses`.
+    tells_apart : bool
+        Whether `frames` knows where on the robot each camera is.
+    """
+
+    def __init__(self, max_gap_s: float = 0.2, frames: Frames | None = None, tells_apart: bool = False) -> None:
+        super().__init__(0.0, frames)
+        self._max_gap_ns, self._tells_apart = round(max_gap_s * SECOND), tells_apart
+
+    @property
+    def knows_frames(self) -> bool:
+        """Whether cameras are told apart by where they are on the robot."""
+        return self._tells_apart
+
+    def _given(self, stamp: int, last_chance: bool) -> GivenPose | None:
+        exact, stamps = self._poses.values.get(stamp), self._poses.stamps
+        after = bisect_left(stamps, stamp)
+        if exact is not None or not 0 < after < len(stamps):
+            return exact
+        earlier, later = stamps[after - 1], stamps[after]
+        return None if later - earlier > self._max_gap_ns else self._between(earlier, later, stamp)
+
+
+class TfFirst(MessagePoses):
+    """Poses that TF knows, and else those of messages.
+
+    Parameters
+    ----------
+    tf : PoseSource
+        Asked first, at the mask's stamp.
+    tolerance_s, frames
+        As for `MessagePoses`.
+    """
+
+    def __init__(self, tf: PoseSource, tolerance_s: float = 0.0, frames: Frames | None = None) -> None:
+        super().__init__(tolerance_s, frames)
+        self._tf = tf
+
+    @property
+    def knows_frames(self) -> bool:
+        """True: TF tells cameras apart, and is asked alone where that matters."""
+        return True
+
+    def at(self, stamp: int, frame_id: str = "", last_chance: bool = False, several: bool = False) -> Pose | None:
+        """Find the pose (4, 4) as `PoseSource` says."""
+        known = self._tf.at(stamp, frame_id)
+        return super().at(stamp, frame_id, last_chance) if known is None and not several else known
+
+    def too_late(self, stamp: int) -> bool:
+        """Tell nothing, as TF may still come to know it."""
+        return False
+
+    def clear(self) -> None:
+        """Forget all poses, and all transforms but the static ones."""
+        super().clear()
+        self._tf.clear()
