@@ -32,6 +32,14 @@ class EmptySceneError(GssegError):
     """A scene, or a selection from one, holds no Gaussian."""
 
 
+class SceneDeltaError(GssegError):
+    """A change of a scene is damaged or out of turn, or does not fit the Gaussians and groups that are there."""
+
+
+class UnknownGroupError(GssegError):
+    """A view belongs to a group that the scene has not."""
+
+
 class CameraFileError(GssegError):
     """A camera file is missing or broken, or a folder has no cameras."""
 

@@ -66,6 +66,8 @@ class Segmentation:
         What these had learnt themselves, in the order of the scene; zeros where unobserved. Not calibrated.
     temperature : float
         At which the probabilities are; 1 where they are those that blend, as they were learnt.
+    ids : (N,) int64 or None
+        Ids of the Gaussians that stay while the scene changes, if it has any; see docs/living_map.md.
     """
 
     labels: np.ndarray
@@ -75,6 +77,7 @@ class Segmentation:
     clustered: np.ndarray
     learnt: np.ndarray
     temperature: float = 1.0
+    ids: np.ndarray | None = None
 
     @classmethod
     def from_codes(
@@ -113,7 +116,7 @@ class Segmentation:
             refined = cluster(scene.means, codes, observed, settings.k, settings.beta, neighbours)
             probabilities, clustered = refined.probabilities, refined.changed
         _, labels = largest(probabilities)  # -1, which is UNOBSERVED, where nothing is known
-        return cls(labels, probabilities, names, scene.digest, clustered, codes[clustered])
+        return cls(labels, probabilities, names, scene.digest, clustered, codes[clustered], ids=scene.ids)
 
     def filtered(self, scene: GaussianScene, settings: RefineSettings) -> Segmentation:
         """Take the outliers out of each object: the paper's statistical filter."""
@@ -230,7 +233,7 @@ class Segmentation:
         return CSRRows.from_dense(codes), bool(codes[:, 0].any())
 
     def save(self, path: str | os.PathLike[str], run: str | None = None) -> None:
-        """Write labels, probabilities, confidence, class ids and names as one npz, atomically.
+        """Write labels, probabilities, confidence, class ids and names as one npz, atomically; ids where there are any.
 
         `run` is the id of the run that it belongs to, for the header.
 
@@ -242,7 +245,8 @@ class Segmentation:
         header = {"format": FORMAT, "scene": self.scene_digest, "class_names": self.class_names,
                   "temperature": self.temperature, **({} if run is None else {"run": run})}  # fmt: skip
         names = ("labels", "probabilities", "class_ids", "confidence", "clustered", "learnt")
-        write_npz(path, header, **{name: getattr(self, name) for name in names})
+        arrays = {name: getattr(self, name) for name in names}
+        write_npz(path, header, **arrays, **({} if self.ids is None else {"ids": self.ids}))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], scene: GaussianScene) -> Segmentation:
@@ -280,4 +284,4 @@ class Segmentation:
                 raise UnfitError("array class_ids holds other ids than class_names of its header; expected the same")
             check_shares("probabilities", probabilities)
             check_shares("learnt", learnt)
-        return cls(labels, probabilities, names, scene.digest, clustered, learnt, temperature)
+        return cls(labels, probabilities, names, scene.digest, clustered, learnt, temperature, scene.ids)

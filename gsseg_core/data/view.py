@@ -50,6 +50,9 @@ class View:
     numbering : tuple of int, or None
         If given, the mask holds these ids, ascending, and labels are read as places among them; see
         `Dataset.numbered`. `class_names` are by place.
+    group : int or None
+        The group of Gaussians that the camera moves with, and in whose frame its pose is, see docs/living_map.md; None
+        if it stays where it is in the scene.
     """
 
     camera: Camera
@@ -61,6 +64,7 @@ class View:
     numbering: tuple[int, ...] | None = None
     foreign_mask: ViewMask | None = field(default=None, repr=False)
     label_map: LabelMap | None = field(default=None, repr=False)
+    group: int | None = None
     _mask: PackedMask | None = field(default=None, repr=False)
 
     @classmethod

@@ -187,11 +187,19 @@ def open_arrays(path: Path, expected: str, error: type[GssegError], within: Path
         raise error(f"{path}: is not {expected}, or is damaged ({reason(cause)})") from cause
 
 
+def read_json_header(arrays: NpzArrays) -> dict[str, Any]:
+    """Read the JSON header of an npz; `ValueError` if it is no object."""
+    header = json.loads(arrays.text("header"))
+    if not isinstance(header, dict):
+        raise ValueError("its header is no JSON object")
+    return header
+
+
 @contextmanager
 def open_npz(
-    path: Path, what: str, file_format: str, digest: str, within: Path | None = None
+    path: Path, what: str, file_format: str, digest: str | None, within: Path | None = None
 ) -> Iterator[tuple[NpzArrays, Any]]:
-    """Open an npz with a JSON header, which must say `file_format` under "format" and `digest` under "scene".
+    """Open an npz with a JSON header, which must say `file_format` as "format" and `digest`, if given, as "scene".
 
     What is yielded, the arrays and the header, is as safe as that of `open_arrays`.
 
@@ -205,17 +213,21 @@ def open_npz(
         The file lies outside `within`.
     """
     with open_arrays(path, what, StateFileError, within) as arrays:
-        header = json.loads(arrays.text("header"))
-        if not isinstance(header, dict):
-            raise ValueError("its header is no JSON object")
+        header = read_json_header(arrays)
         if header.get("format") != file_format:
             raise StateFileError(f"{path}: format is {quoted(header.get('format'))}; expected {file_format!r}")
-        if header.get("scene") != digest:
-            raise StateMismatchError(
-                f"{path}: belongs to the scene {clipped(str(header.get('scene'))[:12])}; expected {digest[:12]}, the "
-                "scene in use"
-            )
+        if digest is not None:
+            check_scene(path, header, digest)
         yield arrays, header
+
+
+def check_scene(path: Path, header: dict[str, Any], digest: str) -> None:
+    """Raise `StateMismatchError` unless the header of an npz says that it belongs to the scene with this digest."""
+    if header.get("scene") != digest:
+        raise StateMismatchError(
+            f"{path}: belongs to the scene {clipped(str(header.get('scene'))[:12])}; expected {digest[:12]}, the "
+            "scene in use"
+        )
 
 
 def npz_format(path: Path) -> str:

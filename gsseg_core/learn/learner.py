@@ -291,7 +291,7 @@ class Learner(ABC):
     def _vote(self, view: View, sign: int) -> None:
         """Add a view's votes, or take them away, and keep nothing of it."""
         seen = self._read(view)
-        operator = make_operator(self.scene, view.camera, self.device)
+        operator = self._operator_of(view)
         if not operator.vote(*self._used_labels(seen, operator), self._votes, UNITS, sign):
             raise UnusableViewError(SEES_NOTHING)
 
@@ -315,8 +315,11 @@ class Learner(ABC):
             raise UnusableViewError(ALL_UNKNOWN)
         return seen
 
+    def _operator_of(self, view: View) -> ViewOperator:
+        return make_operator(self.scene, view.camera, self.device)
+
     def _prepare(self, view: View, seen: SeenLabels) -> Observation:
-        operator = make_operator(self.scene, view.camera, self.device)
+        operator = self._operator_of(view)
         return operator.observe(*self._used_labels(seen, operator))
 
     def _used_labels(self, seen: SeenLabels, operator: ViewOperator) -> SeenLabels:
@@ -355,7 +358,7 @@ class Learner(ABC):
             self.observed_[unsure] = self.codes_[unsure].any(axis=1)
 
     def _blend_codes(self, codes: np.ndarray, view: View) -> np.ndarray:
-        image, left_over = make_operator(self.scene, view.camera, self.device).blend(codes)
+        image, left_over = self._operator_of(view).blend(codes)
         if codes[:, 0].any():
             image[..., 0] += left_over
         return image

@@ -1,11 +1,15 @@
-"""What has been learnt of one scene, on disk: views with their masks, votes and codes, in one compressed npz."""
+"""What has been learnt of one scene, on disk: views with their masks, votes and codes, in one compressed npz.
+
+The state of a scene that changes holds the geometry of the scene, too: votes can then be carried over to what the scene
+has become.
+"""
 
 from __future__ import annotations
 
 import json
 import os
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +25,7 @@ from gsseg_core.files.limits import LIMITS, MAX_LABEL
 from gsseg_core.files.npz_files import (
     NpzArrays,
     UnfitError,
+    check_scene,
     check_shares,
     class_names_of,
     npz_format,
@@ -28,7 +33,10 @@ from gsseg_core.files.npz_files import (
     temperature_of,
     whole_number,
 )
+from gsseg_core.scene import living_files
 from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.living_scene import LivingScene
+from gsseg_core.scene.scene_delta import MAX_ID
 from gsseg_core.text import clipped, quoted
 
 FORMAT = "gsseg-state-1"
@@ -57,9 +65,10 @@ class State:
     num_fused: int  # views in the votes, at least as many as were kept
     class_names: dict[int, str] = field(default_factory=dict)  # as far as they are known
     learnt: Learnt | None = None  # the best codes
+    living: LivingScene | None = None  # the scene, if it changes and so is in the file
 
     def save(self, path: str | os.PathLike[str], digest: str) -> None:
-        """Write the state of the scene with this digest, atomically. The scene itself is not in the file.
+        """Write the state of the scene with this digest, atomically. Colours of the scene are not in the file.
 
         Raises
         ------
@@ -75,7 +84,7 @@ class State:
             "format": FORMAT,
             "scene": digest,
             "shape": list(self.votes.shape),
-            "views": [{"name": view.name, "size": [view.camera.width, view.camera.height]} for view in self.views],
+            "views": [_entry(view) for view in self.views],
             "num_fused": self.num_fused,
             "class_names": self.class_names,
         }
@@ -83,6 +92,9 @@ class State:
         if self.learnt is not None:
             header["learnt"] = {name: value for name, value in vars(self.learnt).items() if name != "codes"}
             arrays["codes"] = self.learnt.codes
+        if self.living is not None:
+            header["frames"] = living_files.frame_entries(self.living)
+            arrays |= living_files.arrays(self.living)
         for i, view in enumerate(self.views):
             arrays[f"labels_{i}"], evidence = view.read_seen()
             if evidence is not None and evidence.mass is not None:
@@ -95,8 +107,14 @@ class State:
             _require_replaceable(path)  # To save takes long.
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str], digest: str, num_gaussians: int, within: Path | None = None) -> State:
+    def load(
+        cls, path: str | os.PathLike[str], digest: str, num_gaussians: int, within: Path | None = None,
+        first: LivingScene | None = None,
+    ) -> State:  # fmt: skip
         """Read what was saved for the same scene, below `within` if given, links followed; all of it is checked.
+
+        With `first`, what was saved for that scene or holds the geometry of its own is read as well; `living` is then
+        the scene that it was saved for.
 
         Raises
         ------
@@ -108,7 +126,14 @@ class State:
             The file lies outside `within`.
         """
         path = Path(path)
-        with open_npz(path, "a saved state", FORMAT, digest, within) as (file, header):
+        with open_npz(path, "a saved state", FORMAT, None if first else digest, within) as (file, header):
+            living = living_files.read(file, header) if living_files.is_in(file) else None
+            if first is not None and header.get("scene") == first.scene.digest:
+                living = living or first
+            if first is not None and living is not None:
+                num_gaussians = len(living)
+            else:
+                check_scene(path, header, digest)
             n, k = header["shape"]
             if n != num_gaussians:
                 raise UnfitError(f"holds {clipped(n)} Gaussians; expected {num_gaussians}, as the scene has")
@@ -128,7 +153,12 @@ class State:
                 check_shares("codes", codes)
                 num_views = whole_number(entry["num_views"], "num_views of what was learnt", 0, _MOST_VIEWS)
                 learnt = Learnt(str(entry["learner"]), codes, num_views, temperature_of(entry))
-            return cls(votes, views, num_fused, class_names_of(header), learnt)
+            return cls(votes, views, num_fused, class_names_of(header), learnt, living)
+
+
+def _entry(view: View) -> dict[str, Any]:
+    entry: dict[str, Any] = {"name": view.name, "size": [view.camera.width, view.camera.height]}
+    return entry if view.group is None else {**entry, "group": view.group}
 
 
 def _require_replaceable(path: Path) -> None:
@@ -167,6 +197,8 @@ def _read_view(file: NpzArrays, i: int, entry: dict[str, Any], num_classes: int)
             view = View.from_seen(camera, SeenLabels(labels, _read_evidence(file, i, labels)))
         else:
             view = View.from_arrays(camera, labels)
+        if "group" in entry:
+            view = replace(view, group=whole_number(entry["group"], "group of a view", 0, MAX_ID))
     except GssegError as error:
         raise UnfitError(str(error)) from error
     if view.largest_label >= num_classes:

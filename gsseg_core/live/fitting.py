@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
+from gsseg_core.errors import UnknownLabelError
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.learner_state import Learnt
@@ -29,3 +31,14 @@ def fitted(name: str, learner: Learner, views: Sequence[View], report: Report, w
         temperature = calibrate(learner, progress=progress).temperature
     learnt = Learnt(name, learner.codes_, len(learner.views), temperature)
     return Outcome(learnt, len(learner.history_), learner.converged_, learner.loss, dict(learner.rejected))
+
+
+def num_classes_with(dataset: Dataset, num_classes: int, max_classes: int) -> int:
+    """Count the classes once those of a dataset are added; raises `UnknownLabelError` if they are too many."""
+    num_classes = max(num_classes, dataset.num_classes)
+    if num_classes > max_classes:
+        raise UnknownLabelError(
+            f"{dataset.root}: has {num_classes} classes; expected at most {max_classes}, as max_classes says, or "
+            "class_names that declare them"
+        )
+    return num_classes

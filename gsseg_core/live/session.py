@@ -6,7 +6,9 @@ import os
 import threading
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -24,7 +26,7 @@ from gsseg_core.errors import (
 from gsseg_core.learn.learner_state import Learnt, State
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.learn.vote_learner import VoteLearner
-from gsseg_core.live.fitting import Report, fitted
+from gsseg_core.live.fitting import Report, fitted, num_classes_with
 from gsseg_core.live.results import SCENE_CHANGED, Outcome, Rejection
 from gsseg_core.progress import Stopwatch
 from gsseg_core.refine.settings import RefineSettings
@@ -93,6 +95,7 @@ class LiveSession:
         self._names = {0: BACKGROUND_NAME, **(class_names or {})}
         self._lock = threading.RLock()
         self._version = 0
+        self._scenes: WeakKeyDictionary[Segmentation, GaussianScene] = WeakKeyDictionary()
         self._forget()
 
     @property
@@ -209,10 +212,12 @@ class LiveSession:
             A file of the dataset is broken.
         """
         with self._lock:
-            views, num_classes, era = list(self._live.views.values()), self._live.num_classes, self._era
+            views, num_classes, era, scene = self._posed_views(), self._live.num_classes, self._era, self.scene
         if dataset is not None:
-            views, num_classes = dataset.views("train"), self._num_classes_with(dataset, num_classes)
-        made = make_learner(learner, self.scene, num_classes, max_steps=max_steps, device=self.device)
+            views = dataset.views("train")
+            if not self._declared:
+                num_classes = num_classes_with(dataset, num_classes, self.max_classes)
+        made = make_learner(learner, scene, num_classes, max_steps=max_steps, device=self.device)
         views = spread(views, num_views)
         outcome = fitted(learner, made, views, report, watch or Stopwatch())
         with self._lock:
@@ -221,22 +226,11 @@ class LiveSession:
             if dataset is not None and not self._declared:
                 self._names.update(dataset.class_names)
             self._live.grow(num_classes)
+            outcome = replace(outcome, learnt=self._carried(outcome.learnt, scene))
             self._learnt = outcome.learnt
             self._cameras = [] if dataset is None else [view.camera for view in views]
             self._version += 1
         return outcome
-
-    def _num_classes_with(self, dataset: Dataset, num_classes: int) -> int:
-        """Count the classes once those of a dataset are added; refuse too many."""
-        if self._declared:
-            return num_classes
-        num_classes = max(num_classes, dataset.num_classes)
-        if num_classes > self.max_classes:
-            raise UnknownLabelError(
-                f"{dataset.root}: has {num_classes} classes; expected at most {self.max_classes}, as "
-                "max_classes says, or class_names that declare them"
-            )
-        return num_classes
 
     def codes(self) -> np.ndarray:
         """Class probabilities of every Gaussian as they are now, (N, K) float32; a row of zeros where nothing is known.
@@ -269,25 +263,29 @@ class LiveSession:
         """
         settings, watch = settings or RefineSettings(), watch or Stopwatch()
         with self._lock:
-            key, known, names = (self._version, settings), self._segmented, self.class_names
+            key, known, names, scene = (self._version, settings), self._segmented, self.class_names, self.scene
             temperature = 1.0 if self._learnt is None else self._learnt.temperature
             if known is not None and known[0] == key:
                 return known[1]
             # Those of a dataset's views and of those that are kept; a state without either has nothing carved.
-            cameras = [*self._cameras, *(view.camera for view in self._live.views.values())]
+            cameras = [*self._cameras, *(view.camera for view in self._posed_views())]
             with watch.stage("codes"):
                 codes = self.codes()
         with watch.stage("knn"):
-            result = Segmentation.unfiltered(self.scene, codes, names, settings)
+            result = Segmentation.unfiltered(scene, codes, names, settings)
         if settings.filter:
             with watch.stage("filter"):
-                result = result.filtered(self.scene, settings)
+                result = result.filtered(scene, settings)
         if settings.carve:
             with watch.stage("carve"):
-                result = result.carved(self.scene, cameras, self.device, settings.carve_views)
+                result = result.carved(scene, cameras, self.device, settings.carve_views)
         result = result.calibrated(temperature)
-        self._segmented = (key, result)
+        self._segmented, self._scenes[result] = (key, result), scene
         return result
+
+    def scene_of(self, result: Segmentation) -> GaussianScene:
+        """Return the scene that a result of `segmentation` is of; it may have changed since."""
+        return self._scenes.get(result, self.scene)
 
     def save(self, path: str | os.PathLike[str]) -> int:
         """Save votes, views and class probabilities, atomically; return the number of views that they come from.
@@ -305,8 +303,9 @@ class LiveSession:
             if not self.has_codes:
                 raise NoCodesError(f"{path}: nothing to save; expected at least one view to be fused first")
             state = self._live.state()
-            names, fused, learnt = self.class_names, self.num_fused, self._learnt
-        State(state.votes, state.views, fused, names, learnt).save(path, self.scene.digest)
+            state = replace(state, num_fused=self.num_fused, class_names=self.class_names, learnt=self._learnt)
+            learnt, fused, scene = self._learnt, self.num_fused, self.scene
+        state.save(path, scene.digest)
         return learnt.num_views if learnt is not None else fused
 
     def load(self, path: str | os.PathLike[str], within: Path | None = None) -> int:
@@ -322,7 +321,7 @@ class LiveSession:
         PathNotAllowedError
             The file lies outside the folder `within`, links followed. Nothing has changed.
         """
-        state = State.load(path, self.scene.digest, len(self.scene), within)
+        state = self._read_state(Path(path), within)
         width = max(state.votes.shape[1], 0 if state.learnt is None else state.learnt.codes.shape[1])
         most, why = (len(self._names), ", as were named") if self._declared else (self.max_classes, " (max_classes)")
         if width > most:
@@ -360,12 +359,26 @@ class LiveSession:
 
     def _forget(self) -> None:
         num_classes = max(self._names) + 1 if self._declared else 1
-        # Views are rendered again by `learn`; to keep them prepared would take far more memory than their masks.
-        self._live = VoteLearner(self.scene, num_classes, device=self.device, memory_budget=0)
+        self._live = self._no_votes(num_classes)
         self._learnt, self._segmented, self.num_fused = None, None, 0
         self._cameras = []
         self._version += 1
         self.retire()
+
+    def _no_votes(self, num_classes: int) -> VoteLearner:
+        # Views are rendered again by `learn`; to keep them prepared would take far more memory than their masks.
+        return VoteLearner(self.scene, num_classes, device=self.device, memory_budget=0)
+
+    def _read_state(self, path: Path, within: Path | None) -> State:
+        return State.load(path, self.scene.digest, len(self.scene), within)
+
+    def _posed_views(self) -> list[View]:
+        """List the views that are kept, posed in the scene as it is now."""
+        return list(self._live.views.values())
+
+    def _carried(self, learnt: Learnt, scene: GaussianScene) -> Learnt:
+        """Carry what was learnt of the scene as it was over to the scene as it is."""
+        return learnt
 
     def _grow_for(self, view: View) -> None:
         if self._declared or not view.has_mask or (needed := view.largest_label + 1) <= self._live.num_classes:

@@ -17,6 +17,7 @@ from gsseg_core.files.limits import LIMITS
 from gsseg_core.scene import spherical_harmonics
 from gsseg_core.scene.ply import write_vertices
 from gsseg_core.scene.scene_formats import read_scene
+from gsseg_core.scene.scene_ids import read_ids
 from gsseg_core.scene.vertices import (
     DC,
     MEANS,
@@ -199,6 +200,17 @@ class GaussianScene:
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 3."""
         return REST_COUNTS.index(_count_rest(self.vertices))
+
+    @cached_property
+    def ids(self) -> npt.NDArray[np.int64] | None:
+        """Ids that stay while the scene changes, (N,) int64; None if its file has none, see docs/living_map.md.
+
+        Raises
+        ------
+        SceneValueError
+            They are no ids.
+        """
+        return read_ids(self.vertices, str(self.path or "scene"))
 
     @cached_property
     def sh(self) -> npt.NDArray[np.float32]:

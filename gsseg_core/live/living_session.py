@@ -1,0 +1,168 @@
+"""A live session whose scene may change under it, with its votes kept: a map that a robot goes on building."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from gsseg_core.data.view import View
+from gsseg_core.learn.learner_state import Learnt, State
+from gsseg_core.live.living_votes import LivingVotes
+from gsseg_core.live.matching_scenes import match_scenes
+from gsseg_core.live.scene_change import SceneChange
+from gsseg_core.live.session import LiveSession
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.living_files import without_colours
+from gsseg_core.scene.living_scene import LivingScene
+from gsseg_core.scene.scene_delta import SceneDelta
+
+
+@dataclass(frozen=True)
+class Changed:
+    """What a change of the scene did.
+
+    Attributes
+    ----------
+    revision : int or None
+        Number of the scene from now on; None if it came from a file.
+    num_carried, num_removed, num_added : int
+        Gaussians that were there before and still are; that no longer are; that were not there before.
+    matched_by : str
+        What told which Gaussians those are: "id" or "position".
+    num_views_kept, num_views_lifted : int
+        Views whose votes are as they were, and those that were lifted anew.
+    num_views_unknown : int
+        Views that the change names and that are not kept.
+    """
+
+    revision: int | None
+    num_carried: int
+    num_removed: int
+    num_added: int
+    matched_by: str
+    num_views_kept: int
+    num_views_lifted: int
+    num_views_unknown: int = 0
+
+
+class LivingSession(LiveSession):
+    """A `LiveSession` of a scene that changes: `update` leaves all as if views had been fused into the new scene.
+
+    Votes of views that are no longer kept go along with their Gaussians. A view that is fused with a `group` moves with
+    that group of Gaussians, and its camera is in the group's frame. See docs/living_map.md for the exact law.
+
+    It is made like a `LiveSession`.
+    """
+
+    _live: LivingVotes
+
+    def __init__(self, scene: GaussianScene | LivingScene, *args: Any, **kwargs: Any) -> None:
+        self._living = scene if isinstance(scene, LivingScene) else LivingScene.of(scene)
+        self._first = self._living
+        self._past: WeakKeyDictionary[GaussianScene, np.ndarray] = WeakKeyDictionary()
+        super().__init__(self._living.scene, *args, **kwargs)
+
+    @property
+    def living(self) -> LivingScene:
+        """The scene as it is now, with ids, groups and their frames."""
+        return self._living
+
+    @property
+    def views(self) -> list[View]:
+        """Views that are kept, in the order in which they came, each in the frame of its group."""
+        with self._lock:
+            return list(self._live.views.values())
+
+    def update(self, delta: SceneDelta) -> Changed:
+        """Change the scene, and lift those views anew that the change can touch; on any error, nothing has changed.
+
+        Raises
+        ------
+        SceneDeltaError
+            The change is out of turn, or names what is not there.
+        EmptySceneError
+            Nothing would be left.
+        """
+        with self._lock:
+            after, origin = self._living.apply(delta)
+            joining = {name: move.group for move in delta.moves for name in move.views}
+            unknown = len(joining.keys() - self._live.views.keys())
+            return replace(self._go_over(self._living, after, origin, joining), num_views_unknown=unknown)
+
+    def replace_scene(self, scene: GaussianScene, tolerance: float = 0.0) -> Changed:
+        """Go over to a scene from a file that has grown out of this one, as `match_scenes` finds it.
+
+        Views stay where they are, and belong to no group any more.
+
+        Raises
+        ------
+        SettingsError
+            The tolerance is no distance.
+        """
+        with self._lock:
+            matching = match_scenes(self._living, scene, tolerance)
+            joining = dict.fromkeys(self._live.views)
+            changed = self._go_over(self._living.flat(), matching.after, matching.origin, joining)
+            return replace(changed, revision=None, matched_by=matching.by)
+
+    def _go_over(
+        self, before: LivingScene, after: LivingScene, origin: np.ndarray, joining: Mapping[str, int | None]
+    ) -> Changed:
+        change = SceneChange(before, after, origin)
+        lifted = len(self._live.change(change, joining))
+        if self._first is self._living:
+            self._first = without_colours(self._living)
+        if self._learnt is not None:
+            self._learnt = replace(self._learnt, codes=change.carry(self._learnt.codes))
+        self._past[self.scene] = before.ids
+        self._living = after
+        self.scene = after.scene
+        self._version += 1
+        carried = int((origin >= 0).sum())
+        return Changed(
+            after.revision, carried, len(before) - carried, len(after) - carried, "id",
+            len(self._live.views) - lifted, lifted,
+        )  # fmt: skip
+
+    def load(self, path: Any, within: Path | None = None) -> int:
+        """Replace all that is known by a saved state, as `LiveSession.load` does, also by one of an earlier scene.
+
+        Gaussians are found by their ids; what the state was saved of is in it, if the scene had ids, or else it must be
+        the scene that the session began with.
+        """
+        with self._lock:
+            return super().load(path, within)
+
+    def _no_votes(self, num_classes: int) -> LivingVotes:
+        return LivingVotes(self._living, num_classes, device=self.device)
+
+    def _posed_views(self) -> list[View]:
+        return [self._live.in_scene(view) for view in self._live.views.values()]
+
+    def _carried(self, learnt: Learnt, scene: GaussianScene) -> Learnt:
+        if scene is self.scene:
+            return learnt
+        ids = self._past[scene]
+        known = np.isin(self._living.ids, ids)
+        order = np.argsort(ids)
+        codes = np.zeros((len(self.scene), learnt.codes.shape[1]), np.float32)
+        codes[known] = learnt.codes[order[np.searchsorted(ids, self._living.ids[known], sorter=order)]]
+        return replace(learnt, codes=codes)
+
+    def _read_state(self, path: Path, within: Path | None) -> State:
+        state = State.load(path, self.scene.digest, len(self.scene), within, self._first)
+        saved = state.living
+        if saved is None:
+            return state
+        votes = LivingVotes(saved, state.votes.shape[1], device=self.device)
+        votes.adopt(state)
+        change = SceneChange(saved, self._living, saved.places(self._living.ids))
+        groups = self._living.frames
+        votes.change(change, {view.name: None for view in state.views if view.group not in groups})
+        learnt = state.learnt and replace(state.learnt, codes=change.carry(state.learnt.codes))
+        return replace(votes.state(), num_fused=state.num_fused, class_names=state.class_names, learnt=learnt)

@@ -1,0 +1,117 @@
+"""Votes of views of a scene that changes: those that a change touches are lifted anew, all others stay as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from gsseg_core.data.soft_masks import SeenLabels
+from gsseg_core.data.view import View
+from gsseg_core.errors import UnknownGroupError
+from gsseg_core.learn.learner import UNITS
+from gsseg_core.learn.learner_state import State
+from gsseg_core.learn.vote_learner import VoteLearner
+from gsseg_core.live.scene_change import SceneChange
+from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.view_operator import ViewOperator
+from gsseg_core.scene.group_frames import IDENTITY, is_identity
+from gsseg_core.scene.living_scene import LivingScene
+
+
+class LivingVotes(VoteLearner):
+    """Learner by votes over a `LivingScene`; a view is lifted in the frame of its group.
+
+    Parameters
+    ----------
+    living : LivingScene
+        N Gaussians.
+    num_classes : int
+        K.
+    device : str
+        Where views are rendered.
+    """
+
+    def __init__(self, living: LivingScene, num_classes: int, *, device: str = "cpu") -> None:
+        # Views are rendered again where they are needed; to keep them prepared would take far more memory than masks.
+        super().__init__(living.scene, num_classes, device=device, memory_budget=0)
+        self.living = living
+
+    def observe(self, view: View) -> bool:
+        """Add a view and its votes, as `Learner.observe` does; raises `UnknownGroupError`, too."""
+        if view.group is not None and view.group not in self.living.frames:
+            raise UnknownGroupError(
+                f"view '{view.name}': belongs to group {view.group}, which the scene has not; expected one of its "
+                f"{len(self.living.frames)} groups"
+            )
+        return super().observe(view)
+
+    def in_scene(self, view: View) -> View:
+        """Pose a view in the frame of the scene as it is now."""
+        if view.group is None:
+            return view
+        frame = self.living.frame(view.group)
+        return replace(view, camera=view.camera if is_identity(frame) else frame.camera(view.camera), group=None)
+
+    def change(self, change: SceneChange, joining: Mapping[str, int | None]) -> list[str]:
+        """Go over to the scene after a change, with the votes that views have in that; on any error, nothing changes.
+
+        Parameters
+        ----------
+        change : SceneChange
+            From the scene of now to another one.
+        joining : mapping from view to group
+            Views that belong to another group from now on; others keep theirs.
+
+        Returns
+        -------
+        list of str
+            Views that were lifted anew.
+
+        Raises
+        ------
+        GssegError
+            The mask of a view that is lifted anew cannot be read any more.
+        """
+        views = {name: self._joined(view, joining.get(name, view.group)) for name, view in self.views.items()}
+        lifted = [name for name, view in views.items() if not self._looks_alike(name, view) or change.touches(view)]
+        # Masks in memory cannot fail: they are read one at a time.
+        read = {name: views[name].read_seen() for name in lifted if not views[name].is_in_memory}
+        self._lift(self.views, lifted, read, -1)
+        self._votes, self.living, self.scene = change.carry(self._votes), change.after, change.after.scene
+        self._lift(views, lifted, read, 1)
+        self.views = views
+        return lifted
+
+    def _lift(self, views: Mapping[str, View], names: list[str], read: Mapping[str, SeenLabels], sign: int) -> None:
+        # In the order of groups, so that the scene is brought into the frame of each but once.
+        for name in sorted(names, key=lambda name: str(views[name].group)):
+            seen = read[name] if name in read else views[name].read_seen()
+            # A view that sees nothing any more is kept: it may see what is added later.
+            self._operator_of(views[name]).vote(seen.labels, seen.evidence, self._votes, UNITS, sign)
+
+    def _joined(self, view: View, group: int | None) -> View:
+        """Have a view belong to a group: it stays where it is in the scene, and from then on moves along."""
+        if group == view.group:
+            return view
+        camera = self.in_scene(view).camera
+        frame = IDENTITY if group is None else self.living.frames.get(group, IDENTITY)
+        return replace(view, camera=camera if is_identity(frame) else frame.inverse().camera(camera), group=group)
+
+    def _looks_alike(self, name: str, view: View) -> bool:
+        """Whether a view that belongs to another group now has the votes that it had, bit for bit."""
+        before = self.views[name]
+        if view is before:
+            return True
+        poses = before.camera.world_to_camera, view.camera.world_to_camera
+        if not np.array_equal(*poses) or (view.group is not None and view.group not in self.living.frames):
+            return False
+        return self.living.seen_from(before.group) is self.living.seen_from(view.group)
+
+    def state(self) -> State:
+        """Return a copy of votes and views, to be saved; of a scene that has ids, with the scene."""
+        return replace(super().state(), living=None if self.scene.ids is None else self.living)
+
+    def _operator_of(self, view: View) -> ViewOperator:
+        return make_operator(self.living.seen_from(view.group), view.camera, self.device)

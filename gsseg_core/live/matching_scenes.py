@@ -1,0 +1,77 @@
+"""Which Gaussian of one scene is which of another: by ids, or else by position."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from gsseg_core.errors import SettingsError
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.living_scene import LivingScene
+
+
+class Matching(NamedTuple):
+    """How a scene goes over into another one.
+
+    Attributes
+    ----------
+    after : LivingScene
+        N' Gaussians; those that match keep their ids.
+    origin : (N',) int64
+        Where each was before; -1 for those that match none.
+    by : str
+        "id" or "position".
+    """
+
+    after: LivingScene
+    origin: np.ndarray
+    by: str
+
+
+def match_scenes(before: LivingScene, scene: GaussianScene, tolerance: float = 0.0) -> Matching:
+    """Find each Gaussian of a scene in the one before: by id where both have ids, else by position.
+
+    Parameters
+    ----------
+    before : LivingScene
+        N Gaussians.
+    scene : GaussianScene
+        N' Gaussians.
+    tolerance : float
+        Farthest that a Gaussian may have moved to be found by its position, in scene units.
+
+    Raises
+    ------
+    SettingsError
+        The tolerance is NaN, infinite or negative.
+    """
+    if not 0 <= tolerance < np.inf:
+        raise SettingsError(f"tolerance is {tolerance:g}; expected a distance in scene units, 0 or more")
+    if before.scene.ids is not None and scene.ids is not None:
+        return Matching(LivingScene.of(scene), before.places(scene.ids), "id")
+    origin = _nearest(before.scene.means, scene.means, tolerance)
+    after = LivingScene.of(scene)
+    if before.scene.ids is not None:
+        # The ids of those that match go on; others get new ones, behind the largest.
+        new = np.flatnonzero(origin < 0)
+        ids = before.ids[origin]
+        ids[new] = before.ids.max() + 1 + np.arange(len(new))
+        after = LivingScene.numbered(scene, ids)
+    return Matching(after, origin, "position")
+
+
+def _nearest(before: np.ndarray, after: np.ndarray, tolerance: float) -> np.ndarray:  # (N, 3), (N', 3)
+    """Find the nearest of the points before, each for one point at most, (N',) int64; -1 where none is near enough."""
+    from scipy.spatial import cKDTree  # It takes a while to load, and few sessions need it.
+
+    bound = max(tolerance * (1 + 1e-9), 1e-30)  # what is not below it is not looked for, and its square must not be 0
+    distances, found = cKDTree(before).query(after, distance_upper_bound=bound)
+    found = np.where(distances <= tolerance, found, -1)
+    # The nearest one keeps a point that several have found; of equally near ones, the first.
+    order = np.lexsort((np.arange(len(after)), distances))
+    order = order[found[order] >= 0]
+    _, first = np.unique(found[order], return_index=True)
+    origin = np.full(len(after), -1, np.int64)
+    origin[order[first]] = found[order[first]]
+    return origin

@@ -1,0 +1,87 @@
+"""Which views a change of the scene can touch, told without rendering any of them.
+
+A view's votes depend on the Gaussians that reach its image, in the frame of its group, and on nothing else. So they
+stay what they are, bit for bit, unless one that changed in this frame reaches the image, where it was or where it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from gsseg_core.data.view import View
+from gsseg_core.raster.cpu.projection import project
+from gsseg_core.scene.group_frames import is_same_relation, relation
+from gsseg_core.scene.living_scene import LivingScene
+
+
+class SceneChange:
+    """What differs between a scene before and after a change, seen from the frame of each group.
+
+    Parameters
+    ----------
+    before, after : LivingScene
+        N and N' Gaussians.
+    origin : (N',) int64
+        Where each Gaussian was before; -1 for those that were not there.
+    """
+
+    def __init__(self, before: LivingScene, after: LivingScene, origin: np.ndarray) -> None:
+        self.before, self.after, self.origin = before, after, origin
+        self._new = (origin < 0) | ~_are_alike(before, after, origin)
+        kept = origin[~self._new]
+        # Gaussians that are alike in all are blended in their order, which must stay.
+        self.keeps_order = bool((np.diff(origin[origin >= 0]) > 0).all())
+        self._gone = np.ones(len(before), bool)
+        self._gone[kept] = False
+        self._parts: dict[int | None, tuple[np.ndarray, np.ndarray]] = {}
+
+    def touches(self, view: View) -> bool:
+        """Whether the votes of a view, which keeps its group and pose, may be others than before.
+
+        None of its Gaussians is rendered: those that changed are projected, as lifting would project them.
+        """
+        if not self.keeps_order:
+            return True
+        places = self._changed(view.group)
+        return any(
+            len(part) > 0 and len(project(scene.part_seen_from(view.group, part), view.camera).ids) > 0
+            for scene, part in zip((self.before, self.after), places, strict=True)
+        )
+
+    def carry(self, rows: np.ndarray) -> np.ndarray:  # (N, ...)
+        """Take what Gaussians had before along to where they are, (N', ...); zeros for those that were not there."""
+        out = np.zeros((len(self.origin), *rows.shape[1:]), rows.dtype)
+        carried = self.origin >= 0
+        out[carried] = rows[self.origin[carried]]
+        return out
+
+    def _changed(self, group: int | None) -> tuple[np.ndarray, np.ndarray]:
+        """Places of the Gaussians that changed in the frame of a group, before (M,) and after (M',)."""
+        if group not in self._parts:
+            apart = [other for other, is_kept in self._relations(group).items() if not is_kept]
+            gone, new = self._gone, self._new
+            self._parts[group] = (
+                np.flatnonzero(gone | np.isin(self.before.groups, apart)),
+                np.flatnonzero(new | np.isin(self.after.groups, apart)),
+            )
+        return self._parts[group]
+
+    def _relations(self, group: int | None) -> Mapping[int, bool]:
+        """Tell of each group that was there before whether it lies in the frame of another one as it did."""
+        before, after = self.before, self.after
+        return {
+            other: other in after.frames
+            and is_same_relation(relation(before.frame(group), frame), relation(after.frame(group), after.frame(other)))
+            for other, frame in before.frames.items()
+        }
+
+
+def _are_alike(before: LivingScene, after: LivingScene, origin: np.ndarray) -> np.ndarray:
+    """Whether each Gaussian after a change is of the same group and geometry as before, bit for bit, (N',) bool."""
+    alike: np.ndarray = before.groups[origin] == after.groups
+    for name in ("means", "quats", "scales", "opacities"):
+        same = getattr(before.local, name)[origin] == getattr(after.local, name)
+        alike &= same if same.ndim == 1 else same.all(axis=1)
+    return alike

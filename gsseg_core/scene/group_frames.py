@@ -1,0 +1,119 @@
+"""Frames of groups of Gaussians: how one lies in another, and Gaussians moved from one to the other.
+
+All is computed number by number, without products of matrices: what comes out for a Gaussian is the same bits whichever
+others are moved with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from gsseg_core.scene import spherical_harmonics
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.scene_ids import with_ids
+from gsseg_core.scene.similarity import Similarity
+from gsseg_core.scene.vertices import MEANS, QUATS, SCALES, columns, rest_names
+
+IDENTITY = Similarity()
+"""The frame of the scene, and of a group that has not moved."""
+
+
+def is_identity(frame: Similarity) -> bool:
+    """Whether a frame is that of the scene, exactly."""
+    return _is_same(frame, IDENTITY)
+
+
+def relation(to: Similarity, frame: Similarity) -> Similarity:
+    """How a frame lies in another one; `IDENTITY` itself if they are the same, bit for bit."""
+    if _is_same(to, frame):
+        return IDENTITY
+    return frame if is_identity(to) else to.inverse().after(frame)
+
+
+def is_same_relation(one: Similarity, other: Similarity) -> bool:
+    """Whether two relations are the same, bit for bit."""
+    return _is_same(one, other)
+
+
+def _is_same(one: Similarity, other: Similarity) -> bool:
+    return one is other or (
+        one.scale == other.scale
+        and np.array_equal(one.rotation, other.rotation)
+        and np.array_equal(one.translation, other.translation)
+    )
+
+
+def moved_geometry(
+    scene: GaussianScene,
+    which: npt.NDArray[np.bool_],  # (N,)
+    frame: Similarity,
+) -> GaussianScene:
+    """Move some Gaussians from a frame to the one that it lies in; their vertices, and so colours, are not moved."""
+    means, quats, scales = scene.means.copy(), scene.quats.copy(), scene.scales.copy()
+    means[which] = _points(means[which], frame)
+    quats[which] = _turned(quats[which], frame)
+    scales[which] = (scales[which].astype(np.float64) * frame.scale).astype(np.float32)
+    return replace(scene, means=means, quats=quats, scales=scales)
+
+
+def moved_scene(scene: GaussianScene, frame: Similarity) -> GaussianScene:
+    """Move a scene from a frame to the one that it lies in, colours and all, as a file would hold it."""
+    vertices = scene.vertices.copy()
+    logs = columns(vertices, SCALES).astype(np.float64) + np.log(frame.scale)
+    changed = {MEANS: _points(scene.means, frame), QUATS: _turned(scene.quats, frame), SCALES: logs}
+    for names, values in changed.items():
+        for name, column in zip(names, values.T, strict=True):
+            vertices[name] = column
+    if names := rest_names(sum(name.startswith("f_rest_") for name in vertices.dtype.names or ())):
+        turned = spherical_harmonics.turned(frame.rotation, scene.sh_degree)[1:, 1:]
+        rest = columns(vertices, names).reshape(len(vertices), 3, -1) @ turned.T.astype(np.float32)
+        for name, column in zip(names, rest.reshape(len(vertices), -1).T, strict=True):
+            vertices[name] = column
+    return GaussianScene.from_vertices(vertices, scene.path)
+
+
+def joined(
+    scene: GaussianScene,
+    stays: npt.NDArray[np.bool_],  # (N,)
+    added: GaussianScene | None,
+    ids: npt.NDArray[np.int64],  # (N',)
+) -> GaussianScene:
+    """Append Gaussians to those that stay; from now on, the scene holds ids.
+
+    Raises
+    ------
+    SceneDeltaError
+        What is added has colours of a higher degree than the scene has room for.
+    """
+    names = ("means", "quats", "scales", "opacities")
+    parts: dict[str, list[npt.NDArray[Any]]] = {name: [getattr(scene, name)[stays]] for name in names}
+    if added is not None:
+        for name in names:
+            parts[name].append(getattr(added, name))
+    vertices = with_ids(scene.vertices[stays], None if added is None else added.vertices, ids)
+    arrays: dict[str, Any] = {name: np.concatenate(part) for name, part in parts.items()}
+    return replace(scene, **arrays, vertices=vertices)
+
+
+def _points(means: npt.NDArray[np.float32], frame: Similarity) -> npt.NDArray[np.float64]:
+    x, y, z = means.astype(np.float64).T
+    rows = [frame.scale * (r[0] * x + r[1] * y + r[2] * z) for r in frame.rotation]
+    return np.stack([row + shift for row, shift in zip(rows, frame.translation, strict=True)], axis=1)
+
+
+def _turned(quats: npt.NDArray[np.float32], frame: Similarity) -> npt.NDArray[np.float64]:
+    from scipy.spatial.transform import Rotation  # It takes a while to load, and few scenes move.
+
+    b, c, d, a = Rotation.from_matrix(frame.rotation).as_quat()
+    w, x, y, z = quats.astype(np.float64).T
+    product = [
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    ]
+    return np.stack(product, axis=1)

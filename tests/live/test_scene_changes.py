@@ -1,0 +1,242 @@
+"""What a change of the scene leaves as it was, what it takes along, and what it is refused for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from small_scenes import NAMES, balls_on_a_table, clean_views, true_labels
+
+from gsseg_core.data.label_images import write_mask
+from gsseg_core.data.view import View
+from gsseg_core.errors import EmptySceneError, GssegError, SceneDeltaError, SettingsError, StateMismatchError
+from gsseg_core.live.living_session import LivingSession
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.scene_delta import GroupMove, SceneDelta
+from gsseg_core.scene.similarity import Similarity
+from gsseg_core.segmentation import Segmentation
+
+SCENE, TRUTH = balls_on_a_table()
+VIEWS = clean_views(4)
+FAR = Similarity(1.5, Rotation.from_rotvec([0.2, -0.1, 0.4]).as_matrix(), np.array([40.0, 3.0, -2.0]))
+
+
+def session(group: int | None = None) -> LivingSession:
+    fused = LivingSession(SCENE, NAMES)
+    for view in VIEWS:
+        assert fused.fuse(replace(view, group=group)) is None
+    return fused
+
+
+def votes(of: LivingSession) -> np.ndarray:
+    return of._live._votes
+
+
+def other_room(shift: tuple[float, float, float], group: int = 1) -> SceneDelta:
+    """The whole scene once more, somewhere else."""
+    copy = GaussianScene.from_arrays(SCENE.means + shift, SCENE.quats, SCENE.scales, SCENE.opacities, SCENE.sh)
+    ids = np.arange(len(SCENE)) + 10**12
+    return SceneDelta(added=copy, added_ids=ids, added_groups=np.full(len(SCENE), group, np.int64))
+
+
+def as_refused(of: LivingSession) -> np.ndarray:
+    """Votes of the kept views in the last scene, from nothing."""
+    again = LivingSession(of.living, NAMES)
+    for view in of.views:
+        again.fuse(view)
+    return votes(again)
+
+
+def test_a_group_that_moves_with_its_keyframes_keeps_their_votes_bit_for_bit() -> None:
+    moving = session(group=0)
+    before = votes(moving).copy()
+    for _ in range(3):
+        changed = moving.update(SceneDelta(moves=(GroupMove(0, FAR),)))
+        assert (changed.num_views_kept, changed.num_views_lifted) == (4, 0)
+    np.testing.assert_array_equal(votes(moving), before)
+    np.testing.assert_allclose(moving.scene.means, FAR.points(FAR.points(FAR.points(SCENE.means))), rtol=1e-5)
+    # What the robot renders from where the keyframe went is what it saw.
+    posed = moving._posed_views()[0]
+    labels = true_labels(moving.scene, TRUTH, posed.camera)
+    assert (labels == VIEWS[0].read_labels()).mean() > 0.999
+
+
+def test_views_that_are_named_in_a_move_go_along_and_others_stay_where_they_are() -> None:
+    moving = session()
+    changed = moving.update(SceneDelta(moves=(GroupMove(0, FAR, ("view0", "view1", "long gone")),)))
+    assert (changed.num_views_kept, changed.num_views_lifted, changed.num_views_unknown) == (2, 2, 1)
+    np.testing.assert_array_equal(votes(moving), as_refused(moving))
+    assert [view.group for view in moving.views] == [0, 0, None, None]
+    alone = LivingSession(SCENE, NAMES)
+    for view in VIEWS[:2]:
+        alone.fuse(view)
+    np.testing.assert_array_equal(votes(moving), votes(alone))
+
+
+def test_a_change_out_of_sight_lifts_nothing_and_one_in_sight_only_those_that_see_it() -> None:
+    growing = session()
+    before = votes(growing).copy()
+    changed = growing.update(other_room((0, 0, 50)))
+    assert (changed.num_added, changed.num_views_kept, changed.num_views_lifted) == (len(SCENE), 4, 0)
+    np.testing.assert_array_equal(votes(growing)[: len(SCENE)], before)
+    corner = np.array([int(SCENE.means[:, :2].sum(axis=1).argmax())])
+    changed = growing.update(SceneDelta(removed=corner))
+    assert changed.num_removed == 1 and changed.num_views_lifted > 0
+    np.testing.assert_array_equal(votes(growing), as_refused(growing))
+
+
+def test_those_that_stay_keep_their_order_and_added_ones_come_behind_with_their_ids(tmp_path: Path) -> None:
+    growing = session()
+    delta = other_room((0, 0, 9))
+    growing.update(replace(delta, removed=np.array([3, 0, 7])))
+    expected = np.concatenate([np.setdiff1d(np.arange(len(SCENE)), [0, 3, 7]), delta.added_ids])
+    np.testing.assert_array_equal(growing.living.ids, expected)
+    result = growing.segmentation()
+    assert len(result.labels) == len(growing.scene) == len(expected)
+    result.save(tmp_path / "segmentation.npz")
+    with np.load(tmp_path / "segmentation.npz") as file:
+        np.testing.assert_array_equal(file["ids"], expected)
+    growing.scene.save(tmp_path / "grown.ply")
+    again = GaussianScene.load(tmp_path / "grown.ply")
+    np.testing.assert_array_equal(again.ids, expected)
+    np.testing.assert_array_equal(Segmentation.load(tmp_path / "segmentation.npz", again).ids, expected)
+    session().segmentation().save(tmp_path / "plain.npz")
+    with np.load(tmp_path / "plain.npz") as file:
+        assert "ids" not in file.files
+
+
+def test_what_was_learnt_goes_along_with_its_gaussians_also_while_it_is_learnt() -> None:
+    growing = session()
+    growing.learn("votes")
+    learnt = growing.codes()
+    growing.update(SceneDelta(removed=np.array([5])))
+    np.testing.assert_array_equal(growing.learnt.codes, np.delete(learnt, 5, axis=0))
+
+    def remove_once(*_: object) -> None:
+        if 6 in growing.living.ids:
+            growing.update(SceneDelta(removed=np.array([6])))
+
+    outcome = growing.learn("votes", report=remove_once)
+    assert len(outcome.learnt.codes) == len(growing.scene) == len(SCENE) - 2
+    assert len(growing.segmentation().labels) == len(growing.scene)
+
+
+def test_votes_of_views_that_are_not_kept_any_more_go_along_with_their_gaussians() -> None:
+    short = LivingSession(SCENE, NAMES, max_views=1)
+    for view in VIEWS:
+        short.fuse(view)
+    last = LivingSession(SCENE, NAMES)
+    last.fuse(VIEWS[-1])
+    forgotten = votes(short) - votes(last)
+    short.update(SceneDelta(removed=np.arange(100)))
+    np.testing.assert_array_equal(votes(short) - as_refused(short), forgotten[100:])
+
+
+@pytest.mark.parametrize(
+    ("delta", "message"),
+    [
+        (SceneDelta(revision=5), "its revision is 5; expected 2, as the scene is at 1"),
+        (SceneDelta(revision=1), "its revision is 1; expected 2"),
+        (SceneDelta(removed=np.array([626])), "removes 1 ids that the scene has not .first 626."),
+        (replace(other_room((0, 0, 9)), added_ids=np.arange(626)), "adds 626 ids that the scene has already .first 0."),
+        (SceneDelta(moves=(GroupMove(9, FAR),)), "moves group 9, which holds no Gaussian"),
+    ],
+)
+def test_a_change_that_does_not_fit_is_refused_in_one_line_and_changes_nothing(delta: SceneDelta, message: str) -> None:
+    refusing = session()
+    refusing.update(SceneDelta(revision=1))
+    before, scene = votes(refusing).copy(), refusing.living
+    with pytest.raises(SceneDeltaError, match=message):
+        refusing.update(delta)
+    np.testing.assert_array_equal(votes(refusing), before)
+    assert refusing.living is scene
+
+
+def test_the_last_gaussian_is_not_removed() -> None:
+    with pytest.raises(EmptySceneError, match="removes the last Gaussian"):
+        session().update(SceneDelta(removed=np.arange(len(SCENE))))
+
+
+def test_a_mask_that_cannot_be_read_any_more_ends_a_change_before_anything_has_changed(tmp_path: Path) -> None:
+    write_mask(tmp_path / "mask.png", VIEWS[0].read_labels(), 8)
+    of_files = session()
+    of_files.fuse(View(replace(VIEWS[0].camera, name="file"), tmp_path / "mask.png"))
+    (tmp_path / "mask.png").unlink()
+    before, living = votes(of_files).copy(), of_files.living
+    with pytest.raises(GssegError, match=r"mask\.png"):
+        of_files.update(SceneDelta(removed=np.arange(30)))
+    np.testing.assert_array_equal(votes(of_files), before)
+    assert of_files.living is living and len(of_files.scene) == len(SCENE)
+
+
+def test_a_view_of_a_group_that_the_scene_has_not_is_refused() -> None:
+    rejection = LivingSession(SCENE, NAMES).fuse(replace(VIEWS[0], group=7))
+    assert rejection is not None and "belongs to group 7, which the scene has not" in rejection.message
+
+
+@pytest.mark.parametrize("began", ["plain", "with ids"])
+def test_a_state_saved_before_changes_loads_after_them_as_if_its_views_had_been_fused_then(
+    tmp_path: Path, began: str
+) -> None:
+    changing = session(group=0)
+    if began == "with ids":
+        changing.update(other_room((0, 0, 6)))
+    changing.save(tmp_path / "state.npz")
+    changing.reset()
+    changing.update(SceneDelta(removed=np.arange(40)))
+    changing.update(other_room((0.3, 0, 0), group=2) if began == "plain" else SceneDelta(moves=(GroupMove(1, FAR),)))
+    changing.update(SceneDelta(moves=(GroupMove(0, FAR),)))
+    assert changing.load(tmp_path / "state.npz") == 4
+    assert changing.num_views == changing.num_fused == 4
+    np.testing.assert_array_equal(votes(changing), as_refused(changing))
+    assert votes(changing).any()
+    changing.save(tmp_path / "later.npz")
+    again = LivingSession(changing.living, NAMES)
+    again.load(tmp_path / "later.npz")
+    np.testing.assert_array_equal(votes(again), votes(changing))
+
+
+def test_a_state_of_another_scene_whose_geometry_nobody_has_is_refused(tmp_path: Path) -> None:
+    session().save(tmp_path / "state.npz")
+    other = LivingSession(SCENE.subset(np.arange(500)), NAMES)
+    with pytest.raises(StateMismatchError):
+        other.load(tmp_path / "state.npz")
+
+
+@pytest.mark.parametrize("by", ["id", "position"])
+def test_a_grown_file_takes_votes_along_and_says_how_many(tmp_path: Path, by: str) -> None:
+    growing = session()
+    if by == "id":
+        growing.update(SceneDelta(removed=np.array([1])))
+    grown = LivingSession(growing.living, NAMES)
+    grown.update(replace(other_room((0, 0, 1.5)), removed=np.arange(20, 30)))
+    file = grown.scene if by == "id" else GaussianScene.from_arrays(
+        grown.scene.means, grown.scene.quats, grown.scene.scales, grown.scene.opacities, grown.scene.sh
+    )  # fmt: skip
+    before = len(growing.scene)
+    changed = growing.replace_scene(file, tolerance=1e-4)
+    assert (changed.num_carried, changed.num_removed, changed.num_added) == (before - 10, 10, len(SCENE))
+    assert changed.matched_by == by
+    np.testing.assert_array_equal(votes(growing), as_refused(growing))
+    with pytest.raises(SettingsError, match="tolerance is -1; expected a distance"):
+        growing.replace_scene(file, tolerance=-1)
+
+
+def test_a_file_in_another_order_takes_the_votes_to_their_gaussians() -> None:
+    shuffled = session()
+    order = np.random.default_rng(0).permutation(len(SCENE))
+    before = votes(shuffled).copy()
+    changed = shuffled.replace_scene(SCENE.subset(order))
+    assert changed.num_carried == len(SCENE)
+    np.testing.assert_array_equal(votes(shuffled), before[order])
+
+
+def test_a_group_that_is_moved_back_is_where_it_was_for_new_views() -> None:
+    moving = session()
+    moving.update(SceneDelta(moves=(GroupMove(0, Similarity(translation=np.array([1.0, 0, 0]))),)))
+    moving.update(SceneDelta(moves=(GroupMove(0, Similarity(translation=np.array([-1.0, 0, 0]))),)))
+    np.testing.assert_array_equal(moving.scene.means, SCENE.means)
+    np.testing.assert_array_equal(votes(moving), votes(session()))
