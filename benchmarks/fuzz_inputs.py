@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import forked  # noqa: F401 - first: it says how numba runs, and where small scenes are
+import fuzz_scenes
 import mask_writers
 import mutations
 import numpy as np
@@ -185,14 +186,48 @@ def _label_map(folder: Path) -> None:
     (folder / "map.json").write_text(json.dumps({"1": "ball", "cup/mug": "ball", "box": None, "background": "ignore"}))
 
 
+def _scene(name: str, file: str, write: fuzz_scenes.Write, mutations: tuple[Mutation, ...]) -> Kind:
+    """Give the kind of a scene of another format."""
+    place = f"{{data}}/{file}"
+    commands = (("doctor", place), *((command[0], place, *command[2:]) for command in (VOTES, CLICK)))
+    return Kind(name, fuzz_scenes.written(file, write), (file,), mutations, commands)
+
+
+def _lens(model: str, parameters: tuple[float, ...]) -> Callable[[Path], None]:
+    """Make a dataset whose cameras in COLMAP's text have a lens that bends."""
+
+    def make(folder: Path) -> None:
+        _colmap_txt(folder)
+        values = " ".join(map(str, (14.0, 14.0, WIDTH / 2, HEIGHT / 2, *parameters)))
+        (folder / "sparse/0/cameras.txt").write_text(f"1 {model} {WIDTH} {HEIGHT} {values}\n")
+
+    return make
+
+
+def _bent_nerfstudio(folder: Path) -> None:
+    _nerfstudio(folder)
+    path = folder / "transforms.json"
+    lens = {"camera_model": "OPENCV", "k1": -0.1, "k2": 0.01, "p1": 0.001, "p2": 0.001}
+    more = {"applied_transform": np.eye(4)[:3].tolist(), "applied_scale": 1.0}
+    path.write_text(json.dumps({**json.loads(path.read_text()), **lens, **more}))
+    fuzz_scenes.dataparser(folder)
+
+
 _LABELS = ("labels/view0.png",)
+_LENSES, _BENT = ("sparse/0/cameras.txt",), (SEGMENT, CLICK, RENDER)
 _ALL_CAMERAS = (SEGMENT, VOTES, CLICK, CLICK, RENDER)
 KINDS = (
     Kind("scene.ply", _as_it_is, ("scene.ply",), PLY, (SEGMENT, CLICK, CLICK, REMOVE, RENDER)),
+    *(_scene(*row) for row in fuzz_scenes.FORMATS),
     Kind("cameras.json", _as_it_is, ("cameras.json",), JSON, _ALL_CAMERAS),
     Kind("transforms.json", _nerfstudio, ("transforms.json",), JSON, _ALL_CAMERAS),
     Kind("colmap bin", _colmap_bin, ("sparse/0/cameras.bin", "sparse/0/images.bin"), BINARY, _ALL_CAMERAS),
     Kind("colmap txt", _colmap_txt, ("sparse/0/cameras.txt", "sparse/0/images.txt"), TEXT, _ALL_CAMERAS),
+    Kind("OPENCV", _lens("OPENCV", (-0.1, 0.01, 0.001, 0.001)), _LENSES, TEXT, _BENT),
+    Kind("FULL_OPENCV", _lens("FULL_OPENCV", (-0.1, 0.01, 0, 0, 0, 0, 0, 0)), _LENSES, TEXT, _BENT),
+    Kind("fisheye", _lens("OPENCV_FISHEYE", (0.01, 0, 0, 0)), _LENSES, TEXT, _BENT),
+    Kind("bent transforms.json", _bent_nerfstudio, ("transforms.json",), JSON, _BENT),
+    Kind("dataparser", _bent_nerfstudio, ("dataparser_transforms.json",), JSON, _BENT),
     Kind("labels 8 bit", _as_it_is, _LABELS, PNG, (SEGMENT, VOTES, PER_VIEW, MASK, EVAL)),
     Kind("labels 16 bit", _sixteen_bits, _LABELS, PNG, (SEGMENT, VOTES, PER_VIEW, MASK, EVAL)),
     Kind("soft npz", _soft, ("labels/view0.npz",), NPZ, (SEGMENT, VOTES)),

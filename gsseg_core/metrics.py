@@ -16,6 +16,7 @@ import numpy as np
 
 from gsseg_core.data.class_names import class_name
 from gsseg_core.data.label_images import UNKNOWN, read_mask
+from gsseg_core.data.mask_formats.masks import MaskSet
 from gsseg_core.errors import MaskFormatError, MaskSizeError, NoUsableViewsError
 from gsseg_core.files.run_folder import settle
 from gsseg_core.scene.camera import Camera
@@ -183,11 +184,7 @@ def evaluate_folders(pred_dir: str | Path, truth_dir: str | Path, cameras: Itera
     MaskSizeError
         A prediction and its truth differ in size.
     """
-    pred_dir, truth_dir = Path(pred_dir), Path(truth_dir)
-    settle(pred_dir)
-    predictions = sorted(pred_dir.glob("*.png"))
-    if not predictions:
-        raise NoUsableViewsError(f"{pred_dir}: found no predictions; expected label images <stem>.png")
+    pred_dir, truth_dir, predictions = Path(pred_dir), Path(truth_dir), predicted_maps(pred_dir)
     from gsseg_core.data.view import View  # It loads numba, which is of no use to anybody else here.
 
     bent = {camera.name: camera for camera in cameras if camera.undistortion is not None}
@@ -203,6 +200,46 @@ def evaluate_folders(pred_dir: str | Path, truth_dir: str | Path, cameras: Itera
         labels = View(bent[path.stem], truth).read_labels() if path.stem in bent else read_mask(truth).labels
         evaluation.add(labels, read_mask(path).labels, name=str(path))
     return evaluation
+
+
+def evaluate_masks(pred_dir: str | Path, masks: MaskSet, cameras: Iterable[Camera] = ()) -> Evaluation:
+    """Compare every `<stem>.png` in a folder of label images with the mask of this view that another program wrote.
+
+    A view without a camera among `cameras` has an image of the size of its prediction.
+
+    Raises
+    ------
+    NoUsableViewsError
+        There is no PNG in `pred_dir`.
+    MaskFormatError, MaskSizeError
+        A prediction has no truth, is no label image, or a mask cannot be read or has another shape.
+    """
+    from gsseg_core.data.view import View
+
+    known, evaluation = {camera.name: camera for camera in cameras}, Evaluation()
+    for path in predicted_maps(pred_dir):
+        labels = read_mask(path).labels
+        height, width = labels.shape
+        camera = known.get(path.stem) or Camera(path.stem, width, height, np.eye(3), np.eye(4))
+        if camera.image not in masks.views:
+            raise MaskFormatError(f"{path}: has no true mask among those of {masks.format}; expected one for each view")
+        evaluation.add(View(camera, foreign_mask=masks.views[camera.image]).read_labels(), labels, name=str(path))
+    return evaluation
+
+
+def predicted_maps(folder: str | Path) -> list[Path]:
+    """List the label maps `<stem>.png` in a folder that `gsseg render` or the like wrote.
+
+    Raises
+    ------
+    NoUsableViewsError
+        There is none.
+    """
+    settle(Path(folder))
+    predictions = sorted(Path(folder).glob("*.png"))
+    if not predictions:
+        raise NoUsableViewsError(f"{folder}: found no predictions; expected label images <stem>.png")
+    return predictions
 
 
 def _count(

@@ -33,6 +33,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 
 LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)  # of RGB, ITU-R BT.601
 _EDGE_PX = 3  # reach of the filter that finds edges, px of a picture
+_WIDEST = 1e4  # tangent of half the field of view at which whoever states it cannot mean it
 _NEAREST = 1e-3  # depth in scene units below which logarithms are not taken
 
 
@@ -192,7 +193,9 @@ class _Window(NamedTuple):
     def of(cls, camera: Camera, side: int) -> _Window:
         """Make the window of `side` x `side` px."""
         focal, principal, size = camera.K[[0, 1], [0, 1]], camera.K[:2, 2], np.array([camera.width, camera.height])
-        reach = float((np.maximum(principal, size - principal) / focal).max())  # tangent of half the field of view
+        with np.errstate(over="ignore"):
+            # The tangent of half the field of view.
+            reach = min(float((np.maximum(principal, size - principal) / focal).max()), _WIDEST)
         corners = principal - reach * focal, principal + reach * focal
         K = np.array([[side / 2 / reach, 0, side / 2], [0, side / 2 / reach, side / 2], [0, 0, 1]])
         centres = (np.arange(side)[:, None] + 0.5) / side * (corners[1] - corners[0]) + corners[0]  # (S, 2)

@@ -14,14 +14,15 @@ have lenses that bend, the truth is undistorted first, as rendered label maps ar
 """
 EXAMPLES = """
   gsseg eval --pred rendered --truth DATASET/labels
-  gsseg eval --pred rendered --truth DATASET/labels --json scores.json
+  gsseg eval --pred rendered --truth DATASET/annotations.json --json scores.json
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the command takes."""
     parser.add_argument("--pred", required=True, metavar="DIR", help="folder of predicted label maps <stem>.png")
-    parser.add_argument("--truth", required=True, metavar="DIR", help="folder of true label maps <stem>.png")
+    truth = "folder of true label maps <stem>.png, or true masks of another program, as COCO"
+    parser.add_argument("--truth", required=True, metavar="PATH", help=truth)
     parser.add_argument("--json", metavar="FILE", help="write the scores there, too")
 
 
@@ -30,11 +31,12 @@ def run(options: argparse.Namespace) -> int:
     from gsseg_core.data.camera_files import read_cameras
     from gsseg_core.data.camera_formats.table import CAMERA_FORMATS
     from gsseg_core.data.class_names import read_classes
-    from gsseg_core.errors import ClassesFileError
+    from gsseg_core.data.mask_formats.table import open_masks
+    from gsseg_core.errors import ClassesFileError, SettingsError
     from gsseg_core.files.atomic import check_writable
     from gsseg_core.files.input_files import is_there
     from gsseg_core.files.json_files import write_json
-    from gsseg_core.metrics import evaluate_folders
+    from gsseg_core.metrics import evaluate_folders, evaluate_masks, predicted_maps
     from gsseg_core.text import evaluation_summary
 
     if options.json:
@@ -43,7 +45,17 @@ def run(options: argparse.Namespace) -> int:
     classes = root / "classes.json"
     names = read_classes(classes) if is_there(classes, ClassesFileError) else None
     cameras = read_cameras(root) if any(known.find(root) for known in CAMERA_FORMATS) else []
-    scores = evaluate_folders(options.pred, options.truth, cameras).as_dict(names)
+    images = [camera.image for camera in cameras] or [path.stem for path in predicted_maps(options.pred)]
+    masks = open_masks(Path(options.truth), images)
+    if masks is None:
+        scores = evaluate_folders(options.pred, options.truth, cameras).as_dict(names)
+    elif masks.per_view:
+        raise SettingsError(
+            f"{options.truth}: is of {masks.format}, whose ids hold in their own view only; expected true masks with "
+            "ids that mean the same in every view"
+        )
+    else:
+        scores = evaluate_masks(options.pred, masks, cameras).as_dict(masks.class_names or names)
     if options.json:
         write_json(options.json, scores)
     tell(evaluation_summary(scores))

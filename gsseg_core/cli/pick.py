@@ -17,6 +17,8 @@ DIR/object.ply, with the indices in DIR/pick.npz and a picture of the view. Need
 """
 EXAMPLES = """
   gsseg pick scene.ply --data DATASET --view 0001 --mask chair.png --out chair
+  gsseg pick scene.ply --data DATASET --view 0001 --mask coco.json \\
+             --label chair --out chair
   gsseg pick scene.ply --data DATASET --view 0001 --click 160 120 --out cup
   gsseg pick scene.ply --data D --view 0001 --click 16 12 --not 20 12 --out cup
 """
@@ -27,11 +29,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_scene(parser)
     parser.add_argument("--view", required=True, metavar="STEM", help="the view in which it is shown")
     how = parser.add_mutually_exclusive_group(required=True)
-    how.add_argument("--mask", metavar="FILE", help="label image of the view: all that is not 0 is the object")
+    mask = "label image of the view, or masks of another program, as COCO: all that is not 0 is the object"
+    how.add_argument("--mask", metavar="PATH", help=mask)
     pixel: dict[str, Any] = {"nargs": 2, "type": int, "action": "append", "metavar": ("COLUMN", "ROW")}
     how.add_argument("--click", **pixel, help="a pixel of the object; several add up")
     parser.add_argument("--not", **pixel, dest="outside", default=[], help="with --click: a pixel that is not of it")
-    parser.add_argument("--label", type=int, help="with --mask: the object is this label alone")
+    label = "with --mask: the object is this label alone, an id or the name that another program's masks have"
+    parser.add_argument("--label", help=label)
     parser.add_argument("--out", required=True, metavar="DIR", help="gets object.ply, pick.npz and pick.png")
 
 
@@ -39,7 +43,6 @@ def run(options: argparse.Namespace) -> int:
     """Pick, and say what was written."""
     from gsseg_core.align.placing import place
     from gsseg_core.data.dataset import Dataset
-    from gsseg_core.data.label_images import UNKNOWN
     from gsseg_core.data.view import View
     from gsseg_core.export.pictures import overlay, palette, save_png
     from gsseg_core.export.view_pictures import background_image
@@ -63,11 +66,7 @@ def run(options: argparse.Namespace) -> int:
     camera = placed.dataset.cameras[names.index(options.view)]
     with staged_run(out, "pick", places=("object.ply", "pick.npz", "pick.png")) as run:
         if options.mask:
-            mask = read_object_mask(options.mask, options.label)
-            if camera.undistortion is not None:
-                camera.check_image_mask_size(mask.shape[1], mask.shape[0], options.mask)
-                mask = camera.undistortion.sample(mask, UNKNOWN)
-            view = View.from_arrays(camera, mask)
+            view = View.from_arrays(camera, read_object_mask(options.mask, camera, options.label))
             picked = pick_mask(scene, view, device=options.device)
         else:
             inside, outside = ([(row, column) for column, row in clicks] for clicks in (options.click, options.outside))

@@ -21,13 +21,18 @@ Clicks become a mask first (`gsseg_core.objects.clicks`).
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from gsseg_core.data.label_images import UNKNOWN, read_mask
+from gsseg_core.data.class_names import class_ids
+from gsseg_core.data.label_images import UNKNOWN, mask_header, read_mask
+from gsseg_core.data.mask_files import CLASS_ID
+from gsseg_core.data.mask_formats.shapes import check_fit, scaled
+from gsseg_core.data.mask_formats.table import open_masks
 from gsseg_core.data.view import View
 from gsseg_core.errors import MaskFormatError, NoUsableViewsError, SettingsError
 from gsseg_core.files.npz_files import write_npz
@@ -37,6 +42,7 @@ from gsseg_core.refine.label_propagation import GraphSettings, propagate
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbour_graph import graph_of
+from gsseg_core.text import quoted
 
 FORMAT = "gsseg-pick-1"
 
@@ -141,27 +147,49 @@ def pick_clicks(
     return pick_mask(scene, View.from_arrays(camera, labels), device=device)
 
 
-def read_object_mask(path: str | os.PathLike[str], label: int | None = None) -> np.ndarray:
-    """Read a drawn mask, or one label of a label image, as labels for `pick_mask`.
+def read_object_mask(path: str | os.PathLike[str], camera: Camera, label: str | int | None = None) -> np.ndarray:
+    """Read a drawn mask of a view, or one label of it, as labels for `pick_mask`.
 
     Parameters
     ----------
     path : path
-        A label image as `read_mask` takes it. In one of black and white only, 255 is the object and not unknown.
-    label : int, optional
-        The object's; by default all but 0.
+        A label image as `read_mask` takes it; in one of black and white only, 255 is the object and not unknown. Or
+        masks of another program, see docs/formats.md; a file with the mask of one image may have any name.
+    camera : Camera
+        Of the view. The mask is drawn on the image as it was taken, of its size or the same larger or smaller.
+    label : int or str, optional
+        The object's: an id, or the name of a class of another program; by default all but 0.
 
     Returns
     -------
     (H, W) int32
-        1 object, 0 not, -1 unknown.
+        1 object, 0 not, -1 unknown, as the pinhole view sees them.
 
     Raises
     ------
-    MaskFormatError
-        The file is no label image, or nothing in it is the object.
+    MaskFormatError, MaskSizeError
+        The file holds no masks, has none of this view or of another shape, or nothing in it is the object.
+    SettingsError
+        There is no such class.
     """
-    return object_mask(read_mask(path).labels, label, str(Path(path)))
+    path, names = Path(path), None
+    masks = None if path.suffix.lower() == ".png" else open_masks(path, [camera.image])
+    if masks is None:
+        header = mask_header(path)  # Before any pixel is read.
+        check_fit(header.width, header.height, camera, str(path))
+        labels = scaled(read_mask(path).labels, camera)
+    else:
+        names, labels = masks.class_names, masks.views[camera.image].labels(camera)
+    mask = object_mask(labels, None if label is None else _label_id(str(label), names), str(path))
+    return mask if camera.undistortion is None else camera.undistortion.sample(mask, UNKNOWN)
+
+
+def _label_id(label: str, class_names: Mapping[int, str] | None) -> int:
+    if class_names is not None:
+        return class_ids([label], dict(sorted(class_names.items())))[0]
+    if not re.fullmatch(CLASS_ID, label):
+        raise SettingsError(f"label is {quoted(label)}; expected a number, as the mask has no names of classes")
+    return int(label)
 
 
 def object_mask(

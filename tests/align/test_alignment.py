@@ -21,7 +21,7 @@ from gsseg_core.align.registration import Located, Photo, fit_poses
 from gsseg_core.align.settings import AlignSettings
 from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset
-from gsseg_core.data.view import spread
+from gsseg_core.data.view import View, spread
 from gsseg_core.errors import AlignmentError
 from gsseg_core.export.view_pictures import background_image
 from gsseg_core.raster.backends import make_operator
@@ -106,6 +106,12 @@ def test_views_that_show_nothing_are_not_judged(demo: Path, scene: GaussianScene
     assert place(scene, Dataset(demo, "no_such_folder"), check=True).agreement is None
     with pytest.raises(AlignmentError, match="no view has a photo or a mask"):
         place(scene, Dataset(demo, "no_such_folder"), align=True)
+
+
+def test_a_focal_length_of_next_to_nothing_does_no_harm() -> None:
+    camera = Camera("wide", 8, 6, np.array([[1e-310, 0, 4], [0, 1e-310, 3], [0, 0, 1]]), np.eye(4))
+    (shown,) = look_at([View.from_arrays(camera, np.eye(6, 8, dtype=np.int32))], AlignSettings())
+    assert np.isfinite(shown.edges).all() and np.isfinite(shown.camera.K).all()
 
 
 def test_turning_a_picture_is_turning_its_camera(demo: Path, scene: GaussianScene) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import mask_writers
@@ -12,7 +13,7 @@ from segmented_place import assert_one_line, segment
 from small_scenes import NAMES
 
 from gsseg_core.cli.main import main
-from gsseg_core.data.label_images import read_mask
+from gsseg_core.data.label_images import read_mask, write_mask
 
 
 def masks_of(place: Path, writer: mask_writers.Writer, factor: int = 1) -> Path:
@@ -89,3 +90,40 @@ def test_a_folder_of_unknown_files_is_refused_with_what_is_read(
         (place / f"data/strange/view{view}.json").write_text("{}")
     assert main([*segment(place), "--labels", "strange"]) == 2
     assert_one_line(capsys.readouterr().err, "strange/view0.json: is no file of masks that is known; gsseg reads label")
+
+
+@pytest.mark.parametrize("name", ["COCO polygons", "LabelMe masks", "SAM 2 video"])
+def test_an_object_is_picked_by_the_mask_of_another_program(place: Path, name: str) -> None:
+    masks = masks_of(place, mask_writers.WRITERS[name])
+    mask = masks / "view0.json" if name.startswith("LabelMe") else masks
+    data = place / "data"
+    start = ["pick", str(data / "scene.ply"), "--data", str(data), "--view", "view0", "--quiet"]
+    label = "1" if name in mask_writers.NAMELESS else NAMES[1]
+    for out, given, wanted in (("own", data / "labels/view0.png", "1"), ("other", mask, label)):
+        assert main([*start, "--mask", str(given), "--label", wanted, "--out", str(place / out)]) == 0
+    own, other = (np.load(place / out / "pick.npz")["ids"] for out in ("own", "other"))
+    assert len(own) and np.array_equal(own, other)
+
+
+@pytest.mark.parametrize("name", ["COCO text", "YOLO", "EISeg images"])
+def test_scores_by_the_truth_of_another_program_are_those_of_the_same_label_images(
+    place: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, predicted = place / "data", place / "predicted"
+    shutil.copytree(data / "labels", predicted)
+    write_mask(predicted / "view1.png", np.roll(read_mask(predicted / "view1.png").labels, 3, axis=1), 8)
+    truth = masks_of(place, mask_writers.WRITERS[name])
+    for json_file, path in (("own.json", data / "labels"), ("other.json", truth)):
+        assert main(["eval", "--pred", str(predicted), "--truth", str(path), "--json", str(place / json_file)]) == 0
+    own, other = (json.loads((place / file).read_text()) for file in ("own.json", "other.json"))
+    assert own["mean_iou"] < 1 and own == other
+    write_mask(predicted / "no_view.png", np.zeros((96, 128), np.int32), 8)
+    capsys.readouterr()
+    assert main(["eval", "--pred", str(predicted), "--truth", str(truth)]) == 2
+    assert_one_line(capsys.readouterr().err, "no_view.png: has no true mask among those of")
+
+
+def test_scores_by_ids_that_hold_in_one_view_only_are_refused(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth = masks_of(place, mask_writers.sam_json)
+    assert main(["eval", "--pred", str(place / "data/labels"), "--truth", str(truth)]) == 2
+    assert_one_line(capsys.readouterr().err, "is of SAM JSON, whose ids hold in their own view only")

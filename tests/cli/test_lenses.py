@@ -83,7 +83,7 @@ def test_an_object_is_picked_by_a_mask_drawn_on_the_bent_photo(
     assert (truth[picked] == 1).mean() > 0.8
     write_mask(tmp_path / "small.png", np.ones((9, 9), np.int32), 8)
     assert main(["pick", *inputs, "--mask", f"{tmp_path}/small.png"]) == 2
-    assert f"small.png: mask is 9 x 9 pixels; expected {WIDTH} x {HEIGHT}" in capsys.readouterr().err
+    assert f"small.png: is for an image of 9 x 9 pixels; expected {WIDTH} x {HEIGHT}" in capsys.readouterr().err
 
 
 def test_the_report_shows_photos_without_the_distortion(place: Path) -> None:

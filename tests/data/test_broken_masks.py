@@ -221,7 +221,12 @@ def test_names_of_yolo_that_are_wrong_are_refused(tmp_path: Path, content: str) 
 
 @pytest.mark.parametrize(
     ("row", "said"),
-    [("../x,9", "has a mask '../x' of '9' pixels"), ("-1,9", "has a mask '-1'"), ("5,9", "5.png: cannot be read")],
+    [
+        ("../x,9", "has a mask '../x' of '9' pixels"),
+        ("-1,9", "has a mask '-1'"),
+        ("5,9", "5.png: cannot be read"),
+        ("9" * 2**18, "metadata.csv: is no CSV"),
+    ],
 )
 def test_a_list_of_automatic_masks_that_names_others_is_refused(tmp_path: Path, row: str, said: str) -> None:
     place = written(tmp_path, PER_VIEW_WRITERS["SAM folders"])

@@ -134,7 +134,7 @@ def write_sog_1(path: Path, scene: GaussianScene) -> None:
 
     def between(values: np.ndarray, steps: int) -> tuple[np.ndarray, list[float], list[float]]:
         low, high = values.min(axis=0), values.max(axis=0)
-        return np.round((values - low) / (high - low) * steps).astype(int), low.tolist(), high.tolist()
+        return np.round((values - low) / np.maximum(high - low, 1e-9) * steps).astype(int), low.tolist(), high.tolist()
 
     def image(pixels: np.ndarray) -> np.ndarray:
         out = np.full((-(-n // width) * width, 4), 255, np.uint8)

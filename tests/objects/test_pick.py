@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import small_scenes
+from mask_writers import PER_VIEW_WRITERS, WRITERS
+from small_scenes import NAMES
 
 from gsseg_core.cli.main import main
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.data.view import View
-from gsseg_core.errors import MaskFormatError, NoUsableViewsError, SettingsError
+from gsseg_core.errors import MaskFormatError, MaskSizeError, NoUsableViewsError, SettingsError
 from gsseg_core.objects.pick import Pick, pick_mask, read_object_mask
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -92,13 +94,36 @@ def test_prompts_that_say_nothing_are_refused() -> None:
 
 
 def test_drawn_masks_are_read_black_and_white_or_by_label(tmp_path: Path) -> None:
-    write_mask(tmp_path / "drawn.png", np.array([[-1, 0]]), 8)  # written as 255, white
-    assert read_object_mask(tmp_path / "drawn.png").tolist() == [[1, 0]]
+    small = Camera("small", 4, 1, np.eye(3), np.eye(4))
+    write_mask(tmp_path / "drawn.png", np.array([[-1, 0, 0, 0]]), 8)  # written as 255, white
+    assert read_object_mask(tmp_path / "drawn.png", small).tolist() == [[1, 0, 0, 0]]
     write_mask(tmp_path / "labels.png", np.array([[3, 5, 0, -1]]), 8)
-    assert read_object_mask(tmp_path / "labels.png").tolist() == [[1, 1, 0, -1]]
-    assert read_object_mask(tmp_path / "labels.png", 5).tolist() == [[0, 1, 0, -1]]
+    assert read_object_mask(tmp_path / "labels.png", small).tolist() == [[1, 1, 0, -1]]
+    assert read_object_mask(tmp_path / "labels.png", small, 5).tolist() == [[0, 1, 0, -1]]
     with pytest.raises(MaskFormatError, match="expected pixels with the label 7"):
-        read_object_mask(tmp_path / "labels.png", 7)
+        read_object_mask(tmp_path / "labels.png", small, 7)
+    with pytest.raises(SettingsError, match="label is 'cup'; expected a number"):
+        read_object_mask(tmp_path / "labels.png", small, "cup")
+    with pytest.raises(MaskSizeError, match="for an image of 4 x 1 pixels"):
+        read_object_mask(tmp_path / "labels.png", CAMERA)
+
+
+@pytest.mark.parametrize("name", [*WRITERS, *PER_VIEW_WRITERS])
+def test_a_mask_of_any_program_is_that_of_the_label_image(tmp_path: Path, name: str) -> None:
+    place = (WRITERS | PER_VIEW_WRITERS)[name](tmp_path, {CAMERA.name: LABELS}, NAMES)
+    if place.is_dir() and not any(path.is_dir() for path in place.iterdir()):
+        file = next(path for path in place.iterdir() if path.stem == CAMERA.name)
+        place = file.rename(file.with_name(f"drawn{file.suffix}"))
+    np.testing.assert_array_equal(read_object_mask(place, CAMERA), LABELS > 0)
+
+
+def test_an_object_of_another_program_is_asked_for_by_name(tmp_path: Path) -> None:
+    labels = LABELS.copy()
+    labels[:2] = 2
+    place = WRITERS["COCO text"](tmp_path, {CAMERA.name: labels}, NAMES)
+    np.testing.assert_array_equal(read_object_mask(place, CAMERA, NAMES[2]), labels == 2)
+    with pytest.raises(SettingsError, match="class 'lamp' does not exist; expected one of 0"):
+        read_object_mask(place, CAMERA, "lamp")
 
 
 def test_the_command_writes_a_ply_and_the_ids(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -60,12 +60,16 @@ class Place:
     def by_view(self, suffix: str) -> dict[str, Path]:
         """Find the files with a suffix that belong to a view, by view: those in a folder, or the file itself.
 
+        A file that is named itself, where there is one view only, belongs to it whatever it is called.
+
         Raises
         ------
         MaskFormatError
             A view has two.
         """
         files = [path for path in self.entries or [self.path] if path.suffix.lower() == suffix and not path.is_dir()]
+        if len(self.stems) == 1 and files == [self.path]:
+            return dict.fromkeys(self.stems, self.path)
         return self.views((path.name, path) for path in files)
 
     def views(self, named: Iterator[tuple[str, Path]]) -> dict[str, Path]:

@@ -95,7 +95,10 @@ def _folders(place: Place) -> dict[str, Path]:
 
 
 def _read_folder(place: Place, folder: Path, camera: Camera) -> npt.NDArray[np.int32]:
-    rows = list(csv.DictReader(place.text(folder / METADATA).splitlines()))
+    try:
+        rows = list(csv.DictReader(place.text(folder / METADATA).splitlines()))
+    except csv.Error as cause:
+        raise MaskFormatError(f"{folder / METADATA}: is no CSV ({cause}); expected a row for each mask") from cause
     masks: list[tuple[float, int, Path]] = []
     for row in rows:
         number, area = str(row.get("id")), str(row.get("area"))
