@@ -95,8 +95,8 @@ clean:  ## remove the environments, the caches, what was built and the demo's ou
 	find benchmarks gsseg_core gsseg_ros tests -name __pycache__ -prune -exec rm -rf {} +
 
 define check-python
-@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(None if (3, 10) <= v <= (3, 13) else \
-	"gsseg needs Python 3.10 to 3.13, and $(PYTHON) is %d.%d: name another with `make PYTHON=...`" % v)'
+@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(None if (3, 10) <= v <= (3, 14) else \
+	"gsseg needs Python 3.10 to 3.14, and $(PYTHON) is %d.%d: name another with `make PYTHON=...`" % v)'
 endef
 
 define check-ros
@@ -132,9 +132,13 @@ $(MSGS_READY): $(MSGS) | $(ROS_READY)
 		$(BIN)/python -m pip install --quiet --no-deps --force-reinstall ./msg_defs
 	touch $@
 
-$(COLCON_READY): .ci/colcon-requirements.txt constraints.txt
+# As on a robot: versions of Ubuntu 24.04 where it has any.
+$(COLCON_READY): .ci/colcon-requirements.txt .ci/ubuntu-24.04.txt constraints.txt
 	$(check-python)
 	$(check-ros)
 	$(PYTHON) -m venv $(COLCON_VENV)
-	$(COLCON_VENV)/bin/python -m pip install --quiet --constraint constraints.txt -r .ci/colcon-requirements.txt
+	sed -n 's/^\([a-z0-9]*==\).*/^\1/p' .ci/ubuntu-24.04.txt | grep -v -f - constraints.txt | \
+		cat - .ci/ubuntu-24.04.txt > $(COLCON_VENV)/constraints.txt
+	$(COLCON_VENV)/bin/python -m pip install --quiet --constraint $(COLCON_VENV)/constraints.txt \
+		-r .ci/colcon-requirements.txt
 	touch $@

@@ -105,7 +105,7 @@ def _colmap_poses(folder: Path) -> list[tuple[str, list[float]]]:
 
     found = []
     for camera in _cameras(folder):
-        quat = Rotation.from_matrix(camera.world_to_camera[:3, :3]).as_quat(scalar_first=True)
+        quat = Rotation.from_matrix(camera.world_to_camera[:3, :3]).as_quat()[[3, 0, 1, 2]]
         found.append((f"{camera.name}.png", [*quat.tolist(), *camera.world_to_camera[:3, 3].tolist()]))
     (folder / "sparse" / "0").mkdir(parents=True)
     return found

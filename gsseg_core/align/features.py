@@ -13,6 +13,7 @@ import numpy as np
 
 from gsseg_core.align.agreement import LUMINANCE
 from gsseg_core.align.settings import AlignSettings
+from gsseg_core.errors import AlignmentError
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.depth import COVERED, colours_and_depth
 from gsseg_core.scene.camera import Camera
@@ -33,8 +34,12 @@ class Extractor:
     """COLMAP's SIFT on the CPU, which is the same from run to run."""
 
     def __init__(self, settings: AlignSettings) -> None:
-        import pycolmap
-
+        try:
+            import pycolmap
+        except ModuleNotFoundError as missing:
+            raise AlignmentError(
+                "locating photos in a scene needs pycolmap, which is missing: pip install pycolmap"
+            ) from missing
         pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, 1)  # It tells each time that it was made.
         options = pycolmap.FeatureExtractionOptions()
         options.use_gpu, options.num_threads = False, 1

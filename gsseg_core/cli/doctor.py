@@ -54,7 +54,7 @@ _EXTRAS_FOR = {
 }
 _ROS_MODULES = {
     "rclpy": "ROS 2 itself: source its setup file, or see the extra ros above",
-    "gsseg_msgs": "the messages: pip install ./msg_defs, or colcon build",
+    "gsseg_msgs": "the messages: pip install ./msg_defs, or in a workspace ln -s gsseg/msg_defs src/gsseg_msgs",
     "gsseg_ros": "the nodes: they come with gsseg",
     "tf2_ros": "only for pose_source tf; apt install ros-jazzy-tf2-ros",
 }
@@ -172,8 +172,8 @@ def _listed(findings: list[Finding]) -> str:
 
 def _versions() -> Iterator[Finding]:
     yield Finding("machine", "gsseg", metadata.version("gsseg"))
-    supported = (3, 10) <= sys.version_info[:2] <= (3, 13)
-    mark, fix = ("ok", "") if supported else ("!!", "use Python 3.10 to 3.13")
+    supported = (3, 10) <= sys.version_info[:2] <= (3, 14)
+    mark, fix = ("ok", "") if supported else ("!!", "use Python 3.10 to 3.14")
     yield Finding("machine", "Python", f"{platform.python_version()}, {sys.executable}", mark, fix)
     yield Finding("machine", "system", f"{platform.system()} {platform.release()}, {platform.machine()}")
     for name in _requirements(""):

@@ -103,7 +103,8 @@ class State:
                     arrays[f"supervised_{i}"] = evidence.supervised
             arrays[f"pose_{i}"] = np.stack([np.pad(view.camera.K, (0, 1)), view.camera.world_to_camera])
         with write_atomically(path) as temporary, open(temporary, "wb") as file:
-            np.savez_compressed(file, allow_pickle=False, header=np.array(json.dumps(header)), **arrays)
+            # Without allow_pickle=False, which NumPy 1.26 would take for one more array.
+            np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
             _require_replaceable(path)  # To save takes long.
 
     @classmethod

@@ -56,9 +56,10 @@ class RunClouds:
         """
         stamp = stamp_ns(header.stamp)
         if not self._spinner.wait_for(lambda: max([*self._clouds, -1]) >= stamp, deadline - time.monotonic()):
+            publishers = self._spinner.node.count_publishers(self._topic.topic_name)
             raise NodeUnavailableError(
                 f"{self._topic.topic_name}: segment was answered, but its cloud did not come in time "
-                f"({self._topic.get_publisher_count()} publishers, {len(self._clouds)} other clouds); did "
+                f"({publishers} publishers, {len(self._clouds)} other clouds); did "
                 "another request replace it, or does a qos_override make it best effort or volatile?"
             )
         return self._clouds.get(stamp)

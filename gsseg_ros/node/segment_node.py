@@ -15,8 +15,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.srv import ChangeState, GetAvailableStates, GetAvailableTransitions, GetState
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
@@ -81,7 +80,9 @@ class SegmentNode(LifecycleNode):
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(1.0, self._tell, callback_group=MutuallyExclusiveCallbackGroup(), clock=steady)
         self.add_on_set_parameters_callback(self._check_parameters)
-        self.add_post_set_parameters_callback(self._take_parameters)
+        self._told_after = hasattr(self, "add_post_set_parameters_callback")  # Humble has the one before alone.
+        if self._told_after:
+            self.add_post_set_parameters_callback(self._take_parameters)
 
     def autostart(self) -> None:
         """Configure and activate, unless the parameter says not to; what fails is logged and can be tried again."""
@@ -212,11 +213,14 @@ class SegmentNode(LifecycleNode):
 
     def _check_parameters(self, changed: Sequence[Parameter]) -> SetParametersResult:
         configured = self._outputs is not None
-        return parameters.check(self, changed, configured, self.workspace.require_allowed_scene)
+        result = parameters.check(self, changed, configured, self.workspace.require_allowed_scene)
+        if result.successful and not self._told_after:
+            self._take_parameters(changed)
+        return result
 
     def _take_parameters(self, changed: Sequence[Parameter]) -> None:
         if {parameter.name for parameter in changed} & parameters.AT_ONCE:
-            self.workspace.settings = Settings.read(self)
+            self.workspace.settings = Settings.read(self, changed)
 
     def _tell(self) -> None:
         inputs, clock_problem = self.inputs, self._sim_time.problem()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from gsseg_core.align.agreement import agreement, look_at, render
 from gsseg_core.align.conventions import AXIS_ROTATIONS, OPENGL, Convention
-from gsseg_core.align.features import Features
+from gsseg_core.align.features import Extractor, Features
 from gsseg_core.align.placing import find_alignment, place
 from gsseg_core.align.registration import Located, Photo, fit_poses
 from gsseg_core.align.settings import AlignSettings
@@ -229,3 +230,9 @@ def test_segment_warns_in_one_line_of_cameras_that_do_not_fit_and_align_mends_it
     frame = json.loads((tmp_path / "out/report.json").read_text())["frame"]
     assert frame["agreement"]["agrees"] is True
     np.testing.assert_allclose(frame["alignment"]["world_axes"], AXIS_ROTATIONS[9].T)
+
+
+def test_a_missing_pycolmap_is_one_error_that_says_what_to_type(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(AlignmentError, match="needs pycolmap, which is missing: pip install pycolmap"):
+        Extractor(SETTINGS)

@@ -14,13 +14,14 @@ import re
 import runpy
 import shutil
 import sys
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from doc_blocks import FENCE, FIRST, PAGES, REPOSITORY, Block, blocks_of, needs_ros
-from doc_commands import Started, check, core_libraries, kind_of, run_commands, words_of
+from doc_commands import Started, check, core_libraries, kind_of, run_commands, setup_py, words_of
 
 from gsseg_core.cli.arguments import COMMANDS, command_module
 from gsseg_core.data.dataset import Dataset
@@ -32,6 +33,7 @@ PROGRAMS = {
     "dask": "dask", "python": "", "python3": "",
 }  # fmt: skip
 MASKS = "docs/masks.md"
+APT_NAMES = {"pillow": "pil"}
 
 _COMMAND = re.compile(r"^(?: {4}|\t)(gsseg|python3?|pip|make|ros2|dask|segment_node|replay_node|colcon) ", re.MULTILINE)
 
@@ -171,7 +173,7 @@ def test_what_a_block_that_is_not_run_names_is_there(block: Block) -> None:
     "line",
     ["make demos", "pip install '.[veiw]'", "pip install ./msgs", "pip install somethingelse",
      "gsseg segment x --dat y", "ros2 run gsseg_ros no_node", "python benchmarks/no.py",
-     "colcon build --base-paths src src/gsseg/no", "sudo something"],
+     "ln -s gsseg/messages src/gsseg_msgs", "sudo something"],
 )  # fmt: skip
 def test_a_wrong_command_is_noticed(line: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises((AssertionError, SystemExit, pytest.fail.Exception)):
@@ -186,10 +188,15 @@ def test_examples_in_the_help_can_be_typed() -> None:
             check(re.split(r"[>(]", line)[0])
 
 
-def test_a_robot_is_told_to_install_every_library_that_ros_does_not_bring() -> None:
-    lines = [line for block in blocks_of("docs/tutorial_robot.md") for line in block.lines]
-    (line,) = [line for line in lines if "--break-system-packages" in line]
-    assert set(words_of(line)[2:-1]) == core_libraries() - {"numpy"}  # Which rclpy depends on.
+def test_a_robot_gets_every_library_from_apt_or_by_pip_or_is_told_when_it_is_needed() -> None:
+    (line,) = [line for block in blocks_of("docs/tutorial_robot.md") for line in block.lines if "'numpy<2'" in line]
+    by_pip = set(words_of(line)[2:])
+    assert {word for word in by_pip if ">" in word} <= set(setup_py()["install_requires"])
+    keys = {element.text for element in ElementTree.parse(REPOSITORY / "package.xml").getroot().iter("exec_depend")}
+    by_apt = {library for library in core_libraries() if f"python3-{APT_NAMES.get(library, library)}" in keys}
+    missing = core_libraries() - by_apt - {re.split("[<>]", word)[0] for word in by_pip}
+    assert missing == {"pycolmap", "shtab", "torch"}
+    assert all(name in (REPOSITORY / "docs" / "tutorial_robot.md").read_text() for name in missing)
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -177,7 +177,8 @@ def test_a_rigid_motion_carves_the_same() -> None:
     turn = Rotation.from_euler("xyz", [0.4, -1.1, 2.0])
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = turn.as_matrix(), [0.3, -2, 1]
-    quats = (turn * Rotation.from_quat(scene.quats, scalar_first=True)).as_quat(scalar_first=True)
+    turned = turn * Rotation.from_quat(np.roll(scene.quats, -1, axis=1))  # SciPy has the scalar last.
+    quats = np.roll(turned.as_quat(), 1, axis=1)
     moved = GaussianScene.from_arrays(
         scene.means @ motion[:3, :3].T + motion[:3, 3], quats, scene.scales, scene.opacities, scene.sh
     )

@@ -17,6 +17,8 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from lifecycle_msgs.msg import Transition
 from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from gsseg_ros.node import diagnostics
 from gsseg_ros.node.segment_node import SegmentNode
@@ -81,6 +83,19 @@ def test_an_activate_that_breaks_off_leaves_nothing_behind_and_works_afterwards(
     assert node.trigger_activate() == SUCCESS
     assert node.trigger_deactivate() == SUCCESS
     assert entities(node) == before
+
+
+def test_parameters_take_effect_at_once_on_humble_too(
+    ros: Ros, parameters: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(Node, "add_post_set_parameters_callback")
+    node = SegmentNode(context=ros.context)
+    try:
+        good, bad = node.set_parameters([Parameter("k", value=7), Parameter("pose_source", value="gps")])
+        assert good.successful and not bad.successful
+        assert (node.workspace.settings.k, node.workspace.settings.pose_source) == (7, "topic")
+    finally:
+        node.close()
 
 
 def test_a_deactivate_that_fails_is_said_and_brings_it_back_to_unconfigured(

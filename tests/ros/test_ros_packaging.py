@@ -6,6 +6,7 @@ import ast
 import importlib.util
 import json
 import os
+import runpy
 import stat
 import subprocess
 import sys
@@ -215,7 +216,14 @@ def test_package_xml_is_of_format_3_and_names_the_same_maintainer(folder: Path) 
     assert len(set(depends)) == len(depends)
 
 
-def test_colcon_finds_both_packages() -> None:
+def test_without_the_messages_the_import_says_which_link_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gsseg_msgs", None)
+    with pytest.raises(ModuleNotFoundError, match="run `ln -s gsseg/msg_defs src/gsseg_msgs`, and `colcon") as it:
+        runpy.run_path(str(ROOT / "gsseg_ros" / "__init__.py"))
+    assert it.value.name == "gsseg_msgs"
+
+
+def test_colcon_finds_both_packages_in_the_repository_itself() -> None:
     defaults = yaml.safe_load((ROOT / "colcon_defaults.yaml").read_text())
     assert defaults == {verb: {"base-paths": [".", "msg_defs"]} for verb in ("build", "list", "test")}
     assert all((ROOT / path / "package.xml").is_file() for path in defaults["build"]["base-paths"])
