@@ -215,13 +215,15 @@ class GaussianScene:
     @cached_property
     def sh(self) -> npt.NDArray[np.float32]:
         """Coefficients of spherical harmonics, (N, (d + 1)^2, 3) float32, band after band, RGB last."""
-        sh = columns(self.vertices, DC)[:, None, :]
-        count = _count_rest(self.vertices)
-        if count:
-            # In the PLY all of red comes first, then green, then blue; f_dc is one of each.
-            rest = columns(self.vertices, rest_names(count)).reshape(len(self), 3, -1).transpose(0, 2, 1)
-            sh = np.concatenate([sh, rest], axis=1)
-        return np.ascontiguousarray(sh)
+        sh = np.empty((len(self), (self.sh_degree + 1) ** 2, 3), np.float32)
+        sh[:, 0] = self._coefficients[:, :3]
+        sh[:, 1:] = self._coefficients[:, 3:].reshape(len(self), 3, -1).transpose(0, 2, 1)
+        return sh
+
+    @cached_property
+    def _coefficients(self) -> npt.NDArray[np.float32]:
+        """Coefficients as they lie in a PLY, (N, 3 B): of degree 0, then all others of red, of green, and of blue."""
+        return columns(self.vertices, DC + rest_names(_count_rest(self.vertices)))
 
     @cached_property
     def log_opacities(self) -> npt.NDArray[np.float32]:
@@ -242,12 +244,14 @@ class GaussianScene:
 
         With `ids`, only those of some Gaussians: (M, 3).
         """
-        chosen = slice(None) if ids is None else ids
-        if camera_center is None:
-            return spherical_harmonics.to_rgb(columns(self.vertices, DC)[chosen, None, :], self.means[chosen])
-        offsets = self.means[chosen] - np.asarray(camera_center, np.float32)
-        lengths = np.linalg.norm(offsets, axis=1, keepdims=True)
-        return spherical_harmonics.to_rgb(self.sh[chosen], offsets / np.maximum(lengths, np.finfo(np.float32).tiny))
+        from gsseg_core.scene.harmonics_kernel import seen_colors  # It loads numba, which reading scenes does without.
+
+        ids = np.arange(len(self)) if ids is None else ids
+        degree, center = (0, np.zeros(3)) if camera_center is None else (self.sh_degree, np.asarray(camera_center))
+        seen: npt.NDArray[np.float32] = seen_colors(
+            self._coefficients, self.means, ids.astype(np.int32), center.astype(np.float32), degree
+        )
+        return seen
 
 
 def _count_rest(vertices: npt.NDArray[np.void]) -> int:

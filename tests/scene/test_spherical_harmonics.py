@@ -9,7 +9,8 @@ import pytest
 from scipy.special import lpmv
 
 from gsseg_core.errors import SceneValueError
-from gsseg_core.scene.spherical_harmonics import C0, basis, to_rgb
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.spherical_harmonics import C0, basis
 
 
 def random_directions(n: int, seed: int = 0) -> np.ndarray:
@@ -51,10 +52,17 @@ def test_degrees_beyond_three_are_refused() -> None:
         basis(np.eye(3), 4)
 
 
-def test_colours_are_half_plus_the_sum_and_stay_in_range() -> None:
-    sh = np.random.default_rng(1).normal(size=(50, 16, 3)).astype(np.float32)
-    directions = random_directions(50)
-    expected = np.clip(0.5 + np.einsum("nb,nbc->nc", reference_basis(directions, 3), sh), 0, 1)
-    rgb = to_rgb(sh, directions)
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_colours_are_half_plus_the_sum_and_stay_in_range(degree: int) -> None:
+    rng = np.random.default_rng(degree)
+    sh, means = rng.normal(size=(50, (degree + 1) ** 2, 3)), rng.normal(size=(50, 3))
+    scene = GaussianScene.from_arrays(means, np.tile([1.0, 0, 0, 0], (50, 1)), np.ones((50, 3)), np.full(50, 0.5), sh)
+    centre, ids = np.array([0.3, -2.0, 1.0]), np.arange(1, 50, 3)
+    directions = (means - centre) / np.linalg.norm(means - centre, axis=1, keepdims=True)
+    expected = np.clip(0.5 + np.einsum("nb,nbc->nc", reference_basis(directions, degree), sh), 0, 1)
+    rgb = scene.colors(centre)
     assert rgb.dtype == np.float32 and rgb.min() == 0 and rgb.max() == 1
     np.testing.assert_allclose(rgb, expected, atol=1e-5)
+    np.testing.assert_array_equal(scene.colors(centre, ids), rgb[ids])
+    np.testing.assert_allclose(scene.colors(), np.clip(0.5 + C0 * sh[:, 0], 0, 1), atol=1e-6)
+    np.testing.assert_array_equal(scene.sh, sh.astype(np.float32))
