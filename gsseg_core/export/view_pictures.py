@@ -40,9 +40,7 @@ def view_file_name(name: str, prefix: str = "") -> str:
 
 def background_image(scene: GaussianScene, operator: ViewOperator) -> np.ndarray:
     """Render the scene's colours from a view, (H, W, 3) uint8, on black."""
-    colors, seen = np.zeros((len(scene), 3), np.float32), np.sort(operator.ids)  # once through memory
-    colors[seen] = scene.colors(operator.camera.center, seen)
-    image = operator.render(colors)
+    image = operator.blend_seen(scene.colors(operator.camera.center, operator.ids)).image
     pixels: np.ndarray = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
     return pixels
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numba as nb
 import numpy as np
 
 from gsseg_core.raster.view_operator import Blended, ViewOperator
@@ -24,9 +25,7 @@ class Surface(NamedTuple):
 
 def surface(scene: GaussianScene, operator: ViewOperator) -> Surface:
     """Render coverage and depth of a scene, or of an object alone, from the view of its operator."""
-    codes = np.zeros((len(scene), 1), np.float32)
-    codes[operator.ids, 0] = depths(scene, operator.camera, operator.ids)
-    image, left_over = operator.blend(codes)
+    image, left_over = operator.blend_seen(depths(scene, operator.camera, operator.ids)[:, None])
     coverage = 1 - left_over
     depth = np.divide(image[..., 0], coverage, out=np.full_like(coverage, np.inf), where=coverage > _EMPTY)
     return Surface(coverage, depth)
@@ -34,14 +33,21 @@ def surface(scene: GaussianScene, operator: ViewOperator) -> Surface:
 
 def colours_and_depth(scene: GaussianScene, operator: ViewOperator) -> Blended:
     """Blend the colours of a scene and the depths of its centres into a view: (H, W, 4) float32, and what is left."""
-    codes, seen = np.zeros((len(scene), 4), np.float32), np.sort(operator.ids)  # once through memory
-    codes[seen, :3] = scene.colors(operator.camera.center, seen)
-    codes[seen, 3] = depths(scene, operator.camera, seen)
-    return operator.blend(codes)
+    colors, depth = scene.colors(operator.camera.center, operator.ids), depths(scene, operator.camera, operator.ids)
+    return operator.blend_seen(np.concatenate([colors, depth[:, None]], axis=1))
 
 
 def depths(scene: GaussianScene, camera: Camera, ids: np.ndarray | None = None) -> np.ndarray:
     """Depth of each centre, or of some of them, (M,) float32 in scene units, from a camera; 0 for those behind it."""
-    row, means = camera.world_to_camera[2], scene.means if ids is None else scene.means[ids]
-    depth: np.ndarray = np.maximum(means @ row[:3] + row[3], 0).astype(np.float32)
+    ids = np.arange(len(scene), dtype=np.int32) if ids is None else ids
+    depth: np.ndarray = _depths(scene.means, ids, camera.world_to_camera[2].astype(np.float64))
+    return depth
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _depths(means: np.ndarray, ids: np.ndarray, row: np.ndarray) -> np.ndarray:  # (N, 3), (M,), (4,) float64
+    depth = np.empty(ids.shape[0], np.float32)
+    for m in nb.prange(ids.shape[0]):
+        i = ids[m]
+        depth[m] = max(means[i, 0] * row[0] + means[i, 1] * row[1] + means[i, 2] * row[2] + row[3], 0.0)
     return depth

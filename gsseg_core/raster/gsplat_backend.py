@@ -184,8 +184,8 @@ class GsplatOperator(ViewOperator):
         other._opacities = self._opacities.masked_fill(torch.tensor(hidden, device=self.device), 0)
         return other
 
-    def _blend(self, codes: np.ndarray) -> Blended:
-        codes = codes[self.ids]
+    def blend_seen(self, codes: np.ndarray) -> Blended:
+        """Blend codes (M, K) of what is visible."""
         image = np.empty((self.camera.height, self.camera.width, codes.shape[1]), np.float32)
         left_over = None
         with torch.no_grad():

@@ -90,11 +90,15 @@ class ViewOperator(ABC):
         codes = np.asarray(codes)
         if codes.ndim != 2 or len(codes) != self.num_gaussians:
             raise SceneValueError(f"codes have shape {codes.shape}; expected ({self.num_gaussians}, K)")
-        return self._blend(codes)
+        return self.blend_seen(codes.take(self.ids, axis=0))
+
+    @abstractmethod
+    def blend_seen(self, codes: np.ndarray) -> Blended:
+        """Do the same for codes (M, K) of `ids` alone."""
 
     def blend_rows(self, codes: CSRRows, num_classes: int) -> Blended:
         """Do the same for codes (N, K) of which only the entries that are not zero are at hand."""
-        return self._blend(codes.dense(num_classes))
+        return self.blend_seen(codes.take(self.ids).dense(num_classes))
 
     def strongest(self, codes: CSRRows, num_classes: int, background: bool) -> Strongest:
         """Find the class of each pixel, from codes (N, K) of which only the entries that are not zero are at hand.
@@ -190,7 +194,7 @@ class ViewOperator(ABC):
 
     def transmittance(self) -> np.ndarray:
         """Return what is left of each ray after the last Gaussian, (H, W) float32 in [0, 1]."""
-        return self._blend(np.empty((self.num_gaussians, 0), np.float32)).transmittance
+        return self.blend_seen(np.empty((len(self.ids), 0), np.float32)).transmittance
 
     @abstractmethod
     def footprints(self) -> np.ndarray:
@@ -225,9 +229,6 @@ class ViewOperator(ABC):
     @abstractmethod
     def _without(self, hidden: np.ndarray) -> ViewOperator:
         """Make the view without some of `ids`, (M,) bool."""
-
-    @abstractmethod
-    def _blend(self, codes: np.ndarray) -> Blended: ...
 
     @abstractmethod
     def _adjoint(self, residual: np.ndarray) -> np.ndarray: ...

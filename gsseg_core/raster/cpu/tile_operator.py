@@ -58,12 +58,13 @@ class TileOperator(ViewOperator):
         other._tiles = self._tiles._replace(table=table)
         return other
 
-    def _blend(self, codes: np.ndarray) -> Blended:
-        visible = label_pairs.take(np.ascontiguousarray(codes, np.float32), self.ids)
+    def blend_seen(self, codes: np.ndarray) -> Blended:
+        """Blend codes (M, K) of what is visible."""
+        codes = np.ascontiguousarray(codes, np.float32)
         if codes.shape[1] <= products.FEW:
-            return Blended(*products.render_few(self._tiles, visible))
+            return Blended(*products.render_few(self._tiles, codes))
         # A Gaussian speaks for few classes; the others cost nothing.
-        return Blended(*products.render(self._tiles, CSRRows.from_dense(visible), codes.shape[1]))
+        return Blended(*products.render(self._tiles, CSRRows.from_dense(codes), codes.shape[1]))
 
     def blend_rows(self, codes: CSRRows, num_classes: int) -> Blended:
         """Blend codes without their zeros."""
