@@ -33,7 +33,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/gsseg_ros"]),
         (SHARE, ["package.xml"]),
-        (f"{SHARE}/config", ["config/segment_node.yaml"]),
+        (f"{SHARE}/config", ["config/nav2_obstacles.yaml", "config/segment_node.yaml"]),
         (f"{SHARE}/foxglove", ["foxglove/gsseg.json"]),
         (f"{SHARE}/launch", ["launch/replay.launch.py", "launch/segment.launch.py"]),
         (f"{SHARE}/rviz", ["rviz/gsseg.rviz"]),

@@ -277,17 +277,31 @@ def cloud(
     records["rgb"] = rgb @ np.array([1 << 16, 1 << 8, 1], np.uint32)
     records["label"] = labels
     records["confidence"] = confidence
+    return _cloud_of(header, records, [datatype for _, datatype, _ in _CLOUD_FIELDS])
+
+
+def points_cloud(
+    header: Header,
+    points: npt.NDArray[np.float32],  # (M, 3)
+) -> PointCloud2:
+    """Write points (M, 3) in metres, and nothing besides."""
+    records = np.ascontiguousarray(points, "<f4").view([(axis, "<f4") for axis in "xyz"])[:, 0]
+    return _cloud_of(header, records, [PointField.FLOAT32] * 3)
+
+
+def _cloud_of(header: Header, records: npt.NDArray[Any], datatypes: list[int]) -> PointCloud2:
+    """Write records (M,) whose fields have these types, four bytes each."""
     message = PointCloud2(
         header=header,
         height=1,
-        width=count,
+        width=len(records),
         fields=[
             PointField(name=name, offset=4 * i, datatype=datatype, count=1)
-            for i, (name, datatype, _) in enumerate(_CLOUD_FIELDS)
+            for i, (name, datatype) in enumerate(zip(records.dtype.names or (), datatypes, strict=True))
         ],
         is_bigendian=False,
-        point_step=_CLOUD_POINT.itemsize,
-        row_step=_CLOUD_POINT.itemsize * count,
+        point_step=records.dtype.itemsize,
+        row_step=records.dtype.itemsize * len(records),
         is_dense=True,
     )
     message.data = byte_array(records)

@@ -15,7 +15,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from gsseg_core.data.class_names import flaw_of_class_name
+from gsseg_core.data.class_names import class_ids, flaw_of_class_name
 from gsseg_core.data.label_images import PER_VIEW
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.files.limits import MAX_LABEL
@@ -186,6 +186,20 @@ DECLARATIONS = (
         f"format of the classes that ~/export writes: {', '.join(SCENE_WRITERS)}",
         at_once=True,
     ),
+    Declaration(
+        "obstacle_classes",
+        [],
+        "classes, by name or number, that ~/obstacles says the places of, for planners; empty: none",
+        at_once=True,
+    ),
+    Declaration("obstacle_rate", 2.0, "messages on ~/obstacles per second [Hz]", 0.01, 100.0),
+    Declaration("obstacle_resolution", 0.05, "side of a cell of ~/obstacles [m]", 0.001, 10.0),
+    Declaration(
+        "obstacle_min_height", 0.05, "lower parts of a class are no obstacle, z of the map [m]", -1e6, 1e6, at_once=True
+    ),
+    Declaration(
+        "obstacle_max_height", 2.0, "higher parts of a class are no obstacle, z of the map [m]", -1e6, 1e6, at_once=True
+    ),
     Declaration("device", "cpu", f"where views are rendered: {devices()}"),
     Declaration("autostart", True, "configure and activate at start; false: wait for a lifecycle manager"),
     Declaration("queue_size", 30, "masks waiting to be fused; of more, the oldest are dropped [count]", 1, 1000),
@@ -236,6 +250,11 @@ class Settings:
     k: int
     beta: float
     export_format: str
+    obstacle_classes: tuple[str, ...]
+    obstacle_rate: float
+    obstacle_resolution: float
+    obstacle_min_height: float
+    obstacle_max_height: float
     device: str
     autostart: bool
     queue_size: int
@@ -274,6 +293,16 @@ class Settings:
         twice = sorted({name for name in self.class_names if self.class_names.count(name) > 1})
         if twice:
             raise SettingsError(f"parameter class_names: {twice[0]!r} occurs more than once; expected distinct names")
+        if self.obstacle_min_height > self.obstacle_max_height:
+            raise SettingsError(
+                f"parameter obstacle_min_height is {self.obstacle_min_height:g}; expected at most "
+                f"{self.obstacle_max_height:g}, the parameter obstacle_max_height"
+            )
+        if self.class_names:
+            try:
+                class_ids(self.obstacle_classes, self.names_by_id)
+            except SettingsError as error:
+                raise SettingsError(f"parameter obstacle_classes: {error}") from error
         if self.data_root and not Path(self.data_root).is_dir():
             raise SettingsError(f"parameter data_root: {self.data_root} is no folder; expected one that exists")
 
@@ -286,7 +315,7 @@ class Settings:
         for name in ("scene_path", "data_root"):
             plain[name] = os.path.expanduser(plain[name])
         plain["rectified"] = str(plain["rectified"]).lower()  # Both true and "true", as YAML and shells have it.
-        for name in ("class_names", "cameras"):
+        for name in ("class_names", "cameras", "obstacle_classes"):
             plain[name] = tuple(values[name] or ())
         plain["palette"] = Palette(values["palette"]) if values["palette"] else None
         tolerance = DepthTolerance(*(values[f"depth_tolerance.{part}"] for part in ("absolute", "relative")))

@@ -27,6 +27,7 @@ from gsseg_ros.node import diagnostics, parameters
 from gsseg_ros.node.complaints import Complaints
 from gsseg_ros.node.inputs import Inputs
 from gsseg_ros.node.learn_action import LearnAction
+from gsseg_ros.node.obstacles import Obstacles
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.parameters import Settings
 from gsseg_ros.node.services import AT_WORK, WAITING, Services, describe
@@ -34,9 +35,10 @@ from gsseg_ros.node.sim_time import SimTime
 from gsseg_ros.node.viewpoints import Lookup
 from gsseg_ros.node.workspace import Workspace
 
-THREADS = AT_WORK + WAITING + 6
-"""Of the executor: those that requests hold that take long, one for a learn job, one for a transition, and always some
-for messages, parameters, diagnostics, the lifecycle state, and requests that are refused at once."""
+THREADS = AT_WORK + WAITING + 7
+"""Of the executor: those that requests hold that take long, one for a learn job, one for a transition, one for
+obstacles, and always some for messages, parameters, diagnostics, the lifecycle state, and requests that are refused at
+once."""
 
 STOP_SECONDS = 3.0
 """How long a job gets to stop when the node is deactivated or shut down."""
@@ -69,6 +71,7 @@ class SegmentNode(LifecycleNode):
         parameters.declare(self)
         self.workspace = Workspace(Settings.read(self), lambda: self.get_clock().now().to_msg())
         self.inputs: Inputs | None = None
+        self.obstacles: Obstacles | None = None
         self._outputs: Outputs | None = None
         self._requests = Services(self, self.workspace, self._require_outputs, self._lookup)
         self._learn = LearnAction(self, self.workspace, self._require_outputs)
@@ -154,6 +157,7 @@ class SegmentNode(LifecycleNode):
 
     def _activate(self) -> None:
         self.inputs = Inputs(self, self.workspace, self._require_outputs(), self._complaints)
+        self.obstacles = Obstacles(self, self.workspace, self._complaints)
         self.workspace.active = True
         topics = ", ".join(self.inputs.arrivals)
         self.get_logger().info(
@@ -167,6 +171,9 @@ class SegmentNode(LifecycleNode):
             self.get_logger().warning(f"a job did not stop within {STOP_SECONDS:g} s; going on without it")
         if not self.workspace.requests.drained(STOP_SECONDS):
             self.get_logger().warning(f"a request did not end within {STOP_SECONDS:g} s; it will publish nothing")
+        if self.obstacles is not None:
+            self.obstacles.close()
+            self.obstacles = None
         if self.inputs is not None:
             self.inputs.close()
             self.inputs = None

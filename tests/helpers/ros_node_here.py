@@ -21,6 +21,7 @@ from rclpy.parameter import Parameter
 
 from gsseg_core.data.view import View
 from gsseg_ros.node.inputs import Inputs
+from gsseg_ros.node.obstacles import Obstacles
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.segment_node import SegmentNode
 
@@ -62,6 +63,11 @@ class NodeHere:
     def outputs(self) -> Outputs:
         assert self.node._outputs is not None
         return self.node._outputs
+
+    @property
+    def obstacles(self) -> Obstacles:
+        assert self.node.obstacles is not None
+        return self.node.obstacles
 
     def send(
         self,

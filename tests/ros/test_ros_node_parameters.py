@@ -17,7 +17,7 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import Parameter
 
-from gsseg_ros.node.parameters import DECLARATIONS
+from gsseg_ros.node.parameters import AT_ONCE, DECLARATIONS
 
 
 @pytest.fixture(scope="module")
@@ -135,10 +135,10 @@ def test_arguments_that_ros_cannot_parse_are_one_error(ros: Ros) -> None:
 
 
 @pytest.mark.parametrize("state", ["inactive", "active"])
-def test_while_it_is_configured_only_k_beta_and_the_format_of_exports_can_be_set(robot: Robot, state: str) -> None:
+def test_while_it_is_configured_only_what_takes_effect_at_once_can_be_set(robot: Robot, state: str) -> None:
     robot.brought_to(state)
     for declaration in DECLARATIONS:
-        if declaration.name in ("k", "beta", "export_format"):
+        if declaration.name in AT_ONCE:
             continue
         value = robot.get(declaration.name)
         message = Parameter("", value=value)
@@ -153,7 +153,9 @@ def test_while_it_is_configured_only_k_beta_and_the_format_of_exports_can_be_set
         assert result.reason == (
             f"{declaration.name} can change only while the node is unconfigured: deactivate and clean it up first"
         )
+    assert {"k", "beta", "export_format", "obstacle_classes"} < AT_ONCE
     assert robot.set("k", 50) == robot.set("beta", 0.65) == robot.set("export_format", "ply") == (True, "")
+    assert robot.set("obstacle_classes", ["box"]) == (True, "")
 
 
 @pytest.mark.parametrize(
