@@ -27,11 +27,13 @@ ARGUMENTS = (
     ("pose", "pose", "topic with the camera's pose in the map"),
     ("odometry", "odometry", "topic with the odometry, where pose_source is odometry"),
     ("image", "image", "topic with the camera's pictures, for the overlay"),
+    ("depth", "depth", "topic with depths of the camera's image"),
+    ("remap", "", "more of that, between blanks: 'front/mask:=/a/mask left/mask:=/b/mask'"),
     ("use_sim_time", "false", "whether time comes from /clock: true or false"),
     ("log_level", "info", "debug, info, warn, error or fatal"),
     ("rviz", "false", "whether to show what the node publishes in RViz: true or false"),
 )
-INPUTS = ("mask", "camera_info", "pose", "odometry", "image")
+INPUTS = ("mask", "camera_info", "pose", "odometry", "image", "depth")
 # Topics of the node that rviz/gsseg.rviz shows, below the name gsseg and relative to the namespace.
 SHOWN = ("cloud", "object_markers", "overlay")
 
@@ -82,7 +84,10 @@ def _nodes(context: LaunchContext) -> list[Node]:
         name=value["name"],
         namespace=value["namespace"],
         parameters=[value["params_file"], sim_time | given],
-        remappings=[(name, value[name]) for name in INPUTS],
+        remappings=[
+            *((name, value[name]) for name in INPUTS),
+            *(tuple(rule.split(":=")) for rule in value["remap"].split()),
+        ],
         ros_arguments=["--log-level", value["log_level"]],
         output="screen",
         emulate_tty=True,

@@ -115,7 +115,8 @@ class Obstacles:
     def _found(self, session: LiveSession, settings: Settings) -> Cells:
         """Find the cells, from what a request of ~/segment left at its defaults would publish now."""
         refine = RefineSettings(k=settings.k, beta=settings.beta, filter=True, carve=False)
-        result, scene, place = session.segmentation(refine), session.scene, settings.scene_to_map
+        result, place = session.segmentation(refine), settings.scene_to_map
+        scene = session.scene_of(result)
         chosen = self._chosen(settings.obstacle_classes, result.class_names)
         index = np.flatnonzero(np.isin(result.labels, chosen) & (scene.opacities >= OPAQUE))
         half_axes = rotations(scene.quats[index]) * scene.scales[index, None, :]

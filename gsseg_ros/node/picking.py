@@ -17,14 +17,15 @@ from gsseg_core.errors import IntrinsicsError, MaskFormatError, MaskSizeError, P
 from gsseg_core.export.pictures import palette
 from gsseg_core.objects.oriented_boxes import class_box
 from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_ros.camera_infos import camera_of_image
 from gsseg_ros.conversions import byte_array, cloud
 from gsseg_ros.errors import InvalidRequestError, TooManyPixelsError, ViewpointError
+from gsseg_ros.frames import Similarity
 from gsseg_ros.node.masks.reader import MaskReader
 from gsseg_ros.node.parameters import Settings
 from gsseg_ros.node.size_limits import require_size
 from gsseg_ros.node.viewpoints import Lookup, viewpoint_pose
-from gsseg_ros.node.workspace import Workspace
 from gsseg_ros.object_messages import object_message
 
 if TYPE_CHECKING:
@@ -37,8 +38,10 @@ MOST_POINTS = 1000
 """Points of one kind that a request may give."""
 
 
-def pick_object(request: PickService.Request, workspace: Workspace, lookup: Lookup | None, *, rectified: bool) -> Pick:
-    """Pick the object that a request shows; `rectified` says what its mask and its points are of.
+def pick_object(
+    request: PickService.Request, scene: GaussianScene, settings: Settings, lookup: Lookup | None, *, rectified: bool
+) -> Pick:
+    """Pick the object of a scene that a request shows; `rectified` says what its mask and its points are of.
 
     Raises
     ------
@@ -46,32 +49,31 @@ def pick_object(request: PickService.Request, workspace: Workspace, lookup: Look
         The mask or the points cannot be used, or there are both or neither.
     ViewpointError, NoTransformError
         The view cannot be used.
-    NoSceneError
-        No scene is loaded.
     NoUsableViewsError
         The view does not show both the object and what is not it.
     """
     from gsseg_core.objects.pick import pick_clicks, pick_mask  # A node starts without the SciPy that it needs.
 
-    session, inside, outside = workspace.session, request.inside, request.outside
+    inside, outside = request.inside, request.outside
     if bool(request.mask.width) == bool(inside or outside):
         raise InvalidRequestError("mask and points: found both or neither; expected a mask, or points inside")
-    camera = _camera(request, workspace, lookup, rectified=rectified)
+    camera = _camera(request, settings, lookup, rectified=rectified)
     if request.mask.width:
-        return pick_mask(
-            session.scene, View.from_arrays(camera, _labels(request, camera, workspace.settings)), device=session.device
-        )
+        view = View.from_arrays(camera, _labels(request, camera, settings))
+        return pick_mask(scene, view, device=settings.device)
     if camera.undistortion is not None:
         raise ViewpointError(
             "viewpoint_camera: d is of a lens that distorts; expected points in a rectified image, and zeros, or a mask"
         )
     clicks = [_pixels(points, name) for points, name in ((inside, "inside"), (outside, "outside"))]
-    return pick_clicks(session.scene, camera, *clicks, device=session.device)
+    return pick_clicks(scene, camera, *clicks, device=settings.device)
 
 
-def fill_answer(response: PickService.Response, picked: Pick, name: str, workspace: Workspace, header: Header) -> None:
-    """Fill in indices, cloud and object of what was picked."""
-    scene, place, index = workspace.session.scene, workspace.settings.scene_to_map, picked.ids
+def fill_answer(
+    response: PickService.Response, picked: Pick, name: str, scene: GaussianScene, place: Similarity, header: Header
+) -> None:
+    """Fill in indices, cloud and object of what was picked of a scene that has a place in the map."""
+    index = picked.ids
     confidence, color = picked.membership[index], palette(OBJECT + 1)[OBJECT]
     points, rgb = place.points_to_map(scene.means[index]), np.tile(color, (len(index), 1))
     response.indices = byte_array(index.astype(np.uint32), "I")
@@ -84,9 +86,9 @@ def fill_answer(response: PickService.Response, picked: Pick, name: str, workspa
         response.object = object_message(OBJECT, name or "object", shade, confidence, box)
 
 
-def _camera(request: PickService.Request, workspace: Workspace, lookup: Lookup | None, *, rectified: bool) -> Camera:
+def _camera(request: PickService.Request, settings: Settings, lookup: Lookup | None, *, rectified: bool) -> Camera:
     """Make the scene's camera of the view, of the size of the mask if there is one."""
-    settings, info, mask = workspace.settings, request.viewpoint_camera, request.mask
+    info, mask = request.viewpoint_camera, request.mask
     size = (mask.width, mask.height) if mask.width else (info.width, info.height)
     try:
         for message, what in ((info, "viewpoint_camera"), (mask, "mask")):

@@ -203,14 +203,15 @@ class Services:
     @in_turn
     def pick(self, request: Pick.Request, response: Pick.Response) -> None:
         """Pick one object of one view."""
-        workspace, topics = self.workspace, [self.node.resolve_topic_name(name) for name in ("mask", "camera_info")]
-        rectified = is_rectified(workspace.settings.rectified, *topics)
-        with workspace.run("pick") as run:
+        settings, scene = self.workspace.settings, self.workspace.session.scene
+        topics = [self.node.resolve_topic_name(name) for name in ("mask", "camera_info")]
+        rectified = is_rectified(settings.rectified, *topics)
+        with self.workspace.run("pick") as run:
             with run.watch.stage("pick"):
-                picked = pick_object(request, workspace, self._lookup(), rectified=rectified)
+                picked = pick_object(request, scene, settings, self._lookup(), rectified=rectified)
             run.stamp = self.node.get_clock().now().to_msg()
             with run.watch.stage("boxes"):
-                fill_answer(response, picked, request.name, workspace, self._header(run))
+                fill_answer(response, picked, request.name, scene, settings.scene_to_map, self._header(run))
             response.stages = stage_timings(run)
 
     @answered

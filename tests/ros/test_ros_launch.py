@@ -143,6 +143,12 @@ def test_inputs_are_in_the_namespace_of_the_node_unless_another_topic_is_given(l
     ]  # fmt: skip
 
 
+def test_those_of_several_cameras_are_given_as_remappings(launched: Launched) -> None:
+    segment, _ = launched(cameras="[front, left]", remap="front/mask:=/a/mask left/mask:=b/mask")
+    assert all(isinstance(rule, tuple) for rule in segment.remappings), "launch takes nothing else"
+    assert resolved(segment, "gsseg", ["front/mask", "left/mask", "left/pose"]) == ["/a/mask", "/b/mask", "/left/pose"]
+
+
 def test_another_map_frame_is_the_one_that_rviz_stands_in(launched: Launched) -> None:
     _, rviz = launched(map_frame="site")
     assert rviz.arguments[-2:] == ["-f", "site"]
