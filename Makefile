@@ -20,7 +20,10 @@ MSGS := $(wildcard msg_defs/*.* msg_defs/action/* msg_defs/msg/* msg_defs/srv/*)
 # Of tests that run beside each other: those that start nodes wait more than they work.
 TEST_WORKERS ?= 4
 
-# No bytecode of what nobody imports. pip reads this one the other way round: 0 is --no-compile, here and where it builds.
+# Bytecode of what is imported, whatever the environment has to say: without it a node takes 3.2 s of processor time to
+# import what it needs, in place of 1.0. And none of what nobody imports: pip reads the second one the other way round,
+# 0 is --no-compile, here and where it builds.
+unexport PYTHONDONTWRITEBYTECODE
 export PIP_NO_COMPILE = 0
 
 # Both builders of the messages obey it; without it one of them compiles file after file.
