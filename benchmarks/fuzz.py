@@ -180,7 +180,7 @@ def judge(ended: Ended) -> str:
         return f"traceback: {raised.split(':')[0]} at {':'.join(frames[-1]) if frames else 'no line of gsseg'}"
     if ended.code < 0:
         return f"ended by signal {-ended.code}"
-    short = len(lines) == 1 and lines[0].startswith("gsseg: error: memory is not enough")
+    short = len(lines) == 1 and "memory is not enough" in lines[0]
     if ended.peak > MOST_MEMORY or (_NO_MEMORY.search(ended.errors) and not short):
         return "memory: more than 2 GiB"
     if ended.code == 0:

@@ -22,6 +22,7 @@ from PIL import Image
 from scipy import ndimage
 
 from gsseg_core.align.settings import AlignSettings
+from gsseg_core.align.thinning import thinned
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.photos import read_photo
 from gsseg_core.data.view import View, spread
@@ -139,7 +140,8 @@ def agreement(
     """Compare a scene with views, at least one, each from its own camera; None if there is none."""
     if not shown:
         return None
-    rendered = [render(scene, view.camera, device) for view in shown]
+    few = thinned(scene, settings.gaussians)
+    rendered = [render(few, view.camera, device) for view in shown]
     scores = np.array([[view.score(picture) for view in shown] for picture in rendered])
     score, own = float(np.diag(scores).mean()), np.eye(len(shown), dtype=bool)
     turned = float(np.mean([view.upside_down().score(picture) for view, picture in zip(shown, rendered, strict=True)]))

@@ -21,6 +21,7 @@ import numpy as np
 
 from gsseg_core.align.agreement import Shown, render
 from gsseg_core.align.settings import AlignSettings
+from gsseg_core.align.thinning import thinned
 from gsseg_core.progress import Progress, silent
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -99,6 +100,7 @@ def find_convention(
     progress: Progress = silent,
 ) -> Convention:
     """Find the convention that agrees best with some views, at least one."""
+    scene = thinned(scene, settings.gaussians)
     tried = [
         (inverted, world, looking)
         for looking, inverted, world in product(range(len(_LOOKING)), (False, True), AXIS_ROTATIONS)

@@ -15,6 +15,8 @@ class AlignSettings:
         Views that are compared with the scene, spread evenly over the dataset.
     picture_px : int
         Longer side of the pictures that are compared, in px.
+    gaussians : int
+        Gaussians of which they are rendered, at most; see `gsseg_core.align.thinning`.
     photo_margins, mask_margins : (float, float)
         By how much the score of views, 0 to 1, is above that of pictures that do not belong together: below the first,
         cameras and scene have nothing to do with each other; from the second on they agree; between, nobody can tell.
@@ -40,6 +42,7 @@ class AlignSettings:
 
     views: int = 6
     picture_px: int = 96
+    gaussians: int = 1 << 17
     photo_margins: tuple[float, float] = (0.1, 0.35)
     mask_margins: tuple[float, float] = (0.03, 0.1)
     survivors: float = 0.25

@@ -226,7 +226,7 @@ def check_scene(path: Path, header: dict[str, Any], digest: str) -> None:
     if header.get("scene") != digest:
         raise StateMismatchError(
             f"{path}: belongs to the scene {clipped(str(header.get('scene'))[:12])}; expected {digest[:12]}, the "
-            "scene in use"
+            "scene in use (the same scene in another format has other numbers: give the file that was segmented)"
         )
 
 

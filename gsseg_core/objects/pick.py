@@ -30,7 +30,7 @@ import numpy as np
 
 from gsseg_core.data.class_names import class_ids
 from gsseg_core.data.label_images import UNKNOWN, mask_header, read_mask
-from gsseg_core.data.mask_files import CLASS_ID
+from gsseg_core.data.mask_files import CLASS_ID, mask_files
 from gsseg_core.data.mask_formats.shapes import check_fit, scaled
 from gsseg_core.data.mask_formats.table import open_masks
 from gsseg_core.data.view import View
@@ -175,6 +175,7 @@ def read_object_mask(path: str | os.PathLike[str], camera: Camera, label: str | 
     path, names = Path(path), None
     masks = None if path.suffix.lower() == ".png" else open_masks(path, [camera.image])
     if masks is None:
+        path = mask_files(path, [camera.image]).get(camera.image, path) if path.is_dir() else path
         header = mask_header(path)  # Before any pixel is read.
         check_fit(header.width, header.height, camera, str(path))
         labels = scaled(read_mask(path).labels, camera)

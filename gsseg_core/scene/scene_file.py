@@ -37,6 +37,8 @@ def open_scene(path: Path, within: Path | None, expected: str) -> Iterator[Buffe
             yield file
     except UnfitError as error:
         raise SceneFileError(f"{path}: {error}") from error
+    except MemoryError as error:
+        raise SceneFileError(f"{path}: memory is not enough ({reason(error)}); expected a smaller scene") from error
     except DAMAGED as error:
         raise SceneFileError(f"{path}: truncated or not {expected} ({reason(error)}); expected it whole") from error
 

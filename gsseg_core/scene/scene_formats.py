@@ -131,7 +131,7 @@ def read_scene(path: str | os.PathLike[str], within: Path | None = None) -> Read
         if isinstance(error, OSError):
             what = f"{path}: cannot be read ({reason(error)}); expected a {scene_format.name}"
         formats = ", ".join(f"{known.name} ({known.looked_for})" for known in SCENE_FORMATS)
-        known = "" if suited else f"; gsseg reads {formats}"
+        known = "" if suited or path.is_dir() else f"; gsseg reads {formats}"
         hint = scene_hint(path) if within is None else ""  # It looks around, wherever links lead.
         raise SceneFileError(f"{what}{known}{hint}") from error
 

@@ -103,13 +103,21 @@ def format_of(path: str | os.PathLike[str], asked: str | None = None) -> str:
     Raises
     ------
     SettingsError
-        The suffix says another format than the one that is asked for.
+        The suffix says another format than the one that is asked for, or one that gsseg reads only.
     """
+    from gsseg_core.scene.scene_formats import SCENE_FORMATS  # `gsseg --help` does without.
+
     file = Path(path).name.lower()
     fits = {max((s for s in writer.suffixes if file.endswith(s)), default="", key=len): name
             for name, writer in SCENE_WRITERS.items()}  # fmt: skip
     suffix = max(fits, key=len)
     said = fits[suffix] if suffix else None
+    only_read = None if said else next((known for known in SCENE_FORMATS if file.endswith(known.suffixes)), None)
+    if only_read:
+        suffixes = ", ".join(writer.suffixes[0] for writer in SCENE_WRITERS.values())
+        raise SettingsError(
+            f"{path}: has the suffix of {only_read.name}, which gsseg reads and does not write; expected {suffixes}"
+        )
     if asked is None or said in (None, asked):
         return asked or said or DEFAULT
     raise SettingsError(

@@ -20,6 +20,7 @@ from gsseg_core.align.features import Extractor, Features
 from gsseg_core.align.placing import find_alignment, place
 from gsseg_core.align.registration import Located, Photo, fit_poses
 from gsseg_core.align.settings import AlignSettings
+from gsseg_core.align.thinning import thinned
 from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View, spread
@@ -107,6 +108,19 @@ def test_views_that_show_nothing_are_not_judged(demo: Path, scene: GaussianScene
     assert place(scene, Dataset(demo, "no_such_folder"), check=True).agreement is None
     with pytest.raises(AlignmentError, match="no view has a photo or a mask"):
         place(scene, Dataset(demo, "no_such_folder"), align=True)
+
+
+def test_an_eighth_of_the_gaussians_tells_whether_cameras_fit(
+    demo: Path, with_photos: Path, scene: GaussianScene
+) -> None:
+    few = thinned(scene, len(scene) // 8)
+    assert len(few) == len(scene) // 8 and thinned(scene, len(scene)) is scene
+    assert np.array_equal(few.means, thinned(scene, len(scene) // 8).means)
+    assert (few.opacities > 0).all() and (few.opacities < 1).all()
+    for folder in (demo, with_photos):
+        for dataset, fits in ((Dataset(folder), True), (Dataset(folder).moved(DISTURBED.camera), False)):
+            found = agreement(few, look_at(dataset.views("train"), SETTINGS), SETTINGS)
+            assert found is not None and found.agrees is fits, (folder, found)
 
 
 def test_a_focal_length_of_next_to_nothing_does_no_harm() -> None:

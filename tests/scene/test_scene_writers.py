@@ -189,6 +189,9 @@ def test_the_format_of_a_file_is_what_its_suffix_says() -> None:
     asked = {"a.ply": "ply", "a.COMPRESSED.ply": "compressed-ply", "a.usda": "usd", "a.glb": "glb", "a": "ply"}
     assert {name: format_of(name) for name in asked} == asked
     assert format_of("a.dat", "spz") == "spz"
+    for asked_for in (None, "ply"):
+        with pytest.raises(SettingsError, match=r"a\.ksplat: has the suffix of ksplat, which gsseg reads and does not"):
+            format_of("a.ksplat", asked_for)
     with pytest.raises(SettingsError, match=r"a\.spz: has the suffix of the format spz, but glb is asked for"):
         format_of("a.spz", "glb")
     with pytest.raises(SettingsError, match="suffix of the format compressed-ply, but ply"):

@@ -1,6 +1,7 @@
 """LabelMe: a JSON file per image, with shapes that name their class: polygons, rectangles, circles and masks.
 
-`_background_` is 0 and `__ignore__` unknown, as in LabelMe's own converters. The last shape is on top.
+Rectangles may be turned. `_background_` is 0 and `__ignore__` unknown, as in LabelMe's own converters. The last shape is
+on top.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ def _region(shape: Record) -> Region:
     kind = shape.fields.get("shape_type") or "polygon"
     outline = Polygons.of(shape.value("points"), shape.where)
     points = outline.rings[0]
-    if kind == "polygon":
+    if kind in ("polygon", "oriented_rectangle"):
         return outline
     if kind not in _KINDS:
         raise MaskFormatError(

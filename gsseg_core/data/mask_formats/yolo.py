@@ -1,7 +1,8 @@
 """YOLO segmentation: a text file per image, in each line a class and a polygon in shares of the image's size.
 
 Class c is id c + 1, since its 0 is an object. Names come from `data.yaml` beside the texts or up to two folders above,
-or else from `classes.txt` beside them. The last line is on top.
+or else from `classes.txt` beside them. The last line is on top. Predictions may end a line with a confidence, or with
+the id of a track, which are left out; of an object of a pixel or two they have one or two points, which cover nothing.
 """
 
 from __future__ import annotations
@@ -23,12 +24,13 @@ from gsseg_core.files.yaml_files import read_yaml
 from gsseg_core.scene.camera import Camera
 from gsseg_core.text import quoted
 
-_LINE = rb"\s*(?:[0-9]+(?:[ \t]+[-+0-9.eE]+){4,}[ \t]*(?:[\r\n]|$)|$)"
+_NUMBER, _END = r"(?:[ \t]+[-+0-9.eE]+)", r"[ \t]*(?:[\r\n]|$)"
+_LINE = rf"\s*(?:(?:[0-9]+{_NUMBER}{{0,3}}[ \t]*[\r\n]+)*[0-9]+{_NUMBER}{{4,}}{_END}|$)".encode()
 _BOX = 4
 
 
 def is_yolo(place: Place) -> bool:
-    """Recognise YOLO: the texts of views begin with a line of a class and numbers, or are empty."""
+    """Recognise YOLO: the texts of views begin with lines of a class and numbers, one of four or more, or are empty."""
     files = place.by_view(".txt").values()
     return bool(files) and all(place.holds(path, _LINE) for path in files)
 
@@ -58,19 +60,22 @@ def _read(place: Place, path: Path, camera: Camera) -> npt.NDArray[np.int32]:
 
 def _lines(place: Place, path: Path) -> list[tuple[int, npt.NDArray[np.float64]]]:
     """Label and polygon (P, 2), in shares of width and height, of each line."""
+    lines = [(f"{path}, line {i}", line.split()) for i, line in enumerate(place.text(path).splitlines(), 1)]
+    are_boxes = all(len(words) <= 2 + _BOX for _, words in lines)  # With a confidence, or without.
     found = []
-    for i, line in enumerate(place.text(path).splitlines(), 1):
-        words, where = line.split(), f"{path}, line {i}"
+    for where, words in lines:
         if not words:
             continue
         try:
             values = np.array(words[1:], np.float64)
         except ValueError:
-            values = np.zeros(1)
-        if len(values) == _BOX:
+            values = None
+        if values is None or not re.fullmatch(r"[0-9]{1,5}", words[0]):
+            line = quoted(" ".join(words)[:60])
+            raise MaskFormatError(f"{where}: is {line}; expected a class and pairs x y from 0 to 1")
+        values = values[: len(values) // 2 * 2]
+        if are_boxes and len(values) == _BOX:
             raise MaskFormatError(f"{where}: is a box; expected a class and the points of an outline")
-        if not re.fullmatch(r"[0-9]{1,5}", words[0]) or len(values) % 2 or len(values) < _BOX:
-            raise MaskFormatError(f"{where}: is {quoted(line[:60])}; expected a class and pairs x y from 0 to 1")
         if not (np.abs(values - 0.5) <= 1).all():
             odd = values[~(np.abs(values - 0.5) <= 1)][0]
             raise MaskFormatError(f"{where}: has the coordinate {odd:g}; expected shares of the image, from 0 to 1")
