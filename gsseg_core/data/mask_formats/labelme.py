@@ -1,7 +1,7 @@
 """LabelMe: a JSON file per image, with shapes that name their class: polygons, rectangles, circles and masks.
 
-Rectangles may be turned. `_background_` is 0 and `__ignore__` unknown, as in LabelMe's own converters. The last shape is
-on top.
+Rectangles may be turned. `_background_` is 0 and `__ignore__` unknown, as in LabelMe's own converters. The last shape
+is on top.
 """
 
 from __future__ import annotations
