@@ -17,6 +17,7 @@ COMMANDS = {
     "pick": "pick one object by a mask or clicks in one view, and write it as a PLY",
     "view": "look at a scene in the browser, class by class, and correct labels",
     "remove": "write the scene without some of its objects",
+    "merge": "add up what several robots have learnt of one scene",
     "demo": "make a small scene with known truth and segment it",
     "doctor": "say what this machine has and lacks, and how to get it",
     "completion": "print a script for tab completion",

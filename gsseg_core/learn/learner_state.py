@@ -67,6 +67,11 @@ class State:
     learnt: Learnt | None = None  # the best codes
     living: LivingScene | None = None  # the scene, if it changes and so is in the file
 
+    @property
+    def num_classes(self) -> int:
+        """Classes of votes or codes."""
+        return max(self.votes.shape[1], 0 if self.learnt is None else self.learnt.codes.shape[1])
+
     def save(self, path: str | os.PathLike[str], digest: str) -> None:
         """Write the state of the scene with this digest, atomically. Colours of the scene are not in the file.
 
@@ -135,26 +140,41 @@ class State:
                 num_gaussians = len(living)
             else:
                 check_scene(path, header, digest)
-            n, k = header["shape"]
-            if n != num_gaussians:
-                raise UnfitError(f"holds {clipped(n)} Gaussians; expected {num_gaussians}, as the scene has")
-            k = whole_number(k, "number of classes", 1, MAX_LABEL + 1)
-            views = [_read_view(file, i, entry, k) for i, entry in enumerate(header["views"])]
-            twice = [name for name, count in Counter(view.name for view in views).items() if count > 1]
-            if twice:
-                raise UnfitError(f"has two views of the name {quoted(twice[0])}; expected one of each name")
-            num_fused = whole_number(header["num_fused"], "num_fused", len(views), _MOST_VIEWS)
-            votes = _read_votes(file, (n, k), len(views), num_fused)
-            learnt = None
-            if "learnt" in header:
-                entry = header["learnt"]
-                codes = file.expect("codes", np.float32, (n, None))
-                if not 1 <= codes.shape[1] <= k:
-                    raise UnfitError(f"array codes is of {codes.shape[1]} classes; expected 1 to {k}")
-                check_shares("codes", codes)
-                num_views = whole_number(entry["num_views"], "num_views of what was learnt", 0, _MOST_VIEWS)
-                learnt = Learnt(str(entry["learner"]), codes, num_views, temperature_of(entry))
-            return cls(votes, views, num_fused, class_names_of(header), learnt, living)
+            return cls._read(file, header, living, num_gaussians)
+
+    @classmethod
+    def load_alone(cls, path: str | os.PathLike[str]) -> tuple[str, State]:
+        """Read a state without its scene: the scene's digest, and the state; raises `StateFileError` as `load` does."""
+        with open_npz(Path(path), "a saved state", FORMAT, None) as (file, header):
+            living = living_files.read(file, header) if living_files.is_in(file) else None
+            n, k = (whole_number(side, "a side of the votes", 1, LIMITS.max_gaussians) for side in header["shape"])
+            if 8 * n * k > LIMITS.max_npz_bytes or (living is not None and len(living) != n):
+                raise UnfitError(f"claims votes of {n:,} Gaussians and {k:,} classes; expected as many as its scene "
+                                 f"has, and at most {LIMITS.max_npz_bytes:,} bytes (limit max_npz_bytes)")  # fmt: skip
+            return str(header["scene"]), cls._read(file, header, living, n)
+
+    @classmethod
+    def _read(cls, file: NpzArrays, header: dict[str, Any], living: LivingScene | None, num_gaussians: int) -> State:
+        n, k = header["shape"]
+        if n != num_gaussians:
+            raise UnfitError(f"holds {clipped(n)} Gaussians; expected {num_gaussians}, as the scene has")
+        k = whole_number(k, "number of classes", 1, MAX_LABEL + 1)
+        views = [_read_view(file, i, entry, k) for i, entry in enumerate(header["views"])]
+        twice = [name for name, count in Counter(view.name for view in views).items() if count > 1]
+        if twice:
+            raise UnfitError(f"has two views of the name {quoted(twice[0])}; expected one of each name")
+        num_fused = whole_number(header["num_fused"], "num_fused", len(views), _MOST_VIEWS)
+        votes = _read_votes(file, (n, k), len(views), num_fused)
+        learnt = None
+        if "learnt" in header:
+            entry = header["learnt"]
+            codes = file.expect("codes", np.float32, (n, None))
+            if not 1 <= codes.shape[1] <= k:
+                raise UnfitError(f"array codes is of {codes.shape[1]} classes; expected 1 to {k}")
+            check_shares("codes", codes)
+            num_views = whole_number(entry["num_views"], "num_views of what was learnt", 0, _MOST_VIEWS)
+            learnt = Learnt(str(entry["learner"]), codes, num_views, temperature_of(entry))
+        return cls(votes, views, num_fused, class_names_of(header), learnt, living)
 
 
 def _entry(view: View) -> dict[str, Any]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 
 from gsseg_core.data.view import View
 from gsseg_core.learn.learner_state import Learnt, State
+from gsseg_core.learn.merged_states import Saved, merge_states
 from gsseg_core.live.living_votes import LivingVotes
 from gsseg_core.live.matching_scenes import match_scenes
 from gsseg_core.live.scene_change import SceneChange
@@ -137,6 +139,38 @@ class LivingSession(LiveSession):
         """
         with self._lock:
             return super().load(path, within)
+
+    def merge(self, paths: Sequence[str | os.PathLike[str]], within: Path | None = None) -> int:
+        """Add what other sessions of the scene have saved to what is known; return how many views came with it.
+
+        Votes are added exactly. What was learnt stays in force until it is learnt again; of several views of one name,
+        the later ones get others, and only the last `max_views` are kept. On any error, nothing has changed.
+
+        Raises
+        ------
+        StateFileError
+            A file is missing or damaged, has other names for the classes, or more classes than there may be.
+        StateMismatchError
+            It belongs to another scene.
+        PathNotAllowedError
+            It lies outside the folder `within`, links followed.
+        """
+        with self._lock:
+            digest, now = self.scene.digest, self._live.state()
+            now = replace(now, num_fused=self.num_fused, class_names=self.class_names, living=None)
+            saved = [Saved("what is known here", digest, now)]
+            for path in paths:
+                state = self._read_state(Path(path), within)
+                self._check_classes(path, state)
+                saved.append(Saved(str(path), digest, replace(state, living=None)))
+            merged = merge_states(saved)
+            if not self._declared:
+                self._names = merged.class_names
+            came, self.num_fused = merged.num_fused - self.num_fused, merged.num_fused
+            self._live.adopt(merged)
+            self._version += 1
+            self._drop_old_views()
+        return came
 
     def _no_votes(self, num_classes: int) -> LivingVotes:
         return LivingVotes(self._living, num_classes, device=self.device)

@@ -322,16 +322,13 @@ class LiveSession:
             The file lies outside the folder `within`, links followed. Nothing has changed.
         """
         state = self._read_state(Path(path), within)
-        width = max(state.votes.shape[1], 0 if state.learnt is None else state.learnt.codes.shape[1])
-        most, why = (len(self._names), ", as were named") if self._declared else (self.max_classes, " (max_classes)")
-        if width > most:
-            raise StateFileError(f"{path}: holds {width} classes; expected at most {most}{why}")
+        self._check_classes(path, state)
         with self._lock:
             if not self._declared:
                 self._names = {0: BACKGROUND_NAME, **state.class_names}
             self._forget()
             self._live.adopt(state)
-            self._live.grow(max(width, len(self._names) if self._declared else 1))
+            self._live.grow(max(state.num_classes, len(self._names) if self._declared else 1))
             self.num_fused, self._learnt = state.num_fused, state.learnt
             self._drop_old_views()
         return state.learnt.num_views if state.learnt is not None else state.num_fused
@@ -371,6 +368,12 @@ class LiveSession:
 
     def _read_state(self, path: Path, within: Path | None) -> State:
         return State.load(path, self.scene.digest, len(self.scene), within)
+
+    def _check_classes(self, path: str | os.PathLike[str], state: State) -> None:
+        """Raise `StateFileError` if a state has too many classes."""
+        most, why = (len(self._names), ", as were named") if self._declared else (self.max_classes, " (max_classes)")
+        if state.num_classes > most:
+            raise StateFileError(f"{path}: holds {state.num_classes} classes; expected at most {most}{why}")
 
     def _posed_views(self) -> list[View]:
         """List the views that are kept, posed in the scene as it is now."""

@@ -1,0 +1,38 @@
+"""The command `gsseg merge`."""
+
+from __future__ import annotations
+
+import argparse
+
+from gsseg_core.cli.terminal import tell
+
+DESCRIPTION = """
+Adds up saved states of one scene, as robots save them with ~/save_state: votes are added exactly, as if all masks had
+come to one robot, and views of the same name are told apart. Learnt codes are those of one state's views, and are left
+out: load the result and learn again.
+"""
+EXAMPLES = """
+  gsseg merge first_robot.npz second_robot.npz -o both.npz
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what the command takes."""
+    parser.add_argument("states", metavar="STATE", nargs="+", help="saved state of the scene that all states share")
+    parser.add_argument("-o", "--out", required=True, metavar="FILE", help="state to write")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Merge, and say what came together."""
+    from gsseg_core.files.atomic import check_writable
+    from gsseg_core.learn.learner_state import State
+    from gsseg_core.learn.merged_states import Saved, merge_states
+    from gsseg_core.text import counted
+
+    check_writable(options.out)
+    saved = [Saved(path, *State.load_alone(path)) for path in options.states]
+    merged = merge_states(saved)
+    merged.save(options.out, saved[0].scene)
+    tell(f"{counted(merged.num_fused, 'view')} of {counted(len(saved), 'state')}, {len(merged.views):,} with masks: "
+         f"{options.out}")  # fmt: skip
+    return 0

@@ -1,0 +1,89 @@
+"""States of one scene added up: what several robots have learnt, as if all masks had come to one of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from gsseg_core.data.class_names import class_name
+from gsseg_core.data.view import View
+from gsseg_core.errors import StateFileError, StateMismatchError
+from gsseg_core.learn.learner_state import State
+from gsseg_core.scene.group_frames import is_same_relation
+from gsseg_core.scene.living_scene import LivingScene
+from gsseg_core.text import quoted
+
+
+class Saved(NamedTuple):
+    """A state, and what errors call it."""
+
+    source: str  # its file, or "the session"
+    scene: str  # digest of its scene
+    state: State
+
+
+def merge_states(saved: Sequence[Saved]) -> State:  # at least one
+    """Add up states of one scene: votes exactly, views one after the other, class names together.
+
+    Views of the same name are told apart: the later one is called like "view_2". Codes that were learnt are those of
+    the views of one state, and go.
+
+    Raises
+    ------
+    StateMismatchError
+        They are of different scenes.
+    StateFileError
+        They have different names for one class.
+    """
+    first = saved[0]
+    names: dict[int, str] = {}
+    views: dict[str, View] = {}
+    votes = np.zeros((len(first.state.votes), max(one.state.votes.shape[1] for one in saved)), np.int64)
+    for one in saved:
+        if one.scene != first.scene or not _is_same_map(one.state.living, first.state.living):
+            raise StateMismatchError(
+                f"{one.source}: belongs to the scene {one.scene[:12]}; expected {first.scene[:12]}, that of "
+                f"{first.source}, with the same groups"
+            )
+        _add_names(names, one)
+        votes[:, : one.state.votes.shape[1]] += one.state.votes
+        for view in one.state.views:
+            name = _free_name(view.name, views)
+            views[name] = view if name == view.name else replace(view, camera=replace(view.camera, name=name))
+    num_fused = sum(one.state.num_fused for one in saved)
+    return State(votes, list(views.values()), num_fused, dict(sorted(names.items())), living=first.state.living)
+
+
+def _add_names(names: dict[int, str], one: Saved) -> None:
+    for k, name in one.state.class_names.items():
+        known = names.get(k)
+        # One like "class_07" was made up where none was known.
+        if known is None or known == class_name({}, k):
+            names[k] = name
+        elif name not in (known, class_name({}, k)):
+            raise StateFileError(
+                f"{one.source}: calls class {k} {quoted(name)}; expected {quoted(known)}, as in the states before it"
+            )
+
+
+def _free_name(name: str, taken: dict[str, View]) -> str:
+    free, count = name, 1
+    while free in taken:
+        count += 1
+        free = f"{name}_{count}"
+    return free
+
+
+def _is_same_map(one: LivingScene | None, other: LivingScene | None) -> bool:
+    """Whether two states hold their views in the same frames; without a scene of their own, in that of the scene."""
+    if one is None or other is None or one is other:
+        return one is other
+    return (
+        np.array_equal(one.ids, other.ids)
+        and np.array_equal(one.groups, other.groups)
+        and one.frames.keys() == other.frames.keys()
+        and all(is_same_relation(frame, other.frames[group]) for group, frame in one.frames.items())
+    )

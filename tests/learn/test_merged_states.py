@@ -1,0 +1,91 @@
+"""States of several robots come together as if one had seen all, or are refused with one clear error."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_scenes import NAMES, balls_on_a_table, clean_views
+
+from gsseg_core.cli.main import main
+from gsseg_core.data.view import View
+from gsseg_core.live.living_session import LivingSession
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.scene_delta import SceneDelta
+
+SCENE, TRUTH = balls_on_a_table()
+VIEWS = clean_views(6)
+
+
+def robot(path: Path, views: list[View], scene: GaussianScene = SCENE, names: dict[int, str] | None = NAMES) -> str:
+    session = LivingSession(scene, names)
+    for view in views:
+        assert session.fuse(view) is None
+    session.save(path)
+    return str(path)
+
+
+def load(path: str | Path) -> LivingSession:
+    session = LivingSession(SCENE, NAMES)
+    session.load(path)
+    return session
+
+
+def test_merged_votes_are_those_of_one_robot_that_saw_all_and_every_view_is_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, other = robot(tmp_path / "a.npz", VIEWS[:4]), robot(tmp_path / "b.npz", VIEWS[3:])
+    assert main(["merge", one, other, "-o", str(tmp_path / "c.npz")]) == 0
+    assert "7 views of 2 states, 7 with masks" in capsys.readouterr().out
+    merged = load(tmp_path / "c.npz")
+    again = View.from_arrays(replace(VIEWS[3].camera, name="view3_2"), VIEWS[3].read_labels())
+    whole = load(robot(tmp_path / "all.npz", [*VIEWS[:4], again, *VIEWS[4:]]))
+    np.testing.assert_array_equal(merged._live._votes, whole._live._votes)
+    assert [view.name for view in merged.views] == ["view0", "view1", "view2", "view3", "view3_2", "view4", "view5"]
+    merged._live.retract("view3_2")
+    np.testing.assert_array_equal(merged._live._votes, load(robot(tmp_path / "six.npz", VIEWS))._live._votes)
+
+
+def test_a_session_takes_in_what_others_saved_also_before_its_scene_changed(tmp_path: Path) -> None:
+    saved = robot(tmp_path / "a.npz", VIEWS[:3])
+    session = LivingSession(SCENE, NAMES)
+    for view in VIEWS[3:]:
+        session.fuse(view)
+    session.update(SceneDelta(removed=np.arange(50)))
+    assert session.merge([saved]) == 3
+    assert session.num_fused == session.num_views == 6
+    whole = LivingSession(session.living, NAMES)
+    for view in VIEWS:
+        whole.fuse(view)
+    np.testing.assert_array_equal(session._live._votes, whole._live._votes)
+
+
+def test_states_that_do_not_belong_together_are_refused_with_one_error_and_nothing_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, out = robot(tmp_path / "a.npz", VIEWS[:2]), tmp_path / "c.npz"
+    cases = {
+        robot(tmp_path / "scene.npz", VIEWS[:2], SCENE.subset(np.arange(600))): "belongs to the scene",
+        robot(tmp_path / "names.npz", VIEWS[:2], names={**NAMES, 2: "vase"}): "calls class 2 'vase'; expected",
+        str(tmp_path / "none.npz"): "does not exist",
+    }
+    for other, message in cases.items():
+        assert main(["merge", one, other, "-o", str(out)]) == 2
+        told = capsys.readouterr().err
+        assert message in told and told.count("\n") == 1 and not out.exists()
+        session = load(one)
+        before = session._live._votes.copy()
+        with pytest.raises(Exception, match=Path(other).name):
+            session.merge([one, other])
+        np.testing.assert_array_equal(session._live._votes, before)
+
+
+def test_names_that_were_made_up_give_way_to_real_ones(tmp_path: Path) -> None:
+    unnamed, named = robot(tmp_path / "a.npz", VIEWS[:2], names=None), robot(tmp_path / "b.npz", VIEWS[2:])
+    assert main(["merge", unnamed, named, "-o", str(tmp_path / "c.npz")]) == 0
+    assert load(tmp_path / "c.npz").class_names == NAMES
+    fresh = LivingSession(SCENE)
+    fresh.load(tmp_path / "c.npz")
+    assert fresh.class_names == NAMES
