@@ -70,7 +70,7 @@ class State:
     @property
     def num_classes(self) -> int:
         """Classes of votes or codes."""
-        return max(self.votes.shape[1], 0 if self.learnt is None else self.learnt.codes.shape[1])
+        return max(int(self.votes.shape[1]), 0 if self.learnt is None else int(self.learnt.codes.shape[1]))
 
     def save(self, path: str | os.PathLike[str], digest: str) -> None:
         """Write the state of the scene with this digest, atomically. Colours of the scene are not in the file.

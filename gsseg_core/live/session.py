@@ -29,11 +29,11 @@ from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.fitting import Report, fitted, num_classes_with
 from gsseg_core.live.results import SCENE_CHANGED, Outcome, Rejection
 from gsseg_core.progress import Stopwatch
-from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.refine.settings import UNREFINED, RefineSettings
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.spatial.neighbourhood import neighbours_of
+from gsseg_core.spatial.neighbourhood import find_neighbours
 
 VOTES_LIMIT = 2 << 30
 """Bytes of votes up to which classes without declared names are added as their labels turn up."""
@@ -72,7 +72,6 @@ class LiveSession:
     """
 
     _LABEL, _REMEDY = "mask holds the label", ", or class_names that declare it"
-
     _learnt: Learnt | None
     _segmented: tuple[object, Segmentation] | None
     _cameras: list[Camera]  # of the dataset that was learnt from
@@ -93,8 +92,7 @@ class LiveSession:
         self.rejected: Counter[str] = Counter()
         self._declared = bool(class_names)
         self._names = {0: BACKGROUND_NAME, **(class_names or {})}
-        self._lock = threading.RLock()
-        self._version = 0
+        self._lock, self._version = threading.RLock(), 0
         self._scenes: WeakKeyDictionary[Segmentation, GaussianScene] = WeakKeyDictionary()
         self._forget()
 
@@ -121,7 +119,7 @@ class LiveSession:
 
     @property
     def learnt(self) -> Learnt | None:
-        """Class probabilities of the last `learn`; None without one."""
+        """Class probabilities of the last `learn`."""
         return self._learnt
 
     @property
@@ -283,8 +281,15 @@ class LiveSession:
         self._segmented, self._scenes[result] = (key, result), scene
         return result
 
+    def unrefined(self) -> Segmentation:
+        """Label every Gaussian by its class probabilities as they are now; raises `NoCodesError`, as `codes` does."""
+        with self._lock:
+            result = Segmentation.unfiltered(self.scene, self.codes(), self.class_names, UNREFINED)
+            self._scenes[result] = self.scene
+        return result
+
     def scene_of(self, result: Segmentation) -> GaussianScene:
-        """Return the scene that a result of `segmentation` is of; it may have changed since."""
+        """Return the scene as it was for a result of `segmentation` or `unrefined`."""
         return self._scenes.get(result, self.scene)
 
     def save(self, path: str | os.PathLike[str]) -> int:
@@ -302,9 +307,8 @@ class LiveSession:
         with self._lock:
             if not self.has_codes:
                 raise NoCodesError(f"{path}: nothing to save; expected at least one view to be fused first")
-            state = self._live.state()
-            state = replace(state, num_fused=self.num_fused, class_names=self.class_names, learnt=self._learnt)
             learnt, fused, scene = self._learnt, self.num_fused, self.scene
+            state = replace(self._live.state(), num_fused=fused, class_names=self.class_names, learnt=learnt)
         state.save(path, scene.digest)
         return learnt.num_views if learnt is not None else fused
 
@@ -335,12 +339,7 @@ class LiveSession:
 
     def prepare(self, settings: RefineSettings) -> None:
         """Find the neighbours that refinement needs, in a thread of their own, so that the first request has them."""
-
-        def find() -> None:
-            if (neighbours := neighbours_of(self.scene, settings.k)) is not None:
-                neighbours.look_for()
-
-        threading.Thread(target=find, name="neighbours").start()
+        threading.Thread(target=find_neighbours, args=(self.scene, settings.k), name="neighbours").start()
 
     def retire(self) -> None:
         """Begin another `era`, so that what is still being fused or learnt is refused; what is known stays."""

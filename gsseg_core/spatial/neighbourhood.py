@@ -130,6 +130,12 @@ def neighbours_of(scene: GaussianScene, k: int) -> Neighbours | None:
     return _KNOWN.of(scene, lambda: Neighbours.among(scene.means, k, tree_of(scene)), lambda known: known.k == k)
 
 
+def find_neighbours(scene: GaussianScene, k: int) -> None:
+    """Find the neighbours of all Gaussians of a scene now, so that those who ask later have them."""
+    if (neighbours := neighbours_of(scene, k)) is not None:
+        neighbours.look_for()
+
+
 @nb.njit(parallel=True, nogil=True, cache=True)
 def average(
     tree: Tree, codes: CSRRows, counted: np.ndarray,  # n rows, int32 in steps of CODE_UNIT; (n,) bool, by row

@@ -13,7 +13,7 @@ MISSING = {role: f"no data on {role}" for role in ("mask", "camera_info", "depth
 """Kinds of complaint: an input that is silent."""
 
 REFUSED_POSE, TIME_JUMP, CLOCK, LIVE, OTHER = "refused pose", "time set back", "no clock", "overlay or objects", "other"
-OBSTACLES = "obstacles"
+OBSTACLES, SCENE_DELTA = "obstacles", "scene delta"
 
 REASONS = (
     "no_pose", "no_camera_info", "no_depth", "repeated_stamp", "several_cameras", "time_jump", "queue_full", "no_scene",
@@ -22,7 +22,7 @@ REASONS = (
 )  # fmt: skip
 """Kinds of complaint: why a mask became no view."""
 
-KINDS = frozenset((*MISSING.values(), REFUSED_POSE, TIME_JUMP, CLOCK, LIVE, OBSTACLES, *REASONS, OTHER))
+KINDS = frozenset((*MISSING.values(), REFUSED_POSE, TIME_JUMP, CLOCK, LIVE, OBSTACLES, SCENE_DELTA, *REASONS, OTHER))
 
 
 @dataclass

@@ -211,6 +211,7 @@ def _scene_values(workspace: Workspace) -> dict[str, object]:
         "codes": "none" if not session.has_codes else "votes" if learnt is None else learnt.learner,
         "views fused": session.num_fused,
         "views kept": session.num_views,
+        **{f"scene changes: {what}": count for what, count in sorted(workspace.changes.items())},
     }
 
 

@@ -21,7 +21,6 @@ from std_msgs.msg import Header
 from gsseg_core.errors import GssegError
 from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.refine.settings import UNREFINED
 from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.camera_infos import camera_of_image, is_rectified
@@ -156,7 +155,7 @@ class LiveOutputs:
             camera, photo = self._photo(paired)
         result = self._current()
         colors = palette(result.num_classes)
-        labels = result.render(make_operator(session.scene, camera, session.device)).labels
+        labels = result.render(make_operator(session.scene_of(result), camera, session.device)).labels
         picture = colors[labels] if photo is None else overlay(photo, labels, colors)
         header = Header(stamp=header.stamp, frame_id=header.frame_id)
         # A reset meanwhile has cleared the overlay.
@@ -199,7 +198,7 @@ class LiveOutputs:
             if kept == key or (kept[0] is key[0] and time.monotonic() - since < CODES_PERIOD):
                 return result
         learnt = session.learnt
-        result = Segmentation.unfiltered(session.scene, session.codes(), session.class_names, UNREFINED)
+        result = session.unrefined()
         result = result.calibrated(1.0 if learnt is None else learnt.temperature)
         self._segmentation = (key, time.monotonic(), result)
         return result

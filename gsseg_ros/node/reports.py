@@ -17,6 +17,7 @@ from gsseg_core.export.summary import gaussian_counts
 from gsseg_core.live.session import LIVE, LiveSession
 from gsseg_core.objects.oriented_boxes import class_box
 from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.conversions import cloud
 from gsseg_ros.frames import Similarity
@@ -48,6 +49,11 @@ class Selection:
     min_confidence: float
     similarity: Similarity
 
+    @property
+    def scene(self) -> GaussianScene:
+        """The scene that the result is of; the session's may have changed since."""
+        return self.session.scene_of(self.result)
+
     @cached_property
     def of_all_classes(self) -> Selection:
         """The same without a choice of classes."""
@@ -74,7 +80,7 @@ class Selection:
 
     @cached_property
     def _points(self) -> np.ndarray:
-        return self.similarity.points_to_map(self.session.scene.means)
+        return self.similarity.points_to_map(self.scene.means)
 
     @cached_property
     def _colors(self) -> np.ndarray:
@@ -103,7 +109,7 @@ class Selection:
 
     def _object(self, k: int, index: np.ndarray) -> Object:
         confidence = self._confidence[index]
-        box = self.similarity.box_to_map(class_box(self.session.scene, index, confidence))
+        box = self.similarity.box_to_map(class_box(self.scene, index, confidence))
         return object_message(k, self.result.class_names[k], self._color(k), confidence, box)
 
     def _color(self, k: int) -> ColorRGBA:
@@ -145,9 +151,9 @@ def report_message(
         header=Header(stamp=run.stamp, frame_id=map_frame),
         revision=run.revision,
         job=run.job,
-        scene_path=str(session.scene.path),
-        scene_hash=session.scene.digest,
-        num_gaussians=len(session.scene),
+        scene_path=str(selection.scene.path),
+        scene_hash=selection.scene.digest,
+        num_gaussians=len(selection.scene),
         num_objects=counts["labelled"] - background,
         num_background=background,
         num_unobserved=counts["unobserved"],

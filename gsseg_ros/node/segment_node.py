@@ -24,12 +24,13 @@ from rclpy.signals import SignalHandlerOptions
 from gsseg_core.freed_memory import keep_freed_memory
 from gsseg_core.warm_up import warm_up
 from gsseg_ros.node import diagnostics, parameters
-from gsseg_ros.node.complaints import Complaints
+from gsseg_ros.node.complaints import SCENE_DELTA, Complaints
 from gsseg_ros.node.inputs import Inputs
 from gsseg_ros.node.learn_action import LearnAction
 from gsseg_ros.node.obstacles import Obstacles
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.parameters import Settings
+from gsseg_ros.node.scene_changes import SceneChanges
 from gsseg_ros.node.services import AT_WORK, WAITING, Services, describe
 from gsseg_ros.node.sim_time import SimTime
 from gsseg_ros.node.viewpoints import Lookup
@@ -74,6 +75,7 @@ class SegmentNode(LifecycleNode):
         self.obstacles: Obstacles | None = None
         self._outputs: Outputs | None = None
         self._requests = Services(self, self.workspace, self._require_outputs, self._lookup)
+        self._changes = SceneChanges(self._requests, lambda message: self._complaints.add(SCENE_DELTA, message))
         self._learn = LearnAction(self, self.workspace, self._require_outputs)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._complaints = Complaints(self.get_logger().warning)

@@ -249,8 +249,13 @@ class Services:
                 workspace.require_active()
                 job.check()
 
-            workspace.load_scene(path, within, check)
-            self._clear(run)
+            if request.keep_votes:
+                changed = workspace.grow_scene(path, within, request.tolerance)
+                response.num_carried, response.num_views_lifted = changed.num_carried, changed.num_views_lifted
+                response.matched_by = changed.matched_by
+            else:
+                workspace.load_scene(path, within, check)
+            self.clear(run)
             session = workspace.session
         corners = workspace.settings.scene_to_map.points_to_map(session.scene.means)
         response.path, response.scene_hash = str(session.scene.path), session.scene.digest
@@ -273,7 +278,7 @@ class Services:
         session, path = self.workspace.session, self.workspace.existing(request.path, STATE_FILE)
         with self.workspace.slot.take("load_state"), self.workspace.run("load_state") as run:
             response.num_views = self.workspace.load_state(path, self.workspace.root)
-            self._clear(run)
+            self.clear(run)
         response.path, response.class_names = str(path), list(session.class_names.values())
 
     @answered
@@ -292,14 +297,14 @@ class Services:
             result = selection.result.selected(selection.chosen, selection.min_confidence)
             with run.watch.stage("write"), staged_export(directory, self.workspace.root) as staged:
                 result.save(staged.folder / "segmentation.npz", staged.id)
-                meshes = collision_meshes(session.scene, result, collision) if collision else {}
+                meshes = collision_meshes(selection.scene, result, collision) if collision else {}
                 classes = staged.folder / "classes"
-                files = write_classes(session.scene, result, classes, staged.id, scene_format, meshes)
+                files = write_classes(selection.scene, result, classes, staged.id, scene_format, meshes)
                 names = {k: str(path.relative_to(staged.folder)) for k, path in files.items()}
                 mesh_names = {k: f"classes/{mesh_file_name(k, result.class_names[k])}" for k in meshes}
                 report = finish(report_message(run, selection, refine, settings.map_frame), run)
                 content = RunReport.of(
-                    session.scene,
+                    selection.scene,
                     result,
                     views={"used": report.num_views, "rejected": dict(Counter(session.rejected) + run.dropped)},
                     settings={
@@ -325,7 +330,7 @@ class Services:
         workspace = self.workspace
         with workspace.slot.take("reset"), workspace.run("reset") as run:
             response.num_views_dropped = workspace.reset()
-            self._clear(run)
+            self.clear(run)
 
     def _select(self, request: Any, run: Run) -> tuple[Selection, RefineSettings]:
         session, refine = self.workspace.session, refinement(request, self.workspace)
@@ -337,7 +342,7 @@ class Services:
         chosen = chosen_classes(request, result.class_names)
         return Selection(session, result, chosen, threshold, self.workspace.settings.scene_to_map), refine
 
-    def _clear(self, run: Run) -> None:
+    def clear(self, run: Run) -> None:
         """Replace all that is latched by empty messages."""
         workspace = self.workspace
         workspace.number(run)

@@ -86,12 +86,11 @@ def viewpoint_pose(request: Any, settings: Settings, lookup: Lookup | None) -> n
 
 def draw(selection: Selection, camera: Camera, header: Header, *, with_overlay: bool = False) -> Drawing:
     """Draw the labels of a view: classes that were not asked for as background, but in the overlay as they are."""
-    session = selection.session
-    operator = make_operator(session.scene, camera, session.device)
+    operator = make_operator(selection.scene, camera, selection.session.device)
     seen = selection.result.render(operator)
     labels = np.where(np.isin(seen.labels, selection.chosen), seen.labels, 0)
     picture = Image()
     if with_overlay:
         colors = palette(selection.result.num_classes)
-        picture = rgb_image(overlay(background_image(session.scene, operator), seen.labels, colors), header)
+        picture = rgb_image(overlay(background_image(selection.scene, operator), seen.labels, colors), header)
     return Drawing(label_image(labels, header), confidence_image(np.minimum(seen.confidence, 1.0), header), picture)

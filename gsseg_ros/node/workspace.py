@@ -17,6 +17,7 @@ from builtin_interfaces.msg import Time
 from gsseg_core.data.class_names import class_ids
 from gsseg_core.data.label_images import PER_VIEW
 from gsseg_core.errors import PathNotAllowedError, SettingsError
+from gsseg_core.live.living_session import Changed, LivingSession
 from gsseg_core.live.session import LiveSession
 from gsseg_core.progress import Stopwatch
 from gsseg_core.refine.settings import RefineSettings
@@ -85,6 +86,8 @@ class Workspace:
         What the last job was, and how it ended.
     dropped : Counter of str
         Masks that never came to be views, by reason, since the scene was loaded or reset.
+    changes : Counter of str
+        Changes of the scene that were made, and refused; and views that were kept and lifted anew by them.
     """
 
     def __init__(self, settings: Settings, now: Callable[[], Time]) -> None:
@@ -94,6 +97,7 @@ class Workspace:
         self.active = False
         self.last_job = "none"
         self.dropped: Counter[str] = Counter()
+        self.changes: Counter[str] = Counter()
         self._now = now
         self._session: LiveSession | None = None
         self._lock = threading.Lock()
@@ -116,6 +120,24 @@ class Workspace:
         if self._session is None:
             raise NoSceneError("no scene is loaded; expected the parameter scene_path, or a call of ~/load_scene")
         return self._session
+
+    @property
+    def living_session(self) -> LivingSession:
+        """The session of the scene, for what changes it and for what other robots have learnt.
+
+        Raises
+        ------
+        NoSceneError
+            No scene is loaded.
+        InvalidRequestError
+            The session finds its objects itself, and so cannot follow.
+        """
+        if not isinstance(session := self.session, LivingSession):
+            raise InvalidRequestError(
+                "the parameter ids is per-view: objects that the node finds itself are of the scene as it was, and of "
+                "this robot alone; expected ids given, or to load the new scene"
+            )
+        return session
 
     @property
     def era(self) -> object:
@@ -178,12 +200,25 @@ class Workspace:
 
             session: LiveSession = PerViewSession(scene, **kept)
         else:
-            session = LiveSession(scene, settings.names_by_id, **kept)
+            session = LivingSession(scene, settings.names_by_id, **kept)
         check()
         self._replace(session)
         self.dropped = Counter()
         self.forget_waiting()
         session.prepare(RefineSettings(k=settings.k))
+
+    def grow_scene(self, path: str | Path, within: Path | None, tolerance: float) -> Changed:
+        """Go over to a scene that has grown out of the one there is, with its votes; on any error nothing changes."""
+        session = self.living_session
+        changed = session.replace_scene(GaussianScene.load(path, within), tolerance)
+        self.count(changed)
+        session.prepare(RefineSettings(k=self.settings.k))
+        return changed
+
+    def count(self, changed: Changed) -> None:
+        """Count a change of the scene."""
+        kept, lifted = changed.num_views_kept, changed.num_views_lifted
+        self.changes.update({"made": 1, "views kept": kept, "views lifted anew": lifted})
 
     def load_state(self, path: str | Path, within: Path | None = None) -> int:
         """Replace what is known of the scene by a saved state; return how many views are in it."""

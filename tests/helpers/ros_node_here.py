@@ -98,7 +98,7 @@ class NodeHere:
 
     def ask(self, service: str, **fields: Any) -> Any:
         """Call the handler of a service."""
-        handler = getattr(self.node._requests, service)
+        handler = getattr(self.node._requests, service, None) or getattr(self.node._changes, service)
         return handler(SERVICES[service].Request(**fields), SERVICES[service].Response())
 
     def done(self, service: str, **fields: Any) -> Any:

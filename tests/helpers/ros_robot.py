@@ -20,7 +20,18 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from gsseg_msgs.action import Learn
-from gsseg_msgs.srv import Export, LoadScene, LoadState, Pick, RenderView, Reset, SaveState, Segment
+from gsseg_msgs.srv import (
+    Export,
+    LoadScene,
+    LoadState,
+    MergeStates,
+    Pick,
+    RenderView,
+    Reset,
+    SaveState,
+    Segment,
+    UpdateScene,
+)
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
@@ -43,7 +54,7 @@ SERVICES = {
     "segment": Segment, "pick": Pick, "render_view": RenderView, "load_scene": LoadScene, "save_state": SaveState,
     "load_state": LoadState, "export": Export, "reset": Reset, "change_state": ChangeState,
     "describe_parameters": DescribeParameters, "get_parameters": GetParameters, "list_parameters": ListParameters,
-    "set_parameters": SetParameters, "get_state": GetState,
+    "update_scene": UpdateScene, "merge_states": MergeStates, "set_parameters": SetParameters, "get_state": GetState,
 }  # fmt: skip
 GREETING_SECONDS = 2.0
 """Until a node that has not answered its first question is asked again."""

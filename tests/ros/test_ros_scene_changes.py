@@ -1,0 +1,173 @@
+"""The node's scene changes under it: by a request, by a topic and by a grown file; and robots come together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
+from ros_helpers import Ros
+from ros_node_here import NodeHere, node_here
+from scipy.spatial.transform import Rotation
+from small_scenes import balls_on_a_table, clean_views
+
+pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
+
+from gsseg_msgs.msg import SceneDelta as SceneDeltaMessage
+
+from gsseg_core.live.living_session import LivingSession
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.scene_delta import GroupMove, SceneDelta
+from gsseg_core.scene.similarity import Similarity
+from gsseg_ros.delta_messages import delta_from_message, message_from_delta
+from gsseg_ros.errors import InvalidRequestError
+
+SCENE, _ = balls_on_a_table()
+COPY = SceneDelta(
+    added=GaussianScene.from_arrays(SCENE.means + [0, 0, 1.5], SCENE.quats, SCENE.scales, SCENE.opacities, SCENE.sh),
+    added_ids=np.arange(len(SCENE)) + 2**40,
+    added_groups=np.full(len(SCENE), 5, np.int64),
+)
+
+
+@pytest.fixture(scope="module")
+def module_here(shared: Ros, tmp_path_factory: pytest.TempPathFactory) -> Iterator[NodeHere]:
+    root = tmp_path_factory.mktemp("living")
+    SCENE.save(root / "scene.ply")
+    with node_here(shared, {"data_root": root, "scene_path": root / "scene.ply"}) as here:
+        yield here
+
+
+@pytest.fixture
+def here(module_here: NodeHere) -> NodeHere:
+    """A node with its scene as at the start, and four views."""
+    module_here.done("load_scene")
+    module_here.node.workspace.changes.clear()
+    module_here.fuse(clean_views(4))
+    return module_here
+
+
+def votes(session: LivingSession) -> np.ndarray:
+    return session._live._votes
+
+
+def as_refused(session: LivingSession) -> np.ndarray:
+    again = LivingSession(session.living)
+    for view in session.views:
+        again.fuse(view)
+    return votes(again)
+
+
+def root(here: NodeHere) -> Path:
+    return here.node.workspace.root
+
+
+def test_a_request_and_the_topic_change_the_scene_and_votes_are_those_of_the_views_in_it(here: NodeHere) -> None:
+    session = here.node.workspace.living_session
+    delta = replace(COPY, removed=np.arange(30))
+    answer = here.done("update_scene", delta=message_from_delta(delta))
+    assert (answer.num_removed, answer.num_added, answer.num_views_lifted) == (30, len(SCENE), 4)
+    assert (answer.revision, answer.num_gaussians, answer.scene_hash) == (1, 2 * len(SCENE) - 30, session.scene.digest)
+    stamp = session.views[0].name.split("_")[-1]
+    move = GroupMove(0, Similarity(translation=np.array([50.0, 0, 0])), (stamp, "17"))
+    here.node._changes.on_scene_delta(message_from_delta(SceneDelta(revision=2, moves=(move,))))
+    assert session.living.revision == 2
+    assert [view.group for view in session.views] == [0, None, None, None]
+    np.testing.assert_array_equal(votes(session), as_refused(session))
+    assert here.node.workspace.changes["made"] == 2 and not here.node.workspace.changes["refused"]
+    assert here.done("segment").report.num_gaussians == len(session.scene)
+
+
+def test_a_file_changes_the_scene_and_a_grown_one_takes_votes_along(here: NodeHere) -> None:
+    session = here.node.workspace.living_session
+    COPY.save(root(here) / "delta.npz")
+    answer = here.done("update_scene", path="delta.npz")
+    assert answer.num_added == len(SCENE)
+    session.scene.subset(np.arange(10, 2 * len(SCENE))).save(root(here) / "grown.ply")
+    loaded = here.done("load_scene", path="grown.ply", keep_votes=True)
+    assert (loaded.num_carried, loaded.matched_by) == (2 * len(SCENE) - 10, "id")
+    np.testing.assert_array_equal(votes(session), as_refused(session))
+    assert here.node.workspace.session is session and session.num_fused == 4
+    assert here.ask("load_scene", path="grown.ply", keep_votes=True, tolerance=-1.0).error_code % 100 == 3
+
+
+@pytest.mark.parametrize(
+    ("fields", "code", "message"),
+    [
+        ({"delta": SceneDeltaMessage(removed=[9999])}, 3, "removes 1 ids that the scene has not"),
+        ({"delta": SceneDeltaMessage(removed=[2**63])}, 3, "expected numbers of at most"),
+        ({"delta": SceneDeltaMessage(added_ids=[9999], means=[0.0])}, 3, "means are 1 numbers; expected 3"),
+        ({"path": "none.npz"}, 11, "does not exist"),
+        ({"path": "scene.ply"}, 12, "is not a scene delta"),
+        ({"path": "../x.npz"}, 10, "not below data_root"),
+    ],
+)
+def test_a_change_that_cannot_be_made_is_answered_in_one_line_and_changes_nothing(
+    here: NodeHere, fields: dict[str, Any], code: int, message: str
+) -> None:
+    session = here.node.workspace.living_session
+    before = votes(session).copy()
+    answer = here.ask("update_scene", **fields)
+    assert answer.error_code == 11000 + code and message in answer.error_msg and "\n" not in answer.error_msg
+    np.testing.assert_array_equal(votes(session), before)
+
+
+def test_a_delta_out_of_turn_is_complained_of_once_and_changes_nothing(
+    here: NodeHere, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(here.node._changes, "_complain", said.append)
+    session = here.node.workspace.living_session
+    for revision in (7, 9, 8):
+        message = message_from_delta(SceneDelta(revision=revision, removed=np.array([revision])))
+        here.node._changes.on_scene_delta(message)
+    assert len(said) == 1 and "its revision is 9; expected 8, as the scene is at 7" in said[0]
+    assert here.node.workspace.changes["refused"] == 1 and len(session.scene) == len(SCENE) - 2
+    np.testing.assert_array_equal(votes(session), as_refused(session))
+
+
+def test_states_of_other_robots_are_added_exactly(here: NodeHere) -> None:
+    session = here.node.workspace.living_session
+    here.done("save_state", path="one.npz")
+    alone = votes(session).copy()
+    answer = here.done("merge_states", paths=["one.npz", "one.npz"])
+    assert (answer.num_merged, answer.num_views) == (8, 12)
+    np.testing.assert_array_equal(votes(session), 3 * alone)
+    assert here.ask("merge_states").error_code == 11103
+    assert here.ask("merge_states", paths=["scene.ply"]).error_code == 11112
+
+
+def test_a_node_that_finds_objects_itself_refuses_changes_and_says_why(shared: Ros, parameters: dict[str, Any]) -> None:
+    del parameters["class_names"]
+    with node_here(shared, {**parameters, "ids": "per-view"}) as here:
+        for service, fields in (("update_scene", {}), ("merge_states", {"paths": ["x"]})):
+            answer = here.ask(service, **fields)
+            assert answer.error_code % 100 == 3 and "the parameter ids is per-view" in answer.error_msg
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32), st.booleans(), st.floats(0.1, 10))
+def test_a_delta_goes_through_a_message_unchanged(seed: int, adds: bool, scale: float) -> None:
+    rng = np.random.default_rng(seed)
+    motion = Similarity(scale, Rotation.random(random_state=seed).as_matrix(), rng.normal(size=3))
+    delta = replace(COPY if adds else SceneDelta(), revision=int(rng.integers(1, 2**62)),
+                    removed=rng.choice(2**40, 5, replace=False), moves=(GroupMove(3, motion, ("a", "b")),))  # fmt: skip
+    again = delta_from_message(message_from_delta(delta))
+    np.testing.assert_array_equal(again.removed, delta.removed)
+    np.testing.assert_array_equal(again.added_ids, delta.added_ids)
+    np.testing.assert_array_equal(again.added_groups, delta.added_groups)
+    np.testing.assert_allclose(again.moves[0].motion.rotation, motion.rotation, atol=1e-12)
+    assert (again.revision, again.moves[0].motion.scale, again.moves[0].views) == (delta.revision, scale, ("a", "b"))
+    if adds:
+        np.testing.assert_array_equal(again.added.means, COPY.added.means)
+        np.testing.assert_allclose(again.added.opacities, COPY.added.opacities, atol=1e-6)
+    with pytest.raises(InvalidRequestError):
+        message = message_from_delta(delta)
+        message.moves[0].motion.rotation.w = float("nan")
+        delta_from_message(message)
