@@ -12,6 +12,7 @@ from typing import Any
 
 import rclpy
 from geometry_msgs.msg import PoseStamped
+from gsseg_msgs.msg import SceneDelta
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
@@ -25,7 +26,9 @@ from gsseg_core.errors import GssegError, SettingsError
 from gsseg_ros.conversions import stamp_message
 from gsseg_ros.replay.sources import TYPES, BagSource, FolderSource, Group, Source
 
-_CLASSES = {"mask": Image, "camera_info": CameraInfo, "pose": PoseStamped, "image": Image}
+_CLASSES = {
+    "mask": Image, "camera_info": CameraInfo, "pose": PoseStamped, "image": Image, "scene_delta": SceneDelta,
+}  # fmt: skip
 _QOS = QoSProfile(depth=30, reliability=ReliabilityPolicy.RELIABLE)
 
 # Name, default, smallest, largest (of numbers), description.
@@ -36,6 +39,7 @@ _PARAMETERS: tuple[tuple[str, str | int | float, float | None, float | None, str
     ("split", "train", None, None, "Views of 'data' to replay: train, test or all"),
     ("rate", 10.0, 1e-3, 1e3, "Masks per second"),
     ("loop", 1, 0, 2**31 - 1, "How many times; 0 is for ever"),
+    ("grow", False, None, None, "Whether the scene of 'data' arrives in five submaps, and a loop closes at the end"),
     ("frame_id", "camera", None, None, "Frame of the camera, in the headers of mask, camera_info and image ('data')"),
     ("map_frame", "map", None, None, "Frame in which the poses are ('data')"),
     ("wait_for_subscribers", 5.0, 0.0, 3600.0, "Seconds to wait for somebody who listens to 'mask'"),
@@ -87,7 +91,12 @@ class ReplayNode(Node):
                 self.declare_parameter(name, default, descriptor)
             except ParameterException as error:
                 limits = "" if low is None else f" from {low:g} to {high:g}"
-                kind = {str: "a string", int: "a whole number", float: "a number with a decimal point"}[type(default)]
+                kind = {
+                    str: "a string",
+                    bool: "true or false",
+                    int: "a whole number",
+                    float: "a number with a decimal point",
+                }[type(default)]
                 reason = " ".join(str(error).split())
                 raise SettingsError(f"parameter '{name}': {reason}; expected {kind}{limits}") from None
         return {name: self.get_parameter(name).value for name, *_ in _PARAMETERS}
@@ -164,9 +173,14 @@ def make_source(settings: dict[str, Any]) -> Source:
         raise SettingsError(f"parameters: {found}; expected exactly one of 'data' (a dataset folder) and 'bag'")
     if bag:
         return BagSource(Path(bag).expanduser(), {role: settings[f"{role}_topic"] for role in TYPES})
-    return FolderSource(
-        Path(data).expanduser(), settings["labels"], settings["split"], settings["frame_id"], settings["map_frame"]
-    )
+    folder = Path(data).expanduser(), settings["labels"], settings["split"], settings["frame_id"], settings["map_frame"]
+    if not settings["grow"]:
+        return FolderSource(*folder)
+    if settings["loop"] != 1:
+        raise SettingsError(f"parameters: grow is true and loop is {settings['loop']}; expected 1: a scene grows once")
+    from gsseg_ros.replay.growing import GrowingSource  # It loads the scene, and a bag is played without.
+
+    return GrowingSource(*folder)
 
 
 def _run(node: ReplayNode) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,25 +13,31 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
-from ros_helpers import Ros
+from ros_helpers import Ros, wait_until
 from ros_node_here import NodeHere, node_here
+from ros_robot import SECOND
 from scipy.spatial.transform import Rotation
-from small_scenes import balls_on_a_table, clean_views
+from small_scenes import balls_on_a_table, clean_views, write_dataset
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from gsseg_msgs.msg import SceneDelta as SceneDeltaMessage
 
+from gsseg_core.data.dataset import Dataset
 from gsseg_core.live.living_session import LivingSession
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_delta import GroupMove, SceneDelta
 from gsseg_core.scene.similarity import Similarity
+from gsseg_ros.conversions import stamp_message
 from gsseg_ros.delta_messages import delta_from_message, message_from_delta
 from gsseg_ros.errors import InvalidRequestError
+from gsseg_ros.replay.growing import GrowingSource
 
 SCENE, _ = balls_on_a_table()
 COPY = SceneDelta(
-    added=GaussianScene.from_arrays(SCENE.means + [0, 0, 1.5], SCENE.quats, SCENE.scales, SCENE.opacities, SCENE.sh),
+    added=GaussianScene.from_arrays(
+        SCENE.means + np.array([0, 0, 1.5]), SCENE.quats, SCENE.scales, SCENE.opacities, SCENE.sh
+    ),
     added_ids=np.arange(len(SCENE)) + 2**40,
     added_groups=np.full(len(SCENE), 5, np.int64),
 )
@@ -149,6 +156,37 @@ def test_a_node_that_finds_objects_itself_refuses_changes_and_says_why(shared: R
         for service, fields in (("update_scene", {}), ("merge_states", {"paths": ["x"]})):
             answer = here.ask(service, **fields)
             assert answer.error_code % 100 == 3 and "the parameter ids is per-view" in answer.error_msg
+
+
+def test_a_scene_that_arrives_in_submaps_ends_as_if_it_had_been_there_from_the_start(
+    here: NodeHere, tmp_path: Path
+) -> None:
+    here.done("load_scene")
+    session = here.node.workspace.living_session
+    source = GrowingSource(write_dataset(tmp_path / "data"), "labels", "all", "camera", "map")
+    stamps, masks = itertools.count(here.stamp, SECOND // 10), 0
+    before = here.inputs.accepted
+    for group in source:
+        stamp = stamp_message(next(stamps))
+        for topic, message in group.messages:
+            message.header.stamp = stamp
+            if topic == "scene_delta":
+                wait_until(lambda m=masks: here.inputs.accepted == before + m, "the masks so far")
+                here.node._changes.on_scene_delta(message)
+            else:
+                here.hand({topic: message})
+                masks += topic == "mask"
+    here.stamp = next(stamps)
+    assert here.node.workspace.changes["made"] == 6 and not here.node.workspace.changes["refused"]
+    assert session.num_views == masks == 6
+    assert sorted({view.group for view in session.views if view.group is not None}) == [1, 2, 3, 4]
+    np.testing.assert_array_equal(votes(session), as_refused(session))
+    places = session.living.places(np.arange(len(SCENE)))
+    np.testing.assert_allclose(session.scene.means[places], SCENE.means, atol=1e-4)
+    whole = LivingSession(SCENE)
+    for view in Dataset(tmp_path / "data").views():
+        whole.fuse(view)
+    assert (session.codes()[places].argmax(axis=1) == whole.codes().argmax(axis=1)).mean() > 0.98
 
 
 @settings(max_examples=20, deadline=None)
