@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from gsseg_core.learn.learner_state import State
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.scene_change import SceneChange
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.cpu.occlusion import ray_ends
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.group_frames import IDENTITY, is_identity
 from gsseg_core.scene.living_scene import LivingScene
@@ -37,6 +39,7 @@ class LivingVotes(VoteLearner):
         # Views are rendered again where they are needed; to keep them prepared would take far more memory than masks.
         super().__init__(living.scene, num_classes, device=device, memory_budget=0)
         self.living = living
+        self._ends: WeakKeyDictionary[View, np.ndarray] = WeakKeyDictionary()
 
     def observe(self, view: View) -> bool:
         """Add a view and its votes, as `Learner.observe` does; raises `UnknownGroupError`, too."""
@@ -75,14 +78,31 @@ class LivingVotes(VoteLearner):
             The mask of a view that is lifted anew cannot be read any more.
         """
         views = {name: self._joined(view, joining.get(name, view.group)) for name, view in self.views.items()}
-        lifted = [name for name, view in views.items() if not self._looks_alike(name, view) or change.touches(view)]
+        lifted = [
+            name
+            for name, view in views.items()
+            if not self._looks_alike(name, view) or change.touches(view, self._ends_of(view))
+        ]
         # Masks in memory cannot fail: they are read one at a time.
         read = {name: views[name].read_seen() for name in lifted if not views[name].is_in_memory}
         self._lift(self.views, lifted, read, -1)
         self._votes, self.living, self.scene = change.carry(self._votes), change.after, change.after.scene
         self._lift(views, lifted, read, 1)
         self.views = views
+        for name in lifted:
+            self._ends.pop(views[name], None)
         return lifted
+
+    def _ends_of(self, view: View) -> Callable[[], np.ndarray] | None:
+        """Tell where the rays of a view end, when asked; it is kept until the view is lifted anew. None on a GPU."""
+
+        def ends() -> np.ndarray:
+            if view not in self._ends:
+                scene = self.living.seen_from(view.group)
+                self._ends[view] = ray_ends(scene, view.camera, view.read_seen().labels)
+            return self._ends[view]
+
+        return ends if self.device == "cpu" else None
 
     def _lift(self, views: Mapping[str, View], names: list[str], read: Mapping[str, SeenLabels], sign: int) -> None:
         # In the order of groups, so that the scene is brought into the frame of each but once.

@@ -6,14 +6,16 @@ stay what they are, bit for bit, unless one that changed in this frame reaches t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
 from gsseg_core.data.view import View
-from gsseg_core.raster.cpu.projection import project
+from gsseg_core.raster.cpu.occlusion import nearest_depths
 from gsseg_core.scene.group_frames import is_same_relation, relation
 from gsseg_core.scene.living_scene import LivingScene
+
+_MARGIN = 1 + 1e-5
 
 
 class SceneChange:
@@ -37,18 +39,25 @@ class SceneChange:
         self._gone[kept] = False
         self._parts: dict[int | None, tuple[np.ndarray, np.ndarray]] = {}
 
-    def touches(self, view: View) -> bool:
+    def touches(self, view: View, ends: Callable[[], np.ndarray] | None = None) -> bool:
         """Whether the votes of a view, which keeps its group and pose, may be others than before.
 
-        None of its Gaussians is rendered: those that changed are projected, as lifting would project them.
+        None of its Gaussians is rendered: those that changed are projected, as lifting would project them. If some
+        reach the image, `ends` is asked where the view's rays end, as `raster.cpu.occlusion.ray_ends` tells: behind
+        that, they change nothing.
         """
         if not self.keeps_order:
             return True
-        places = self._changed(view.group)
-        return any(
-            len(part) > 0 and len(project(scene.part_seen_from(view.group, part), view.camera).ids) > 0
-            for scene, part in zip((self.before, self.after), places, strict=True)
-        )
+        depths = [
+            nearest_depths(scene.part_seen_from(view.group, part), view.camera)
+            for scene, part in zip((self.before, self.after), self._changed(view.group), strict=True)
+            if len(part)
+        ]
+        nearest = np.minimum.reduce(depths) if depths else np.array(np.inf)
+        if np.isinf(nearest).all():
+            return False
+        # Depths are compared with a margin many times what rounding could make of them.
+        return ends is None or bool((nearest < np.inf)[nearest <= ends() * _MARGIN].any())
 
     def carry(self, rows: np.ndarray) -> np.ndarray:  # (N, ...)
         """Take what Gaussians had before along to where they are, (N', ...); zeros for those that were not there."""

@@ -74,6 +74,21 @@ class Story:
         self.next_id += 40
         self.session.update(added(ids, int(rng.integers(0, 4)), places, float(rng.normal() * 0.5)))
 
+    def wall(self, seed: int) -> None:
+        """What comes is so large and dense that rays end in it: later changes behind it touch nothing."""
+        rng = np.random.default_rng(seed)
+        flat = Rotation.random(4, random_state=seed).as_quat()[:, [3, 0, 1, 2]]
+        part = GaussianScene.from_arrays(
+            rng.normal(size=(4, 3)) * 0.7 + [0, 0, 0.8],
+            flat,
+            np.full((4, 3), 1.5),
+            np.full(4, 0.999),
+            np.zeros((4, 1, 3)),
+        )
+        ids = np.arange(self.next_id, self.next_id + 4)
+        self.next_id += 4
+        self.session.update(SceneDelta(added=part, added_ids=ids, added_groups=np.full(4, int(rng.integers(0, 4)))))
+
     def move(self, seed: int) -> None:
         rng, groups = np.random.default_rng(seed), sorted(self.session.living.frames)
         names = [view.name for view in self.session.views]
@@ -98,7 +113,7 @@ class Story:
     st.lists(
         st.one_of(
             st.tuples(st.just("fuse"), st.integers(0, 11), st.integers(-1, 3)),
-            st.tuples(st.sampled_from(["remove", "add", "move", "together"]), st.integers(0, 2**16)),
+            st.tuples(st.sampled_from(["remove", "add", "wall", "move", "together"]), st.integers(0, 2**16)),
         ),
         min_size=3,
         max_size=14,

@@ -88,6 +88,29 @@ def test_a_change_out_of_sight_lifts_nothing_and_one_in_sight_only_those_that_se
     np.testing.assert_array_equal(votes(growing), as_refused(growing))
 
 
+def test_what_changes_behind_a_wall_touches_no_view_and_in_front_of_it_does() -> None:
+    wall = GaussianScene.from_arrays(
+        np.zeros((8, 3)), np.tile([1.0, 0, 0, 0], (8, 1)), np.full((8, 3), 9.0), np.full(8, 0.999), np.zeros((8, 1, 3))
+    )
+    walled = LivingSession(wall, NAMES)
+    pose = np.eye(4)
+    pose[2, 3] = 1
+    camera = replace(VIEWS[0].camera, world_to_camera=pose)
+    labels = VIEWS[0].read_labels()
+    labels[:16] = -1
+    assert walled.fuse(View.from_arrays(camera, labels)) is None
+    before = votes(walled).copy()
+    behind, in_front = other_room((0, 0, 12)), other_room((0, 0, 0), group=2)
+    changed = walled.update(behind)
+    assert (changed.num_views_kept, changed.num_views_lifted) == (1, 0)
+    np.testing.assert_array_equal(votes(walled)[:8], before)
+    np.testing.assert_array_equal(votes(walled), as_refused(walled))
+    assert walled.update(replace(in_front, added_ids=in_front.added_ids + 10**6)).num_views_lifted == 1
+    np.testing.assert_array_equal(votes(walled), as_refused(walled))
+    assert walled.update(SceneDelta(removed=behind.added_ids)).num_views_lifted == 0
+    np.testing.assert_array_equal(votes(walled), as_refused(walled))
+
+
 def test_those_that_stay_keep_their_order_and_added_ones_come_behind_with_their_ids(tmp_path: Path) -> None:
     growing = session()
     delta = other_room((0, 0, 9))
