@@ -14,7 +14,7 @@ ARGUMENTS = (
     ("split", str, "train", "views of data to replay: train, test or all"),
     ("rate", float, "10.0", "masks per second"),
     ("loop", int, "1", "how many times; 0: for ever"),
-    ("grow", bool, "false", "whether the scene of data arrives in five submaps, and a loop closes at the end"),
+    ("grow", bool, "False", "whether the scene of data arrives in five submaps, and a loop closes at the end"),
     ("frame_id", str, "camera", "frame of the camera, with data"),
     ("map_frame", str, "map", "frame of the poses, with data"),
     ("wait_for_subscribers", float, "5.0", "seconds to wait for somebody who listens"),
