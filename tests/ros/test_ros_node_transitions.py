@@ -48,7 +48,7 @@ def fails_at(node: SegmentNode, monkeypatch: pytest.MonkeyPatch, method: str, to
     make = getattr(node, method)
 
     def broken(kind: Any, name: str, *arguments: Any, **settings: Any) -> Any:
-        if name == topic:
+        if name in (topic, f"/{topic}"):
             raise MemoryError("none left")
         return make(kind, name, *arguments, **settings)
 
@@ -69,14 +69,14 @@ def test_a_configure_that_breaks_off_leaves_nothing_behind_and_works_afterwards(
     assert node.trigger_configure() == SUCCESS
 
 
-@pytest.mark.parametrize("topic", ["image", "mask", "camera_info", "pose"])
+@pytest.mark.parametrize("topic", ["image", "mask", "camera_info", "pose", "~/obstacles"])
 def test_an_activate_that_breaks_off_leaves_nothing_behind_and_works_afterwards(
     node: SegmentNode, errors: list[str], monkeypatch: pytest.MonkeyPatch, topic: str
 ) -> None:
     assert node.trigger_configure() == SUCCESS
     before = entities(node)
     with monkeypatch.context() as patch:
-        fails_at(node, patch, "create_subscription", topic)
+        fails_at(node, patch, "create_publisher" if topic.startswith("~") else "create_subscription", topic)
         assert node.trigger_activate() == FAILURE
     assert "cannot be activated: unexpected MemoryError: none left\nTraceback" in errors[0] and len(errors) == 1
     assert entities(node) == before and node.inputs is None and not node.workspace.active
