@@ -19,6 +19,9 @@ PAPER, INK, FAINT_INK = (255, 255, 255), (32, 34, 38), (128, 131, 138)
 FILL = 0.55
 """How much of a label's colour goes into an overlaid pixel."""
 
+CELL_PX = 640
+"""Pictures of a contact sheet have at most this many px a side: a sheet is looked at as a whole."""
+
 LEGEND_ROWS = 24
 """Most lines in a column of a legend."""
 
@@ -87,13 +90,15 @@ def contact_sheet(images: Sequence[np.ndarray], captions: Sequence[str], columns
     Parameters
     ----------
     images : sequence of ndarray (H, W, 3) uint8
-        One or more pictures; smaller ones are centred in cells of the largest one's size.
+        One or more pictures, shrunk to `CELL_PX` a side at most; smaller ones are centred in cells of the largest
+        one's size.
     captions : sequence of str
         One for each picture.
     columns : int
         Pictures in a row.
     """
     gap, text = 12, 14
+    images = [_shrunk(image) for image in images]
     height, width = np.max([image.shape[:2] for image in images], axis=0).tolist()
     columns = min(columns, len(images))
     rows = -(-len(images) // columns)
@@ -162,6 +167,15 @@ def outline(labels: np.ndarray) -> np.ndarray:
     border[1:] |= down
     border[:-1] |= down
     return border
+
+
+def _shrunk(image: np.ndarray) -> np.ndarray:  # (H, W, 3) uint8
+    """Shrink a picture so that neither side is longer than `CELL_PX`."""
+    if max(image.shape[:2]) <= CELL_PX:
+        return image
+    picture = Image.fromarray(image)
+    picture.thumbnail((CELL_PX, CELL_PX), Image.Resampling.BOX)
+    return np.asarray(picture)
 
 
 def _shorten(text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: float) -> str:

@@ -10,7 +10,7 @@ from PIL import Image
 
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import WriteError
-from gsseg_core.export.pictures import BACKGROUND, PAPER, contact_sheet, legend, overlay, palette, save_png
+from gsseg_core.export.pictures import BACKGROUND, CELL_PX, PAPER, contact_sheet, legend, overlay, palette, save_png
 
 
 def test_colours_are_all_different_and_the_first_is_the_background() -> None:
@@ -62,6 +62,13 @@ def test_a_contact_sheet_holds_every_picture_whole() -> None:
     for image, color in zip(images, colors, strict=True):
         assert (sheet == color).all(axis=-1).sum() == image.shape[0] * image.shape[1]
     assert tuple(sheet[0, 0]) == PAPER
+
+
+def test_large_pictures_are_shrunk_onto_a_contact_sheet() -> None:
+    wide, small = np.full((400, 1600, 3), 200, np.uint8), np.full((90, 120, 3), 90, np.uint8)
+    sheet = contact_sheet([wide, small], ["wide", "small"], columns=2)
+    assert sheet.shape[1] < 2 * CELL_PX + 50
+    assert (sheet == 200).all(axis=-1).sum() == 160 * CELL_PX and (sheet == 90).all(axis=-1).sum() == 90 * 120
 
 
 def test_a_legend_has_a_swatch_for_every_class_in_as_many_columns_as_it_takes() -> None:

@@ -57,9 +57,9 @@ def scene_edges(operator: ViewOperator, scene: GaussianScene) -> np.ndarray:
     camera, light = operator.camera, _LIGHT.of(scene, lambda: scene.colors().mean(axis=1))
     if light.min() == light.max():
         return np.zeros((camera.height, camera.width), np.float32)
-    channels = np.empty((len(scene), 2), np.float32)
-    _luminance_and_inverse_depth(scene.means, light, camera.world_to_camera[2].astype(np.float32), channels)
-    light_edges, depth_edges = _differences(*operator.blend(channels))
+    ahead = camera.world_to_camera[2].astype(np.float32)
+    channels = _luminance_and_inverse_depth(scene.means, light, operator.ids, ahead)
+    light_edges, depth_edges = _differences(*operator.blend_seen(channels))
     edges: np.ndarray = _in_units(light_edges) + _in_units(depth_edges)
     return edges
 
@@ -161,12 +161,17 @@ def _mean_field_round(
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _luminance_and_inverse_depth(means: np.ndarray, light: np.ndarray, ahead: np.ndarray, channels: np.ndarray) -> None:
-    """Write luminance and inverse depth of each Gaussian into channels (N, 2); ahead is the row of depths, (4,)."""
-    for i in nb.prange(means.shape[0]):
+def _luminance_and_inverse_depth(
+    means: np.ndarray, light: np.ndarray, ids: np.ndarray, ahead: np.ndarray  # (N, 3), (N,), (M,), (4,) row of depths
+) -> np.ndarray:  # fmt: skip
+    """Luminance and inverse depth of some Gaussians, (M, 2) float32."""
+    channels = np.empty((ids.shape[0], 2), np.float32)
+    for m in nb.prange(ids.shape[0]):
+        i = ids[m]
         depth = means[i, 0] * ahead[0] + means[i, 1] * ahead[1] + means[i, 2] * ahead[2] + ahead[3]
-        channels[i, 0] = light[i]
-        channels[i, 1] = 1 / max(depth, np.float32(1e-6))  # what is behind the camera is not drawn
+        channels[m, 0] = light[i]
+        channels[m, 1] = 1 / max(depth, np.float32(1e-6))  # what is behind the camera is not drawn
+    return channels
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
