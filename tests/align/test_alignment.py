@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from gsseg_core.align import placing
 from gsseg_core.align.agreement import agreement, look_at, render
 from gsseg_core.align.conventions import AXIS_ROTATIONS, OPENGL, Convention
 from gsseg_core.align.features import Extractor, Features
@@ -60,6 +61,13 @@ def with_photos(demo: Path, scene: GaussianScene, tmp_path_factory: pytest.TempP
     train = [camera.name for camera in cameras]
     (folder / "split.json").write_text(json.dumps({"train": train, "test": []}))
     return folder
+
+
+@pytest.fixture
+def few_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have frames found by fewer and smaller pictures than usual, which takes a fraction of the time."""
+    few = replace(SETTINGS, views=3, survivors=0.05, picture_px=64, photos=4)
+    monkeypatch.setattr(placing, "AlignSettings", lambda: few)
 
 
 def poses_apart(first: Dataset, second: Dataset) -> float:
@@ -188,6 +196,7 @@ def test_a_similarity_of_a_real_scene_is_found_to_a_fraction_of_a_pixel(real_dat
     assert found.offset_px is not None and found.offset_px < 1
 
 
+@pytest.mark.usefixtures("few_views")
 def test_what_is_a_little_off_is_brought_closer(with_photos: Path, scene: GaussianScene) -> None:
     true = Dataset(with_photos)
     nudge = Similarity(1.0, Rotation.from_rotvec([0.01, 0, 0]).as_matrix(), np.zeros(3))
@@ -216,6 +225,7 @@ def write_moved(source: Path, target: Path, move: Callable[[Camera], Camera]) ->
     return target
 
 
+@pytest.mark.usefixtures("few_views")
 def test_doctor_says_what_makes_cameras_fit_and_whether_they_did(
     demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -228,6 +238,7 @@ def test_doctor_says_what_makes_cameras_fit_and_whether_they_did(
     assert "expected a dataset, too" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("few_views")
 def test_segment_warns_in_one_line_of_cameras_that_do_not_fit_and_align_mends_it(
     demo: Path, demo_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -31,13 +31,13 @@ SETTINGS = EMSettings(max_steps=6, tolerance=0.0)
 
 
 @contextmanager
-def three_workers() -> Iterator[str]:
-    """The address of a scheduler with three workers, each a process of one thread, which come back when killed."""
+def workers(count: int) -> Iterator[str]:
+    """The address of a scheduler with some workers, each a process of one thread, which come back when killed."""
     patient = {f"distributed.comm.timeouts.{name}": f"{PATIENCE:g}s" for name in ("connect", "tcp")}
     with (
         dask.config.set(patient),
         distributed.LocalCluster(
-            processes=True, n_workers=3, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=50
+            processes=True, n_workers=count, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=50
         ) as cluster,
     ):
         yield cluster.scheduler_address
@@ -46,7 +46,7 @@ def three_workers() -> Iterator[str]:
 @pytest.fixture(name="address", scope="module")
 def address_fixture() -> Iterator[str]:
     """Workers for all tests that leave them as they were."""
-    with three_workers() as address:
+    with workers(3) as address:
         yield address
 
 
@@ -59,7 +59,7 @@ def client_fixture(address: str) -> Iterator[Any]:
 @pytest.fixture(name="client_of_victims")
 def client_of_victims_fixture() -> Iterator[Any]:
     """Workers of one test's own, which kills them: how soon they come back is nothing to the other tests."""
-    with three_workers() as address, scheduler.connected(address) as client:
+    with workers(2) as address, scheduler.connected(address) as client:
         yield client
 
 
