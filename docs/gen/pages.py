@@ -24,6 +24,11 @@ API = {
 }
 """Public names of the library by subject; what is missing here comes last, under "More"."""
 
+GROWING = (
+    "live.living_session.LivingSession", "live.living_session.Changed", "scene.scene_delta.SceneDelta",
+    "scene.scene_delta.GroupMove", "scene.similarity.Similarity", "scene.living_scene.LivingScene",
+)  # fmt: skip
+
 
 def command_line() -> str:
     """Make the page of the command line from its parser."""
@@ -69,6 +74,7 @@ def python() -> str:
         parts += [f"::: {getattr(gsseg_core, name).__module__}.{name}\n" for name in names]
     parts += ["## Files that are read\n", _formats()]
     parts += ["## A robot without ROS\n", "::: gsseg_core.live.session.LiveSession\n"]
+    parts += ["## A map that grows\n", *(f"::: gsseg_core.{name}\n" for name in GROWING)]
     parts += ["## The client of the ROS node\n", "::: gsseg_ros.client.SegmentationClient\n"]
     return "\n".join(parts)
 

@@ -161,6 +161,10 @@ class State:
         k = whole_number(k, "number of classes", 1, MAX_LABEL + 1)
         views = [_read_view(file, i, entry, k) for i, entry in enumerate(header["views"])]
         twice = [name for name, count in Counter(view.name for view in views).items() if count > 1]
+        known = {0} if living is None else living.frames.keys()
+        strange = {view.group for view in views if view.group is not None} - known
+        if strange:
+            raise UnfitError(f"has views of the groups {clipped(sorted(strange))}; expected groups of its scene only")
         if twice:
             raise UnfitError(f"has two views of the name {quoted(twice[0])}; expected one of each name")
         num_fused = whole_number(header["num_fused"], "num_fused", len(views), _MOST_VIEWS)

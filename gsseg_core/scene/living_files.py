@@ -36,18 +36,18 @@ def read(file: NpzArrays, header: dict[str, Any]) -> LivingScene:
     """Read a scene, colourless; `UnfitError` if what is there is none."""
     geometry = file.expect("geometry", np.float32, (None, len(_GEOMETRY)))
     ids, groups = (file.expect(name, np.int64, (len(geometry),)) for name in ("ids", "groups"))
-    frames = {
-        whole_number(entry["group"], "group of a frame", 0, MAX_ID): read_similarity(entry)
-        for entry in header["frames"]
-    }
     if ids.min(initial=0) < 0 or len(np.unique(ids)) < len(ids):
         raise UnfitError("array ids holds negative numbers, or some twice; expected another from 0 for each Gaussian")
-    if not np.isin(groups, list(frames)).all():
-        raise UnfitError(f"array groups holds other groups than the {len(frames)} of its frames; expected those")
     try:
+        frames = {
+            whole_number(entry["group"], "group of a frame", 0, MAX_ID): read_similarity(entry)
+            for entry in header["frames"]
+        }
+        if not np.isin(groups, list(frames)).all():
+            raise UnfitError(f"array groups holds other groups than the {len(frames)} of its frames; expected those")
         return LivingScene.placed(_colourless(geometry), ids, groups, frames)
     except GssegError as error:
-        raise UnfitError(f"array geometry holds no scene ({error})") from error
+        raise UnfitError(f"its scene is unusable ({error}); expected Gaussians, and a similarity per group") from error
 
 
 def without_colours(living: LivingScene) -> LivingScene:

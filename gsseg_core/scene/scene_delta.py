@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.errors import SceneDeltaError
+from gsseg_core.errors import EmptySceneError, SceneDeltaError, SceneValueError
 from gsseg_core.files.limits import LIMITS
 from gsseg_core.files.npz_files import UnfitError, open_arrays, read_json_header, whole_number, write_npz
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -121,12 +121,18 @@ class SceneDelta:
         ------
         SceneDeltaError
             The file is missing or damaged, or holds what is no delta.
-        SceneValueError
-            Values of the added Gaussians are impossible.
         PathNotAllowedError
             The file lies outside `within`.
         """
         path = Path(path)
+        try:
+            return cls._read(path, within)
+        except (SceneDeltaError, SceneValueError, EmptySceneError) as error:
+            named = str(error).startswith(str(path))
+            raise SceneDeltaError(str(error) if named else f"{path}: {error}") from error
+
+    @classmethod
+    def _read(cls, path: Path, within: Path | None) -> SceneDelta:
         with open_arrays(path, "a scene delta", SceneDeltaError, within) as file:
             header = read_json_header(file)
             if header.get("format") != FORMAT:

@@ -7,6 +7,7 @@ import shutil
 import struct
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,11 @@ from gsseg_core.data.mask_files import read_soft_mask
 from gsseg_core.errors import GssegError
 from gsseg_core.learn.learner_state import State
 from gsseg_core.learn.vote_learner import VoteLearner
+from gsseg_core.live.living_session import LivingSession
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.living_scene import LivingScene
+from gsseg_core.scene.scene_delta import GroupMove, SceneDelta
+from gsseg_core.scene.similarity import Similarity
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.text import printable
 
@@ -37,6 +42,8 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "ascii.ply": GaussianScene.load,
     "segmentation.npz": lambda path: Segmentation.load(path, SCENE),
     "state.npz": lambda path: State.load(path, SCENE.digest, len(SCENE)),
+    "living.npz": lambda path: State.load(path, SCENE.digest, len(SCENE), first=LivingScene.of(SCENE)),
+    "delta.npz": SceneDelta.load,
     "mask.png": read_mask,
     "soft.npz": lambda path: read_soft_mask(path, NAMES, ring(1)[0]),
     "detections/1.tif": lambda path: read_soft_mask(path.parent, NAMES, ring(1)[0]),
@@ -64,6 +71,12 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
         folder / "segmentation.npz"
     )
     taught(VoteLearner(SCENE, NUM_CLASSES), clean_views(2)).save(folder / "state.npz")
+    delta = SceneDelta(1, np.arange(5), SMALL, np.arange(len(SMALL)) + 999, np.full(len(SMALL), 2, np.int64))
+    replace(delta, moves=(GroupMove(2, Similarity(2.0), ("view0",)),)).save(folder / "delta.npz")
+    session = LivingSession(SCENE, NAMES)
+    session.fuse(clean_views(1)[0])
+    session.update(delta)
+    session.save(folder / "living.npz")
     np.savez_compressed(folder / "soft.npz", probabilities=np.full((4, 48, 64), 0.25, np.float32))
     (folder / "detections").mkdir()
     Image.fromarray(np.full((48, 64), 0.5, np.float32)).save(folder / "detections/1.tif")

@@ -1,0 +1,129 @@
+"""Changes of a scene on disk, and ids in files: whole, or refused with one clear error that names the file."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from small_scenes import balls_on_a_table
+
+from gsseg_core.errors import GssegError, SceneDeltaError, SceneValueError
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.living_scene import LivingScene
+from gsseg_core.scene.scene_delta import GroupMove, SceneDelta
+from gsseg_core.scene.similarity import Similarity
+
+SCENE, _ = balls_on_a_table()
+PART = SCENE.subset(np.arange(20))
+NONE = np.empty(0, np.int64)
+
+
+def change() -> SceneDelta:
+    motion = Similarity(1.5, Rotation.from_rotvec([1, 2, 3]).as_matrix(), np.array([1.0, 2, 3]))
+    moves = (GroupMove(3, motion, ("a", "b")), GroupMove(0, Similarity()))
+    return SceneDelta(4, np.array([7, 2**62]), PART, np.arange(20) + 10**15, np.arange(20) % 4, moves)
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    change().save(tmp_path / "delta.npz")
+    return tmp_path / "delta.npz"
+
+
+def rewritten(path: Path, header: dict[str, Any] | None = None, **arrays: np.ndarray) -> Path:
+    with np.load(path) as file:
+        content = {**dict(file), **arrays}
+    if header is not None:
+        content["header"] = np.array(json.dumps({**json.loads(str(content["header"])), **header}))
+    np.savez_compressed(path, **content)
+    return path
+
+
+def test_a_change_comes_back_as_it_was_saved(saved: Path) -> None:
+    again, delta = SceneDelta.load(saved), change()
+    for name in ("removed", "added_ids", "added_groups"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(delta, name))
+    np.testing.assert_allclose(again.added.means, PART.means)  # type: ignore[union-attr]
+    np.testing.assert_array_equal(again.moves[0].motion.rotation, delta.moves[0].motion.rotation)
+    assert (again.revision, again.moves[0].views, again.moves[0].motion.scale) == (4, ("a", "b"), 1.5)
+    SceneDelta().save(saved)
+    empty = SceneDelta.load(saved)
+    assert empty.revision is None and empty.added is None and not empty.moves
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
+def test_a_truncated_file_is_refused_with_one_error(saved: Path, share: float) -> None:
+    content = saved.read_bytes()
+    saved.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(SceneDeltaError, match="is not a scene delta, or is damaged"):
+        SceneDelta.load(saved)
+
+
+@pytest.mark.parametrize(
+    ("header", "arrays", "message"),
+    [
+        ({"format": "gsseg-state-1"}, {}, "format is 'gsseg-state-1'; expected 'gsseg-delta-1'"),
+        ({"revision": -1}, {}, "revision is -1; expected a whole number"),
+        ({"moves": [{}]}, {}, "damaged"),
+        ({"moves": [{"group": 0, "scale": 0, "rotation": np.eye(3).tolist(), "translation": [0, 0, 0], "views": []}]},
+         {}, "a scale of 0"),
+        ({"moves": [{"group": 0, "scale": 1, "rotation": np.ones((3, 3)).tolist(), "translation": [0, 0, 0],
+                     "views": []}]}, {}, "is no rotation"),
+        ({}, {"removed": np.array([-1])}, "removed hold"),
+        ({}, {"removed": np.array([5, 5])}, "removed hold 5 twice"),
+        ({}, {"added_ids": np.zeros(20, np.int64)}, "added_ids hold 0 twice"),
+        ({}, {"added_groups": np.zeros(19, np.int64)}, "array added_groups is int64"),
+        ({}, {"means": np.full((20, 3), np.nan, np.float32)}, "NaN"),
+        ({}, {"scales": np.zeros((20, 3), np.float32)}, "not positive"),
+        ({}, {"sh": np.zeros((20, 5, 3), np.float32)}, "sh has shape"),
+    ],
+)  # fmt: skip
+def test_a_file_that_holds_no_change_is_refused_and_named(
+    saved: Path, header: dict[str, Any], arrays: dict[str, np.ndarray], message: str
+) -> None:
+    with pytest.raises(SceneDeltaError) as raised:
+        SceneDelta.load(rewritten(saved, header, **arrays))
+    assert str(raised.value).startswith(str(saved)) and message in str(raised.value)
+
+
+def test_an_array_that_claims_to_be_huge_is_refused_before_it_is_inflated(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "huge.npz", "w") as archive:
+        with archive.open("removed.npy", "w") as member:
+            np.lib.format.write_array_header_1_0(member, {"descr": "<i8", "fortran_order": False, "shape": (2**40,)})
+        with archive.open("header.npy", "w") as member:
+            text = json.dumps({"format": "gsseg-delta-1", "revision": None, "moves": []})
+            np.lib.format.write_array(member, np.array(text))
+    with pytest.raises(SceneDeltaError, match=r"huge\.npz.*expected at most"):
+        SceneDelta.load(tmp_path / "huge.npz")
+
+
+def test_what_is_added_may_not_have_more_colours_than_the_scene_has_room_for() -> None:
+    sh = np.zeros((20, 4, 3))
+    bright = GaussianScene.from_arrays(PART.means, PART.quats, PART.scales, PART.opacities, sh)
+    delta = SceneDelta(added=bright, added_ids=np.arange(20) + 900, added_groups=np.zeros(20, np.int64))
+    with pytest.raises(SceneDeltaError, match="9 coefficients of SH more than the scene"):
+        LivingScene.of(SCENE).apply(delta)
+    wide = GaussianScene.from_arrays(
+        SCENE.means, SCENE.quats, SCENE.scales, SCENE.opacities, np.ones((len(SCENE), 4, 3))
+    )
+    dull = SceneDelta(added=PART, added_ids=np.arange(20) + 900, added_groups=np.zeros(20, np.int64))
+    after, _ = LivingScene.of(wide).apply(dull)
+    assert after.scene.sh_degree == 1 and not after.scene.sh[-20:, 1:].any()
+
+
+def test_ids_of_a_file_are_checked(tmp_path: Path) -> None:
+    grown, _ = LivingScene.of(SCENE).apply(SceneDelta(removed=np.array([0])))
+    twice = grown.scene.vertices.copy()
+    twice["id_low"][1] = twice["id_low"][0]
+    GaussianScene.from_vertices(twice, None).save(tmp_path / "twice.ply")
+    with pytest.raises(SceneValueError, match=r"twice\.ply: ids are negative, or some are there twice"):
+        LivingScene.of(GaussianScene.load(tmp_path / "twice.ply"))
+    huge = grown.scene.vertices.copy()
+    huge["id_high"] = 2**32 - 1
+    with pytest.raises(GssegError, match="ids are negative"):
+        LivingScene.of(GaussianScene.from_vertices(huge, None))
