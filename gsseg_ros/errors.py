@@ -76,6 +76,10 @@ class DepthImageError(GssegError):
     """A depth image does not belong to its mask, or is broken."""
 
 
+class LabelInfoError(GssegError):
+    """A message that names the labels of masks cannot be used."""
+
+
 class MissingFileError(GssegError):
     """A file or folder of a request does not exist."""
 

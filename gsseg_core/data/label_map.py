@@ -61,6 +61,11 @@ def read_label_map(
     SettingsError
         It is YAML, and PyYAML is not installed.
     """
+    return map_labels(read_new_names(path, within), class_names, str(path))
+
+
+def read_new_names(path: str | os.PathLike[str], within: Path | None = None) -> dict[str, str | None]:
+    """Read what a label map says, new names (None: ignored) by id, name or "*"; raises as `read_label_map` does."""
     path = Path(path)
     is_yaml = path.suffix.lower() in (".yaml", ".yml")
     content: Any = (read_yaml if is_yaml else read_json)(path, LabelMapError, within)
@@ -69,7 +74,7 @@ def read_label_map(
     given = {str(key): _new_name(value, key, path) for key, value in content.items() if type(key) in (str, int)}
     if len(given) < len(content):
         raise LabelMapError(f"{path}: has keys that are neither names nor ids; expected {_EXPECTED}")
-    return map_labels(given, class_names, str(path))
+    return given
 
 
 def map_labels(given: Mapping[str, str | None], class_names: Mapping[int, str], source: str) -> LabelMap:

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gsseg_core.errors import GssegError, IntrinsicsError, MaskFormatError, MaskSizeError, PoseError, UnknownLabelError
+from gsseg_core.errors import (
+    GssegError,
+    IntrinsicsError,
+    LabelMapError,
+    MaskFormatError,
+    MaskSizeError,
+    PoseError,
+    UnknownLabelError,
+)
 from gsseg_core.learn.learner_state import Learnt
 
 SCENE_CHANGED = "scene_changed"
@@ -14,6 +22,7 @@ _REASONS: dict[type[GssegError], str] = {
     MaskFormatError: "mask_format",
     MaskSizeError: "size_mismatch",
     UnknownLabelError: "unknown_label",
+    LabelMapError: "unknown_label",
     PoseError: "bad_pose",
     IntrinsicsError: "bad_camera_info",
 }

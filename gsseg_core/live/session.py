@@ -21,11 +21,11 @@ from gsseg_core.errors import (
     NoUsableViewsError,
     SettingsError,
     StateFileError,
-    UnknownLabelError,
 )
 from gsseg_core.learn.learner_state import Learnt, State
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.learn.vote_learner import VoteLearner
+from gsseg_core.live.class_numbers import add_names, ids_by_name, require_affordable
 from gsseg_core.live.fitting import Report, fitted, num_classes_with
 from gsseg_core.live.results import SCENE_CHANGED, Outcome, Rejection
 from gsseg_core.progress import Stopwatch
@@ -34,9 +34,6 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.spatial.neighbourhood import find_neighbours
-
-VOTES_LIMIT = 2 << 30
-"""Bytes of votes up to which classes without declared names are added as their labels turn up."""
 
 LIVE = "votes"
 """Name of the learner that fuses views as they arrive."""
@@ -126,6 +123,13 @@ class LiveSession:
     def has_codes(self) -> bool:
         """Whether anything is known of the scene."""
         return self._learnt is not None or self.num_fused > 0
+
+    def number_classes(self, names: Mapping[int, str], *, keep_numbers: bool = True) -> dict[int, int]:
+        """Find the ids of a segmenter's classes, by its numbers, and add those that are new; see `ids_by_name`."""
+        with self._lock:
+            ids = ids_by_name(names, self._names, 0 if self._declared else self.max_classes, keep_numbers=keep_numbers)
+            self._version += not self._declared and add_names(self._names, names, ids)
+            return ids
 
     def fuse(self, view: View, era: object = None) -> Rejection | None:
         """Add a view with a mask to the votes, and keep it for `learn`.
@@ -385,14 +389,8 @@ class LiveSession:
     def _grow_for(self, view: View) -> None:
         if self._declared or not view.has_mask or (needed := view.largest_label + 1) <= self._live.num_classes:
             return
-        affordable = VOTES_LIMIT // (8 * len(self.scene))
-        if needed > min(self.max_classes, affordable):
-            most = f"{affordable - 1} for a scene of {len(self.scene)} Gaussians"
-            if self.max_classes <= affordable:
-                most = f"{self.max_classes - 1}, as max_classes is {self.max_classes}"
-            raise UnknownLabelError(
-                f"view '{view.name}': {self._LABEL} {needed - 1}; expected at most {most}{self._REMEDY}"
-            )
+        what = f"view '{view.name}': {self._LABEL}"
+        require_affordable(needed, self.max_classes, len(self.scene), what, self._REMEDY)
         self._live.grow(needed)
 
     def _drop_old_views(self) -> None:

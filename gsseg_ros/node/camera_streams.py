@@ -13,6 +13,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from gsseg_core.errors import PoseError
 from gsseg_ros.conversions import matrix_from_pose, stamp_ns
+from gsseg_ros.node.masks.detections import Detected
 from gsseg_ros.node.pairing import Pairing, PairingSettings
 from gsseg_ros.node.parameters import Settings
 from gsseg_ros.node.pose_frames import PoseFrames
@@ -27,6 +28,11 @@ class Listen(Protocol):
         self, kind: Any, role: str, topic: str, callback: Callable[[str, Any], None], required: bool = True
     ) -> None:
         """Subscribe with the type, role and name of a topic, what takes in its messages, and whether it has to come."""
+
+
+def mask_class(settings: Settings) -> Any:
+    """Class of the messages that masks come in."""
+    return CompressedImage if settings.mask_transport == "compressed" else Image
 
 
 class CameraStreams:
@@ -77,10 +83,9 @@ class CameraStreams:
         self._frames = PoseFrames(settings.map_frame, tf, in_base)
         self.pairing = Pairing(self.poses(), PairingSettings(with_depth=settings.depth_gating), prefix, name)
         self._pairings = [self.pairing]
-        topics: list[tuple[Any, str, Callable[[str, Any], None]]] = [
-            (CompressedImage if settings.mask_transport == "compressed" else Image, "mask", self.on_mask),
-            (CameraInfo, "camera_info", self.on_camera_info),
-        ]
+        topics: list[tuple[Any, str, Callable[[str, Any], None]]] = [(CameraInfo, "camera_info", self.on_camera_info)]
+        if not settings.detections_topic:
+            topics.insert(0, (mask_class(settings), "mask", self.on_mask))
         if settings.depth_gating:
             topics.append((Image, "depth", self.on_depth))
         if source == "odometry":
@@ -110,8 +115,8 @@ class CameraStreams:
         """Hand every camera_info and every pose to another pairing, too: that of its pictures."""
         self._pairings.append(pairing)
 
-    def on_mask(self, topic: str, message: Image | CompressedImage) -> None:
-        """Take in a mask."""
+    def on_mask(self, topic: str, message: Image | CompressedImage | Detected) -> None:
+        """Take in a mask, or what was detected in its place."""
         stamp = stamp_ns(message.header.stamp)
         self.pairing.add_mask(stamp, (topic, message), message.header.frame_id, self._era())
 

@@ -9,20 +9,23 @@ from dataclasses import dataclass
 
 PERIOD = 5.0  # s
 
-MISSING = {role: f"no data on {role}" for role in ("mask", "camera_info", "depth", "pose", "odometry")}
+MISSING = {role: f"no data on {role}" for role in ("mask", "camera_info", "depth", "pose", "odometry", "detections")}
 """Kinds of complaint: an input that is silent."""
 
 REFUSED_POSE, TIME_JUMP, CLOCK, LIVE, OTHER = "refused pose", "time set back", "no clock", "overlay or objects", "other"
 OBSTACLES, SCENE_DELTA = "obstacles", "scene delta"
+REFUSED_LABELS, DETECTIONS_TYPE = "refused label_info", "type of detections"
 
 REASONS = (
-    "no_pose", "no_camera_info", "no_depth", "repeated_stamp", "several_cameras", "time_jump", "queue_full", "no_scene",
-    "mask_format", "size_mismatch", "unknown_label", "bad_pose", "bad_camera_info", "bad_depth", "all_pixels_unknown",
-    "sees_no_Gaussian", "no_mask", "too_large", "scene_changed", "unusable", "unexpected",
+    "no_pose", "no_camera_info", "no_depth", "no_detections", "repeated_stamp", "several_cameras", "time_jump",
+    "queue_full", "no_scene", "mask_format", "size_mismatch", "unknown_label", "bad_pose", "bad_camera_info",
+    "bad_depth", "all_pixels_unknown", "sees_no_Gaussian", "no_mask", "too_large", "scene_changed", "unusable",
+    "unexpected",
 )  # fmt: skip
 """Kinds of complaint: why a mask became no view."""
 
-KINDS = frozenset((*MISSING.values(), REFUSED_POSE, TIME_JUMP, CLOCK, LIVE, OBSTACLES, SCENE_DELTA, *REASONS, OTHER))
+_OTHER_KINDS = (REFUSED_POSE, TIME_JUMP, CLOCK, LIVE, OBSTACLES, SCENE_DELTA, REFUSED_LABELS, DETECTIONS_TYPE, OTHER)
+KINDS = frozenset((*MISSING.values(), *REASONS, *_OTHER_KINDS))
 
 
 @dataclass

@@ -28,6 +28,7 @@ _HINTS = {
     "other sources: parameter pose_source",
     "depth": "expected sensor_msgs/Image with depths of the camera's image (--ros-args -r depth:=...), or the "
     "parameter depth_gating to be false",
+    "detections": "is the detector running, and is this the parameter detections_topic that was meant?",
     "odometry": "expected nav_msgs/Odometry; is it remapped (--ros-args -r odometry:=...)?",
 }
 

@@ -14,6 +14,7 @@ from typing import Any
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode
+from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CompressedImage
 
@@ -23,15 +24,18 @@ from gsseg_core.live.results import SCENE_CHANGED, Rejection
 from gsseg_ros.camera_infos import camera_of_image, is_rectified
 from gsseg_ros.errors import DepthImageError, NoSceneError, TooManyPixelsError
 from gsseg_ros.node.camera_images import CameraImages
-from gsseg_ros.node.camera_streams import CameraStreams
-from gsseg_ros.node.complaints import LIVE, PERIOD, REFUSED_POSE, Complaints
+from gsseg_ros.node.camera_streams import CameraStreams, mask_class
+from gsseg_ros.node.complaints import DETECTIONS_TYPE, LIVE, PERIOD, REFUSED_POSE, Complaints
 from gsseg_ros.node.depth_images import gate_by_image
 from gsseg_ros.node.jobs import Worker
 from gsseg_ros.node.live_outputs import LiveOutputs
 from gsseg_ros.node.masks.compressed import compressed_topic
+from gsseg_ros.node.masks.detections_input import DetectionsInput
+from gsseg_ros.node.masks.label_info_input import LabelInfoInput
 from gsseg_ros.node.masks.reader import MaskReader
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.pairing import Paired
+from gsseg_ros.node.parameters import Settings
 from gsseg_ros.node.sim_time import on_set_back
 from gsseg_ros.node.tf_poses import TfPoses
 from gsseg_ros.node.workspace import Workspace
@@ -118,8 +122,12 @@ class Inputs:
             lambda _, message: self._complaints.add(LIVE, message),
         )
         built.callback(self.live.close)
-        self._masks, compressed = MaskReader(settings), settings.image_transport == "compressed"
+        compressed = settings.image_transport == "compressed"
+        self._masks = MaskReader(settings, workspace.label_space, self._say_once)
+        self.label_info = LabelInfoInput(node, workspace.label_space, self._group, self._complaints)
+        built.callback(self.label_info.close)
         self.cameras: dict[str, CameraStreams] = {}
+        self.detections: list[DetectionsInput] = []
         self._images: list[CameraImages] = []
         # A simulator's stamps repeat, and views of an earlier activation may come back with a saved state.
         activation = secrets.token_hex(4)
@@ -133,6 +141,9 @@ class Inputs:
             built.callback(images.close)
             self.cameras[name] = camera
             self._images.append(images)
+            if settings.detections_topic:
+                self.detections.append(self._detections_of(camera, settings))
+                built.callback(self.detections[-1].close)
         # Not by /clock, which may stand still.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         timer = node.create_timer(EXPIRE_PERIOD, self._expire, callback_group=self._group, clock=steady)
@@ -149,15 +160,36 @@ class Inputs:
         """Count the publishers of an input."""
         return int(self._node.count_publishers(topic))
 
+    def _detections_of(self, camera: CameraStreams, settings: Settings) -> DetectionsInput:
+        """Make the input of detections; their type, and so whether a mask belongs to them, turns out later."""
+        topic = self._node.resolve_topic_name(camera.topic(settings.detections_topic))
+        self.arrivals[topic], self.roles[topic] = (0, self.started), "detections"
+        self.policies[topic] = _policies(sensor_data())
+        return DetectionsInput(
+            self._node,
+            topic,
+            lambda kind, take: self._listen(None, kind, "detections", topic, take),
+            lambda take: self._listen(None, mask_class(settings), "mask", camera.topic("mask"), take),
+            camera.on_mask,
+            self._lose,
+        )
+
+    def _lose(self, reason: str, message: str) -> None:
+        """Count a mask that went on without what belongs to it."""
+        self._count_rejected(reason)
+        self.explained[reason] = message
+        self._complaints.add(reason, message)
+
     def _listen(
         self,
-        built: ExitStack,
+        built: ExitStack | None,
         kind: Any,
         role: str,
         topic: str,
         callback: Callable[[str, Any], None],
         required: bool = True,
-    ) -> None:
+    ) -> Any:
+        """Subscribe until the stack is closed; without one, the caller takes the subscription away."""
         topic = compressed_topic(self._node, topic) if kind is CompressedImage else topic
         subscription: Any = None
 
@@ -180,9 +212,10 @@ class Inputs:
         self.arrivals[subscription.topic_name] = (0, self.started)
         if required:
             self.roles[subscription.topic_name] = role
-        policies = f"{quality.reliability.short_key}, {quality.durability.short_key}"
-        self.policies[subscription.topic_name] = policies.replace("_", " ")
-        built.callback(self._node.destroy_subscription, subscription)
+        self.policies[subscription.topic_name] = _policies(quality)
+        if built is not None:
+            built.callback(self._node.destroy_subscription, subscription)
+        return subscription
 
     def _refuse_pose(self, why: str) -> None:
         self.refused_poses += 1
@@ -202,6 +235,10 @@ class Inputs:
         self._hand_over()
         for images in self._images:
             images.tick()
+        for detections in self.detections:
+            problem = detections.look()
+            if problem and self._complaints.due(DETECTIONS_TYPE):
+                self._complaints.add(DETECTIONS_TYPE, problem)
         self.live.tick()
 
     def _hand_over(self) -> None:
@@ -257,7 +294,7 @@ class Inputs:
             return Rejection(SCENE_CHANGED, f"mask {paired.name} came before the scene was loaded or reset")
         session = workspace.session
         (topic, mask), (info_topic, info) = paired.mask, paired.camera_info
-        seen = self._masks.read(mask, topic)
+        seen = self._masks.read(mask, topic, session, info)
         settings = workspace.settings
         size, rectified = seen.labels.shape[::-1], is_rectified(settings.rectified, topic, info_topic)
         pose = settings.scene_to_map.world_to_camera(paired.pose)
@@ -295,3 +332,8 @@ class Inputs:
         if message not in self._said:
             self._said.add(message)
             self._node.get_logger().info(message)
+
+
+def _policies(quality: QoSProfile) -> str:
+    """Name what has to match between publisher and subscription."""
+    return f"{quality.reliability.short_key}, {quality.durability.short_key}".replace("_", " ")

@@ -20,6 +20,7 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
 from gsseg_ros.conversions import cloud, topic_tokens
+from gsseg_ros.node.masks.label_info import label_info, label_info_class
 from gsseg_ros.node.reports import Selection
 from gsseg_ros.object_messages import object_markers
 from gsseg_ros.qos import clear_overrides, latched
@@ -61,6 +62,7 @@ class Outputs:
         self._announced: set[str] = set()
         self._filled: set[str] = set()
         self._shown: set[str] = set()  # Cameras that have an overlay latched.
+        self._names: dict[int, str] = {}  # on ~/label_info
         try:
             self._cloud = self._overridable(PointCloud2, "~/cloud")
             self._report = self._overridable(SegmentationReport, "~/report")
@@ -69,6 +71,8 @@ class Outputs:
             self._objects = self._overridable(ObjectArray, "~/objects")
             self._markers = self._overridable(MarkerArray, "~/object_markers")
             self._detections = self._vision_publisher()
+            kind = label_info_class()
+            self._label_info = None if kind is None else self._overridable(kind, "~/label_info")
         except Exception:
             self.close()
             raise
@@ -89,6 +93,8 @@ class Outputs:
             self._announced = set(topic_tokens(class_names).values())
             for token in self._announced:
                 self._class(token)
+            if class_names and self._label_info is not None:
+                self._publish_names(class_names, Header(stamp=self._node.get_clock().now().to_msg()))
 
     def topics(self, class_names: Mapping[int, str]) -> dict[int, str]:
         """Full names of the topics of those classes that have one."""
@@ -123,6 +129,7 @@ class Outputs:
             self._empty(self._filled - {tokens[k] for k in selection.chosen if tokens[k] in kept}, header)
             self._filled = filled
             flow.publish(self._cloud, selection.objects_cloud(header))
+            self._publish_names(selection.result.class_names, header)
             self._take_away(self._classes.keys() - kept, flow)
 
     def publish_objects(self, objects: ObjectArray, since: int | None = None) -> bool:
@@ -180,6 +187,12 @@ class Outputs:
                 self._node.destroy_publisher(publisher)
             self._always.clear()
             self._classes.clear()
+
+    def _publish_names(self, class_names: Mapping[int, str], header: Header) -> None:
+        """Publish the names of the classes, where vision_msgs is installed and they are news."""
+        if self._label_info is not None and dict(class_names) != self._names:
+            self._names = dict(class_names)
+            self._label_info.publish(label_info(class_names, header))
 
     def _heard(self, *publishers: Publisher) -> bool:
         # Without the lock: whoever asks must not wait for a run that is being published.

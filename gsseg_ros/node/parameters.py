@@ -29,7 +29,8 @@ from gsseg_ros.node.masks.compressed import TRANSPORTS
 from gsseg_ros.node.masks.palette import Palette
 
 POSE_SOURCES = ("topic", "odometry", "tf", "auto")
-IDS = ("given", PER_VIEW)
+GIVEN = "given"
+IDS = (AUTO, GIVEN, PER_VIEW)
 _CHOICES = {
     "pose_source": POSE_SOURCES, "ids": IDS, "rectified": RECTIFIED, "mask_transport": TRANSPORTS,
     "image_transport": TRANSPORTS,
@@ -95,14 +96,27 @@ DECLARATIONS = (
     Declaration(
         "class_names",
         [],
-        "names of the classes, the index being the label in the masks (0: background); empty: classes are added and "
-        "named after their numbers as they turn up",
+        "names of the classes, the index being the id (0: background), which is the label in masks unless label_info "
+        "names those; empty: classes are added as they turn up, named by label_info or after their numbers",
     ),
     Declaration(
         "ids",
-        "given",
-        "what the labels of a mask are: given, the numbers of the classes; per-view, numbers that hold in their own "
-        "mask only, as automatic mask generators give, so that objects are found and named by the node",
+        AUTO,
+        "what the labels of a mask are: given, those of classes; per-view, numbers that hold in their own mask only, "
+        "as automatic mask generators give, so that objects are found and named by the node; auto: per-view for "
+        "detections without class_names, else given",
+    ),
+    Declaration(
+        "label_map",
+        "",
+        "file (JSON or YAML) that renames, merges and ignores (null: unknown) the segmenter's classes; empty: none; "
+        "set later, it must lie below data_root",
+    ),
+    Declaration(
+        "detections_topic",
+        "",
+        "topic of yolo_msgs/DetectionArray, which takes the place of masks, or vision_msgs/Detection2DArray, which "
+        "names what is in them; empty: none",
     ),
     Declaration(
         "palette",
@@ -235,6 +249,8 @@ class Settings:
     max_pixels: int
     class_names: tuple[str, ...]
     ids: str
+    label_map: str
+    detections_topic: str
     palette: Palette | None
     mask_transport: str
     image_transport: str
@@ -274,6 +290,12 @@ class Settings:
             check_format(self.export_format)
         except SettingsError as error:
             raise SettingsError(f"parameter export_{error}") from error
+        if len(self.cameras) > 1 and self.detections_topic.startswith("/"):
+            found = f"{self.detections_topic}, but there are {len(self.cameras)} cameras"
+            raise SettingsError(f"parameter detections_topic is {found}; expected a name below that of each camera")
+        if self.ids == PER_VIEW and self.label_map and not self.detections_topic:
+            found = f"{self.label_map}, but with ids '{PER_VIEW}' masks have no classes"
+            raise SettingsError(f"parameter label_map is {found}; expected it to be empty")
         if self.ids == PER_VIEW and self.class_names:
             raise SettingsError(
                 f"parameter class_names gives {len(self.class_names)} names, but with ids '{PER_VIEW}' the node finds "
@@ -298,9 +320,9 @@ class Settings:
                 f"parameter obstacle_min_height is {self.obstacle_min_height:g}; expected at most "
                 f"{self.obstacle_max_height:g}, the parameter obstacle_max_height"
             )
-        if self.class_names:
+        if self.class_names and not self.label_map:  # Which may make more.
             try:
-                class_ids(self.obstacle_classes, self.names_by_id)
+                class_ids(self.obstacle_classes, dict(enumerate(self.class_names)))
             except SettingsError as error:
                 raise SettingsError(f"parameter obstacle_classes: {error}") from error
         if self.data_root and not Path(self.data_root).is_dir():
@@ -312,12 +334,14 @@ class Settings:
         similarity = Similarity.from_parameters(*_triple(values, "scene_to_map", with_scale=True))
         camera = pose_from_parameters("camera_in_base", *_triple(values, "camera_in_base"))
         plain = {f.name: values[f.name] for f in fields(cls) if f.name in values}
-        for name in ("scene_path", "data_root"):
+        for name in ("scene_path", "data_root", "label_map"):
             plain[name] = os.path.expanduser(plain[name])
         plain["rectified"] = str(plain["rectified"]).lower()  # Both true and "true", as YAML and shells have it.
         for name in ("class_names", "cameras", "obstacle_classes"):
             plain[name] = tuple(values[name] or ())
         plain["palette"] = Palette(values["palette"]) if values["palette"] else None
+        if plain["ids"] == AUTO:
+            plain["ids"] = PER_VIEW if plain["detections_topic"] and not plain["class_names"] else GIVEN
         tolerance = DepthTolerance(*(values[f"depth_tolerance.{part}"] for part in ("absolute", "relative")))
         return cls(**plain, scene_to_map=similarity, camera_in_base=camera, depth_tolerance=tolerance)
 
@@ -327,11 +351,6 @@ class Settings:
         values = {d.name: node.get_parameter_or(d.name, None) for d in DECLARATIONS}
         values = {name: None if parameter is None else parameter.value for name, parameter in values.items()}
         return cls.of({**values, **{p.name: p.value for p in changed if p.name in values}})
-
-    @property
-    def names_by_id(self) -> dict[int, str]:
-        """Declared class names by id."""
-        return dict(enumerate(self.class_names))
 
 
 def _triple(values: dict[str, Any], name: str, with_scale: bool = False) -> list[Any]:
@@ -348,7 +367,7 @@ def declare(node: Node) -> None:
 
 
 def check(
-    node: Node, changed: Sequence[Parameter], configured: bool, require_allowed_scene: Callable[[str], object]
+    node: Node, changed: Sequence[Parameter], configured: bool, require_allowed: Callable[[Settings], object]
 ) -> SetParametersResult:
     """Decide whether a node's parameters may change, and say why not; rclpy itself refuses those of the start."""
     known = {declaration.name for declaration in DECLARATIONS}
@@ -359,7 +378,7 @@ def check(
             )
             return SetParametersResult(successful=False, reason=reason)
     try:
-        require_allowed_scene(Settings.read(node, changed).scene_path)
+        require_allowed(Settings.read(node, changed))
     except GssegError as error:
         return SetParametersResult(successful=False, reason=str(error))
     return SetParametersResult(successful=True)

@@ -22,7 +22,7 @@ from gsseg_ros.camera_infos import camera_of_image
 from gsseg_ros.conversions import byte_array, cloud
 from gsseg_ros.errors import InvalidRequestError, TooManyPixelsError, ViewpointError
 from gsseg_ros.frames import Similarity
-from gsseg_ros.node.masks.reader import MaskReader
+from gsseg_ros.node.masks.reader import read_image
 from gsseg_ros.node.parameters import Settings
 from gsseg_ros.node.size_limits import require_size
 from gsseg_ros.node.viewpoints import Lookup, viewpoint_pose
@@ -106,7 +106,7 @@ def _labels(request: PickService.Request, camera: Camera, settings: Settings) ->
     from gsseg_core.objects.pick import object_mask
 
     try:
-        seen = MaskReader(settings).read(request.mask, "mask")
+        seen = read_image(request.mask, "mask", settings)
         labels = object_mask(seen.named(), request.label or None, "mask")
     except MaskFormatError as error:
         raise InvalidRequestError(str(error)) from error

@@ -145,12 +145,13 @@ class SegmentNode(LifecycleNode):
         return SUCCESS
 
     def _configure(self) -> None:
-        self.workspace.settings = settings = Settings.read(self)
+        settings = Settings.read(self)
+        self.workspace.configure(settings)
         warm_up(settings.device, self.get_logger().info)
         if settings.scene_path:
-            self.workspace.load_scene(*self.workspace.scene_path())
+            self.workspace.load_scene(*self.workspace.parameter_path("scene_path"))
         self._outputs = Outputs(self, settings.cameras)
-        self._outputs.announce(settings.names_by_id)
+        self._outputs.announce(self.workspace.label_space.classes)
         if self.workspace.has_scene:
             session = self.workspace.session
             self.get_logger().info(f"loaded {session.scene.path}: {len(session.scene):,} Gaussians")
@@ -222,7 +223,7 @@ class SegmentNode(LifecycleNode):
 
     def _check_parameters(self, changed: Sequence[Parameter]) -> SetParametersResult:
         configured = self._outputs is not None
-        result = parameters.check(self, changed, configured, self.workspace.require_allowed_scene)
+        result = parameters.check(self, changed, configured, self.workspace.require_allowed)
         if result.successful and not self._told_after:
             self._take_parameters(changed)
         return result

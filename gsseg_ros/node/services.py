@@ -240,7 +240,7 @@ class Services:
         if request.path:
             path, within = workspace.existing(request.path), workspace.root
         elif workspace.settings.scene_path:
-            path, within = workspace.scene_path()
+            path, within = workspace.parameter_path("scene_path")
         else:
             raise InvalidRequestError("path and the parameter scene_path are both empty; expected a scene in either")
         with workspace.slot.take("load_scene") as job, workspace.run("load_scene") as run:

@@ -16,6 +16,7 @@ from builtin_interfaces.msg import Time
 
 from gsseg_core.data.class_names import class_ids
 from gsseg_core.data.label_images import PER_VIEW
+from gsseg_core.data.label_map import read_new_names
 from gsseg_core.errors import PathNotAllowedError, SettingsError
 from gsseg_core.live.living_session import Changed, LivingSession
 from gsseg_core.live.session import LiveSession
@@ -30,7 +31,10 @@ from gsseg_ros.errors import (
     UnknownClassError,
 )
 from gsseg_ros.node.jobs import JobSlot, Requests
+from gsseg_ros.node.masks.label_space import LabelSpace, NewNames
 from gsseg_ros.node.parameters import Settings
+
+_PATHS = {"scene_path": "a scene", "label_map": "a label map"}
 
 
 @dataclass
@@ -80,6 +84,8 @@ class Workspace:
         Those at work.
     forget_waiting : callable
         Drops the masks that wait to be fused.
+    label_space : LabelSpace
+        What labels of masks mean.
     active : bool
         Whether the node's lifecycle state is active.
     last_job : str
@@ -93,7 +99,8 @@ class Workspace:
     def __init__(self, settings: Settings, now: Callable[[], Time]) -> None:
         self.settings, self.slot, self.requests = settings, JobSlot(), Requests()
         self.forget_waiting: Callable[[], None] = lambda: None
-        self._scene_at_start = settings.scene_path
+        self.label_space = LabelSpace(settings.class_names, None, settings.max_classes)
+        self._at_start = {name: getattr(settings, name) for name in _PATHS}
         self.active = False
         self.last_job = "none"
         self.dropped: Counter[str] = Counter()
@@ -145,23 +152,26 @@ class Workspace:
         session = self._session
         return self if session is None else session.era
 
-    def require_allowed_scene(self, path: str) -> None:
-        """Refuse what a peer may not set the parameter scene_path to.
+    def require_allowed(self, settings: Settings) -> None:
+        """Refuse what a peer may not set the parameters scene_path and label_map to.
 
         Raises
         ------
         PathNotAllowedError
             It is not what was given at the start, and no request could name it.
         """
-        if path in ("", self._scene_at_start):
-            return
-        try:
-            self.path(os.path.abspath(path))
-        except (PathNotAllowedError, ValueError) as error:
-            raise PathNotAllowedError(f"parameter scene_path, set after the start: {error}") from error
+        for name, at_start in self._at_start.items():
+            path = getattr(settings, name)
+            try:
+                if path not in ("", at_start):
+                    self.path(os.path.abspath(path))
+            except (PathNotAllowedError, ValueError) as error:
+                raise PathNotAllowedError(f"parameter {name}, set after the start: {error}") from error
 
-    def scene_path(self) -> tuple[Path, Path | None]:
-        """Path of the parameter scene_path, and the folder that it must not lead out of: none for that of the start.
+    def parameter_path(self, name: str) -> tuple[Path, Path | None]:
+        """Path of the parameter scene_path or label_map, and the folder that it must not lead out of.
+
+        There is no such folder for what was given at the start.
 
         Raises
         ------
@@ -170,11 +180,30 @@ class Workspace:
         PathNotAllowedError
             It was set later, and does not lie below data_root.
         """
-        path = Path(self.settings.scene_path)
-        self.require_allowed_scene(self.settings.scene_path)
+        path = Path(getattr(self.settings, name))
+        self.require_allowed(self.settings)
         if not path.exists():
-            raise MissingFileError(f"parameter scene_path: {path} does not exist; expected a scene")
-        return path, None if self.settings.scene_path == self._scene_at_start else self.root
+            raise MissingFileError(f"parameter {name}: {path} does not exist; expected {_PATHS[name]}")
+        return path, None if str(path) == self._at_start[name] else self.root
+
+    def configure(self, settings: Settings) -> None:
+        """Take in the parameters, and read the label map.
+
+        Raises
+        ------
+        GssegError
+            The label map cannot be used.
+        """
+        self.settings, new_names = settings, None
+        if settings.label_map:
+            path, within = self.parameter_path("label_map")
+            new_names = NewNames(read_new_names(path, within), str(path))
+            if settings.ids == PER_VIEW and any(name is not None for name in new_names.given.values()):
+                raise SettingsError(
+                    f"parameter label_map: {path} gives classes new names, but with ids '{PER_VIEW}' the node names "
+                    "the objects that it finds itself; expected null for all of them"
+                )
+        self.label_space = LabelSpace(settings.class_names, new_names, settings.max_classes)
 
     def load_scene(
         self, path: str | Path, within: Path | None = None, check: Callable[[], None] = lambda: None
@@ -200,7 +229,7 @@ class Workspace:
 
             session: LiveSession = PerViewSession(scene, **kept)
         else:
-            session = LivingSession(scene, settings.names_by_id, **kept)
+            session = LivingSession(scene, self.label_space.classes, **kept)
         check()
         self._replace(session)
         self.dropped = Counter()

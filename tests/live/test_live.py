@@ -25,7 +25,7 @@ from gsseg_core.errors import (
 )
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.vote_learner import VoteLearner
-from gsseg_core.live import session as live
+from gsseg_core.live import class_numbers
 from gsseg_core.live.session import LiveSession
 from gsseg_core.refine.settings import UNREFINED
 
@@ -60,7 +60,7 @@ def test_classes_turn_up_with_their_labels_unless_they_were_declared() -> None:
 
 
 def test_a_label_that_would_take_too_much_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "VOTES_LIMIT", 8 * len(SCENE) * 10)
+    monkeypatch.setattr(class_numbers, "VOTES_LIMIT", 8 * len(SCENE) * 10)
     session = LiveSession(SCENE)
     assert session.fuse(blank(VIEWS[0], 9)) is None
     rejection = session.fuse(blank(VIEWS[1], 10))

@@ -128,12 +128,12 @@ def test_an_overlay_is_drawn_on_compressed_pictures(ros: Ros, parameters: dict[s
         wait_until(lambda: here.outputs.wants_overlay, "a subscriber of the overlay")
         here.fuse([view])
         wait_until(lambda: len(overlays) == 1, "the classes alone, since there is no picture yet")
-        here.inputs._images.tick()
-        assert here.inputs._images._subscription.topic_name == "/image/compressed"
+        here.inputs._images[0].tick()
+        assert here.inputs._images[0]._subscription.topic_name == "/image/compressed"
         sent = messages(view, here.stamp)
         here.hand({"camera_info": sent["camera_info"], "pose": sent["pose"]})
         white = np.full((48, 64, 3), 255, np.uint8)
-        here.inputs._images._arrived(png(white, sent["mask"], "rgb8; jpeg compressed bgr8", "JPEG"))
+        here.inputs._images[0]._arrived(png(white, sent["mask"], "rgb8; jpeg compressed bgr8", "JPEG"))
         wait_until(lambda: len(overlays) == 2, "the picture with the classes on it")
         drawn = [np.frombuffer(overlay.data, np.uint8).reshape(48, 64, 3) for overlay in overlays]
         assert (drawn[1] >= drawn[0]).all() and drawn[1].mean() > drawn[0].mean()

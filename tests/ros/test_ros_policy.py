@@ -22,7 +22,7 @@ from gsseg_ros.client.view_source import RosSource
 # they are shown, depth if it is asked for, and detections only where vision_msgs is installed.
 ONE_OF = {
     "/pose", "/odometry", "/tf", "/tf_static", "/clock", "/image", "/image/compressed", "/mask/compressed",
-    "/depth", "/gsseg/detections_3d",
+    "/depth", "/gsseg/detections_3d", "/detections", "/label_info", "/gsseg/label_info",
 }  # fmt: skip
 
 

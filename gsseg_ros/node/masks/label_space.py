@@ -1,0 +1,155 @@
+"""What labels of masks mean: the segmenter's names for them, renamed or ignored, and the classes of the scene.
+
+A mask's labels have names: those that come with it, those of `label_info`, or those of the parameter class_names. A
+label map says what becomes of a name, or that its pixels are unknown. Then names are looked up among the classes of the
+scene. So another segmenter, which numbers its classes in another way, goes on where the last one ended.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from gsseg_core.data.class_names import BACKGROUND_NAME, class_name, listed
+from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.label_map import map_labels
+from gsseg_core.data.soft_masks import SeenLabels
+from gsseg_core.live.session import LiveSession
+
+UNLABELED = "unlabeled"
+"""What vision_msgs calls pixels without a label, in whichever case."""
+
+
+@dataclass(frozen=True)
+class NewNames:
+    """What a label map says: new names, None where pixels become unknown, by id, name or "*" of the segmenter."""
+
+    given: Mapping[str, str | None]
+    source: str
+
+    def of(self, name: str) -> str | None:
+        """Look up what becomes of a name."""
+        return self.given[name] if name in self.given else self.given.get("*", name)
+
+    def names(self, labels: Mapping[int, str]) -> dict[int, str | None]:
+        """Look up what becomes of all labels of a segmenter; raises `LabelMapError` if a key is none of them."""
+        found = map_labels(self.given, labels, self.source)
+        return {k: None if new == UNKNOWN else found.class_names[new] for k, new in found.new_ids.items()}
+
+
+class LabelSpace:
+    """Turns labels of masks into classes of a session. Its methods may be called from any thread.
+
+    Parameters
+    ----------
+    class_names : sequence of str
+        The classes by id, if they are declared.
+    new_names : NewNames, optional
+        Of the label map.
+    max_classes : int
+        Without `class_names`: labels that have no name may be so many.
+
+    Attributes
+    ----------
+    classes : dict of int to str
+        The classes, if they are declared: `class_names`, and after them what else the label map makes.
+    heard : dict of int to str, or None
+        The names of labels that `label_info` told last.
+    """
+
+    def __init__(self, class_names: tuple[str, ...], new_names: NewNames | None, max_classes: int) -> None:
+        self._class_names, self._new_names, self._max_classes = dict(enumerate(class_names)), new_names, max_classes
+        made = [] if new_names is None else [name for name in new_names.given.values() if name is not None]
+        known = dict.fromkeys(class_names)
+        self.classes = dict(enumerate(known | dict.fromkeys(made))) if class_names else {}
+        self.heard: dict[int, str] | None = None
+        self._kept: tuple[tuple[object, object], dict[int, int]] | None = None
+
+    def hear(self, names: Mapping[int, str]) -> bool:
+        """Take in the names of labels, and return whether they are news."""
+        if names == self.heard:
+            return False
+        self.heard = dict(names)
+        return True
+
+    def classes_of(
+        self,
+        seen: SeenLabels,
+        names: Mapping[int, str] | None,
+        session: LiveSession,
+        source: str,
+        say: Callable[[str], None],
+    ) -> SeenLabels:
+        """Turn the labels of a mask into classes of the session.
+
+        Parameters
+        ----------
+        seen : SeenLabels
+            The mask.
+        names : mapping from label to name, or None
+            Those that came with the mask.
+        session : LiveSession
+            Gets classes that it did not have, unless its classes are declared.
+        source : str
+            What messages call the mask.
+        say : callable
+            Gets what a person should know.
+
+        Raises
+        ------
+        LabelMapError
+            The label map names a class that the segmenter does not have.
+        UnknownLabelError
+            The mask holds a label that has no name.
+        """
+        if names is not None:
+            new_names = {k: self._new_names.of(name) if self._new_names else name for k, name in names.items()}
+            return seen.relabelled(self._numbered(new_names, session, source, say, keep_numbers=False), source)
+        if self.heard is None and self._new_names is None:
+            return seen
+        key, kept = (session.era, self.heard), self._kept
+        if kept is None or kept[0][0] is not key[0] or kept[0][1] is not key[1]:
+            kept = self._kept = (key, self._ids(session, source, say))
+        return seen.relabelled(kept[1], source)
+
+    def ignored(self, names: Mapping[int, str]) -> set[int]:
+        """Labels whose pixels become unknown."""
+        return {k for k, name in names.items() if self._new_names is not None and self._new_names.of(name) is None}
+
+    def _ids(self, session: LiveSession, source: str, say: Callable[[str], None]) -> dict[int, int]:
+        """Find the ids of the session's classes for the labels of masks that come without names."""
+        labels = self.heard or self._class_names
+        if not labels:
+            return self._ids_by_number(session)
+        labels = {0: BACKGROUND_NAME, **labels}
+        names = dict(labels) if self._new_names is None else self._new_names.names(labels)
+        labeled = {k: None if name is None or name.lower() == UNLABELED else name for k, name in names.items()}
+        return self._numbered(labeled, session, source, say)
+
+    def _ids_by_number(self, session: LiveSession) -> dict[int, int]:
+        """Apply the label map to labels that have no names."""
+        labels = {k: class_name({0: BACKGROUND_NAME}, k) for k in range(self._max_classes)}
+        if self._new_names is None:
+            return {k: k for k in labels}
+        found = map_labels(self._new_names.given, labels, self._new_names.source)
+        ids = session.number_classes({k: n for k, n in found.class_names.items() if n != labels.get(k)})
+        return {k: ids.get(new, new) for k, new in found.new_ids.items()}
+
+    def _numbered(
+        self,
+        names: Mapping[int, str | None],
+        session: LiveSession,
+        source: str,
+        say: Callable[[str], None],
+        *,
+        keep_numbers: bool = True,
+    ) -> dict[int, int]:
+        """Ids of the session's classes by label, `UNKNOWN` where it has no name."""
+        named = {k: BACKGROUND_NAME if n.lower() == BACKGROUND_NAME else n for k, n in names.items() if n is not None}
+        others = sorted(set(named.values()) - set(self.classes.values()) - {BACKGROUND_NAME}) if self.classes else []
+        if others:
+            say(
+                f"{source}: its classes {listed(others)} are not among class_names, and become background; a label map "
+                "can make them unknown (null) or others"
+            )
+        return {**dict.fromkeys(names, UNKNOWN), **session.number_classes(named, keep_numbers=keep_numbers)}
