@@ -118,11 +118,14 @@ def zip_members(data: bytes, rng: random.Random) -> bytes:
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
         for member, content in members.items():
-            archive.writestr(zipfile.ZipInfo(member), content)
-        if kind == "bomb" and rng.random() < 0.2:
-            with archive.open(zipfile.ZipInfo(name), "w", force_zip64=True) as file:
-                for piece in _gigabytes():
-                    file.write(piece)
+            info = zipfile.ZipInfo(member)  # With no time of its own: the same draw gives the same bytes.
+            info.compress_type = zipfile.ZIP_DEFLATED
+            if kind == "bomb" and member == name and rng.random() < 0.2:
+                with archive.open(info, "w", force_zip64=True) as file:
+                    for piece in _gigabytes():
+                        file.write(piece)
+            else:
+                archive.writestr(info, content)
     return packed.getvalue()
 
 

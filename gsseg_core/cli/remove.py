@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from gsseg_core.cli.shared import add_format
+from gsseg_core.cli.shared import add_collision, add_format
 from gsseg_core.cli.terminal import tell
 
 DESCRIPTION = """
@@ -27,12 +27,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--class", dest="classes", action="append", required=True, metavar="NAME", help=classes)
     parser.add_argument("--out", required=True, metavar="FILE", help="file to write")
     add_format(parser.add_argument, None, "what the suffix of FILE says, else ply")
+    add_collision(parser.add_argument, "each object that is left, as .obj beside FILE, or in a USD")
 
 
 def run(options: argparse.Namespace) -> int:
     """Remove, and say what is left."""
     from gsseg_core.data.class_names import class_ids, listed
     from gsseg_core.export.class_files import write_selection
+    from gsseg_core.export.collision import check_collision, collision_meshes
     from gsseg_core.files.atomic import check_writable
     from gsseg_core.objects.removal import left_without
     from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -43,11 +45,14 @@ def run(options: argparse.Namespace) -> int:
     check_writable(options.out)
     scene_format = format_of(options.out, options.format)
     check_format(scene_format)
+    check_collision(options.collision)
     scene = GaussianScene.load(options.scene)
     segmentation = Segmentation.load(options.segmentation, scene)
     chosen = class_ids(options.classes, segmentation.class_names)
     rest = left_without(scene, segmentation, chosen)
-    write_selection(scene, rest, segmentation.labels, segmentation.class_names, options.out, scene_format)
+    meshes = collision_meshes(scene, segmentation, options.collision) if options.collision else {}
+    meshes = {k: mesh for k, mesh in meshes.items() if k not in chosen}
+    write_selection(scene, rest, segmentation.labels, segmentation.class_names, options.out, scene_format, meshes)
     removed = listed(f"{k} ({clipped(segmentation.class_names[k])})" for k in chosen)
     tell(f"without {removed}: {int(rest.sum()):,} of {counted(len(scene), 'Gaussian')} in {options.out}")
     return 0

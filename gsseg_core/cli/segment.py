@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from gsseg_core.cli.shared import LABELS, add_format, add_scene, labels_path, load_kernels
+from gsseg_core.cli.shared import LABELS, add_collision, add_format, add_scene, labels_path, load_kernels
 from gsseg_core.cli.terminal import note, tell
 from gsseg_core.learn.registry import DEFAULT, LEARNERS, distributed_learners
 from gsseg_core.progress import progress_bars
@@ -48,8 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--scheduler", metavar="ADDRESS", help=f"learn on the workers of this Dask scheduler ({learners})")
     add = parser.add_argument_group("files of the classes").add_argument
     add_format(add, DEFAULT_FORMAT)
-    mesh = "a mesh of each object to collide with, as .obj and in USD: convex, or watertight (default: none, or hull)"
-    add("--collision", nargs="?", choices=("hull", "surface"), const="hull", help=mesh)
+    add_collision(add, "each object, as .obj and in USD")
     add = parser.add_argument_group("refinement").add_argument
     k, beta = RefineSettings.k, RefineSettings.beta
     add("--k", type=int, default=k, help="neighbours in KNN and filter (default: %(default)s)")

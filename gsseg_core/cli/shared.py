@@ -53,6 +53,12 @@ def add_format(add: Callable[..., object], default: str | None, otherwise: str =
     add("--format", choices=tuple(SCENE_WRITERS), default=default, help=f"format to write (default: {otherwise})")
 
 
+def add_collision(add: Callable[..., object], what: str) -> None:
+    """Add `--collision` by the `add_argument` of a parser or group; `what` says of what, and where they are written."""
+    mesh = f"a mesh to collide with of {what}: convex, or watertight (default: none, or hull)"
+    add("--collision", nargs="?", choices=("hull", "surface"), const="hull", help=mesh)
+
+
 def labels_path(options: argparse.Namespace) -> str:
     """Return the place of the masks: in the dataset, or else, where that lacks it, as a shell completes it."""
     labels: str = options.labels

@@ -103,8 +103,11 @@ def write_selection(
     class_names: Mapping[int, str],
     path: str | os.PathLike[str],
     scene_format: str,
+    meshes: Mapping[int, TriangleMesh] | None = None,
 ) -> None:
     """Write some Gaussians of a scene as one file, in which USD keeps the classes of these labels apart.
+
+    Meshes to collide with go into the USD, or beside another file, as `<its stem>_<id>_<name>.obj`.
 
     Raises
     ------
@@ -115,10 +118,12 @@ def write_selection(
     """
     part = scene.subset(chosen)
     if not SCENE_WRITERS[scene_format].together:
+        for k, mesh in (meshes or {}).items():
+            mesh.save(Path(path).with_name(f"{stem_of(path, scene_format)}_{mesh_file_name(k, class_names[k])}"))
         write_scene(part, path, scene_format)
         return
     labels = labels[chosen]
-    objects = _objects(part, labels, class_names)
+    objects = _objects(part, labels, class_names, meshes)
     if (labels < 0).any():
         objects.append(SceneObject(part.subset(labels < 0)))
     write_objects(objects, path, scene_format)
@@ -150,6 +155,13 @@ def class_file_name(label: int, name: str, scene_format: str = DEFAULT) -> str:
 def mesh_file_name(label: int, name: str) -> str:
     """File name of the mesh to collide with of a class, safe on any file system."""
     return f"{_stem(label, name)}.obj"
+
+
+def stem_of(path: str | os.PathLike[str], scene_format: str) -> str:
+    """Name of a file without the suffix of its format, or without the last one it has."""
+    path = Path(path)
+    suffixes = (s for s in SCENE_WRITERS[scene_format].suffixes if path.name.lower().endswith(s))
+    return path.name[: -len(next(suffixes, path.suffix)) or None]
 
 
 def _stem(label: int, name: str) -> str:

@@ -61,17 +61,27 @@ def collision_meshes(scene: GaussianScene, segmentation: Segmentation, kind: str
         There is no such kind, or the library that makes it is not installed.
     """
     check_collision(kind)
+    found = {
+        k: collision_mesh(scene, np.flatnonzero(segmentation.labels == k), segmentation.confidence, kind)
+        for k in np.flatnonzero(segmentation.counts()).tolist()
+        if k
+    }
+    return {k: mesh for k, mesh in found.items() if mesh is not None}
+
+
+def collision_mesh(
+    scene: GaussianScene,
+    ids: npt.NDArray[np.integer],  # (M,)
+    confidence: npt.NDArray[np.floating],  # (N,)
+    kind: str,
+) -> TriangleMesh | None:
+    """Make the mesh of one object, whose Gaussians are `ids`; None where it has no opaque Gaussian or no volume."""
+    index = ids[scene.opacities[ids] >= OPAQUE]
+    if not len(index):
+        return None
+    kept = without_floaters(scene.means[index].astype(np.float64), scene.opacities[index] * confidence[index])
     make = _hull if kind == HULL else _surface
-    solid, confidence = scene.opacities >= OPAQUE, segmentation.confidence
-    meshes = {}
-    for k in np.flatnonzero(segmentation.counts()).tolist():
-        index = np.flatnonzero((segmentation.labels == k) & solid)
-        if k and len(index):
-            kept = without_floaters(scene.means[index].astype(np.float64), scene.opacities[index] * confidence[index])
-            mesh = make(scene.means[index[kept]], _half_axes(scene, index[kept]))
-            if mesh is not None:
-                meshes[k] = mesh
-    return meshes
+    return make(scene.means[index[kept]], _half_axes(scene, index[kept]))
 
 
 def _half_axes(scene: GaussianScene, index: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:  # (M,)

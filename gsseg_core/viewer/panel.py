@@ -17,6 +17,7 @@ import viser
 from gsseg_core.data.class_names import class_name
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, SettingsError
+from gsseg_core.export.collision import KINDS
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.scene_writers import SCENE_WRITERS
 from gsseg_core.text import counted, html_text, printable
@@ -37,6 +38,7 @@ ONLY, REMOVE = "only this", "remove"
 REGION, DISC = "the whole region", "a disc"
 _OFF = (73, 80, 87)
 _STYLE = "padding: 0 0.75em 0.75em; font-size: 0.875em; overflow-wrap: anywhere"
+_NO_MESH = "none"
 _ASK = "Click on something in the picture to ask what it is."
 
 Event = viser.GuiEvent[Any]
@@ -73,7 +75,11 @@ class Panel:
             self._build_correct()
         with tabs.add_tab("Save"):
             as_format = gui.add_dropdown("format", tuple(SCENE_WRITERS))
-            self._add_download("what is shown", lambda: state.selection(str(as_format.value)))
+            mesh = gui.add_dropdown("mesh to collide with, in usd", (_NO_MESH, *KINDS))
+            self._add_download(
+                "what is shown",
+                lambda: state.selection(str(as_format.value), None if mesh.value == _NO_MESH else str(mesh.value)),
+            )
             self._add_download("the segmentation, as npz", state.segmentation_npz)
             self._live = gui.add_html(_paragraph("live: waiting for the first probabilities")) if live else None
 

@@ -13,6 +13,7 @@ import numpy as np
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
 from gsseg_core.export.class_files import write_selection
+from gsseg_core.export.collision import check_collision, collision_mesh
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
@@ -132,26 +133,39 @@ class ViewerState:
             self._learnt = learnt
             self._relabel()
 
-    def selection(self, scene_format: str) -> tuple[str, bytes]:
+    def selection(self, scene_format: str, collision: str | None = None) -> tuple[str, bytes]:
         """Write what is shown in a format of `gsseg_core.scene.scene_writers.SCENE_WRITERS`: a file name and its bytes.
+
+        With `collision`, one of `gsseg_core.export.collision.KINDS`, a USD has a mesh of each object, too.
 
         Raises
         ------
         EmptySceneError
             Nothing is shown.
         SettingsError
-            There is no such format, or the library that writes it is not installed.
+            There is no such format or kind of mesh, the library that makes it is not installed, or the format holds
+            no meshes.
         SceneValueError
             The format cannot hold what is shown.
         """
         check_format(scene_format)
+        check_collision(collision)
+        if collision and not SCENE_WRITERS[scene_format].together:
+            raise SettingsError(f"format {scene_format}: holds no meshes to collide with; expected usd, or none")
         with self._lock:
             shown, (labels, _, names) = self.model.shown(), self.model.labelling
             scene, ids = self.model.scene, self.model.ids()
         name = f"selection{SCENE_WRITERS[scene_format].suffixes[0]}"
         given = np.array([*ids, REMOVED, UNOBSERVED])[labels]  # labels -1 and -2 are its last two
         known = {ids[k]: text for k, text in names.items()}
-        return name, _as_file(lambda path: write_selection(scene, shown, given, known, path, scene_format), name)
+        meshes = {}
+        for k in np.unique(given[shown & (given > 0)]).tolist() if collision else []:
+            mesh = collision_mesh(scene, np.flatnonzero(shown & (given == k)), self.model.confidence, str(collision))
+            if mesh is not None:
+                meshes[k] = mesh
+        return name, _as_file(
+            lambda path: write_selection(scene, shown, given, known, path, scene_format, meshes), name
+        )
 
     def segmentation_npz(self) -> tuple[str, bytes]:
         """Write labels and class probabilities, corrections included: the name `segmentation.npz`, and its bytes."""

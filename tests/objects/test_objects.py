@@ -331,6 +331,24 @@ def test_gsseg_remove_writes_the_format_that_the_suffix_says(
     assert "rest.spz: has the suffix of the format spz, but glb is asked for" in capsys.readouterr().err
 
 
+def test_gsseg_remove_writes_meshes_of_the_objects_that_are_left(tmp_path: Path) -> None:
+    from pxr import Usd
+
+    data = write_dataset(tmp_path / "data")
+    segmentation().save(tmp_path / "segmentation.npz")
+    command = ["remove", f"{data}/scene.ply", "--segmentation", f"{tmp_path}/segmentation.npz", "--class", "box"]
+    out = tmp_path / "rest"
+    out.mkdir()
+    assert main([*command, "--out", f"{out}/rest.compressed.ply", "--collision"]) == 0
+    assert sorted(path.name for path in out.iterdir()) == [
+        "rest.compressed.ply", "rest_1_red_ball.obj", "rest_2_cup_mug.obj"
+    ]  # fmt: skip
+    assert main([*command, "--out", f"{out}/rest.usdc", "--collision"]) == 0
+    stage = Usd.Stage.Open(f"{out}/rest.usdc")
+    meshes = [prim.GetParent().GetName() for prim in stage.Traverse() if prim.GetName() == "collision"]
+    assert len(meshes) == 2 and len(list(out.iterdir())) == 4
+
+
 def test_gsseg_segment_carves_when_asked_to(tmp_path: Path) -> None:
     data = write_dataset(tmp_path / "data")
     out = tmp_path / "out"

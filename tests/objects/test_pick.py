@@ -144,3 +144,12 @@ def test_the_command_writes_a_ply_and_the_ids(tmp_path: Path, capsys: pytest.Cap
     assert "Gaussians" in capsys.readouterr().out
     assert main([*start[:5], "nowhere", "--click", "0", "0", "--out", str(tmp_path)]) == 2
     assert "has no view 'nowhere'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("scene_format", "file"), [("spz", "object.spz"), ("usd", "object.usdc")])
+def test_the_command_writes_the_format_asked_for_and_a_mesh(tmp_path: Path, scene_format: str, file: str) -> None:
+    data = small_scenes.write_dataset(tmp_path / "data")
+    start = ["pick", f"{data}/scene.ply", "--data", str(data), "--view", "view0", "--quiet", "--out", f"{tmp_path}/o"]
+    mask = ["--mask", f"{data}/labels", "--label", "1"]
+    assert main([*start, *mask, "--format", scene_format, "--collision"]) == 0
+    assert {path.name for path in (tmp_path / "o").glob("object*")} == {"object.obj", file}

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small_scenes import NAMES, balls_on_a_table
 
-from gsseg_core.errors import StateFileError, UnknownLabelError
+from gsseg_core.errors import SettingsError, StateFileError, UnknownLabelError
 from gsseg_core.segmentation import REMOVED, UNOBSERVED
 from gsseg_core.viewer.model import (
     BY_CLASS,
@@ -32,6 +32,7 @@ from gsseg_core.viewer.picture import BANDS, Node, Picture, cut
 pytest.importorskip("viser")
 
 from gsseg_core.viewer.splats import SplatNodes, Splats
+from gsseg_core.viewer.state import ViewerState
 
 SCENE, TRUTH = balls_on_a_table()
 N, K = len(SCENE), len(NAMES)
@@ -232,3 +233,17 @@ def test_a_class_and_a_mark_of_the_slider_are_switched_without_sending_a_gaussia
         shown.min_confidence = mark * (1 / BANDS)
         browser.show(wanted(shown))
     assert browser.sent == N
+
+
+def test_what_is_shown_is_saved_with_meshes_to_collide_with_in_usd_alone(tmp_path: Path) -> None:
+    from pxr import Usd
+
+    state = ViewerState(model(), [], {}, "cpu")
+    state.change(lambda shown: shown.toggle(2))
+    name, content = state.selection("usd", "hull")
+    (tmp_path / name).write_bytes(content)
+    stage = Usd.Stage.Open(str(tmp_path / name))
+    meshes = [prim.GetParent().GetName() for prim in stage.Traverse() if prim.GetName() == "collision"]
+    assert sorted(meshes) == ["class_1_red_ball", "class_3_box"]
+    with pytest.raises(SettingsError, match="format glb: holds no meshes to collide with"):
+        state.selection("glb", "hull")
