@@ -76,7 +76,7 @@ STEMS = ("0_background", "1_red_ball", "2_cup_mug", "3_box")
         ("mask_transport", "zip", "parameter mask_transport is 'zip'; expected raw, compressed"),
         ("export_format", "obj", "parameter export_format is 'obj'; expected one of ply, compressed-ply, spz"),
         ("rectified", "maybe", "parameter rectified is 'maybe'; expected auto, true, false"),
-        ("ids", "mine", "parameter ids is 'mine'; expected given, per-view"),
+        ("ids", "mine", "parameter ids is 'mine'; expected auto, given, per-view"),
         ("ids", "per-view", "parameter class_names gives 4 names, but with ids 'per-view' the node finds the objects"),
         ("map_frame", "", "parameter map_frame is empty; expected the name of a frame"),
         ("data_root", "/", "read-only"),
