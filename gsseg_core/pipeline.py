@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -24,6 +24,7 @@ from gsseg_core.export.view_pictures import (
     Drawn,
     draw_views,
     draw_worst_views,
+    look_at,
     view_file_name,
     write_overview,
     write_pictures,
@@ -61,6 +62,7 @@ class Inputs:
     scene: GaussianScene
     root: Path  # of the dataset
     train: list[View]
+    looked_at: list[View]  # of these, to carve objects by
     pictured: list[View]
     class_names: Mapping[int, str]  # of classes as they are learnt, numbered without gaps
     class_ids: tuple[int, ...] | None  # of these classes in the dataset; None where the classes are objects
@@ -202,15 +204,20 @@ def segment(
             if settings.graph:
                 probabilities = spread_if_scarce(inputs.scene, probabilities, evidence)
             result = Segmentation.from_codes(inputs.scene, probabilities, inputs.class_names, settings.refine)
-            result = result.calibrated(assessment.calibration.temperature)
             del probabilities
+        drawn: dict[str, Drawn] = {}
         if settings.refine.carve:
             with watch.stage("carve"):
-                cameras = [view.camera for view in inputs.train]
-                result = result.carved(inputs.scene, cameras, device, settings.refine.carve_views)
+                seen = look_at(inputs.scene, result, inputs.looked_at, inputs.pictured, drawn, device=device)
+                result = result.carved_by(inputs.scene, seen)
+        with watch.stage("pictures"):
+            left = [view for view in inputs.pictured if view.name not in drawn]
+            drawn |= {one.view.name: one for one in draw_views(inputs.scene, result, left, device=device)}
+        with watch.stage("refine"):
+            result = result.calibrated(assessment.calibration.temperature)
         with ExitStack() as writing:
             behind = writing.enter_context(writing_behind())
-            report = _write(run, inputs, assessment, result, settings, watch, behind)
+            report = _write(run, inputs, assessment, result, drawn, settings, watch, behind)
             with watch.stage("export"):  # what is left of it
                 writing.close()
         write_json(run.folder / "report.json", report.as_dict())
@@ -233,9 +240,14 @@ def _inputs(scene: GaussianScene, placed: Placed, settings: RunSettings) -> Inpu
     class_ids = None if settings.ids == PER_VIEW else dataset.class_ids
     if class_ids is not None:
         dataset = dataset.numbered()
-    train, pictured = spread(dataset.views("train"), settings.views), spread(dataset.views("all"), PICTURED_VIEWS)
+    train = spread(dataset.views("train"), settings.views)
+    # Views that carving looks at anyway, unless there are few.
+    looked_at = spread(train, settings.refine.carve_views)
+    enough = settings.refine.carve and len(looked_at) >= PICTURED_VIEWS
+    pictured = spread(looked_at if enough else dataset.views("all"), PICTURED_VIEWS)
     names = {} if class_ids is None else dataset.class_names
-    return Inputs(scene, dataset.root, train, pictured, names, class_ids, placed.as_dict(), dataset.describe_masks())
+    frame, masks = placed.as_dict(), dataset.describe_masks()
+    return Inputs(scene, dataset.root, train, looked_at, pictured, names, class_ids, frame, masks)
 
 
 def _ids(dataset: Dataset, settings: RunSettings) -> str:
@@ -296,14 +308,9 @@ def _assess(learner: Learner, class_names: Mapping[int, str], watch: Stopwatch, 
 
 
 def _write(
-    run: StagedRun,
-    inputs: Inputs,
-    assessment: Assessment,
-    result: Segmentation,
-    settings: RunSettings,
-    watch: Stopwatch,
-    behind: WriteBehind[...],
-) -> RunReport:
+    run: StagedRun, inputs: Inputs, assessment: Assessment, result: Segmentation, drawn: Mapping[str, Drawn],
+    settings: RunSettings, watch: Stopwatch, behind: WriteBehind[...],
+) -> RunReport:  # fmt: skip
     """Write all files of a run but `report.json`, some of them behind the work, and report it."""
     scene, folder = inputs.scene, run.folder
     named = result if inputs.class_ids is None else result.with_ids(inputs.class_ids)
@@ -312,7 +319,8 @@ def _write(
         meshes = collision_meshes(scene, named, settings.collision) if settings.collision else {}
         files = write_classes(scene, named, folder / "classes", run.id, settings.scene_format, meshes)
     with watch.stage("pictures"):
-        images, evidence, pictures = _picture(run, inputs, assessment, result, settings.device, behind)
+        shown = [drawn[view.name] for view in inputs.pictured]
+        images, evidence, pictures = _picture(run, inputs, assessment, result, shown, settings.device, behind)
     report = RunReport.of(
         scene, named, run=run.id, views=assessment.report, settings=settings.as_dict(), seconds=watch.seconds,
         objective=assessment.objective, calibration=assessment.calibration.as_dict(), prepared_views=assessment.memory,
@@ -327,26 +335,19 @@ def _write(
 
 
 def _picture(
-    run: StagedRun,
-    inputs: Inputs,
-    assessment: Assessment,
-    result: Segmentation,
-    device: str,
+    run: StagedRun, inputs: Inputs, assessment: Assessment, result: Segmentation, shown: Iterable[Drawn], device: str,
     behind: WriteBehind[...],
-) -> tuple[ViewImages, Evidence, list[Path]]:
+) -> tuple[ViewImages, Evidence, list[Path]]:  # fmt: skip
     """Write the pictures; what the report page can use of them is kept."""
     views, folder, images = assessment.views, run.folder / "pictures", ViewImages(inputs.scene, device)
     checks = list(assessment.checks or ())
 
-    def noted() -> Iterator[Drawn]:
-        for drawn in draw_views(inputs.scene, result, inputs.pictured, device=device):
-            images.keep(drawn.view, drawn.image)
-            if assessment.checks is None and drawn.view.name in views:
-                checks.append(compare_mask(views[drawn.view.name], drawn.labels, result.num_classes))
-            yield drawn
-
+    for drawn in shown:
+        images.keep(drawn.view, drawn.image)
+        if assessment.checks is None and drawn.view.name in views:
+            checks.append(compare_mask(views[drawn.view.name], drawn.labels, result.num_classes))
     save = partial(behind, save_png)
-    pictures = write_pictures(result, noted(), folder, run.id, save)
+    pictures = write_pictures(result, shown, folder, run.id, save)
     if assessment.checks:
         pictures.append(folder / "worst_views.png")
         save(pictures[-1], draw_worst_views(inputs.scene, views, assessment.checks, device=device), run.id)

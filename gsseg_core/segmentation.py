@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +18,6 @@ from gsseg_core.files.npz_files import UnfitError, check_shares, class_names_of,
 from gsseg_core.files.run_folder import settle
 from gsseg_core.learn.temperature import tempered
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.raster.cpu.tile_operator import TileOperator
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.refine.knn_filter import cluster, statistical_filter
 from gsseg_core.refine.settings import RefineSettings
@@ -201,13 +200,12 @@ class Segmentation:
         all masks together, so that errors of single masks carve nothing away. So many of the views have their say,
         spread evenly.
         """
-        return self._without(carve(scene, self.labels, self._silhouettes(scene, spread(cameras, num_views), device)))
+        operators = (make_operator(scene, camera, device) for camera in spread(cameras, num_views))
+        return self.carved_by(scene, (Silhouette.of(scene, each, self.label_map(each)) for each in operators))
 
-    def _silhouettes(self, scene: GaussianScene, cameras: Sequence[Camera], device: str) -> Iterator[Silhouette]:
-        for camera in cameras:
-            operator = make_operator(scene, camera, device)
-            shown = Silhouette.of(scene, operator, self.label_map(operator))
-            yield shown._replace(operator=operator) if isinstance(operator, TileOperator) else shown
+    def carved_by(self, scene: GaussianScene, silhouettes: Iterable[Silhouette]) -> Segmentation:
+        """Take out of each object what sticks out of silhouettes that `label_map` has made; else as `carved`."""
+        return self._without(carve(scene, self.labels, silhouettes))
 
     def label_map(self, operator: ViewOperator) -> np.ndarray:
         """Class of every pixel of a view, (H, W) int32: those of `render`, without the confidence."""

@@ -16,7 +16,9 @@ from gsseg_core.data.view import View
 from gsseg_core.export.pictures import contact_sheet, legend, overlay, palette, save_png
 from gsseg_core.learn.mask_reliability import WORST, ViewCheck, worst_views
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.depth import colours_and_depth, surface_of
 from gsseg_core.raster.view_operator import ViewOperator
+from gsseg_core.refine.silhouette_carving import Silhouette
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
@@ -40,7 +42,11 @@ def view_file_name(name: str, prefix: str = "") -> str:
 
 def background_image(scene: GaussianScene, operator: ViewOperator) -> np.ndarray:
     """Render the scene's colours from a view, (H, W, 3) uint8, on black."""
-    image = operator.blend_seen(scene.colors(operator.camera.center, operator.ids)).image
+    return as_pixels(operator.blend_seen(scene.colors(operator.camera.center, operator.ids)).image)
+
+
+def as_pixels(image: np.ndarray) -> np.ndarray:  # (H, W, 3) in [0, 1]
+    """Round blended colours to pixels, (H, W, 3) uint8."""
     pixels: np.ndarray = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
     return pixels
 
@@ -63,17 +69,41 @@ class Drawn(NamedTuple):
     overlay: np.ndarray
     image: np.ndarray
 
+    @classmethod
+    def of(cls, view: View, labels: np.ndarray, image: np.ndarray, num_classes: int) -> Drawn:
+        """Tint an image by its labels."""
+        return cls(view, labels, overlay(image, labels, palette(num_classes)), image)
+
 
 def draw_views(
     scene: GaussianScene, segmentation: Segmentation, views: Iterable[View], *, device: str = "cpu"
 ) -> Iterator[Drawn]:
     """Draw the labels of some views, and the scene under them."""
-    colors = palette(segmentation.num_classes)
     for view in views:
         operator = make_operator(scene, view.camera, device)
         labels = segmentation.label_map(operator)
-        image = background_image(scene, operator)
-        yield Drawn(view, labels, overlay(image, labels, colors), image)
+        yield Drawn.of(view, labels, background_image(scene, operator), segmentation.num_classes)
+
+
+def look_at(
+    scene: GaussianScene,
+    segmentation: Segmentation,
+    views: Iterable[View],
+    pictured: Iterable[View],
+    drawn: dict[str, Drawn],
+    *,
+    device: str = "cpu",
+) -> Iterator[Silhouette]:
+    """Tell what views show, to carve objects by, and draw those in `pictured` on the way, into `drawn`."""
+    names = {view.name for view in pictured}
+    for view in views:
+        operator, depth = make_operator(scene, view.camera, device), None
+        labels = segmentation.label_map(operator)
+        if view.name in names:
+            image, left_over = colours_and_depth(scene, operator)
+            depth = surface_of(image[..., 3], left_over).depth
+            drawn[view.name] = Drawn.of(view, labels, as_pixels(image[..., :3]), segmentation.num_classes)
+        yield Silhouette.of(scene, operator, labels, depth)
 
 
 def write_pictures(

@@ -26,9 +26,14 @@ class Surface(NamedTuple):
 def surface(scene: GaussianScene, operator: ViewOperator) -> Surface:
     """Render coverage and depth of a scene, or of an object alone, from the view of its operator."""
     image, left_over = operator.blend_seen(depths(scene, operator.camera, operator.ids)[:, None])
+    return surface_of(image[..., 0], left_over)
+
+
+def surface_of(depth: np.ndarray, left_over: np.ndarray) -> Surface:  # (H, W), (H, W)
+    """Tell what rays meet by their blended depth and what is left of them."""
     coverage = 1 - left_over
-    depth = np.divide(image[..., 0], coverage, out=np.full_like(coverage, np.inf), where=coverage > _EMPTY)
-    return Surface(coverage, depth)
+    mean = np.divide(depth, coverage, out=np.full_like(coverage, np.inf), where=coverage > _EMPTY)
+    return Surface(coverage, mean)
 
 
 def colours_and_depth(scene: GaussianScene, operator: ViewOperator) -> Blended:

@@ -48,8 +48,10 @@ class Silhouette(NamedTuple):
     operator: TileOperator | None = None  # of the same scene from there, where there is one already
 
     @classmethod
-    def of(cls, scene: GaussianScene, operator: ViewOperator, labels: np.ndarray) -> Silhouette:  # (H, W) int32
-        """Put a label map and the depth of the scene together.
+    def of(
+        cls, scene: GaussianScene, operator: ViewOperator, labels: np.ndarray, depth: np.ndarray | None = None
+    ) -> Silhouette:
+        """Put a label map (H, W) int32 and the depth of the scene together, which is rendered unless it is at hand.
 
         Raises
         ------
@@ -61,7 +63,8 @@ class Silhouette(NamedTuple):
             raise MaskSizeError(
                 f"view '{camera.name}': labels have shape {labels.shape}; expected ({camera.height}, {camera.width})"
             )
-        return cls(camera, labels.astype(np.int32), surface(scene, operator).depth)
+        depth = surface(scene, operator).depth if depth is None else depth
+        return cls(camera, labels.astype(np.int32), depth, operator if isinstance(operator, TileOperator) else None)
 
 
 class KeptShares(NamedTuple):
