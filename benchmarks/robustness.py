@@ -22,10 +22,11 @@ from pathlib import Path
 import numpy as np
 from jobs import hard_votes
 from machine import DATA, REPOSITORY
+from moving_occluder import DepthOf, depth_of_demo, depth_of_scene, gated, occlude
 from PIL import Image
 from plots import Axis, draw_panels
 from results import machine, markdown, points, score
-from robustness_text import BAR, CURVES, HEADER, RELIABILITY
+from robustness_text import BAR, CURVES, HEADER, OCCLUDER, RELIABILITY
 from scipy.stats import spearmanr
 from view_errors import STRONGEST, PoseErrors, corrupt_views, errors_at, typical_depth
 from wrong_masks import WrongMasks
@@ -116,6 +117,7 @@ def main() -> int:
         benches = list(open_benches(Path(folder), options.data / "replica_apartment", options.quick))
         sections = [measure_bar(benches), measure_curves(benches, out.parent / "pictures", aside)]
         sections.append(measure_reliability(benches, out.parent / "pictures", aside))
+        sections.append(measure_occluder(benches))
     minutes = (time.perf_counter() - start) / 60
     header = HEADER.format(machine=machine(), minutes=f"{minutes:.0f}", quick=" --quick" * options.quick)
     out.write_text("\n".join([header, *sections]), encoding="utf-8")
@@ -158,13 +160,14 @@ def learn(bench: Bench, views: Sequence[View], names: Sequence[str] = LEARNERS) 
     return runs
 
 
-def taught(name: str, bench: Bench, views: Sequence[View]) -> Learner:
-    """Return a learner that has learnt from views."""
+def taught(name: str, bench: Bench, views: Sequence[View], num_classes: int | None = None) -> Learner:
+    """Return a learner that has learnt from views, of the classes of the scene unless told how many."""
     learner: Learner
+    num_classes = num_classes or bench.data.num_classes
     if name in SETTINGS:
-        learner = EMLearner(bench.scene, bench.data.num_classes, SETTINGS[name])
+        learner = EMLearner(bench.scene, num_classes, SETTINGS[name])
     else:
-        learner = make_learner("votes" if name == HARD else name, bench.scene, bench.data.num_classes)
+        learner = make_learner("votes" if name == HARD else name, bench.scene, num_classes)
     learner.observe_all(views)
     return learner.fit()
 
@@ -342,6 +345,38 @@ def with_bad_frames(bench: Bench, seed: int) -> list[View]:
         errors = replace(errors, **worse[kind]) if i in bad else errors
         views += corrupt_views([view], int(rng.integers(1 << 31)), errors, PoseErrors())
     return views
+
+
+# Somebody in front
+
+
+def measure_occluder(benches: Sequence[Bench]) -> str:
+    """Measure what somebody costs who stands before the scene in every view, with depth gating and without."""
+    rows = []
+    for bench in benches:
+        depth_of: DepthOf = depth_of_demo if bench.name.startswith("demo") else depth_of_scene(bench.scene)
+        person = bench.data.num_classes
+        occluded = occlude(bench.train, person, depth_of, seed=0)
+        views, hidden, lost_share = gated(bench.scene, occluded)
+        sets = {"without": bench.train, "with": [one.view for one in occluded], "gated": views}
+        names = {**bench.data.class_names, person: "person"}
+        covered = f"{100 * np.mean([one.person.mean() for one in occluded]):.0f} %"
+        for name in (EM, VOTES):
+            scores = {}
+            for title, seen in sets.items():
+                learner = taught(name, bench, seen, person + 1)
+                result = Segmentation.from_codes(bench.scene, learner.codes_, names)
+                # Over the classes of the scene, to which the person does not belong.
+                scores[title] = float(np.nanmean(score(result, bench.scene, bench.test).iou[:person]))
+            print(f"{bench.name}, somebody in front: {name} {scores}", flush=True)
+            losses = [f"{100 * (scores['without'] - scores[title]):.1f}" for title in ("with", "gated")]
+            figures = [f"{100 * share:.1f} %" for share in (hidden, lost_share)]
+            rows.append([
+                bench.name, name, points(scores["without"]), points(scores["with"]), losses[0],
+                points(scores["gated"]), losses[1], covered, *figures,
+            ])  # fmt: skip
+    header = ["scene", "learner", "nobody: mIoU", "somebody", "points lost", "gated by depth", "points lost"]
+    return OCCLUDER.format(table=markdown([*header, "in front", "of that unknown", "of the rest"], rows))
 
 
 def save_small(path: Path, image: np.ndarray) -> None:

@@ -63,3 +63,16 @@ The two worst views of the demo scene: the mask, what the other views say, and i
 
 ![the two worst views](pictures/worst_views.png)
 """
+
+OCCLUDER = """## Somebody walks through the room
+
+In every train view somebody stands between the camera and the scene, elsewhere in each
+(`benchmarks/moving_occluder.py`), and the masks show them as a class of its own, whose votes go to what is behind. A
+depth camera measures the same pixels, with noise of 1 % of the depth, and nothing in 3 % of them; of the demo scene it
+measures the solids that its Gaussians were made of, of the real one Gaussians, as there is no other truth. "Gated":
+what the depth contradicts is unknown (`gsseg_core/raster/depth_gating.py`, default tolerances, a scene unit being a
+metre; `depth_gating` of the node). mIoU is over the classes of the scene, without refinement. The last columns: pixels
+of the person, how many of these gating makes unknown, and how many of the others.
+
+{table}
+"""

@@ -86,7 +86,7 @@ def build_demo(folder: str | os.PathLike[str], seed: int = 0) -> DemoScene:
     """
     root = Path(folder)
     scene_rng, mask_rng = np.random.default_rng(seed).spawn(2)
-    parts, cameras = _furnish(), _make_cameras()
+    parts, cameras = furnish(), _make_cameras()
     viewpoints = np.array([camera.center for camera in cameras])
     pieces = [_float(scene_rng), *(_cover(part, parts, viewpoints, scene_rng) for part in parts)]
     *properties, truth = (np.concatenate(arrays) for arrays in zip(*pieces, strict=True))
@@ -151,7 +151,7 @@ class Part:
         return points @ self.rotation.T + self.position, normals @ self.rotation.T
 
 
-def _furnish() -> list[Part]:
+def furnish() -> list[Part]:
     """All parts: floor, table, and the eight objects resting on the table or on each other."""
     parts: list[Part] = []
 

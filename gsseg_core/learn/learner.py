@@ -6,6 +6,7 @@ import os
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from typing import Any, TypeVar
 
 import numpy as np
@@ -164,7 +165,8 @@ class Learner(ABC):
         if observation is not None:
             observation.vote(self._votes, UNITS, -1)
         else:
-            self._vote(self.views[name], -1)
+            with suppress(UnusableViewError):  # It was moved to where it sees nothing.
+                self._vote(self.views[name], -1)
         self.forget(name)
 
     def forget(self, name: str) -> None:

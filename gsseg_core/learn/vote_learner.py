@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from dataclasses import replace
+
 import numpy as np
 
 from gsseg_core.data.view import View
-from gsseg_core.learn.learner import Learner, Progress, silent
+from gsseg_core.learn.learner import Learner, Progress, UnusableViewError, silent
+from gsseg_core.scene.camera import Camera
 
 
 class VoteLearner(Learner):
@@ -22,6 +26,20 @@ class VoteLearner(Learner):
         self.codes_, self.converged_ = self.vote_codes(), True
         self.observed_ = np.asarray(self.codes_.any(axis=1))
         return self
+
+    def move(self, name: str, camera: Camera) -> None:
+        """Have a view seen from another camera: its votes are taken back, and those from there are added.
+
+        A view that sees nothing of the scene from there stays, without votes.
+        """
+        before = self.views[name]
+        after = replace(before, camera=camera)
+        for view, sign in ((before, -1), (after, 1)):
+            with suppress(UnusableViewError):
+                self._vote(view, sign)
+        self.views[name] = after
+        self._prepared.pop(name, None)
+        self._in_file.drop(name)
 
     def predict_without(self, view: View, only_labelled: bool = False) -> np.ndarray:
         """Blend into a view the votes of all others as probabilities, (H, W, K) float32; exact, by subtraction."""

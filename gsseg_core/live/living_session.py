@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from gsseg_core.live.living_votes import LivingVotes
 from gsseg_core.live.matching_scenes import match_scenes
 from gsseg_core.live.scene_change import SceneChange
 from gsseg_core.live.session import LiveSession
+from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.living_files import without_colours
 from gsseg_core.scene.living_scene import LivingScene
@@ -79,6 +80,25 @@ class LivingSession(LiveSession):
         """Views that are kept, in the order in which they came, each in the frame of its group."""
         with self._lock:
             return list(self._live.views.values())
+
+    @property
+    def view_names(self) -> list[str]:
+        """Names of the views that are kept."""
+        with self._lock:
+            return list(self._live.views)
+
+    def move_view(self, name: str, moved: Callable[[Camera], Camera], era: object) -> bool:
+        """Have a view seen from another camera, so that votes are as if it had been fused from there.
+
+        A view that is not kept stays as it is, and so does one of a group, whose camera moves with its Gaussians.
+        Returns False, and changes nothing, if `era` is not that of now.
+        """
+        with self._lock:
+            view = self._live.views.get(name)
+            if era is self._era and view is not None and view.group is None:
+                self._live.move(name, moved(view.camera))
+                self._version += 1
+            return era is self._era
 
     def update(self, delta: SceneDelta) -> Changed:
         """Change the scene, and lift those views anew that the change can touch; on any error, nothing has changed.

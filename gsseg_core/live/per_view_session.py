@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from gsseg_core.learn.learner_state import State
 from gsseg_core.live.results import Outcome, Rejection
 from gsseg_core.live.session import LiveSession
 from gsseg_core.objects.object_table import ObjectTable, Repair, object_name
+from gsseg_core.scene.camera import Camera
 
 
 class PerViewSession(LiveSession):
@@ -47,6 +49,20 @@ class PerViewSession(LiveSession):
         if rejection is not None:
             undo()
         return rejection
+
+    @property
+    def view_names(self) -> list[str]:
+        """Names of the views that are kept."""
+        with self._lock:
+            return list(self._live.views)
+
+    def move_view(self, name: str, moved: Callable[[Camera], Camera], era: object) -> bool:
+        """Have a view seen from another camera, as a `LivingSession` does; its ids are matched to the objects anew."""
+        with self._lock:
+            if era is self._era and name in self._live.views:
+                view = self._table.views[name]
+                self._fuse(replace(view, camera=moved(view.camera)))
+            return era is self._era
 
     def repair(self) -> Repair:
         """Associate the views that are kept anew, and move their votes to the objects that turn out to be right.

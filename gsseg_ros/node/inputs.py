@@ -18,6 +18,7 @@ from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CompressedImage
 
+from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError
 from gsseg_core.live.results import SCENE_CHANGED, Rejection
@@ -292,10 +293,13 @@ class Inputs:
         workspace = self._workspace
         if paired.era is not workspace.era:
             return Rejection(SCENE_CHANGED, f"mask {paired.name} came before the scene was loaded or reset")
-        session = workspace.session
-        (topic, mask), (info_topic, info) = paired.mask, paired.camera_info
-        seen = self._masks.read(mask, topic, session, info)
-        settings = workspace.settings
+        seen = self._masks.read(paired.mask[1], paired.mask[0], workspace.session, paired.camera_info[1])
+        with workspace.placement.fusing:
+            return self._fused_in_place(paired, seen)
+
+    def _fused_in_place(self, paired: Paired, seen: SeenLabels) -> Rejection | None:
+        (topic, _), (info_topic, info) = paired.mask, paired.camera_info
+        session, settings = self._workspace.session, self._workspace.settings
         size, rectified = seen.labels.shape[::-1], is_rectified(settings.rectified, topic, info_topic)
         pose = settings.scene_to_map.world_to_camera(paired.pose)
         camera = camera_of_image(paired.name, info, size, pose, topic, info_topic, rectified=rectified)

@@ -108,6 +108,13 @@ class LiveOutputs:
                 self._objects_due = True
                 self._changed.notify()
 
+    def show_objects(self) -> None:
+        """Publish the objects so far, even if no view came since they were, and if nobody listens yet."""
+        self._news = self._outputs.objects_count
+        with self._changed:
+            self._objects_due = True
+            self._changed.notify()
+
     def close(self, timeout_s: float = 5.0) -> None:
         """Finish what is in hand, and end."""
         with self._changed:

@@ -71,6 +71,8 @@ class Declaration:
 
 
 MAX_PIXELS = 1 << 24
+SCALES, _NO_TURN = (1e-9, 1e9), [0.0, 0.0, 0.0, 1.0]
+"""Least and largest scene_to_map.scale."""
 
 DECLARATIONS = (
     Declaration(
@@ -134,12 +136,7 @@ DECLARATIONS = (
         "raw",
         f"how camera images are sent: {', '.join(TRANSPORTS)} (JPEG or PNG on image/compressed)",
     ),
-    Declaration(
-        "cameras",
-        [],
-        "names of the cameras, whose topics begin with them, as front/mask; empty: one camera, with mask, camera_info "
-        "and so on",
-    ),
+    Declaration("cameras", [], "names of cameras, with which topics begin, as front/mask; empty: a single one"),
     Declaration(
         "pose_source",
         "topic",
@@ -149,29 +146,20 @@ DECLARATIONS = (
         "pose_tolerance",
         0.0,
         "pose topics: how far a pose may lie before or after the mask's stamp; between two it is interpolated [s]",
-        0.0,
-        10.0,
+        *(0.0, 10.0),
     ),
-    Declaration(
-        "depth_gating",
-        False,
-        "whether masks wait for the depth image of their stamp, and what lies elsewhere than the scene is unknown",
-    ),
+    Declaration("depth_gating", False, "whether masks wait for depth images; what these contradict is unknown"),
     Declaration(
         "depth_tolerance.absolute",
         DepthTolerance.absolute,
         "depth_gating: how far a measured depth may be off, and a share of the depth besides [m]",
-        0.0,
-        1e6,
-        True,
+        *(0.0, 1e6, True),
     ),
     Declaration(
         "depth_tolerance.relative",
         DepthTolerance.relative,
         "depth_gating: this share of the scene's depth [0..1]",
-        0.0,
-        1.0,
-        True,
+        *(0.0, 1.0, True),
     ),
     Declaration(
         "rectified",
@@ -217,17 +205,31 @@ DECLARATIONS = (
     Declaration("device", "cpu", f"where views are rendered: {devices()}"),
     Declaration("autostart", True, "configure and activate at start; false: wait for a lifecycle manager"),
     Declaration("queue_size", 30, "masks waiting to be fused; of more, the oldest are dropped [count]", 1, 1000),
-    Declaration("scene_to_map.scale", 1.0, "metres of the map per unit of the scene [m]", 1e-9, 1e9),
-    Declaration("scene_to_map.translation", [0.0, 0.0, 0.0], "origin of the scene in the map, x y z [m]"),
-    Declaration("scene_to_map.rotation", [0.0, 0.0, 0.0, 1.0], "axes of the scene in the map, quaternion x y z w"),
+    Declaration(
+        "scene_frame",
+        "scene",
+        "frame of the scene's axes, broadcast below map_frame on /tf_static where tf2_msgs is installed; empty: none",
+    ),
+    Declaration(
+        "scene_to_map.scale", 1.0, "metres of the map per unit of the scene; views follow [m]", *SCALES, at_once=True
+    ),
+    Declaration(
+        "scene_to_map.translation", [0.0] * 3, "origin of the scene in the map, x y z; views follow [m]", at_once=True
+    ),
+    Declaration(
+        "scene_to_map.rotation",
+        _NO_TURN,
+        "axes of the scene in the map, quaternion x y z w; views follow",
+        at_once=True,
+    ),
     Declaration(
         "camera_in_base.translation",
-        [0.0, 0.0, 0.0],
+        [0.0] * 3,
         "pose_source odometry: origin of the camera's optical frame in the odometry's child frame, x y z [m]",
     ),
     Declaration(
         "camera_in_base.rotation",
-        [0.0, 0.0, 0.0, 1.0],
+        _NO_TURN,
         "pose_source odometry: axes of the camera's optical frame in the odometry's child frame, quaternion x y z w",
     ),
 )
@@ -261,6 +263,7 @@ class Settings:
     depth_tolerance: DepthTolerance
     rectified: str
     map_frame: str
+    scene_frame: str
     max_views: int
     max_classes: int
     k: int
@@ -303,10 +306,8 @@ class Settings:
             )
         for name in self.cameras:
             if not _CAMERA.fullmatch(name) or self.cameras.count(name) > 1:
-                raise SettingsError(
-                    f"parameter cameras: {name[:60]!r} is no name, or there twice; expected distinct names of letters, "
-                    "digits and single underscores that begin with a letter, such as front"
-                )
+                found = f"parameter cameras: {name[:60]!r} is no name, or there twice"
+                raise SettingsError(f"{found}; expected distinct names of letters, digits and single underscores")
         if not self.map_frame:
             raise SettingsError("parameter map_frame is empty; expected the name of a frame, such as 'map'")
         for index, flaw in enumerate(map(flaw_of_class_name, self.class_names)):

@@ -31,6 +31,7 @@ from gsseg_ros.node.obstacles import Obstacles
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.parameters import Settings
 from gsseg_ros.node.scene_changes import SceneChanges
+from gsseg_ros.node.scene_frame import SceneFrame
 from gsseg_ros.node.services import AT_WORK, WAITING, Services, describe
 from gsseg_ros.node.sim_time import SimTime
 from gsseg_ros.node.viewpoints import Lookup
@@ -74,6 +75,9 @@ class SegmentNode(LifecycleNode):
         self.inputs: Inputs | None = None
         self.obstacles: Obstacles | None = None
         self._outputs: Outputs | None = None
+        self._scene_frame: SceneFrame | None = None
+        self._out_of_place = False  # Whether what is latched is from where the scene lay before.
+        self.workspace.placement.settled = self._publish_again
         self._requests = Services(self, self.workspace, self._require_outputs, self._lookup)
         self._changes = SceneChanges(self._requests, lambda message: self._complaints.add(SCENE_DELTA, message))
         self._learn = LearnAction(self, self.workspace, self._require_outputs)
@@ -152,6 +156,8 @@ class SegmentNode(LifecycleNode):
             self.workspace.load_scene(*self.workspace.parameter_path("scene_path"))
         self._outputs = Outputs(self, settings.cameras)
         self._outputs.announce(self.workspace.label_space.classes)
+        self._scene_frame = SceneFrame(self, settings.map_frame, settings.scene_frame)
+        self._scene_frame.publish(settings.scene_to_map, self.get_clock().now().to_msg())
         if self.workspace.has_scene:
             session = self.workspace.session
             self.get_logger().info(f"loaded {session.scene.path}: {len(session.scene):,} Gaussians")
@@ -162,6 +168,8 @@ class SegmentNode(LifecycleNode):
         self.inputs = Inputs(self, self.workspace, self._require_outputs(), self._complaints)
         self.obstacles = Obstacles(self, self.workspace, self._complaints)
         self.workspace.active = True
+        if self._out_of_place:
+            threading.Thread(target=self._publish_again, name="publish again").start()
         topics = ", ".join(self.inputs.arrivals)
         self.get_logger().info(
             f"active: listening to {topics}; services and the action are below {self.get_fully_qualified_name()}/"
@@ -199,6 +207,10 @@ class SegmentNode(LifecycleNode):
         if self._outputs is not None:
             self._outputs.close()
             self._outputs = None
+        if self._scene_frame is not None:
+            self._scene_frame.close()
+            self._scene_frame = None
+        self._out_of_place = False
 
     def _answered(self, handler: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
         """Refuse a transition that does not start in the present state; in rclpy's own hands that ends the node."""
@@ -229,8 +241,34 @@ class SegmentNode(LifecycleNode):
         return result
 
     def _take_parameters(self, changed: Sequence[Parameter]) -> None:
-        if {parameter.name for parameter in changed} & parameters.AT_ONCE:
-            self.workspace.settings = Settings.read(self, changed)
+        names = {parameter.name for parameter in changed} & parameters.AT_ONCE
+        if not names:
+            return
+        with self.workspace.placement.fusing:
+            before, settings = self.workspace.settings, Settings.read(self, changed)
+            if self._scene_frame is None or not any(name.startswith("scene_to_map.") for name in names):
+                self.workspace.settings = settings
+                return
+            self._out_of_place = True
+            self.workspace.placement.change(
+                before.scene_to_map, settings.scene_to_map, lambda: setattr(self.workspace, "settings", settings)
+            )
+            self._scene_frame.publish(settings.scene_to_map, self.get_clock().now().to_msg())
+
+    def _publish_again(self) -> None:
+        """Publish anew what was published when the scene lay elsewhere, if the node is active; else it is due then."""
+        if not self.workspace.active or self.inputs is None:
+            return
+        self._out_of_place = False
+        session = self.workspace.session if self.workspace.has_scene else None
+        if session is None or not session.has_codes:
+            return
+        left = session.num_fused - session.num_views
+        notes = ["; ~/learn learns from where views are now"] * (session.learnt is not None)
+        notes += [f"; votes of {left} that are not kept any more stay as they were"] * (left > 0)
+        self.get_logger().info(f"the scene was moved, and {session.num_views} views have followed{''.join(notes)}")
+        if not self._requests.publish_again():
+            self.inputs.live.show_objects()
 
     def _tell(self) -> None:
         inputs, clock_problem = self.inputs, self._sim_time.problem()

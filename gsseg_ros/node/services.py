@@ -32,12 +32,16 @@ from gsseg_ros.node.output_folders import pinned_folder, require_own_folder, sta
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.picking import fill_answer, pick_object
 from gsseg_ros.node.reports import Selection, empty_report, finish, report_message, stage_timings
+from gsseg_ros.node.scene_frame import placed
 from gsseg_ros.node.viewpoints import Lookup, draw, viewpoint
 from gsseg_ros.node.workspace import Run, Workspace, checked_confidence, chosen_classes
 from gsseg_ros.object_messages import point_message
 from gsseg_ros.qos import requests
 
 STATE_FILE, EXPORT_FOLDER = "gsseg_state.npz", "gsseg_export"
+
+_PUBLISHED = ("min_confidence", "skip_refinement", "skip_filter", "refine")
+"""Fields of a request of ~/segment that decide what is published."""
 
 PAPER, CARVE = "paper", "carve"
 """What a request may ask for after KNN clustering."""
@@ -143,6 +147,7 @@ class Services:
         self.node, self.workspace = node, workspace
         self.turns = Turns(AT_WORK, WAITING)
         self._outputs, self._lookup = outputs, lookup
+        self._published: Segment.Request | None = None  # What the run was asked for that is latched.
         # Reentrant: a request must not wait for another one to be answered.
         group = ReentrantCallbackGroup()
         for interface, name, handler in (
@@ -194,10 +199,17 @@ class Services:
                     if overlay.width:
                         outputs.publish_overlay(overlay)
                     outputs.publish_report(report)
+                    self._published = Segment.Request(**{name: getattr(request, name) for name in _PUBLISHED})
             # What is published is serialised by now.
             report.classes = [summary for summary in report.classes if summary.class_id in selection.chosen]
             response.report = report
             response.objects = [thing for thing in objects.objects if thing.id in selection.chosen]
+
+    def publish_again(self) -> bool:
+        """Publish anew what is latched, of what is known now; returns whether a run was published before."""
+        if self._published is not None:
+            self.segment(self._published, Segment.Response())
+        return self._published is not None
 
     @answered
     @in_turn
@@ -234,7 +246,7 @@ class Services:
 
     @answered
     def load_scene(self, request: LoadScene.Request, response: LoadScene.Response) -> None:
-        """Load another scene, and drop what was known of the earlier one."""
+        """Load another scene, in another place if that is asked for, and drop what was known of the earlier one."""
         workspace, started = self.workspace, time.perf_counter()
         within: Path | None = None
         if request.path:
@@ -243,16 +255,24 @@ class Services:
             path, within = workspace.parameter_path("scene_path")
         else:
             raise InvalidRequestError("path and the parameter scene_path are both empty; expected a scene in either")
+        wanted = placed(request)
+
+        def place() -> None:
+            if wanted:
+                self.node.set_parameters_atomically(wanted)
+
         with workspace.slot.take("load_scene") as job, workspace.run("load_scene") as run:
 
             def check() -> None:
                 workspace.require_active()
                 job.check()
+                place()  # Before any view of it is fused.
 
             if request.keep_votes:
                 changed = workspace.grow_scene(path, within, request.tolerance)
                 response.num_carried, response.num_views_lifted = changed.num_carried, changed.num_views_lifted
                 response.matched_by = changed.matched_by
+                place()
             else:
                 workspace.load_scene(path, within, check)
             self.clear(run)
@@ -347,6 +367,7 @@ class Services:
         workspace = self.workspace
         workspace.number(run)
         session = workspace.session if workspace.has_scene else None
+        self._published = None
         self._outputs().clear(empty_report(run, session, workspace.settings.map_frame))
 
     def _header(self, run: Run) -> Header:

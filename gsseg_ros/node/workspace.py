@@ -33,6 +33,7 @@ from gsseg_ros.errors import (
 from gsseg_ros.node.jobs import JobSlot, Requests
 from gsseg_ros.node.masks.label_space import LabelSpace, NewNames
 from gsseg_ros.node.parameters import Settings
+from gsseg_ros.node.placement import Placement
 
 _PATHS = {"scene_path": "a scene", "label_map": "a label map"}
 
@@ -78,6 +79,8 @@ class Workspace:
     ----------
     settings : Settings
         As of now.
+    placement : Placement
+        Has views follow the scene.
     slot : JobSlot
         Taken by whatever must not run beside a learn job.
     requests : Requests
@@ -98,6 +101,7 @@ class Workspace:
 
     def __init__(self, settings: Settings, now: Callable[[], Time]) -> None:
         self.settings, self.slot, self.requests = settings, JobSlot(), Requests()
+        self.placement = Placement(self)
         self.forget_waiting: Callable[[], None] = lambda: None
         self.label_space = LabelSpace(settings.class_names, None, settings.max_classes)
         self._at_start = {name: getattr(settings, name) for name in _PATHS}
@@ -251,6 +255,7 @@ class Workspace:
 
     def load_state(self, path: str | Path, within: Path | None = None) -> int:
         """Replace what is known of the scene by a saved state; return how many views are in it."""
+        self.placement.forget()  # Views of the state may have the names of some that are still to follow.
         loaded = self.session.load(path, within)
         self.forget_waiting()
         return loaded
@@ -272,6 +277,7 @@ class Workspace:
             self._session.retire()
 
     def _replace(self, session: LiveSession | None) -> None:
+        self.placement.forget()
         before, self._session = self._session, session
         if before is not None:
             before.retire()

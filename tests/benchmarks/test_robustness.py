@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import robustness
+from moving_occluder import depth_of_scene, gated, occlude
 from plots import Axis, draw_panels
 from robustness import EM, HARD, LEARNERS, PLAIN, VOTES, Bench, learn, right_share, with_bad_frames
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views
@@ -69,3 +70,17 @@ def test_curves_and_the_bar_become_text_and_pictures(tmp_path: Path, monkeypatch
     reliability = robustness.measure_reliability([small], tmp_path, tmp_path)
     assert "of 1 |" in reliability and (tmp_path / "reliability.svg").exists()
     assert (tmp_path / "worst_views.png").stat().st_size > 1000
+
+
+def test_somebody_in_front_is_compared_with_nobody_and_with_what_depth_leaves_of_the_views() -> None:
+    small = bench()
+    text = robustness.measure_occluder([small])
+    rows = [[cell.strip() for cell in line.split("|")] for line in text.splitlines() if line.startswith("| demo scene")]
+    assert [row[2] for row in rows] == [EM, VOTES] and "{" not in text
+    occluded = occlude(small.train, NUM_CLASSES, depth_of_scene(small.scene), seed=0)
+    views, hidden, lost = gated(small.scene, occluded)
+    assert hidden > 0.9 and lost < 0.1
+    for one, view, left in zip(occluded, small.train, views, strict=True):
+        assert (one.view.read_labels() == NUM_CLASSES).sum() == one.person.sum() > 0
+        np.testing.assert_array_equal(one.view.read_labels()[~one.person], view.read_labels()[~one.person])
+        assert (left.read_labels() == NUM_CLASSES).sum() < 0.1 * one.person.sum()

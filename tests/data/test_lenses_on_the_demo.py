@@ -11,7 +11,7 @@ from lens_cases import COEFFICIENTS
 from gsseg_core.data.camera_files import read_cameras
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN, write_mask
-from gsseg_core.demo.table_scene import CLASS_NAMES, Part, _cast_view, _furnish
+from gsseg_core.demo.table_scene import CLASS_NAMES, Part, _cast_view, furnish
 from gsseg_core.files.json_files import write_json
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.metrics import Evaluation
@@ -75,7 +75,7 @@ def score(scene: GaussianScene, dataset: Dataset, cameras: list[Camera], truths:
 def table(demo_run: Path) -> tuple[GaussianScene, list[Camera], list[Part], list[np.ndarray]]:
     """The demo's scene, its cameras and solids, true labels of the test views, and what a pinhole's masks teach."""
     folder = next(demo_run.rglob("scene.ply")).parent
-    scene, cameras, parts = GaussianScene.load(folder / "scene.ply"), read_cameras(folder), _furnish()
+    scene, cameras, parts = GaussianScene.load(folder / "scene.ply"), read_cameras(folder), furnish()
     truths = [_cast_view(parts, camera) for camera in cameras[TEST]]
     return scene, cameras, parts, truths
 

@@ -88,9 +88,9 @@ def test_masks_that_wait_for_their_poses_are_not_fused_into_what_comes_after(her
     here.done("save_state")
     views = clean_views(8, "late")
     stamps = here.send(views, ["camera_info", "mask"])
-    assert here.inputs.pairing.waiting == 8
+    assert here.inputs.cameras[""].pairing.waiting == 8
     here.done(change)
-    assert here.inputs.pairing.waiting == 0 and here.inputs.rejected == {"scene_changed": 8}
+    assert here.inputs.cameras[""].pairing.waiting == 0 and here.inputs.rejected == {"scene_changed": 8}
     here.send(views, ["pose"], stamps)
     here.fuse(clean_views(1, "new"))
     session = here.node.workspace.session

@@ -1,0 +1,83 @@
+"""Keeps the views that were fused where the parameters scene_to_map say the scene lies, while these change."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any, Protocol
+
+from gsseg_core.scene.camera import Camera
+from gsseg_ros.frames import Similarity
+
+
+class Placed(Protocol):
+    """What a placement belongs to: a workspace."""
+
+    @property
+    def has_scene(self) -> bool:
+        """Whether there is a session."""
+
+    @property
+    def session(self) -> Any:
+        """The session, whose views follow: a `LivingSession`, or a `PerViewSession`, which loads SciPy."""
+
+
+class Placement:
+    """Has views follow the scene: cameras were measured in the map, and stay there when the scene is put elsewhere.
+
+    Each view is moved by itself, in a thread, and others are fused in between. In the end votes are what they would be
+    if every view that is kept had come when the scene was there already.
+
+    Parameters
+    ----------
+    owner : Placed
+        Of the session.
+    settled : callable
+        Called in that thread when all views have followed.
+
+    Attributes
+    ----------
+    fusing : threading.RLock
+        Held from where a view's pose is brought into the scene until it is fused, and while the scene is moved.
+    """
+
+    def __init__(self, owner: Placed, settled: Callable[[], None] = lambda: None) -> None:
+        self.fusing, self.settled = threading.RLock(), settled
+        self._owner = owner
+        self._moved_from: dict[str, tuple[Similarity, Similarity]] = {}  # By view, to where it has to follow.
+        self._running = False
+
+    def change(self, before: Similarity, after: Similarity, take_over: Callable[[], None]) -> None:
+        """Move the scene, and begin to have the views follow; `take_over` makes it known to those that come now."""
+        with self.fusing:
+            take_over()
+            names = self._owner.session.view_names if self._owner.has_scene else []
+            self._moved_from = {name: (self._moved_from.get(name, (before,))[0], after) for name in names}
+            if not self._running:
+                self._running = True
+                threading.Thread(target=self._follow, name="placement", daemon=True).start()
+
+    def forget(self) -> None:
+        """Leave all views where they are, before they are replaced."""
+        self._moved_from = {}  # Without the lock: whoever replaces them must not wait for one that is being fused.
+
+    def _follow(self) -> None:
+        while True:
+            with self.fusing:
+                moved_from = self._moved_from
+                if not moved_from or not self._owner.has_scene:
+                    self._running = False
+                    break
+                session = self._owner.session
+                name, (before, after) = next(iter(moved_from.items()))
+                if session.move_view(name, partial(_moved, before=before, after=after), session.era):
+                    del moved_from[name]
+        self.settled()
+
+
+def _moved(camera: Camera, before: Similarity, after: Similarity) -> Camera:
+    """Keep a camera where it is in the map."""
+    pose = before.camera_in_map(camera.world_to_camera)
+    return replace(camera, world_to_camera=after.world_to_camera(pose))

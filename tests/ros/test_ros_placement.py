@@ -1,0 +1,229 @@
+"""The scene is put elsewhere in the map while the node is active: views follow, nothing is lost, outputs come anew."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
+from ros_helpers import Ros, wait_until
+from ros_node_here import node_here
+from ros_robot import CLASSES, IDENTITY, LATCHED, core_session, messages
+from small_scenes import balls_on_a_table, clean_views
+
+from gsseg_core.data.view import View
+from gsseg_core.live.living_session import LivingSession
+from gsseg_core.live.per_view_session import PerViewSession
+from gsseg_core.refine.settings import UNREFINED
+from gsseg_core.scene.gaussian_scene import GaussianScene
+
+pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
+
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, Pose, Quaternion
+from gsseg_msgs.msg import ObjectArray, SegmentationReport
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import PointCloud2
+
+from gsseg_ros.conversions import arrays_from_cloud, matrix_from_transform
+from gsseg_ros.frames import Similarity
+from gsseg_ros.node.placement import Placement
+from gsseg_ros.node.scene_frame import SceneFrame, transform
+
+ASIDE = Similarity.from_parameters(1.0, [0.05, -0.02, 0.03], [0.0, 0.0, 0.02, 1.0])
+FAR = Similarity.from_parameters(1.0, [1e4, 0, 0], [0.0, 0.0, 0.0, 1.0])
+
+
+def placed_views(views: list[View], now: Similarity) -> list[View]:
+    """The views as they are once the scene, which lay at the origin, lies elsewhere."""
+    return [
+        replace(view, camera=replace(view.camera, world_to_camera=now.world_to_camera(
+            IDENTITY.camera_in_map(view.camera.world_to_camera))))
+        for view in views
+    ]  # fmt: skip
+
+
+def placement_of(session: LivingSession) -> tuple[Placement, list[int]]:
+    settled: list[int] = []
+    owner: Any = SimpleNamespace(has_scene=True, session=session)
+    return Placement(owner, lambda: settled.append(session.num_views)), settled
+
+
+SCENE, _ = balls_on_a_table()
+
+
+def living_session(views: list[View]) -> LivingSession:
+    session = LivingSession(SCENE, dict(enumerate(CLASSES)))
+    for view in views:
+        assert session.fuse(view) is None
+    return session
+
+
+@given(st.lists(st.sampled_from([ASIDE, FAR, IDENTITY]), min_size=1, max_size=3))
+def test_after_any_moves_votes_are_those_of_views_that_came_at_the_last_place(places: list[Similarity]) -> None:
+    views = clean_views(3)
+    session = living_session(views)
+    placement, settled = placement_of(session)
+    before, told = IDENTITY, []
+    for after in places:
+        placement.change(before, after, lambda after=after: told.append(after))  # type: ignore[misc]
+        before = after
+    wait_until(lambda: not placement._running and settled, "the views to follow")
+    assert told == places
+    assert session.num_views == session.num_fused == 3
+    expected = LivingSession(SCENE, session.class_names)
+    for view in placed_views(views, places[-1]):
+        expected.fuse(view)
+    found = session._live._votes
+    np.testing.assert_allclose(found, expected._live._votes, rtol=0, atol=2e-3 * abs(found).max() + 1)
+    if places[-1] is FAR:
+        assert not found.any() and expected.num_fused == 0, "nothing is seen from there, and nothing is lost"
+        return
+    assert list(session._live.views) == [view.name for view in views]
+
+
+def test_views_of_a_state_that_is_loaded_meanwhile_stay_where_they_are() -> None:
+    views = clean_views(2)
+    session = living_session(views)
+    codes = session.codes()
+    placement, settled = placement_of(session)
+    with placement.fusing:
+        placement.change(IDENTITY, FAR, lambda: None)
+        placement.forget()
+    wait_until(lambda: settled, "the thread to end")
+    np.testing.assert_array_equal(session.codes(), codes)
+
+
+def test_a_view_does_not_follow_once_what_is_known_was_replaced() -> None:
+    session = living_session(clean_views(1))
+    era = session.era
+    session.retire()
+    assert not session.move_view(session.view_names[0], lambda camera: pytest.fail("moved"), era)  # type: ignore[arg-type]
+    assert session.move_view("not kept any more", lambda camera: pytest.fail("moved"), session.era)  # type: ignore[arg-type]
+
+
+def test_objects_of_ids_per_view_follow_too() -> None:
+    views, session = clean_views(3), PerViewSession(SCENE)
+    for view in views:
+        assert session.fuse(view) is None
+    placement, settled = placement_of(session)
+    placement.change(IDENTITY, ASIDE, lambda: None)
+    wait_until(lambda: settled, "the views to follow")
+    kept = [view.camera.world_to_camera for view in session._live.views.values()]
+    np.testing.assert_allclose(kept, [view.camera.world_to_camera for view in placed_views(views, ASIDE)])
+
+
+def parameters_of(similarity: Similarity, z: float) -> list[Parameter]:
+    return [
+        Parameter("scene_to_map.translation", value=similarity.translation.tolist()),
+        Parameter("scene_to_map.rotation", value=[0.0, 0.0, z, 1.0]),
+        Parameter("scene_to_map.scale", value=similarity.scale),
+    ]
+
+
+def test_while_active_views_follow_and_all_that_is_latched_comes_anew(
+    shared: Ros, parameters: dict[str, Any], scene: GaussianScene
+) -> None:
+    views = clean_views(3)
+    with node_here(shared, parameters) as here:
+        here.fuse(views)
+        first = here.done("segment", skip_refinement=True, classes=["box"]).report
+        heard: dict[str, list[Any]] = {"report": [], "cloud": [], "objects": []}
+        kinds = {"report": SegmentationReport, "cloud": PointCloud2, "objects": ObjectArray}
+        subscriptions = [
+            shared.node.create_subscription(kinds[name], f"/gsseg/{name}", seen.append, LATCHED)
+            for name, seen in heard.items()
+        ]
+        for parameter in parameters_of(ASIDE, 0.02):  # One at a time, as `ros2 param set` does.
+            (result,) = here.node.set_parameters([parameter])
+            assert result.successful, result.reason
+        (result,) = here.node.set_parameters([Parameter("scene_to_map.rotation", value=[0.0] * 4)])
+        assert not result.successful and "scene_to_map.rotation is all zeros" in result.reason
+
+        def anew() -> bool:
+            if not heard["cloud"] or heard["report"][-1].revision <= first.revision:
+                return False
+            now = here.done("segment", skip_refinement=True, publish_nothing=True).cloud
+            return heard["cloud"][-1].data == now.data
+
+        wait_until(anew, "the cloud where the scene is now")
+        at = here.node.workspace.session.segmentation(UNREFINED).labels > 0
+        points = arrays_from_cloud(heard["cloud"][-1]).points
+        moved = ASIDE.points_to_map(scene.means[at])
+        np.testing.assert_allclose(np.sort(points, axis=0), np.sort(moved, axis=0), atol=1e-4)
+        here.fuse(clean_views(1, "late"))  # Its pose is in the map.
+        names = [replace(view, camera=replace(view.camera, name=str(i))) for i, view in enumerate(
+            placed_views([*views, *clean_views(1, "late")], ASIDE))]  # fmt: skip
+        np.testing.assert_allclose(here.node.workspace.session.codes(), core_session(scene, names).codes(), atol=5e-3)
+        for subscription in subscriptions:
+            shared.node.destroy_subscription(subscription)
+
+
+def test_a_scene_is_loaded_to_a_place_of_its_own(shared: Ros, parameters: dict[str, Any], scene: GaussianScene) -> None:
+    views = clean_views(2)
+    with node_here(shared, parameters) as here:
+        pose = Pose(position=Point(x=4.0, y=-1.0, z=0.5), orientation=Quaternion(x=0.0, y=0.0, z=0.6, w=0.8))
+        for spoil, why in (
+            ({"scene_to_map_scale": -1.0}, "scene_to_map_scale is -1; expected 0, or"),
+            ({"scene_to_map_scale": float("nan")}, "scene_to_map_scale is nan"),
+            ({"scene_to_map_scale": 1e12}, "scene_to_map_scale is 1e\\+12"),
+            ({"scene_to_map_scale": 1.0, "scene_to_map": Pose(orientation=Quaternion(w=0.0))}, "all zeros"),
+        ):
+            refused = here.ask("load_scene", **spoil)
+            assert refused.error_code == refused.INVALID_REQUEST
+            assert why.replace("\\", "") in refused.error_msg
+        similarity = Similarity.from_parameters(2.5, [4.0, -1.0, 0.5], [0.0, 0.0, 0.6, 0.8])
+        response = here.done("load_scene", scene_to_map=pose, scene_to_map_scale=2.5)
+        corner = similarity.points_to_map(scene.means).max(axis=0)
+        np.testing.assert_allclose([response.box_max.x, response.box_max.y, response.box_max.z], corner, atol=1e-4)
+        assert here.node.get_parameter("scene_to_map.scale").value == 2.5
+        for i, view in enumerate(views):
+            here.hand(messages(view, here.stamp + i, similarity))
+        wait_until(lambda: here.inputs.accepted == 2, "two views")
+        np.testing.assert_allclose(here.node.workspace.session.codes(), core_session(scene, views).codes(), atol=1e-4)
+        here.done("load_scene")
+        assert here.node.get_parameter("scene_to_map.scale").value == 2.5, "a request that says nothing changes nothing"
+
+
+def test_the_static_transform_is_the_pose_of_the_scene_without_its_scale() -> None:
+    similarity = Similarity.from_parameters(2.5, [4.0, -1.0, 0.5], [0.0, 0.0, 0.6, 0.8])
+    sent = transform("map", "scene", similarity, Time(sec=7))
+    assert (sent.header.frame_id, sent.child_frame_id, sent.header.stamp.sec) == ("map", "scene", 7)
+    matrix = matrix_from_transform(sent.transform, "tf")
+    np.testing.assert_allclose(matrix[:3, :3], similarity.rotation, atol=1e-12)
+    np.testing.assert_allclose(matrix[:3, 3], similarity.translation)
+
+
+def test_it_is_broadcast_latched_where_tf2_msgs_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+    from types import ModuleType
+
+    sent: list[Any] = []
+
+    class Node:
+        def create_publisher(self, kind: Any, topic: str, quality: Any) -> Any:
+            assert topic == "/tf_static" and quality.durability.name == "TRANSIENT_LOCAL"
+            return SimpleNamespace(publish=sent.append)
+
+        def destroy_publisher(self, publisher: Any) -> None:
+            sent.clear()
+
+    def message(transforms: list[Any]) -> list[Any]:
+        return transforms
+
+    module: Any = ModuleType("tf2_msgs.msg")
+    module.TFMessage = message
+    monkeypatch.setitem(sys.modules, "tf2_msgs", ModuleType("tf2_msgs"))
+    monkeypatch.setitem(sys.modules, "tf2_msgs.msg", module)
+    frame = SceneFrame(Node(), "map", "scene")
+    frame.publish(ASIDE, Time())
+    assert [one.child_frame_id for (one,) in sent] == ["scene"]
+    frame.close()
+    assert not sent
+    SceneFrame(Node(), "map", "").publish(ASIDE, Time())
+    assert not sent
