@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import numpy.typing as npt
 
@@ -20,7 +22,7 @@ def move(
     What `pack_vertices` returned is changed, positions to colours. Raises nothing: what is NaN stays NaN.
     """
     names = rest_names(sum(name.startswith("f_rest_") for name in vertices.dtype.names or ()))
-    harmonics = spherical_harmonics.turned(turn, REST_COUNTS.index(len(names)))[1:, 1:]
+    harmonics = _turned(turn.tobytes(), REST_COUNTS.index(len(names)))
     with np.errstate(all="ignore"):
         _put(vertices, MEANS, scale * (columns(vertices, MEANS) @ turn.T) + np.asarray(shift))
         if scale != 1:
@@ -34,6 +36,13 @@ def move(
         if names:
             rest = columns(vertices, names).reshape(len(vertices), 3, -1)
             rest[:] = rest @ harmonics.T.astype(np.float32)
+
+
+@lru_cache(maxsize=4)
+def _turned(turn: bytes, degree: int) -> npt.NDArray[np.float64]:
+    """Matrix (B, B) that turns coefficients above degree 0; kept, as files are moved block by block."""
+    matrix: npt.NDArray[np.float64] = spherical_harmonics.turned(np.frombuffer(turn).reshape(3, 3), degree)[1:, 1:]
+    return matrix
 
 
 def _put(vertices: npt.NDArray[np.void], names: tuple[str, ...], values: npt.NDArray[np.floating]) -> None:
