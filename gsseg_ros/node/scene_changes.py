@@ -11,7 +11,7 @@ from gsseg_msgs.msg import SceneDelta as SceneDeltaMessage
 from gsseg_msgs.srv import MergeStates, UpdateScene
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 
-from gsseg_core.errors import EmptySceneError, SceneDeltaError
+from gsseg_core.errors import EmptySceneError, GssegError, SceneDeltaError
 from gsseg_core.live.living_session import Changed, LivingSession
 from gsseg_core.scene.scene_delta import SceneDelta
 from gsseg_ros.delta_messages import delta_from_message
@@ -75,7 +75,9 @@ class SceneChanges:
             self._update(self.workspace.living_session, delta_from_message(message))
         except Exception as error:
             self.workspace.changes["refused"] += 1
-            self._complain(f"scene_delta: {explain(self.node, error)}")
+            # What was not foreseen is logged with its traceback, too.
+            why = str(error) if isinstance(error, GssegError) else explain(self.node, error)
+            self._complain(f"topic scene_delta: {why.removeprefix('scene delta: ')}")
 
     @answered
     @in_turn

@@ -96,7 +96,7 @@ class Workspace:
     dropped : Counter of str
         Masks that never came to be views, by reason, since the scene was loaded or reset.
     changes : Counter of str
-        Changes of the scene that were made, and refused; and views that were kept and lifted anew by them.
+        Changes of the scene that were made and refused, and the views that they left, lifted anew, and did not find.
     """
 
     def __init__(self, settings: Settings, now: Callable[[], Time]) -> None:
@@ -250,8 +250,9 @@ class Workspace:
 
     def count(self, changed: Changed) -> None:
         """Count a change of the scene."""
-        kept, lifted = changed.num_views_kept, changed.num_views_lifted
-        self.changes.update({"made": 1, "views kept": kept, "views lifted anew": lifted})
+        counts = {"kept": changed.num_views_kept, "lifted anew": changed.num_views_lifted,
+                  "named and not kept": changed.num_views_unknown}  # fmt: skip
+        self.changes.update({"made": 1, **{f"views {what}": count for what, count in counts.items()}})
 
     def load_state(self, path: str | Path, within: Path | None = None) -> int:
         """Replace what is known of the scene by a saved state; return how many views are in it."""

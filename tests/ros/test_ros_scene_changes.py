@@ -21,6 +21,8 @@ from small_scenes import balls_on_a_table, clean_views, write_dataset
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus
 from gsseg_msgs.msg import SceneDelta as SceneDeltaMessage
 
 from gsseg_core.data.dataset import Dataset
@@ -31,6 +33,7 @@ from gsseg_core.scene.similarity import Similarity
 from gsseg_ros.conversions import stamp_message
 from gsseg_ros.delta_messages import delta_from_message, message_from_delta
 from gsseg_ros.errors import InvalidRequestError
+from gsseg_ros.node import diagnostics
 from gsseg_ros.replay.growing import GrowingSource
 
 SCENE, _ = balls_on_a_table()
@@ -75,6 +78,10 @@ def root(here: NodeHere) -> Path:
     return here.node.workspace.root
 
 
+def status(here: NodeHere) -> DiagnosticStatus:
+    return diagnostics.diagnostic_array("gsseg", here.node.workspace, here.inputs, Time(), "").status[0]
+
+
 def test_a_request_and_the_topic_change_the_scene_and_votes_are_those_of_the_views_in_it(here: NodeHere) -> None:
     session = here.node.workspace.living_session
     delta = replace(COPY, removed=np.arange(30))
@@ -87,7 +94,8 @@ def test_a_request_and_the_topic_change_the_scene_and_votes_are_those_of_the_vie
     assert session.living.revision == 2
     assert [view.group for view in session.views] == [0, None, None, None]
     np.testing.assert_array_equal(votes(session), as_refused(session))
-    assert here.node.workspace.changes["made"] == 2 and not here.node.workspace.changes["refused"]
+    told = {value.key: value.value for value in status(here).values}
+    assert (told["scene changes: made"], told["scene changes: views named and not kept"]) == ("2", "1")
     assert here.done("segment").report.num_gaussians == len(session.scene)
 
 
@@ -134,7 +142,9 @@ def test_a_delta_out_of_turn_is_complained_of_once_and_changes_nothing(
     for revision in (7, 9, 8):
         message = message_from_delta(SceneDelta(revision=revision, removed=np.array([revision])))
         here.node._changes.on_scene_delta(message)
-    assert len(said) == 1 and "its revision is 9; expected 8, as the scene is at 7" in said[0]
+    assert len(said) == 1 and said[0].startswith(
+        "topic scene_delta: its revision is 9; expected 8, as the scene is at 7"
+    )
     assert here.node.workspace.changes["refused"] == 1 and len(session.scene) == len(SCENE) - 2
     np.testing.assert_array_equal(votes(session), as_refused(session))
 
