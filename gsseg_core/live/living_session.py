@@ -136,7 +136,8 @@ class LivingSession(LiveSession):
         self, before: LivingScene, after: LivingScene, origin: np.ndarray, joining: Mapping[str, int | None]
     ) -> Changed:
         change = SceneChange(before, after, origin)
-        lifted = len(self._live.change(change, joining))
+        all_kept = self.num_fused == len(self._live.views)
+        lifted = len(self._live.change(change, joining, all_kept=all_kept))
         if self._first is self._living:
             self._first = without_colours(self._living)
         if self._learnt is not None:

@@ -57,7 +57,7 @@ class LivingVotes(VoteLearner):
         frame = self.living.frame(view.group)
         return replace(view, camera=view.camera if is_identity(frame) else frame.camera(view.camera), group=None)
 
-    def change(self, change: SceneChange, joining: Mapping[str, int | None]) -> list[str]:
+    def change(self, change: SceneChange, joining: Mapping[str, int | None], *, all_kept: bool = False) -> list[str]:
         """Go over to the scene after a change, with the votes that views have in that; on any error, nothing changes.
 
         Parameters
@@ -66,6 +66,8 @@ class LivingVotes(VoteLearner):
             From the scene of now to another one.
         joining : mapping from view to group
             Views that belong to another group from now on; others keep theirs.
+        all_kept : bool
+            Whether the votes are those of the views that are kept, and of no others.
 
         Returns
         -------
@@ -83,11 +85,17 @@ class LivingVotes(VoteLearner):
             for name, view in views.items()
             if not self._looks_alike(name, view) or change.touches(view, self._ends_of(view))
         ]
+        # To take a view back costs as much as to add it: with more than half of them, all are lifted from nothing.
+        from_nothing = all_kept and 2 * len(lifted) > len(views)
+        names = list(views) if from_nothing else lifted
         # Masks in memory cannot fail: they are read one at a time.
-        read = {name: views[name].read_seen() for name in lifted if not views[name].is_in_memory}
-        self._lift(self.views, lifted, read, -1)
+        read = {name: views[name].read_seen() for name in names if not views[name].is_in_memory}
+        if from_nothing:
+            self._votes[:] = 0
+        else:
+            self._lift(self.views, lifted, read, -1)
         self._votes, self.living, self.scene = change.carry(self._votes), change.after, change.after.scene
-        self._lift(views, lifted, read, 1)
+        self._lift(views, names, read, 1)
         self.views = views
         for name in lifted:
             self._ends.pop(views[name], None)
