@@ -120,7 +120,7 @@ def assert_pairs_are_what_labelled_pixels_see(seen, mask, weights, ids):
     sees = np.zeros((weights.shape[1], len(seen.classes)), bool)
     for j, label in enumerate(seen.classes):
         sees[:, j] = (weights[mask.ravel() == label] > 0).any(axis=0)
-    np.testing.assert_array_equal(seen.ids, ids[sees[ids].any(axis=1)])
+    np.testing.assert_array_equal(seen.ids, np.sort(ids[sees[ids].any(axis=1)]))
     np.testing.assert_array_equal(seen.start, np.concatenate([[0], np.cumsum(sees[seen.ids].sum(axis=1))]))
     np.testing.assert_array_equal(seen.dense(np.ones(len(seen.labels))), sees[seen.ids])
 

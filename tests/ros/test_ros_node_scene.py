@@ -165,20 +165,20 @@ def test_of_requests_at_the_same_time_one_is_published_whole_and_last_the_newest
     here.fuse(clean_views(3))
     for _ in range(10):
         threads, answers = zip(
-            *(in_thread(lambda k=k: here.done("segment", classes=[str(k)])) for k in (1, 3)), strict=True
+            *(in_thread(lambda least=least: here.done("segment", min_confidence=least)) for least in (0.0, 0.9)),
+            strict=True,
         )
         for thread in threads:
             joined(thread)
         newest = max((answer[0].report for answer in answers), key=lambda report: report.revision)
-        topics = ["cloud", *(f"classes/{token}" for token in ("red_ball", "box"))]
+        topics = [f"classes/{token}" for token in ("red_ball", "box")]
         report, objects, *clouds = robot.latched(
             (SegmentationReport, "report"), (ObjectArray, "objects"), *((PointCloud2, topic) for topic in topics)
         )
         assert report.revision == objects.revision == newest.revision
-        chosen = newest.classes[0]
-        assert [thing.id for thing in objects.objects] == [chosen.class_id]
-        found = [cloud.width for cloud in clouds]
-        assert found == [chosen.num_gaussians, *(chosen.num_gaussians * (chosen.class_id == k) for k in (1, 3))]
+        counts = {summary.class_id: summary.num_gaussians for summary in newest.classes}
+        assert all(thing.num_gaussians == counts[thing.id] for thing in objects.objects)
+        assert [cloud.width for cloud in clouds] == [counts[1], counts[3]]
 
 
 def test_deactivate_waits_for_a_request_at_work(here: NodeHere, robot: Robot) -> None:
