@@ -162,7 +162,9 @@ class Hears:
     def verdict(self, clock_problem: str = "") -> tuple[bytes, str]:
         scene = type("Scene", (list,), {"path": "scene.ply"})()
         session = SimpleNamespace(learnt=None, scene=scene, class_names={}, has_codes=False, num_fused=0, num_views=0)
-        workspace: Any = SimpleNamespace(active=True, has_scene=True, last_job="none", session=session)
+        workspace: Any = SimpleNamespace(
+            active=True, has_scene=True, last_job="none", session=session, changes=Counter()
+        )
         (status,) = diagnostics.diagnostic_array("gsseg", workspace, self.inputs, Time().to_msg(), clock_problem).status
         diagnostics.complain(self._complaints, self.inputs, clock_problem)
         return status.level, status.message

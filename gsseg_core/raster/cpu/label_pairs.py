@@ -113,6 +113,20 @@ def renumber(numbers: np.ndarray, before: np.ndarray) -> None:
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
+def put_in_order(
+    order: np.ndarray, first: np.ndarray, start: np.ndarray,  # (M,); (M,), (M + 1,) where pairs begin, before and after
+    labels: np.ndarray, votes: np.ndarray,  # (P,)
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Put the pairs of the Gaussians into another order: their numbers before, int32, their labels and their votes."""
+    numbers, new_labels, new_votes = np.empty(len(labels), np.int32), np.empty_like(labels), np.empty_like(votes)
+    for m in nb.prange(len(order)):
+        before = first[order[m]] - start[m]
+        for s in range(start[m], start[m + 1]):
+            numbers[s], new_labels[s], new_votes[s] = before + s, labels[before + s], votes[before + s]
+    return numbers, new_labels, new_votes
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
 def take(table: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """Copy some rows (M',) of a table (M, K); several times as fast as numpy."""
     out = np.empty((chosen.shape[0], table.shape[1]), table.dtype)

@@ -145,10 +145,9 @@ class TileObservation(Observation):
         self._nearest_first: np.ndarray = ids[seen]
         order, first = _ascending(self._nearest_first), starts(counts)
         self.ids, self.start = self._nearest_first[order], starts(counts[order])
-        pairs = np.repeat(first[order] - self.start[:-1], counts[order]) + np.arange(self.start[-1])
-        self._number = pairs.astype(np.int32)  # of each pair, in `_pair`
-        self.labels = _joined(labels, capacity, found[:, 1])[pairs]
-        self._votes: np.ndarray = _joined(votes, capacity, found[:, 1])[pairs]
+        labels, votes = _joined(labels, capacity, found[:, 1]), _joined(votes, capacity, found[:, 1])
+        # Of each pair its number in `_pair`.
+        self._number, self.labels, self._votes = label_pairs.put_in_order(order, first, self.start, labels, votes)
         table, none = label_pairs.take(tiles.table, seen), np.empty(0, np.int64)
         self._tiles = tiles._replace(
             table=table, start=start, entries=entries, gaussian_start=none, gaussian_entries=none.astype(np.int32)
