@@ -228,6 +228,8 @@ class Inputs:
             camera.set_back(stamp)
         if self.tf is not None:  # It may hold what the pairings, without a mask, have not asked for.
             self.tf.clear()
+        if forgotten := sum(detections.clear() for detections in self.detections):
+            self._count_rejected("time_jump", forgotten)
         self._hand_over()
 
     def _expire(self) -> None:
@@ -260,7 +262,8 @@ class Inputs:
 
     def _forget_waiting(self) -> None:
         """Drop the masks that wait; the session knows those on their way to it by their era."""
-        waiting = sum(camera.pairing.clear() for camera in self.cameras.values())
+        waiting = sum(detections.clear() for detections in self.detections)  # First: others may still become pairs.
+        waiting += sum(camera.pairing.clear() for camera in self.cameras.values())
         self._count_rejected(SCENE_CHANGED, waiting + self.worker.clear())
 
     def _count_rejected(self, reason: str, count: int = 1) -> None:

@@ -206,3 +206,38 @@ def test_what_stays_alone_is_lost_after_thirty_more(monkeypatch: pytest.MonkeyPa
         joined.input.add(TOPIC, joined.stamped(100 + second))
     assert [reason for reason, _ in joined.lost] == ["no_detections", "no_mask"]
     assert joined.lost[0][1].startswith("/mask: no detections with its stamp came on /some/topic; expected")
+
+
+def waiting(monkeypatch: pytest.MonkeyPatch) -> Joined:
+    joined = Joined(Graph("vision_msgs/msg/Detection2DArray"), monkeypatch)
+    joined.input.look()
+    joined.input.add_mask("/mask", joined.stamped(1))
+    joined.input.add(TOPIC, joined.stamped(2))
+    return joined
+
+
+def test_what_waited_for_its_other_part_and_was_forgotten_is_not_joined(monkeypatch: pytest.MonkeyPatch) -> None:
+    joined = waiting(monkeypatch)
+    assert (joined.input.clear(), joined.input.clear()) == (2, 0)
+    joined.input.add(TOPIC, joined.stamped(1))
+    joined.input.add_mask("/mask", joined.stamped(2))
+    assert not joined.forwarded and not joined.lost
+
+
+@pytest.mark.parametrize(
+    ("event", "reason"), [(("_set_back", 0), "time_jump"), (("_forget_waiting",), "scene_changed")]
+)
+def test_it_is_forgotten_when_time_goes_back_or_the_scene_is_another(
+    event: tuple[Any, ...], reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
+    from gsseg_ros.node.inputs import Inputs
+
+    joined, counted = waiting(monkeypatch), []
+    inputs = Fields(
+        cameras={}, tf=None, detections=[joined.input], worker=Fields(clear=lambda: 0), _hand_over=lambda: None,
+        _count_rejected=lambda *told: counted.append(told),
+    )  # fmt: skip
+    name, *stamp = event
+    getattr(Inputs, name)(inputs, *stamp)
+    assert (counted, joined.input.clear()) == ([(reason, 2)], 0)

@@ -53,6 +53,14 @@ class DetectionsInput:
         self._messages: dict[int, Any] = {}
         self._masks: dict[int, tuple[str, Any]] = {}
 
+    def clear(self) -> int:
+        """Forget the masks, and the detections, that wait for each other; return how many they were."""
+        with self._lock:
+            forgotten = len(self._messages) + len(self._masks)
+            self._messages.clear()
+            self._masks.clear()
+            return forgotten
+
     def look(self) -> str:
         """Subscribe once somebody publishes a type that is known; returns what stands in the way, or nothing."""
         with self._lock:
@@ -88,13 +96,15 @@ class DetectionsInput:
         if not self.adapter.takes_mask:
             self._forward(topic, Detected(message.header, self.adapter, message))
             return
-        self._messages[stamp_ns(message.header.stamp)] = message
-        self._join(stamp_ns(message.header.stamp))
+        with self._lock:
+            self._messages[stamp_ns(message.header.stamp)] = message
+            self._join(stamp_ns(message.header.stamp))
 
     def add_mask(self, topic: str, message: Any) -> None:
         """Take in a mask that belongs to detections of its stamp."""
-        self._masks[stamp_ns(message.header.stamp)] = (topic, message)
-        self._join(stamp_ns(message.header.stamp))
+        with self._lock:
+            self._masks[stamp_ns(message.header.stamp)] = (topic, message)
+            self._join(stamp_ns(message.header.stamp))
 
     def _join(self, stamp: int) -> None:
         if self.adapter is not None and stamp in self._messages and stamp in self._masks:
