@@ -15,8 +15,8 @@ from gsseg_core.data.view import View
 from gsseg_core.learn.learner_state import Learnt, State
 from gsseg_core.learn.merged_states import Saved, merge_states
 from gsseg_core.live.living_votes import LivingVotes
-from gsseg_core.live.matching_scenes import match_scenes
-from gsseg_core.live.scene_change import SceneChange
+from gsseg_core.live.matching_scenes import Matching, match_scenes
+from gsseg_core.live.scene_change import SceneChange, carried
 from gsseg_core.live.session import LiveSession
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -67,6 +67,7 @@ class LivingSession(LiveSession):
     def __init__(self, scene: GaussianScene | LivingScene, *args: Any, **kwargs: Any) -> None:
         self._living = scene if isinstance(scene, LivingScene) else LivingScene.of(scene)
         self._first = self._living
+        # Of the scenes that are still in use: where in them the Gaussians of now were.
         self._past: WeakKeyDictionary[GaussianScene, np.ndarray] = WeakKeyDictionary()
         super().__init__(self._living.scene, *args, **kwargs)
 
@@ -127,9 +128,12 @@ class LivingSession(LiveSession):
             The tolerance is no distance.
         """
         with self._lock:
-            matching = match_scenes(self._living, scene, tolerance)
+            before = self._living
+            matching = match_scenes(before, scene, tolerance)
             joining = dict.fromkeys(self._live.views)
-            changed = self._go_over(self._living.flat(), matching.after, matching.origin, joining)
+            changed = self._go_over(before.flat(), matching.after, matching.origin, joining)
+            if before.scene.ids is None:
+                self._first = _renumbered(self._first, before, matching)
             return replace(changed, revision=None, matched_by=matching.by)
 
     def _go_over(
@@ -142,13 +146,15 @@ class LivingSession(LiveSession):
             self._first = without_colours(self._living)
         if self._learnt is not None:
             self._learnt = replace(self._learnt, codes=change.carry(self._learnt.codes))
-        self._past[self.scene] = before.ids
+        self._past[self.scene] = np.arange(len(before))
+        for scene, places in self._past.items():
+            self._past[scene] = np.where(origin >= 0, places[origin], -1)
         self._living = after
         self.scene = after.scene
         self._version += 1
-        carried = int((origin >= 0).sum())
+        num_carried = int((origin >= 0).sum())
         return Changed(
-            after.revision, carried, len(before) - carried, len(after) - carried, "id",
+            after.revision, num_carried, len(before) - num_carried, len(after) - num_carried, "id",
             len(self._live.views) - lifted, lifted,
         )  # fmt: skip
 
@@ -178,7 +184,7 @@ class LivingSession(LiveSession):
         """
         with self._lock:
             digest, now = self.scene.digest, self._live.state()
-            now = replace(now, num_fused=self.num_fused, class_names=self.class_names, living=None)
+            now = replace(now, num_fused=self.num_fused, class_names=self._names, living=None)
             saved = [Saved("what is known here", digest, now)]
             for path in paths:
                 state = self._read_state(Path(path), within)
@@ -202,12 +208,7 @@ class LivingSession(LiveSession):
     def _carried(self, learnt: Learnt, scene: GaussianScene) -> Learnt:
         if scene is self.scene:
             return learnt
-        ids = self._past[scene]
-        known = np.isin(self._living.ids, ids)
-        order = np.argsort(ids)
-        codes = np.zeros((len(self.scene), learnt.codes.shape[1]), np.float32)
-        codes[known] = learnt.codes[order[np.searchsorted(ids, self._living.ids[known], sorter=order)]]
-        return replace(learnt, codes=codes)
+        return replace(learnt, codes=carried(learnt.codes, self._past[scene]))
 
     def _read_state(self, path: Path, within: Path | None) -> State:
         state = State.load(path, self.scene.digest, len(self.scene), within, self._first)
@@ -221,3 +222,13 @@ class LivingSession(LiveSession):
         votes.change(change, {view.name: None for view in state.views if view.group not in groups})
         learnt = state.learnt and replace(state.learnt, codes=change.carry(state.learnt.codes))
         return replace(votes.state(), num_fused=state.num_fused, class_names=state.class_names, learnt=learnt)
+
+
+def _renumbered(first: LivingScene, before: LivingScene, matching: Matching) -> LivingScene:
+    """Give the Gaussians of the first scene the numbers of those that they are now: a state of it holds no ids."""
+    now, found = np.full(len(before), -1), matching.origin >= 0
+    now[matching.origin[found]] = matching.after.ids[found]
+    places = before.places(first.ids)
+    ids = np.where(places >= 0, now[places], -1)
+    # Below 0 is no id that a Gaussian could ever have.
+    return replace(first, ids=np.where(ids >= 0, ids, -1 - np.arange(len(first))))

@@ -61,10 +61,7 @@ class SceneChange:
 
     def carry(self, rows: np.ndarray) -> np.ndarray:  # (N, ...)
         """Take what Gaussians had before along to where they are, (N', ...); zeros for those that were not there."""
-        out = np.zeros((len(self.origin), *rows.shape[1:]), rows.dtype)
-        carried = self.origin >= 0
-        out[carried] = rows[self.origin[carried]]
-        return out
+        return carried(rows, self.origin)
 
     def _changed(self, group: int | None) -> tuple[np.ndarray, np.ndarray]:
         """Places of the Gaussians that changed in the frame of a group, before (M,) and after (M',)."""
@@ -85,6 +82,14 @@ class SceneChange:
             and is_same_relation(relation(before.frame(group), frame), relation(after.frame(group), after.frame(other)))
             for other, frame in before.frames.items()
         }
+
+
+def carried(rows: np.ndarray, origin: np.ndarray) -> np.ndarray:  # (N, ...), (N',)
+    """Take rows of Gaussians along to where they are, (N', ...); zeros where the origin is -1."""
+    out = np.zeros((len(origin), *rows.shape[1:]), rows.dtype)
+    found = origin >= 0
+    out[found] = rows[origin[found]]
+    return out
 
 
 def _are_alike(before: LivingScene, after: LivingScene, origin: np.ndarray) -> np.ndarray:

@@ -160,7 +160,8 @@ class LivingScene:
         if self.revision is not None and delta.revision != self.revision + 1:
             raise SceneDeltaError(
                 f"scene delta: its revision is {delta.revision}; expected {self.revision + 1}, as the scene is at "
-                f"{self.revision}: one came twice, too early, or was lost"
+                f"{self.revision}: one came twice, too early, or was lost. After one that was lost, load the scene as "
+                "it is now and keep the votes (replace_scene, or ~/load_scene with keep_votes); any revision may follow"
             )
         return delta.revision
 

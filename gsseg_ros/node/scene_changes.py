@@ -88,6 +88,7 @@ class SceneChanges:
             raise InvalidRequestError("paths are empty; expected at least one state")
         session, paths = workspace.living_session, [workspace.existing(path) for path in request.paths]
         with workspace.slot.take("merge_states"), workspace.run("merge_states"):
+            self._require_current(session)
             response.num_merged = session.merge(paths, workspace.root)
         response.num_views, response.class_names = session.num_fused, list(session.class_names.values())
 
@@ -96,8 +97,14 @@ class SceneChanges:
             changed = session.update(_with_names(delta, session))
         except (SceneDeltaError, EmptySceneError) as error:
             raise InvalidRequestError(str(error)) from error
+        self._require_current(session)
         self.workspace.count(changed)
         return changed
+
+    def _require_current(self, session: LivingSession) -> None:
+        """Raise `InvalidRequestError` where another scene was loaded while a file was read."""
+        if not self.workspace.has_scene or self.workspace.session is not session:
+            raise InvalidRequestError("another scene was loaded meanwhile, and is unchanged; expected one that stays")
 
 
 def _with_names(delta: SceneDelta, session: LivingSession) -> SceneDelta:

@@ -12,9 +12,17 @@ from small_scenes import NAMES, balls_on_a_table, clean_views, true_labels
 
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.data.view import View
-from gsseg_core.errors import EmptySceneError, GssegError, SceneDeltaError, SettingsError, StateMismatchError
+from gsseg_core.errors import (
+    EmptySceneError,
+    GssegError,
+    SceneDeltaError,
+    SettingsError,
+    StateFileError,
+    StateMismatchError,
+)
 from gsseg_core.live.living_session import LivingSession
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.living_scene import LivingScene
 from gsseg_core.scene.scene_delta import GroupMove, SceneDelta
 from gsseg_core.scene.similarity import Similarity
 from gsseg_core.segmentation import Segmentation
@@ -147,6 +155,21 @@ def test_what_was_learnt_goes_along_with_its_gaussians_also_while_it_is_learnt()
     assert len(growing.segmentation().labels) == len(growing.scene)
 
 
+def test_a_gaussian_that_takes_the_id_of_a_removed_one_while_it_is_learnt_gets_nothing_of_that() -> None:
+    growing, again = session(), other_room((0, 0, 9))
+    growing.learn("votes")
+    seen = int(growing.learnt.codes.any(axis=1).argmax())
+    one = SCENE.subset(np.array([seen]))
+
+    def take_the_place(*_: object) -> None:
+        if growing.living.revision is None:
+            growing.update(SceneDelta(removed=np.array([seen])))
+            growing.update(replace(again, added=one, added_ids=np.array([seen]), added_groups=np.zeros(1, np.int64)))
+
+    codes = growing.learn("votes", report=take_the_place).learnt.codes
+    assert growing.living.ids[-1] == seen and not codes[-1].any() and codes[:-1].any()
+
+
 def test_votes_of_views_that_are_not_kept_any_more_go_along_with_their_gaussians() -> None:
     short = LivingSession(SCENE, NAMES, max_views=1)
     for view in VIEWS:
@@ -255,6 +278,44 @@ def test_a_file_in_another_order_takes_the_votes_to_their_gaussians() -> None:
     changed = shuffled.replace_scene(SCENE.subset(order))
     assert changed.num_carried == len(SCENE)
     np.testing.assert_array_equal(votes(shuffled), before[order])
+
+
+@pytest.mark.parametrize("with_ids", [False, True])
+def test_a_state_saved_before_a_file_in_another_order_loads_after_it_to_its_gaussians(
+    tmp_path: Path, with_ids: bool
+) -> None:
+    shuffled = LivingSession(SCENE, NAMES, max_views=1)
+    for view in VIEWS:
+        shuffled.fuse(view)
+    shuffled.learn("votes")
+    forgotten, learnt = votes(shuffled) - as_refused(shuffled), shuffled.learnt.codes
+    shuffled.save(tmp_path / "state.npz")
+    rng, origin, file = np.random.default_rng(0), np.arange(len(SCENE)), SCENE
+    for ids in (None, rng.permutation(len(SCENE) - 50) if with_ids else None):
+        order = rng.permutation(len(file))[: len(SCENE) - 50]
+        origin, file = origin[order], file.subset(order)
+        file = file if ids is None else LivingScene.numbered(file, ids).scene
+        shuffled.replace_scene(file)
+    shuffled.load(tmp_path / "state.npz")
+    np.testing.assert_array_equal(votes(shuffled) - as_refused(shuffled), forgotten[origin])
+    np.testing.assert_array_equal(shuffled.learnt.codes, learnt[origin])
+    assert forgotten.any() and learnt.any()
+
+
+def test_a_class_that_is_announced_and_not_yet_seen_is_not_given_to_another_robots_class(tmp_path: Path) -> None:
+    other = LivingSession(SCENE)
+    other.number_classes({2: "sofa"})
+    for view in VIEWS:
+        other.fuse(view)
+    other.save(tmp_path / "other.npz")
+    here = LivingSession(SCENE)
+    here.number_classes({2: "table"})
+    with pytest.raises(StateFileError, match="calls class 2 'sofa'; expected 'table'"):
+        here.merge([tmp_path / "other.npz"])
+    here = LivingSession(SCENE)
+    ids = here.number_classes({40: "lamp"})
+    here.merge([tmp_path / "other.npz"])
+    assert here.number_classes({40: "lamp", 1: "sofa"}) == {**ids, 1: 2}
 
 
 def test_a_group_that_is_moved_back_is_where_it_was_for_new_views() -> None:
