@@ -259,7 +259,9 @@ class Services:
 
         def place() -> None:
             if wanted:
-                self.node.set_parameters_atomically(wanted)
+                result = self.node.set_parameters_atomically(wanted)
+                if not result.successful:
+                    raise InvalidRequestError(f"the place of the scene was refused: {result.reason}")
 
         with workspace.slot.take("load_scene") as job, workspace.run("load_scene") as run:
 
