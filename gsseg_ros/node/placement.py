@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Protocol
 
+from gsseg_core.errors import GssegError
 from gsseg_core.scene.camera import Camera
 from gsseg_ros.frames import Similarity
 
@@ -36,6 +37,8 @@ class Placement:
         Of the session.
     settled : callable
         Called in that thread when all views have followed.
+    refused : callable
+        Gets what was wrong with a view that cannot follow; it stays where it is until the next change.
 
     Attributes
     ----------
@@ -43,10 +46,16 @@ class Placement:
         Held from where a view's pose is brought into the scene until it is fused, and while the scene is moved.
     """
 
-    def __init__(self, owner: Placed, settled: Callable[[], None] = lambda: None) -> None:
-        self.fusing, self.settled = threading.RLock(), settled
+    def __init__(
+        self,
+        owner: Placed,
+        settled: Callable[[], None] = lambda: None,
+        refused: Callable[[str], None] = lambda message: None,
+    ) -> None:
+        self.fusing, self.settled, self.refused = threading.RLock(), settled, refused
         self._owner = owner
         self._moved_from: dict[str, tuple[Similarity, Similarity]] = {}  # By view, to where it has to follow.
+        self._left: dict[str, Similarity] = {}  # By view that could not follow: where the scene was for it.
         self._running = False
 
     def change(self, before: Similarity, after: Similarity, take_over: Callable[[], None]) -> None:
@@ -54,27 +63,40 @@ class Placement:
         with self.fusing:
             take_over()
             names = self._owner.session.view_names if self._owner.has_scene else []
-            self._moved_from = {name: (self._moved_from.get(name, (before,))[0], after) for name in names}
+            at = self._left | {name: moved[0] for name, moved in self._moved_from.items()}
+            self._moved_from, self._left = {name: (at.get(name, before), after) for name in names}, {}
             if not self._running:
                 self._running = True
                 threading.Thread(target=self._follow, name="placement", daemon=True).start()
 
     def forget(self) -> None:
         """Leave all views where they are, before they are replaced."""
-        self._moved_from = {}  # Without the lock: whoever replaces them must not wait for one that is being fused.
+        # Without the lock: whoever replaces them must not wait for one that is being fused.
+        self._moved_from, self._left = {}, {}
 
     def _follow(self) -> None:
-        while True:
-            with self.fusing:
-                moved_from = self._moved_from
-                if not moved_from or not self._owner.has_scene:
-                    self._running = False
-                    break
-                session = self._owner.session
-                name, (before, after) = next(iter(moved_from.items()))
-                if session.move_view(name, partial(_moved, before=before, after=after), session.era):
-                    del moved_from[name]
+        while self._next_follows():
+            pass
         self.settled()
+
+    def _next_follows(self) -> bool:
+        """Have one view follow; returns whether there was one."""
+        with self.fusing:
+            self._running, moved_from = False, self._moved_from  # Whatever is raised here, others may follow later.
+            if not moved_from or not self._owner.has_scene:
+                return False
+            session = self._owner.session
+            name, (before, after) = next(iter(moved_from.items()))
+            try:
+                done = session.move_view(name, partial(_moved, before=before, after=after), session.era)
+            except GssegError as error:
+                self._left[name] = before
+                self.refused(f"a view cannot follow the scene and stays where it was: {error}")
+                done = True
+            if done:
+                del moved_from[name]
+            self._running = True
+            return True
 
 
 def _moved(camera: Camera, before: Similarity, after: Similarity) -> Camera:

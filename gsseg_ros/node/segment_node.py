@@ -78,6 +78,7 @@ class SegmentNode(LifecycleNode):
         self._scene_frame: SceneFrame | None = None
         self._out_of_place = False  # Whether what is latched is from where the scene lay before.
         self.workspace.placement.settled = self._publish_again
+        self.workspace.placement.refused = self.get_logger().warning
         self._requests = Services(self, self.workspace, self._require_outputs, self._lookup)
         self._changes = SceneChanges(self._requests, lambda message: self._complaints.add(SCENE_DELTA, message))
         self._learn = LearnAction(self, self.workspace, self._require_outputs)

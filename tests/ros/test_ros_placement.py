@@ -17,6 +17,7 @@ from ros_robot import CLASSES, IDENTITY, LATCHED, core_session, messages
 from small_scenes import balls_on_a_table, clean_views
 
 from gsseg_core.data.view import View
+from gsseg_core.errors import UnknownLabelError
 from gsseg_core.live.living_session import LivingSession
 from gsseg_core.live.per_view_session import PerViewSession
 from gsseg_core.refine.settings import UNREFINED
@@ -27,6 +28,7 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, Quaternion
 from gsseg_msgs.msg import ObjectArray, SegmentationReport
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 
@@ -118,6 +120,28 @@ def test_objects_of_ids_per_view_follow_too() -> None:
     np.testing.assert_allclose(kept, [view.camera.world_to_camera for view in placed_views(views, ASIDE)])
 
 
+def test_a_view_that_cannot_follow_is_named_and_follows_the_next_change(monkeypatch: pytest.MonkeyPatch) -> None:
+    views = clean_views(3)
+    session, move, told = living_session(views), LivingSession.move_view, []
+
+    def move_view(self: LivingSession, name: str, *args: Any) -> bool:
+        if name == views[0].name and not told:
+            raise UnknownLabelError(f"view '{name}': too many objects")
+        return move(self, name, *args)
+
+    monkeypatch.setattr(LivingSession, "move_view", move_view)
+    placement, settled = placement_of(session)
+    placement.refused = told.append
+    for before, after in ((IDENTITY, FAR), (FAR, ASIDE)):
+        settled.clear()
+        placement.change(before, after, lambda: None)
+        wait_until(lambda: settled, "the views to follow")
+    name = views[0].name
+    assert told == [f"a view cannot follow the scene and stays where it was: view '{name}': too many objects"]
+    kept = [view.camera.world_to_camera for view in session.views]
+    np.testing.assert_allclose(kept, [view.camera.world_to_camera for view in placed_views(views, ASIDE)], atol=1e-6)
+
+
 def parameters_of(similarity: Similarity, z: float) -> list[Parameter]:
     return [
         Parameter("scene_to_map.translation", value=similarity.translation.tolist()),
@@ -146,7 +170,7 @@ def test_while_active_views_follow_and_all_that_is_latched_comes_anew(
         assert not result.successful and "scene_to_map.rotation is all zeros" in result.reason
 
         def anew() -> bool:
-            if not heard["cloud"] or heard["report"][-1].revision <= first.revision:
+            if not (heard["cloud"] and heard["report"]) or heard["report"][-1].revision <= first.revision:
                 return False
             now = here.done("segment", skip_refinement=True, publish_nothing=True).cloud
             return heard["cloud"][-1].data == now.data
@@ -164,7 +188,9 @@ def test_while_active_views_follow_and_all_that_is_latched_comes_anew(
             shared.node.destroy_subscription(subscription)
 
 
-def test_a_scene_is_loaded_to_a_place_of_its_own(shared: Ros, parameters: dict[str, Any], scene: GaussianScene) -> None:
+def test_a_scene_is_loaded_to_a_place_of_its_own(
+    shared: Ros, parameters: dict[str, Any], scene: GaussianScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     views = clean_views(2)
     with node_here(shared, parameters) as here:
         pose = Pose(position=Point(x=4.0, y=-1.0, z=0.5), orientation=Quaternion(x=0.0, y=0.0, z=0.6, w=0.8))
@@ -177,8 +203,14 @@ def test_a_scene_is_loaded_to_a_place_of_its_own(shared: Ros, parameters: dict[s
             refused = here.ask("load_scene", **spoil)
             assert refused.error_code == refused.INVALID_REQUEST
             assert why.replace("\\", "") in refused.error_msg
+        asked = {"scene_to_map": pose, "scene_to_map_scale": 2.5}
+        with monkeypatch.context() as patch:
+            refusal = SetParametersResult(successful=False, reason="not now")
+            patch.setattr(here.node, "set_parameters_atomically", lambda wanted: refusal)
+            refused = here.ask("load_scene", **asked)
+        assert refused.error_code == refused.INVALID_REQUEST and refused.error_msg.endswith("was refused: not now")
         similarity = Similarity.from_parameters(2.5, [4.0, -1.0, 0.5], [0.0, 0.0, 0.6, 0.8])
-        response = here.done("load_scene", scene_to_map=pose, scene_to_map_scale=2.5)
+        response = here.done("load_scene", **asked)
         corner = similarity.points_to_map(scene.means).max(axis=0)
         np.testing.assert_allclose([response.box_max.x, response.box_max.y, response.box_max.z], corner, atol=1e-4)
         assert here.node.get_parameter("scene_to_map.scale").value == 2.5
