@@ -60,8 +60,16 @@ class PerViewSession(LiveSession):
         """Have a view seen from another camera, as a `LivingSession` does; its ids are matched to the objects anew."""
         with self._lock:
             if era is self._era and name in self._live.views:
-                view = self._table.views[name]
-                self._fuse(replace(view, camera=moved(view.camera)))
+                kept, order = self._live.views[name], list(self._live.views)
+                view = self._table.views.get(name, kept)
+                after = replace(view, camera=moved(view.camera))
+                if self._table.sees_any(after):
+                    self._fuse(after)
+                else:
+                    self._table.set_aside(after)
+                    self._live.move(name, after.camera)
+                    self._version += 1
+                self._live.views = {name: self._live.views[name] for name in order}
             return era is self._era
 
     def repair(self) -> Repair:
@@ -75,8 +83,8 @@ class PerViewSession(LiveSession):
             There would be more objects than `max_classes`. Nothing has changed.
         """
         with self._lock:
-            undo = self._table.checkpoint()
-            repair, order = self._table.solve(), list(self._live.views)
+            undo, every = self._table.checkpoint(), list(self._live.views)
+            repair, order = self._table.solve(), [name for name in self._live.views if self._table.sees(name)]
             moved = (repair.successors != np.arange(len(repair.successors))).any()
             forgotten = self.num_fused > len(order)
             names = order if moved and forgotten else [name for name in order if name in set(repair.changed)]
@@ -95,7 +103,7 @@ class PerViewSession(LiveSession):
             for view in views.values():
                 self._live.observe(view)
             # The oldest view still is the first one to go.
-            self._live.views = {name: self._live.views[name] for name in order if name in self._live.views}
+            self._live.views = {name: self._live.views[name] for name in every if name in self._live.views}
             if self._learnt is not None and moved:
                 self._learnt = replace(self._learnt, codes=_renumber(self._learnt.codes, repair.successors))
             self._version += 1

@@ -152,13 +152,29 @@ class ObjectTable:
 
     def remove(self, name: str) -> None:
         """Take a view back, with all its evidence."""
-        del self.views[name], self._lifted[name]
+        del self.views[name]
+        self._lifted.pop(name, None)
         if self._objects.pop(name, None) is not None:
             self._fill()
 
+    def sees(self, name: str) -> bool:
+        """Tell whether a view counts: it was not set aside."""
+        return name in self._lifted
+
+    def sees_any(self, view: View) -> bool:
+        """Tell whether a view has a mask and sees any Gaussian."""
+        return self._lift(view) is not None
+
+    def set_aside(self, view: View) -> None:
+        """Keep a view that sees nothing for now; what was known from it is taken back."""
+        if view.name in self.views:
+            self.remove(view.name)
+        self.views[view.name] = view
+
     def forget(self, name: str) -> None:
         """Drop a view; its evidence still counts for `match`, but no longer for `solve`."""
-        self._forgotten.add(self._lifted.pop(name), self._objects.pop(name))
+        if name in self._lifted:
+            self._forgotten.add(self._lifted.pop(name), self._objects.pop(name))
         del self.views[name]
 
     def solve(self, progress: Progress = silent) -> Repair:

@@ -142,6 +142,23 @@ def test_a_view_that_cannot_follow_is_named_and_follows_the_next_change(monkeypa
     np.testing.assert_allclose(kept, [view.camera.world_to_camera for view in placed_views(views, ASIDE)], atol=1e-6)
 
 
+def test_objects_that_nothing_is_seen_of_for_now_lose_their_votes_and_get_them_back() -> None:
+    session = PerViewSession(SCENE)
+    for view in clean_views(3):
+        assert session.fuse(view) is None
+    before, order = session.codes(), session.view_names
+    placement, settled = placement_of(session)  # type: ignore[arg-type]
+    placement.change(IDENTITY, FAR, lambda: None)
+    wait_until(lambda: settled, "the views to follow")
+    session.repair()
+    assert not session.codes().any() and session.view_names == order
+    settled.clear()
+    placement.change(FAR, IDENTITY, lambda: None)
+    wait_until(lambda: settled, "the views to come back")
+    assert session.view_names == order and session.num_fused == 3
+    np.testing.assert_allclose(session.codes().any(axis=1), before.any(axis=1))
+
+
 def parameters_of(similarity: Similarity, z: float) -> list[Parameter]:
     return [
         Parameter("scene_to_map.translation", value=similarity.translation.tolist()),
