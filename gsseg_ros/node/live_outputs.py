@@ -89,6 +89,10 @@ class LiveOutputs:
         if time.monotonic() - self._last_image.get(paired.stream, -np.inf) > IMAGE_SILENCE:
             self._show(paired, camera)
 
+    def changed(self) -> None:
+        """Take note that the scene or its votes have changed, so that objects are due as after a view."""
+        self._news = self._outputs.objects_count
+
     def image(self, paired: Paired) -> None:
         """Take in a camera image with its pose, in the place of the mask."""
         self._last_image[paired.stream] = time.monotonic()

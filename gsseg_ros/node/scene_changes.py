@@ -34,11 +34,13 @@ class SceneChanges:
         Those of the node: requests here take turns with theirs.
     complain : callable
         Told in one line what is wrong with a message of the topic.
+    show : callable
+        Called after each change: has objects published as after a view, while clouds wait for the next run.
     """
 
-    def __init__(self, services: Services, complain: Callable[[str], None]) -> None:
+    def __init__(self, services: Services, complain: Callable[[str], None], show: Callable[[], None]) -> None:
         self.node, self.workspace, self.turns = services.node, services.workspace, services.turns
-        self._services, self._complain = services, complain
+        self._services, self._complain, self._show = services, complain, show
         group = ReentrantCallbackGroup()
         for interface, name, handler in (
             (UpdateScene, "update_scene", self.update_scene),
@@ -90,6 +92,7 @@ class SceneChanges:
         with workspace.slot.take("merge_states"), workspace.run("merge_states"):
             self._require_current(session)
             response.num_merged = session.merge(paths, workspace.root)
+            self._show()
         response.num_views, response.class_names = session.num_fused, list(session.class_names.values())
 
     def _update(self, session: LivingSession, delta: SceneDelta) -> Changed:
@@ -99,6 +102,7 @@ class SceneChanges:
             raise InvalidRequestError(str(error)) from error
         self._require_current(session)
         self.workspace.count(changed)
+        self._show()
         return changed
 
     def _require_current(self, session: LivingSession) -> None:

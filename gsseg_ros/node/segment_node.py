@@ -22,6 +22,7 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
 from gsseg_core.freed_memory import keep_freed_memory
+from gsseg_core.live.living_session import LivingSession
 from gsseg_core.warm_up import warm_up
 from gsseg_ros.node import diagnostics, parameters
 from gsseg_ros.node.complaints import SCENE_DELTA, Complaints
@@ -80,7 +81,9 @@ class SegmentNode(LifecycleNode):
         self.workspace.placement.settled = self._publish_again
         self.workspace.placement.refused = self.get_logger().warning
         self._requests = Services(self, self.workspace, self._require_outputs, self._lookup)
-        self._changes = SceneChanges(self._requests, lambda message: self._complaints.add(SCENE_DELTA, message))
+        self._changes = SceneChanges(
+            self._requests, lambda message: self._complaints.add(SCENE_DELTA, message), self._show_change
+        )
         self._learn = LearnAction(self, self.workspace, self._require_outputs)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._complaints = Complaints(self.get_logger().warning)
@@ -264,12 +267,19 @@ class SegmentNode(LifecycleNode):
         session = self.workspace.session if self.workspace.has_scene else None
         if session is None or not session.has_codes:
             return
+        following = session.num_views
+        if isinstance(session, LivingSession):
+            following = sum(view.group is None for view in session.views)  # Others move with their group.
         left = session.num_fused - session.num_views
         notes = ["; ~/learn learns from where views are now"] * (session.learnt is not None)
         notes += [f"; votes of {left} that are not kept any more stay as they were"] * (left > 0)
-        self.get_logger().info(f"the scene was moved, and {session.num_views} views have followed{''.join(notes)}")
+        self.get_logger().info(f"the scene was moved, and {following} views have followed{''.join(notes)}")
         if not self._requests.publish_again():
             self.inputs.live.show_objects()
+
+    def _show_change(self) -> None:
+        if (inputs := self.inputs) is not None:
+            inputs.live.changed()
 
     def _tell(self) -> None:
         inputs, clock_problem = self.inputs, self._sim_time.problem()

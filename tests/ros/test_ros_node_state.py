@@ -12,19 +12,23 @@ import pytest
 from ros_checks import counts, latched_clouds, limited
 from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros
-from ros_robot import CLASSES, SERVICES, Robot, assert_same, core_session, viewpoint
+from ros_robot import CLASSES, RELIABLE, SERVICES, Robot, assert_same, core_session, viewpoint
 from small_scenes import clean_views, ring
 
 from gsseg_core.cli import main as cli
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.scene_delta import SceneDelta
 from gsseg_core.segmentation import Segmentation
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from action_msgs.msg import GoalStatus
+from gsseg_msgs.msg import SceneDelta as SceneDeltaMessage
 from gsseg_msgs.msg import SegmentationReport
+
+from gsseg_ros.delta_messages import message_from_delta
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +52,26 @@ def assert_untouched(robot: Robot, before: SegmentationReport, folder: Path) -> 
     after = robot.done("segment").report
     assert counts(after) == counts(before)
     assert (after.scene_hash, after.learner, after.num_views) == (before.scene_hash, before.learner, before.num_views)
+
+
+def test_the_topic_and_requests_of_another_process_change_the_scene_and_add_to_it(
+    robot: Robot, scene: GaussianScene
+) -> None:
+    node = robot.ros.node
+    changes = node.create_publisher(SceneDeltaMessage, f"{robot.namespace}/scene_delta", RELIABLE)
+    try:
+        robot.ros.wait_until(lambda: changes.get_subscription_count() > 0, "the node's subscription to changes")
+        changes.publish(message_from_delta(SceneDelta(revision=1, removed=np.arange(30))))
+        robot.ros.wait_until(
+            lambda: robot.done("segment", publish_nothing=True).report.num_gaussians == len(scene) - 30, "the change"
+        )
+    finally:
+        node.destroy_publisher(changes)
+    answer = robot.done("update_scene", delta=message_from_delta(SceneDelta(revision=2, removed=np.arange(30, 40))))
+    assert (answer.num_removed, answer.num_gaussians, answer.revision) == (10, len(scene) - 40, 2)
+    robot.done("save_state", path="grown.npz")
+    merged = robot.done("merge_states", paths=["grown.npz"])
+    assert (merged.num_merged, merged.num_views) == (6, 12)
 
 
 @pytest.mark.parametrize(

@@ -82,8 +82,12 @@ def status(here: NodeHere) -> DiagnosticStatus:
     return diagnostics.diagnostic_array("gsseg", here.node.workspace, here.inputs, Time(), "").status[0]
 
 
-def test_a_request_and_the_topic_change_the_scene_and_votes_are_those_of_the_views_in_it(here: NodeHere) -> None:
+def test_a_request_and_the_topic_change_the_scene_and_votes_are_those_of_the_views_in_it(
+    here: NodeHere, monkeypatch: pytest.MonkeyPatch
+) -> None:
     session = here.node.workspace.living_session
+    shown: list[int | None] = []
+    monkeypatch.setattr(here.node.inputs.live, "changed", lambda: shown.append(session.living.revision))
     delta = replace(COPY, removed=np.arange(30))
     answer = here.done("update_scene", delta=message_from_delta(delta))
     assert (answer.num_removed, answer.num_added, answer.num_views_lifted) == (30, len(SCENE), 4)
@@ -91,7 +95,7 @@ def test_a_request_and_the_topic_change_the_scene_and_votes_are_those_of_the_vie
     stamp = session.views[0].name.split("_")[-1]
     move = GroupMove(0, Similarity(translation=np.array([50.0, 0, 0])), (stamp, "17"))
     here.node._changes.on_scene_delta(message_from_delta(SceneDelta(revision=2, moves=(move,))))
-    assert session.living.revision == 2
+    assert session.living.revision == 2 and shown == [1, 2]
     assert [view.group for view in session.views] == [0, None, None, None]
     np.testing.assert_array_equal(votes(session), as_refused(session))
     told = {value.key: value.value for value in status(here).values}
@@ -131,6 +135,21 @@ def test_a_change_that_cannot_be_made_is_answered_in_one_line_and_changes_nothin
     answer = here.ask("update_scene", **fields)
     assert answer.error_code == 11000 + code and message in answer.error_msg and "\n" not in answer.error_msg
     np.testing.assert_array_equal(votes(session), before)
+
+
+def test_a_change_whose_scene_was_replaced_while_its_file_was_read_is_not_answered_as_made(
+    here: NodeHere, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    COPY.save(root(here) / "late.npz")
+
+    def late(*_: object) -> SceneDelta:
+        here.done("load_scene")
+        return COPY
+
+    monkeypatch.setattr(SceneDelta, "load", late)
+    answer = here.ask("update_scene", path="late.npz")
+    assert answer.error_code == 11003 and "another scene was loaded meanwhile" in answer.error_msg
+    assert len(here.node.workspace.session.scene) == len(SCENE) and not here.node.workspace.changes
 
 
 def test_a_delta_out_of_turn_is_complained_of_once_and_changes_nothing(
