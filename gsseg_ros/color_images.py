@@ -6,8 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from sensor_msgs.msg import Image
 
-from gsseg_core.errors import MaskFormatError
-from gsseg_ros.conversions import picture_from_image
+from gsseg_ros.conversions import picture_from_image, require_encoding
 
 _CHANNELS = {"rgb8": [0, 1, 2], "rgba8": [0, 1, 2], "bgr8": [2, 1, 0], "bgra8": [2, 1, 0], "mono8": [0, 0, 0]}
 """Which channels are red, green and blue."""
@@ -21,9 +20,7 @@ def color_from_image(message: Image, topic: str) -> npt.NDArray[np.uint8]:
     MaskFormatError
         Another encoding, a size of zero, or data too short.
     """
-    if message.encoding not in _CHANNELS:
-        expected = ", ".join(_CHANNELS)
-        raise MaskFormatError(f"{topic}: encoding is '{message.encoding}'; expected one of {expected}")
+    require_encoding(message, topic, _CHANNELS)
     pixels = picture_from_image(message, topic).reshape(message.height, message.width, -1)
     picture: npt.NDArray[np.uint8] = pixels[..., _CHANNELS[message.encoding]]
     return picture

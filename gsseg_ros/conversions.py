@@ -10,7 +10,7 @@ import array
 import math
 import re
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -89,9 +89,7 @@ def labels_from_image(message: Image, topic: str) -> npt.NDArray[np.int32]:
     MaskFormatError
         Another encoding, a size of zero, data too short, or a label out of range.
     """
-    if message.encoding not in MASK_ENCODINGS:
-        expected = ", ".join(MASK_ENCODINGS)
-        raise MaskFormatError(f"{topic}: encoding is '{message.encoding}'; expected labels as one of {expected}")
+    require_encoding(message, topic, MASK_ENCODINGS, "labels as ")
     kind, unknown = MASK_ENCODINGS[message.encoding]
     labels = pixels_of(message, np.dtype(kind), topic).astype(np.int32)
     labels[labels == unknown] = UNKNOWN
@@ -103,6 +101,13 @@ def labels_from_image(message: Image, topic: str) -> npt.NDArray[np.int32]:
     return labels
 
 
+def require_encoding(message: Image, topic: str, known: Collection[str], what: str = "") -> None:
+    """Refuse an image whose encoding is not among those known, with `MaskFormatError`."""
+    if message.encoding not in known:
+        expected = f"{what}one of {', '.join(known)}"
+        raise MaskFormatError(f"{topic}: encoding is '{message.encoding}'; expected {expected}")
+
+
 def picture_from_image(message: Image, topic: str) -> npt.NDArray[Any]:
     """Read a picture as it is: (H, W) or (H, W, C), uint8, or uint16 and float32 as 16UC1 and 32FC1 are.
 
@@ -111,9 +116,7 @@ def picture_from_image(message: Image, topic: str) -> npt.NDArray[Any]:
     MaskFormatError
         Another encoding, a size of zero, or data too short.
     """
-    if message.encoding not in _PICTURE_ENCODINGS:
-        expected = ", ".join(_PICTURE_ENCODINGS)
-        raise MaskFormatError(f"{topic}: encoding is '{message.encoding}'; expected one of {expected}")
+    require_encoding(message, topic, _PICTURE_ENCODINGS)
     kind, channels = _PICTURE_ENCODINGS[message.encoding]
     pixels = pixels_of(message, np.dtype(kind), topic, channels)
     return pixels.reshape(message.height, message.width, channels) if channels > 1 else pixels

@@ -18,6 +18,7 @@ import numpy as np
 from gsseg_core.data.class_names import class_name
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN, PackedLabels
+from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View, spread
 from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.learn.temperature import VIEWS, Sample, sample_pixels
@@ -90,7 +91,7 @@ class MaskChecker:
     def sample(self, view: View) -> Sample:
         """Take pixels of a view's mask with their predicted probabilities, to fit the temperature to."""
         if view.name not in self._samples:
-            self._sample(view, self.learner.predict_without(view, only_labelled=True))
+            self._sample(view, self.learner.predict_without(view, only_labelled=True), view.read_seen())
         return self._samples[view.name]
 
     def check_all(self, progress: Progress = silent) -> list[ViewCheck]:
@@ -113,19 +114,19 @@ class MaskChecker:
 
     def _check(self, view: View) -> ViewCheck:
         """Compare a view's mask with what is predicted where it says something."""
-        learner = self.learner
+        learner, seen = self.learner, view.read_seen()
         if view.name in self._sampled:  # which needs the probabilities, not the classes alone
             image = learner.predict_without(view, only_labelled=True)
-            self._sample(view, image)
+            self._sample(view, image, seen)
             predicted = Strongest.of(image).labels()
         else:
             predicted = learner.classes_without(view, only_labelled=True)
-        predicted[view.read_seen().labels < 0] = UNKNOWN
-        check = compare_mask(view, predicted, learner.num_classes)
+        predicted[seen.labels < 0] = UNKNOWN
+        check = compare_mask(view, predicted, learner.num_classes, seen)
         return replace(check, rejected=learner.rejected_share(view))
 
-    def _sample(self, view: View, image: np.ndarray) -> None:  # (H, W, K)
-        self._samples[view.name] = sample_pixels(image, view.read_labels())
+    def _sample(self, view: View, image: np.ndarray, seen: SeenLabels) -> None:  # (H, W, K)
+        self._samples[view.name] = sample_pixels(image, seen.named())
 
 
 def check_views(learner: Learner, progress: Progress = silent) -> list[ViewCheck]:
@@ -180,9 +181,14 @@ def reliability_report(checks: Iterable[ViewCheck], class_names: Mapping[int, st
     ]
 
 
-def compare_mask(view: View, predicted: np.ndarray, num_classes: int) -> ViewCheck:  # (H, W) int32
-    """Compare a view's mask with any prediction of its labels, `UNKNOWN` (-1) where there is none."""
-    seen = view.read_seen()
+def compare_mask(
+    view: View, predicted: np.ndarray, num_classes: int, seen: SeenLabels | None = None  # (H, W) int32
+) -> ViewCheck:  # fmt: skip
+    """Compare a view's mask with any prediction of its labels, `UNKNOWN` (-1) where there is none.
+
+    The mask is read, unless it is at hand.
+    """
+    seen = seen or view.read_seen()
     labels, evidence = seen.named(), seen.evidence
     # Where a partial mask names no class, it says "none of these", its last word.
     unnamed = (seen.labels >= 0) & (labels < 0) if evidence is not None and evidence.has_none_of_these else np.False_

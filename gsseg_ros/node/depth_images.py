@@ -10,7 +10,7 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, MaskFormatError
 from gsseg_core.live.session import LiveSession
 from gsseg_core.raster.depth_gating import Gated, gate_view
-from gsseg_ros.conversions import picture_from_image
+from gsseg_ros.conversions import picture_from_image, require_encoding
 from gsseg_ros.errors import DepthImageError
 from gsseg_ros.node.parameters import Settings
 from gsseg_ros.node.size_limits import require_size
@@ -67,9 +67,7 @@ def depth_from_image(message: Image, topic: str) -> npt.NDArray[np.float32]:
     MaskFormatError
         Another encoding, a size of zero, or data too short.
     """
-    if message.encoding not in _METRES:
-        expected = ", ".join(_METRES)
-        raise MaskFormatError(f"{topic}: encoding is '{message.encoding}'; expected depth as one of {expected}")
+    require_encoding(message, topic, _METRES, "depth as ")
     depth: npt.NDArray[np.float32] = picture_from_image(message, topic).astype(np.float32)
     depth *= np.float32(_METRES[message.encoding])
     return depth

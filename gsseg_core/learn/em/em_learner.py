@@ -215,7 +215,7 @@ class EMLearner(Learner):
 
         The spatial prior is left out, too, so rows sum to less where no other view has seen anything.
         """
-        codes, operator = self._codes_without(view), self._operator(view, only_labelled)
+        codes, operator = self._codes_without(view), self._blender(view, only_labelled)
         image, left_over = operator.blend_rows(codes, self.num_classes)
         if (codes.indices == 0).any():
             image[..., 0] += left_over
@@ -223,7 +223,7 @@ class EMLearner(Learner):
 
     def classes_without(self, view: View, only_labelled: bool = False) -> np.ndarray:
         """Tell the class of each pixel by `predict_without`, without an image of all classes."""
-        codes, operator = self._codes_without(view), self._operator(view, only_labelled)
+        codes, operator = self._codes_without(view), self._blender(view, only_labelled)
         return operator.strongest(codes, self.num_classes, bool((codes.indices == 0).any())).labels()
 
     def _codes_without(self, view: View) -> CSRRows:
@@ -234,11 +234,11 @@ class EMLearner(Learner):
         stepped = codes_without(observation, self.error_models_[view.name], codes, gradient, no_prior)
         return codes.with_rows(observation.ids, stepped)
 
-    def _operator(self, view: View, only_labelled: bool) -> ViewOperator:
+    def _blender(self, view: View, only_labelled: bool) -> ViewOperator:
         """Make the operator of a view, or take what its labelled pixels see from where it is kept."""
         if only_labelled:
             return self.observation(view.name).operator(view.camera, len(self.scene))
-        return make_operator(self.scene, view.camera, self.device)
+        return self._operator_of(view)
 
     def rejected_share(self, view: View) -> float:
         """Share of a view's labelled pixels that lie in rejected regions."""

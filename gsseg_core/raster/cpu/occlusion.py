@@ -9,6 +9,7 @@ from gsseg_core.raster.cpu.blending import aim_next, in_block, open_rays, stride
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.splat import OPEN, WIDTH, blend_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles, assign
+from gsseg_core.raster.depth import depths
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.simd import FAST, first_bit
@@ -21,7 +22,7 @@ def nearest_depths(scene: GaussianScene, camera: Camera) -> np.ndarray:
     """
     projected = project(scene, camera)
     tiles = assign(projected, camera.width, camera.height)
-    return _depths(scene, camera, projected.ids, tiles, tiles.start[:-1], np.diff(tiles.start) > 0)
+    return _entry_depths(scene, camera, projected.ids, tiles, tiles.start[:-1], np.diff(tiles.start) > 0)
 
 
 def ray_ends(
@@ -37,24 +38,21 @@ def ray_ends(
     projected = project(scene, camera)
     tiles = assign(projected, camera.width, camera.height)
     ends = _find_ends(tiles, np.ascontiguousarray(labels, np.int32))
-    depths = _depths(scene, camera, projected.ids, tiles, ends, ends >= 0)
-    depths[ends == _NO_LABEL] = -np.inf
-    return depths
+    found = _entry_depths(scene, camera, projected.ids, tiles, ends, ends >= 0)
+    found[ends == _NO_LABEL] = -np.inf
+    return found
 
 
 _GOES_ON, _NO_LABEL = -1, -2
 
 
-def _depths(
+def _entry_depths(
     scene: GaussianScene, camera: Camera, ids: np.ndarray, tiles: Tiles, entries: np.ndarray, valid: np.ndarray
 ) -> np.ndarray:
     """Depths of an entry of each tile, (T,) float32, where that is valid; else infinite."""
-    depths = np.full(len(valid), np.inf, np.float32)
-    ahead = camera.world_to_camera[2]
-    x, y, z = scene.means[ids[tiles.entries[entries[valid]]]].astype(np.float64).T
-    # As `project` has it, by which Gaussians are sorted.
-    depths[valid] = ahead[0] * x + ahead[1] * y + ahead[2] * z + ahead[3]
-    return depths
+    found = np.full(len(valid), np.inf, np.float32)
+    found[valid] = depths(scene, camera, ids[tiles.entries[entries[valid]]])
+    return found
 
 
 @nb.njit(parallel=True, nogil=True, cache=True, fastmath=FAST, error_model="numpy")
