@@ -57,6 +57,11 @@ class Similarity:
         pose = pose_from_parameters("scene_to_map", translation, quaternion_xyzw)
         return cls(pose[:3, :3], pose[:3, 3], float(scale))
 
+    def is_same(self, other: Similarity) -> bool:
+        """Whether it is the same as another one, bit for bit."""
+        same = np.array_equal(self.rotation, other.rotation) and np.array_equal(self.translation, other.translation)
+        return same and self.scale == other.scale
+
     def points_to_map(
         self,
         points: npt.ArrayLike,  # (M, 3)

@@ -12,10 +12,11 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from gsseg_core.data.view import View
+from gsseg_core.errors import StateMismatchError
 from gsseg_core.learn.learner_state import Learnt, State
 from gsseg_core.learn.merged_states import Saved, merge_states
 from gsseg_core.live.living_votes import LivingVotes
-from gsseg_core.live.matching_scenes import Matching, match_scenes
+from gsseg_core.live.matching_scenes import Matching, match_scenes, places_in_saved
 from gsseg_core.live.scene_change import SceneChange, carried
 from gsseg_core.live.session import LiveSession
 from gsseg_core.scene.camera import Camera
@@ -67,6 +68,7 @@ class LivingSession(LiveSession):
     def __init__(self, scene: GaussianScene | LivingScene, *args: Any, **kwargs: Any) -> None:
         self._living = scene if isinstance(scene, LivingScene) else LivingScene.of(scene)
         self._first = self._living
+        self._numbered = self._living.scene.ids is None  # Whether ids are the session's own numbers.
         # Of the scenes that are still in use: where in them the Gaussians of now were.
         self._past: WeakKeyDictionary[GaussianScene, np.ndarray] = WeakKeyDictionary()
         super().__init__(self._living.scene, *args, **kwargs)
@@ -134,6 +136,7 @@ class LivingSession(LiveSession):
             changed = self._go_over(before.flat(), matching.after, matching.origin, joining)
             if before.scene.ids is None:
                 self._first = _renumbered(self._first, before, matching)
+            self._numbered = self._numbered and scene.ids is None
             return replace(changed, revision=None, matched_by=matching.by)
 
     def _go_over(
@@ -162,7 +165,8 @@ class LivingSession(LiveSession):
         """Replace all that is known by a saved state, as `LiveSession.load` does, also by one of an earlier scene.
 
         Gaussians are found by their ids; what the state was saved of is in it, if the scene had ids, or else it must be
-        the scene that the session began with.
+        the scene that the session began with. Where the session had to number them itself, and the state has other
+        numbers, they are found by their place; see `places_in_saved`.
         """
         with self._lock:
             return super().load(path, within)
@@ -217,11 +221,19 @@ class LivingSession(LiveSession):
             return state
         votes = LivingVotes(saved, state.votes.shape[1], device=self.device)
         votes.adopt(state)
-        change = SceneChange(saved, self._living, saved.places(self._living.ids))
-        groups = self._living.frames
-        votes.change(change, {view.name: None for view in state.views if view.group not in groups})
+        change = SceneChange(saved, self._living, self._places_in(saved, path))
+        gone = {group for group in saved.frames if group not in self._living.frames or change.has_flattened(group)}
+        votes.change(change, {view.name: None for view in state.views if view.group in gone})
         learnt = state.learnt and replace(state.learnt, codes=change.carry(state.learnt.codes))
         return replace(votes.state(), num_fused=state.num_fused, class_names=state.class_names, learnt=learnt)
+
+    def _places_in(self, saved: LivingScene, path: Path) -> np.ndarray:
+        if saved is self._first or not self._numbered:
+            return saved.places(self._living.ids)
+        try:
+            return places_in_saved(saved, self._first, self._living)
+        except StateMismatchError as error:
+            raise StateMismatchError(f"{path}: {error}") from error
 
 
 def _renumbered(first: LivingScene, before: LivingScene, matching: Matching) -> LivingScene:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsseg_core.errors import SettingsError
+from gsseg_core.errors import SettingsError, StateMismatchError
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.living_scene import LivingScene
 
@@ -59,6 +59,41 @@ def match_scenes(before: LivingScene, scene: GaussianScene, tolerance: float = 0
         ids[new] = before.ids.max() + 1 + np.arange(len(new))
         after = LivingScene.numbered(scene, ids)
     return Matching(after, origin, "position")
+
+
+def places_in_saved(saved: LivingScene, first: LivingScene, now: LivingScene) -> np.ndarray:
+    """Find the Gaussians of now in a saved scene, where the session has numbered them itself: (N',) int64, or -1.
+
+    Numbers mean the same there if most Gaussians that the session began with are what has their numbers there. If not,
+    the file of one of the two was in another order, and Gaussians are those that lie at exactly the same place.
+
+    Parameters
+    ----------
+    saved : LivingScene
+        What a state was saved of.
+    first : LivingScene
+        What the session began with, under the numbers of now.
+    now : LivingScene
+        N' Gaussians.
+
+    Raises
+    ------
+    StateMismatchError
+        Neither finds half of the smaller scene.
+    """
+    places = saved.places(first.ids)
+    found = places >= 0
+    alike = (saved.local.means[places] == first.local.means).all(axis=1) & found
+    if 2 * alike.sum() > found.sum():
+        return saved.places(now.ids)
+    origin = _nearest(saved.scene.means, now.scene.means, 0.0)
+    count, smaller = int((origin >= 0).sum()), min(len(saved), len(now))
+    if 2 * count < smaller:
+        raise StateMismatchError(
+            f"its Gaussians have ids, which the scene's file has not, and only {count} of {smaller} lie where the "
+            "scene has one; expected the scene that it was saved for, or a file of it with ids"
+        )
+    return origin
 
 
 def _nearest(before: np.ndarray, after: np.ndarray, tolerance: float) -> np.ndarray:  # (N, 3), (N', 3)

@@ -63,6 +63,22 @@ class SceneChange:
         """Take what Gaussians had before along to where they are, (N', ...); zeros for those that were not there."""
         return carried(rows, self.origin)
 
+    def has_flattened(self, group: int) -> bool:
+        """Whether Gaussians of a group are given afterwards as they lay in the scene, and not as in the group's frame.
+
+        So it is where the scene was read from a file in between. Where the frame was that of the scene, it is all one.
+        """
+        found = self.origin >= 0
+        found[found] = self.before.groups[self.origin[found]] == group
+        if not found.any():
+            return False
+        now, places = self.after.local.means[found], self.origin[found]
+        in_scene, in_group = (
+            np.median(np.linalg.norm(now - scene.means[places], axis=1))
+            for scene in (self.before.scene, self.before.local)
+        )
+        return bool(in_scene < in_group)
+
     def _changed(self, group: int | None) -> tuple[np.ndarray, np.ndarray]:
         """Places of the Gaussians that changed in the frame of a group, before (M,) and after (M',)."""
         if group not in self._parts:

@@ -127,7 +127,7 @@ class CameraStreams:
 
     def on_depth(self, topic: str, message: Image) -> None:
         """Take in a depth image."""
-        self.pairing.add_depth(stamp_ns(message.header.stamp), (topic, message))
+        self.pairing.add_depth(stamp_ns(message.header.stamp), (topic, message), message.header.frame_id)
 
     def on_pose(self, topic: str, message: PoseStamped) -> None:
         """Take in a pose of the camera."""

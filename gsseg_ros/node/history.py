@@ -6,11 +6,12 @@ from bisect import insort
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
+K = TypeVar("K", int, tuple[int, str])
 T = TypeVar("T")
 
 
-class History(Generic[T]):
-    """Values by stamp, those of the newest stamps.
+class History(Generic[K, T]):
+    """Values by stamp, or by stamp and frame, those of the newest stamps.
 
     Parameters
     ----------
@@ -21,18 +22,18 @@ class History(Generic[T]):
 
     Attributes
     ----------
-    stamps : list of int
+    stamps : list of int, or of (int, str)
         Ascending.
-    values : dict of int
+    values : dict
         By stamp.
     """
 
     def __init__(self, capacity: int, size: Callable[[T], int] = lambda value: 1) -> None:
         self._capacity, self._size, self._total = capacity, size, 0
-        self.stamps: list[int] = []
-        self.values: dict[int, T] = {}
+        self.stamps: list[K] = []
+        self.values: dict[K, T] = {}
 
-    def add(self, stamp: int, value: T) -> None:
+    def add(self, stamp: K, value: T) -> None:
         """Keep the value of a stamp; of two with the same stamp the first stays."""
         if stamp in self.values:
             return

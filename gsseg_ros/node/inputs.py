@@ -44,6 +44,9 @@ from gsseg_ros.qos import clear_overrides, sensor_data
 
 EXPIRE_PERIOD = 0.1  # s
 
+AWAITED_SECONDS, _PAUSE = 5.0, 0.02
+"""How long, at most, masks are waited for that have come and are not yet fused."""
+
 
 class Inputs:
     """Subscribes from activation to deactivation. Callbacks only put messages aside; a worker fuses them.
@@ -82,7 +85,7 @@ class Inputs:
         self.accepted = 0
         self.rejected: Counter[str] = Counter()
         self.explained: dict[str, str] = {}
-        self._counting = threading.Lock()
+        self._counting, self._handing = threading.Lock(), threading.Lock()
         self.gated: Counter[str] = Counter()
         self.refused_poses = 0
         self.last_refusal = (-PERIOD, "")
@@ -156,6 +159,17 @@ class Inputs:
     def close(self) -> None:
         """Stop listening; a mask that is being fused is finished."""
         self._built.close()
+
+    def await_fused(self, stamps: set[str]) -> None:
+        """Wait until masks of these stamps (ns) that have come are fused or dropped, for some seconds at most."""
+        latest = time.monotonic() + AWAITED_SECONDS
+        while stamps & self._stamps_under_way() and self._workspace.active and time.monotonic() < latest:
+            time.sleep(_PAUSE)
+
+    def _stamps_under_way(self) -> set[str]:
+        with self._handing:
+            stamps = {paired.stamp for paired in self.worker.unfinished}
+            return set(map(str, stamps.union(*(camera.pairing.stamps for camera in self.cameras.values()))))
 
     def publishers_of(self, topic: str) -> int:
         """Count the publishers of an input."""
@@ -245,9 +259,10 @@ class Inputs:
         self.live.tick()
 
     def _hand_over(self) -> None:
-        for camera in self.cameras.values():
-            for paired in camera.pairing.take():
-                self.worker.submit(paired)
+        with self._handing:  # Whoever asks finds a mask here or there.
+            for camera in self.cameras.values():
+                for paired in camera.pairing.take():
+                    self.worker.submit(paired)
         dropped = self.dropped
         self._workspace.dropped.update(dropped - self._told)
         self._told = dropped

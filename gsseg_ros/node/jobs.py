@@ -154,6 +154,7 @@ class Worker(Generic[T]):
         self.dropped = 0
         self._handle, self._capacity = handle, capacity
         self._items: deque[T] = deque()
+        self._in_hand: list[T] = []
         self._changed = threading.Condition()
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="fusion", daemon=True)
@@ -172,6 +173,12 @@ class Worker(Generic[T]):
     def waiting(self) -> int:
         """Number of items that wait."""
         return len(self._items)
+
+    @property
+    def unfinished(self) -> list[T]:
+        """The items that wait, and that in hand."""
+        with self._changed:
+            return [*self._in_hand, *self._items]
 
     def clear(self) -> int:
         """Forget the items that wait; return how many they were."""
@@ -194,5 +201,7 @@ class Worker(Generic[T]):
                 self._changed.wait_for(lambda: self._items or self._stopping)
                 if self._stopping:
                     return
-                item = self._items.popleft()
+                self._in_hand = [item := self._items.popleft()]
             self._handle(item)
+            with self._changed:
+                self._in_hand = []

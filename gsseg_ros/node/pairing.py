@@ -108,10 +108,11 @@ class Pairing:
         self._settings = settings or PairingSettings()
         self._lock = threading.Lock()
         self._timeline = Timeline(self._settings.max_waiting, self._settings.wait_s)
-        self._camera_infos: dict[str, History[Any]] = {}  # By frame_id, that last heard at the end.
-        self._seen: History[list[str]] = History(_STAMPS_KEPT)  # Frames of the masks of a stamp.
+        self._camera_infos: dict[str, History[int, Any]] = {}  # By frame_id, that last heard at the end.
+        self._seen: History[int, list[str]] = History(_STAMPS_KEPT)  # Frames of the masks of a stamp.
         self._unclear_until = 0  # Up to this stamp poses may be of another camera.
-        self._depths: History[Any] = History(_DEPTH_BYTES, lambda image: len(image[1].data))
+        # By stamp and frame_id.
+        self._depths: History[_Key, Any] = History(_DEPTH_BYTES, lambda image: len(image[1].data))
         self._waiting: dict[_Key, _Waiting] = {}
         self._finished: list[Paired] = []
 
@@ -129,9 +130,9 @@ class Pairing:
             raise TypeError(f"{type(self._poses).__name__} takes no poses")
         self._take_in(Message("pose", stamp, given))
 
-    def add_depth(self, stamp: int, message: Any) -> None:
-        """Take in a depth image, the name of its topic and the message."""
-        self._take_in(Message("depth", stamp, message))
+    def add_depth(self, stamp: int, message: Any, frame_id: str = "") -> None:
+        """Take in a depth image whose header has this stamp and frame: the name of its topic and the message."""
+        self._take_in(Message("depth", stamp, message, frame_id))
 
     def set_back(self, stamp: int) -> None:
         """Take in that the clock was set back to `stamp` (ns): nothing of a later time belongs to what comes now."""
@@ -177,6 +178,13 @@ class Pairing:
             return len(self._waiting) + self._timeline.held_masks
 
     @property
+    def stamps(self) -> set[int]:
+        """Stamps of the masks that wait, or have not been taken yet."""
+        with self._lock:
+            waiting = {stamp for stamp, _ in self._waiting} | {paired.stamp for paired in self._finished}
+            return waiting | self._timeline.held_stamps
+
+    @property
     def time_jumps(self) -> int:
         """How often time was set back."""
         return self._timeline.epoch
@@ -213,7 +221,7 @@ class Pairing:
             elif stream == "pose" and isinstance(self._poses, MessagePoses):
                 self._poses.add(stamp, content)
             elif stream == "depth":
-                self._depths.add(stamp, content)
+                self._depths.add((stamp, frame_id), content)
         for stream, stamp, content, frame_id in messages:
             if stream == MASK:
                 mask, era = content
@@ -248,7 +256,7 @@ class Pairing:
         several = stamp < self._unclear_until
         if waiting.pose is None or several:
             waiting.pose = self._poses.at(stamp, frame_id, last_chance, several)
-        info, depth = self._camera_info(stamp, frame_id, last_chance), self._depths.values.get(stamp)
+        info, depth = self._camera_info(stamp, frame_id, last_chance), self._depth(stamp, frame_id, last_chance)
         if several and not self._poses.knows_frames:
             self.dropped["several_cameras"] += 1
         elif waiting.pose is not None and info is not None and (depth or not self._settings.with_depth):
@@ -277,7 +285,19 @@ class Pairing:
             return infos.values[infos.stamps[after - 1]]
         return None
 
-    def _infos_of(self, frame_id: str) -> History[Any] | None:
+    def _depth(self, stamp: int, frame_id: str, last_chance: bool) -> Any:
+        """Find the depth image of a mask; at last one of another frame, whose reader says what is wrong with it."""
+        depths, stamps = self._depths.values, self._depths.stamps
+        for key in ((stamp, frame_id), (stamp, "")):
+            if key in depths:
+                return depths[key]
+        if last_chance or not frame_id or len(self._camera_infos) == 1:
+            first = bisect_left(stamps, (stamp, ""))
+            if first < len(stamps) and stamps[first][0] == stamp:
+                return depths[stamps[first]]
+        return None
+
+    def _infos_of(self, frame_id: str) -> History[int, Any] | None:
         if not frame_id and len(self._camera_infos) == 1:
             return next(iter(self._camera_infos.values()))
         return self._camera_infos.get(frame_id) or self._camera_infos.get("")

@@ -64,7 +64,10 @@ class Placement:
             take_over()
             names = self._owner.session.view_names if self._owner.has_scene else []
             at = self._left | {name: moved[0] for name, moved in self._moved_from.items()}
-            self._moved_from, self._left = {name: (at.get(name, before), after) for name in names}, {}
+            moved_from = {name: (at.get(name, before), after) for name in names}
+            # To go nowhere costs as much as to go far, and rounds the camera.
+            self._moved_from = {name: ways for name, ways in moved_from.items() if not ways[0].is_same(ways[1])}
+            self._left = {}
             if not self._running:
                 self._running = True
                 threading.Thread(target=self._follow, name="placement", daemon=True).start()

@@ -81,7 +81,7 @@ class MessagePoses:
     """
 
     def __init__(self, tolerance_s: float = 0.0, frames: Frames | None = None) -> None:
-        self._poses: History[GivenPose] = History(_POSES_KEPT)
+        self._poses: History[int, GivenPose] = History(_POSES_KEPT)
         self._tolerance_ns, self._frames = round(tolerance_s * SECOND), frames
 
     @property

@@ -36,11 +36,19 @@ class SceneChanges:
         Told in one line what is wrong with a message of the topic.
     show : callable
         Called after each change: has objects published as after a view, while clouds wait for the next run.
+    await_fused : callable
+        Waits until masks of some stamps that have come are fused: a change may name keyframes that are just under way.
     """
 
-    def __init__(self, services: Services, complain: Callable[[str], None], show: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        services: Services,
+        complain: Callable[[str], None],
+        show: Callable[[], None],
+        await_fused: Callable[[set[str]], None],
+    ) -> None:
         self.node, self.workspace, self.turns = services.node, services.workspace, services.turns
-        self._services, self._complain, self._show = services, complain, show
+        self._complain, self._show, self._await_fused = complain, show, await_fused
         group = ReentrantCallbackGroup()
         for interface, name, handler in (
             (UpdateScene, "update_scene", self.update_scene),
@@ -96,8 +104,10 @@ class SceneChanges:
         response.num_views, response.class_names = session.num_fused, list(session.class_names.values())
 
     def _update(self, session: LivingSession, delta: SceneDelta) -> Changed:
+        if stamps := {view for move in delta.moves for view in move.views if _STAMP.fullmatch(view)}:
+            self._await_fused(stamps)
         try:
-            changed = session.update(_with_names(delta, session))
+            changed = session.update(_with_names(delta, session) if stamps else delta)
         except (SceneDeltaError, EmptySceneError) as error:
             raise InvalidRequestError(str(error)) from error
         self._require_current(session)
@@ -113,8 +123,6 @@ class SceneChanges:
 
 def _with_names(delta: SceneDelta, session: LivingSession) -> SceneDelta:
     """Replace stamps among the views of a change by the names of the views that carry them."""
-    if not any(_STAMP.fullmatch(view) for move in delta.moves for view in move.views):
-        return delta
     stamped: dict[str, list[str]] = {}
     for view in session.views:
         # The name of a view ends in its stamp, and at one stamp in the number of its camera; see `pairing`.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -41,6 +43,26 @@ def placed(request: LoadScene.Request) -> list[Parameter]:
         "scale": scale, "translation": [place.x, place.y, place.z], "rotation": [turn.x, turn.y, turn.z, turn.w],
     }  # fmt: skip
     return [Parameter(f"scene_to_map.{name}", value=value) for name, value in values.items()]
+
+
+@contextmanager
+def placed_by(node: Any, wanted: Sequence[Parameter]) -> Iterator[None]:
+    """Set where the scene lies, as `placed` reads it; and as it was if something is raised in the body.
+
+    Raises
+    ------
+    InvalidRequestError
+        It was refused.
+    """
+    before = [node.get_parameter(parameter.name) for parameter in wanted]
+    if wanted and not (result := node.set_parameters_atomically(wanted)).successful:
+        raise InvalidRequestError(f"the place of the scene was refused: {result.reason}")
+    try:
+        yield
+    except Exception:
+        if before:
+            node.set_parameters_atomically(before)
+        raise
 
 
 class SceneFrame:

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import rclpy
@@ -82,8 +83,9 @@ class SegmentNode(LifecycleNode):
         self.workspace.placement.refused = self.get_logger().warning
         self._requests = Services(self, self.workspace, self._require_outputs, self._lookup)
         self._changes = SceneChanges(
-            self._requests, lambda message: self._complaints.add(SCENE_DELTA, message), self._show_change
-        )
+            self._requests, lambda message: self._complaints.add(SCENE_DELTA, message), self._show_change,
+            self._await_fused,
+        )  # fmt: skip
         self._learn = LearnAction(self, self.workspace, self._require_outputs)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._complaints = Complaints(self.get_logger().warning)
@@ -157,7 +159,7 @@ class SegmentNode(LifecycleNode):
         self.workspace.configure(settings)
         warm_up(settings.device, self.get_logger().info)
         if settings.scene_path:
-            self.workspace.load_scene(*self.workspace.parameter_path("scene_path"))
+            self.workspace.load_scene(*self.workspace.parameter_path("scene_path"), nullcontext())
         self._outputs = Outputs(self, settings.cameras)
         self._outputs.announce(self.workspace.label_space.classes)
         self._scene_frame = SceneFrame(self, settings.map_frame, settings.scene_frame)
@@ -280,6 +282,10 @@ class SegmentNode(LifecycleNode):
     def _show_change(self) -> None:
         if (inputs := self.inputs) is not None:
             inputs.live.changed()
+
+    def _await_fused(self, stamps: set[str]) -> None:
+        if (inputs := self.inputs) is not None:
+            inputs.await_fused(stamps)
 
     def _tell(self) -> None:
         inputs, clock_problem = self.inputs, self._sim_time.problem()

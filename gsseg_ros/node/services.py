@@ -6,7 +6,8 @@ import functools
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
@@ -32,7 +33,7 @@ from gsseg_ros.node.output_folders import pinned_folder, require_own_folder, sta
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.picking import fill_answer, pick_object
 from gsseg_ros.node.reports import Selection, empty_report, finish, report_message, stage_timings
-from gsseg_ros.node.scene_frame import placed
+from gsseg_ros.node.scene_frame import placed, placed_by
 from gsseg_ros.node.viewpoints import Lookup, draw, viewpoint
 from gsseg_ros.node.workspace import Run, Workspace, checked_confidence, chosen_classes
 from gsseg_ros.object_messages import point_message
@@ -256,27 +257,22 @@ class Services:
         else:
             raise InvalidRequestError("path and the parameter scene_path are both empty; expected a scene in either")
         wanted = placed(request)
-
-        def place() -> None:
-            if wanted:
-                result = self.node.set_parameters_atomically(wanted)
-                if not result.successful:
-                    raise InvalidRequestError(f"the place of the scene was refused: {result.reason}")
-
         with workspace.slot.take("load_scene") as job, workspace.run("load_scene") as run:
 
-            def check() -> None:
+            @contextmanager
+            def place() -> Iterator[None]:
+                """Last of all, before any view is fused there."""
                 workspace.require_active()
                 job.check()
-                place()  # Before any view of it is fused.
+                with placed_by(self.node, wanted):
+                    yield
 
             if request.keep_votes:
-                changed = workspace.grow_scene(path, within, request.tolerance)
+                changed = workspace.grow_scene(path, within, request.tolerance, place())
                 response.num_carried, response.num_views_lifted = changed.num_carried, changed.num_views_lifted
                 response.matched_by = changed.matched_by
-                place()
             else:
-                workspace.load_scene(path, within, check)
+                workspace.load_scene(path, within, place())
             self.clear(run)
             session = workspace.session
         corners = workspace.settings.scene_to_map.points_to_map(session.scene.means)

@@ -77,6 +77,11 @@ class Timeline:
         """Number of masks that are held back."""
         return sum(message.stream == MASK for message in self._held)
 
+    @property
+    def held_stamps(self) -> set[int]:
+        """Stamps of the masks that are held back."""
+        return {message.stamp for message in self._held if message.stream == MASK}
+
     def take_in(self, message: Message) -> list[Message]:
         """Take in a message; return those that can be used now, in order.
 

@@ -7,7 +7,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -209,19 +209,17 @@ class Workspace:
                 )
         self.label_space = LabelSpace(settings.class_names, new_names, settings.max_classes)
 
-    def load_scene(
-        self, path: str | Path, within: Path | None = None, check: Callable[[], None] = lambda: None
-    ) -> None:
+    def load_scene(self, path: str | Path, within: Path | None, placed: AbstractContextManager[object]) -> None:
         """Load a scene in place of the one there is, with all that was known of that; on any error nothing changes.
 
         Parameters
         ----------
         path : path
             A scene of any format in `gsseg_core.scene.scene_formats`.
-        within : pathlib.Path, optional
+        within : pathlib.Path or None
             A folder that its links must not lead out of.
-        check : callable
-            Called last; what it raises ends the work.
+        placed : context manager
+            Entered last, to put the scene where it is to lie; what it raises ends the work.
         """
         settings = self.settings
         scene = GaussianScene.load(path, within)
@@ -234,16 +232,22 @@ class Workspace:
             session: LiveSession = PerViewSession(scene, **kept)
         else:
             session = LivingSession(scene, self.label_space.classes, **kept)
-        check()
-        self._replace(session)
+        with placed:
+            self._replace(session)
         self.dropped = Counter()
         self.forget_waiting()
         session.prepare(RefineSettings(k=settings.k))
 
-    def grow_scene(self, path: str | Path, within: Path | None, tolerance: float) -> Changed:
-        """Go over to a scene that has grown out of the one there is, with its votes; on any error nothing changes."""
-        session = self.living_session
-        changed = session.replace_scene(GaussianScene.load(path, within), tolerance)
+    def grow_scene(
+        self, path: str | Path, within: Path | None, tolerance: float, placed: AbstractContextManager[object]
+    ) -> Changed:
+        """Go over to a scene that has grown out of the one there is, with its votes; on any error nothing changes.
+
+        `placed` puts it where it is to lie, and back where it lay if something is raised in its body.
+        """
+        session, scene = self.living_session, GaussianScene.load(path, within)
+        with self.placement.fusing, placed:  # No mask is fused, and no view follows, before it is clear where to.
+            changed = session.replace_scene(scene, tolerance)
         self.count(changed)
         session.prepare(RefineSettings(k=self.settings.k))
         return changed

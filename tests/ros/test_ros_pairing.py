@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -129,6 +130,27 @@ class CameraPoses(MessagePoses):
     def at(self, stamp: int, frame_id: str = "", last_chance: bool = False, several: bool = False) -> np.ndarray | None:
         found = super().at(stamp)
         return None if found is None else rigid(np.eye(3), [found[0, 3], len(frame_id), 0])
+
+
+def test_depth_images_of_one_stamp_go_with_the_masks_of_their_camera() -> None:
+    image = SimpleNamespace(data=b"")
+    pairing = Pairing(CameraPoses(), PairingSettings(with_depth=True))
+    send(pairing, [("pose", S), ("pose", 2 * S)])
+    for frame in ("left", "right", "rear"):
+        pairing.add_camera_info(S, f"info {frame}", frame)
+    for frame in ("left", "right", "left"):
+        pairing.add_depth(S, (f"{frame} depth", image), frame)
+    for frame in ("right", "left", "rear"):
+        pairing.add_mask(S, f"{frame} mask", frame)
+    paired = {p.mask: p.depth[0] for p in pairing.take()}
+    assert paired == {"right mask": "right depth", "left mask": "left depth"} and pairing.waiting == 1
+    expire(pairing)
+    # What is wrong with a frame is said where the image is read.
+    assert [(p.mask, p.depth[0]) for p in pairing.take()] == [("rear mask", "left depth")]
+    pairing.add_camera_info(2 * S, "info", "left")
+    pairing.add_depth(2 * S, ("any", image))
+    pairing.add_mask(2 * S, "mask", "left")
+    assert [p.depth[0] for p in pairing.take()] == ["any"]
 
 
 @given(st.data())

@@ -101,6 +101,17 @@ def test_views_of_a_state_that_is_loaded_meanwhile_stay_where_they_are() -> None
     np.testing.assert_array_equal(session.codes(), codes)
 
 
+def test_views_of_a_scene_that_is_put_back_before_they_followed_stay_as_they_are() -> None:
+    session = living_session(clean_views(2))
+    views = session.views
+    placement, settled = placement_of(session)
+    with placement.fusing:
+        placement.change(IDENTITY, FAR, lambda: None)
+        placement.change(FAR, IDENTITY, lambda: None)
+    wait_until(lambda: settled, "the thread to end")
+    assert all(now is before for now, before in zip(session.views, views, strict=True))
+
+
 def test_a_view_does_not_follow_once_what_is_known_was_replaced() -> None:
     session = living_session(clean_views(1))
     era = session.era
@@ -237,6 +248,29 @@ def test_a_scene_is_loaded_to_a_place_of_its_own(
         np.testing.assert_allclose(here.node.workspace.session.codes(), core_session(scene, views).codes(), atol=1e-4)
         here.done("load_scene")
         assert here.node.get_parameter("scene_to_map.scale").value == 2.5, "a request that says nothing changes nothing"
+
+
+@pytest.mark.parametrize("fails", ["the place", "the scene"])
+def test_to_grow_and_to_be_put_elsewhere_is_all_or_nothing(
+    shared: Ros, parameters: dict[str, Any], monkeypatch: pytest.MonkeyPatch, fails: str
+) -> None:
+    with node_here(shared, parameters) as here:
+        here.fuse(clean_views(2))
+        session = here.node.workspace.living_session
+        before, views = session.living, session.views
+        asked = {"keep_votes": True, "scene_to_map": Pose(position=Point(x=4.0)), "scene_to_map_scale": 2.5}
+        if fails == "the place":
+            refusal = SetParametersResult(successful=False, reason="not now")
+            monkeypatch.setattr(here.node, "set_parameters_atomically", lambda wanted: refusal)
+        else:
+            asked["tolerance"] = -1.0
+        refused = here.ask("load_scene", **asked)
+        assert refused.error_code == refused.INVALID_REQUEST
+        assert ("not now" if fails == "the place" else "tolerance is -1") in refused.error_msg
+        wait_until(lambda: not here.node.workspace.placement._running, "views that have nowhere to go")
+        assert here.node.get_parameter("scene_to_map.scale").value == 1.0
+        assert here.node.workspace.settings.scene_to_map.is_same(IDENTITY)
+        assert session.living is before and all(now is was for now, was in zip(session.views, views, strict=True))
 
 
 def test_the_static_transform_is_the_pose_of_the_scene_without_its_scale() -> None:

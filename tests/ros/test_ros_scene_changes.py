@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from patience import PATIENCE
 from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros, wait_until
 from ros_node_here import NodeHere, node_here
@@ -101,6 +103,26 @@ def test_a_request_and_the_topic_change_the_scene_and_votes_are_those_of_the_vie
     told = {value.key: value.value for value in status(here).values}
     assert (told["scene changes: made"], told["scene changes: views named and not kept"]) == ("2", "1")
     assert here.done("segment").report.num_gaussians == len(session.scene)
+
+
+def test_a_keyframe_whose_mask_still_waits_for_its_pose_is_fused_before_the_change_that_names_it(
+    here: NodeHere, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session, asked, under_way = here.node.workspace.living_session, threading.Event(), here.inputs._stamps_under_way
+    monkeypatch.setattr(here.inputs, "_stamps_under_way", lambda: (under_way(), asked.set())[0])
+    (late,) = clean_views(1)
+    (stamp,) = here.send([late], ["camera_info", "mask"])
+    move = GroupMove(0, Similarity(translation=np.array([50.0, 0, 0])), (str(stamp),))
+    delta = message_from_delta(SceneDelta(moves=(move,)))
+    change = threading.Thread(target=here.node._changes.on_scene_delta, args=(delta,))
+    change.start()
+    assert asked.wait(PATIENCE)
+    assert session.living.revision is None
+    here.send([late], ["pose"], [stamp])
+    change.join(PATIENCE)
+    assert [view.group for view in session.views] == [None] * 4 + [0]
+    assert not here.node.workspace.changes["views named and not kept"]
+    np.testing.assert_array_equal(votes(session), as_refused(session))
 
 
 def test_a_file_changes_the_scene_and_a_grown_one_takes_votes_along(here: NodeHere) -> None:
