@@ -6,6 +6,7 @@ import contextlib
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from typing import Any
@@ -64,8 +65,8 @@ def warm_up(device: str = "cpu", say: Callable[[str], object] = lambda text: Non
             refine_something(device)
     finally:
         for process in beside:
-            process.kill()
-            process.wait()
+            with process:
+                process.kill()
 
 
 def telling(say: Callable[[str], object]) -> AbstractContextManager[object]:
@@ -79,10 +80,21 @@ def _start_beside() -> Iterator[subprocess.Popen[bytes]]:
     is_python = os.path.basename(sys.executable or "").startswith("python")  # And no program that has it built in.
     if kernel_cache.FOLDER and is_python:
         # Where this process finds its modules, and nowhere else: not in the folder in which the user happens to be.
-        work = f"import sys; sys.path[:] = {sys.path}; from gsseg_core.warm_up import refine_something as f; f()"
+        work = f"import sys; sys.path[:] = {sys.path}; from gsseg_core.warm_up import refine_beside as f; f()"
         with contextlib.suppress(OSError):
-            quiet: Any = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
-            yield subprocess.Popen([sys.executable, "-I", "-c", work], **quiet)
+            quiet: Any = dict.fromkeys(("stdout", "stderr"), subprocess.DEVNULL)
+            yield subprocess.Popen([sys.executable, "-I", "-c", work], stdin=subprocess.PIPE, **quiet)
+
+
+def refine_beside() -> None:
+    """Do `refine_something` in a process of its own, which ends when whoever holds its standard input does."""
+
+    def end_with_parent() -> None:
+        os.read(0, 1)
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    refine_something()
 
 
 def _square() -> tuple[GaussianScene, Camera, np.ndarray]:

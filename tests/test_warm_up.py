@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from numba.core import event
+from patience import PATIENCE
 from small_scenes import write_dataset
 
 from gsseg_core import warm_up as warming
@@ -46,6 +47,8 @@ def test_the_first_compilation_is_shared_with_a_second_process_and_no_third(monk
 
         def wait(self) -> None: ...
         def kill(self) -> None: ...
+        def __enter__(self) -> None: ...
+        def __exit__(self, *_: object) -> None: ...
 
     def learn(device: str) -> None:
         for _ in range(2):
@@ -55,11 +58,19 @@ def test_the_first_compilation_is_shared_with_a_second_process_and_no_third(monk
     monkeypatch.setattr(warming.subprocess, "Popen", Helper)
     monkeypatch.setattr(warming, "_learn_something", learn)
     warm_up()
-    assert len(started) == 1 and "refine_something" in started[0][-1]
+    assert len(started) == 1 and "refine_beside" in started[0][-1]
     started.clear()
     monkeypatch.setattr(warming.kernel_cache, "FOLDER", None)  # Nothing that it compiles would be found.
     warm_up()
     assert not started
+
+
+def test_the_second_process_does_not_outlive_the_first(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))  # Where it has more than a minute's work to do.
+    (process,) = warming._start_beside()
+    assert process.stdin is not None
+    process.stdin.close()  # As the end of this process would.
+    assert process.wait(PATIENCE) == 1
 
 
 def test_warm_up_says_nothing_where_the_kernels_are_there() -> None:

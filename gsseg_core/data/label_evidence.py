@@ -239,7 +239,7 @@ def is_resolved(votes: np.ndarray, possible: np.ndarray) -> np.ndarray:  # (N, K
     return out
 
 
-@nb.njit(nogil=True, cache=True)
+@called_by_kernels
 def _only_class_left(classes: np.ndarray, votes: np.ndarray, ids: np.ndarray) -> tuple[int, int]:
     """Return the one of all classes `ids` without votes where the others of a row have some, any against; else -1."""
     voted, least, against, place = 0, 2**63 - 1, False, 0
@@ -253,7 +253,7 @@ def _only_class_left(classes: np.ndarray, votes: np.ndarray, ids: np.ndarray) ->
     return (ids[place] if against and voted == ids.shape[0] - 1 else -1), least
 
 
-@nb.njit(nogil=True, cache=True)
+@called_by_kernels
 def resolve_row(
     classes: np.ndarray,  # (n,) of one row
     votes: np.ndarray,  # (n,) int64, of it

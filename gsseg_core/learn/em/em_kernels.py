@@ -161,22 +161,25 @@ def m_step_without_view(
                 out[z] /= total
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
 def confusion_counts(
     codes: CSRRows, pairs: ViewPairs, shares: np.ndarray, num_classes: int, num_labels: int
 ) -> np.ndarray:
     """Sum over the pairs of codes[m] times share, by class and label, (K, L) float64; row m is of `pairs.ids[m]`."""
+    parts = np.zeros((BLOCKS, num_classes, num_labels))
+    _count_confusions(codes, pairs, shares, parts)
+    return np.asarray(parts.sum(axis=0))
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _count_confusions(codes: CSRRows, pairs: ViewPairs, shares: np.ndarray, parts: np.ndarray) -> None:
     indptr, classes, data = codes
     ids, start, labels = pairs
-    parts = np.zeros((BLOCKS, num_classes, num_labels))
     for block in nb.prange(BLOCKS):
         part = parts[block]
         for m in range(ids.shape[0] * block // BLOCKS, ids.shape[0] * (block + 1) // BLOCKS):
             for s in range(start[m], start[m + 1]):
                 for z in range(indptr[m], indptr[m + 1]):
                     part[classes[z], labels[s]] += shares[s] * data[z]
-    counts: np.ndarray = parts.sum(axis=0)
-    return counts
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)

@@ -7,6 +7,7 @@ import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence, resolve_row, vote_units
+from gsseg_core.kernel_cache import called_by_kernels
 from gsseg_core.learn.em.em_kernels import BLOCKS, ViewPairs
 from gsseg_core.learn.learner import UNITS
 from gsseg_core.raster.observation import Observation
@@ -26,7 +27,9 @@ def leave_one_out_counts(
     Gaussian counts at most `most` times the pixels that the other views saw of it.
     """
     pairs, own, classes = ViewPairs.of(observation), observation.votes(), np.flatnonzero(possible)
-    return _count(votes, pairs, own, evidence.votes, classes, len(possible), power, most)
+    parts = np.zeros((BLOCKS, len(possible), evidence.votes.indptr.shape[0] - 1))
+    _count(votes, pairs, own, evidence.votes, classes, power, most, parts)
+    return np.asarray(parts.sum(axis=0))
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
@@ -42,7 +45,7 @@ def subtract_votes(total: CSRRows, pairs: ViewPairs, own: np.ndarray, label_vote
         _subtract_row(classes[row], data[row], labels[seen], own[seen], label_votes)
 
 
-@nb.njit(nogil=True, cache=True)
+@called_by_kernels
 def _subtract_row(
     classes: np.ndarray, total: np.ndarray, labels: np.ndarray, own: np.ndarray, label_votes: CSRRows
 ) -> None:
@@ -55,7 +58,7 @@ def _subtract_row(
                     total[z] -= vote_units(own[s], votes[j], UNITS)
 
 
-@nb.njit(nogil=True, cache=True)
+@called_by_kernels
 def _raised(x: np.float32, power: float) -> np.float32:
     """Return x ** power in float32, of a whole power by products."""
     result, factor, left = np.float32(1), x, int(power)
@@ -70,16 +73,17 @@ def _raised(x: np.float32, power: float) -> np.float32:
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def _count(
-    votes: CSRRows, pairs: ViewPairs, own: np.ndarray, label_votes: CSRRows, possible: np.ndarray, num_classes: int,
-    power: float, most: float,
-) -> np.ndarray:  # fmt: skip
+    votes: CSRRows, pairs: ViewPairs, own: np.ndarray, label_votes: CSRRows, possible: np.ndarray,
+    power: float, most: float, parts: np.ndarray,
+) -> None:  # fmt: skip
     """Count as `leave_one_out_counts` does, row by row, so that the votes of the other views are never stored.
 
-    Here `possible` are the ids that are classes, ascending; other arrays are those of `subtract_votes`.
+    The counts are the sum of `parts`, (BLOCKS, K, L) float64, which come as zeros. Here `possible` are the ids that
+    are classes, ascending; other arrays are those of `subtract_votes`.
     """
     indptr, classes, data = votes
     ids, start, labels = pairs
-    parts = np.zeros((BLOCKS, num_classes, label_votes.indptr.shape[0] - 1))
+    num_classes = parts.shape[1]
     for block in nb.prange(BLOCKS):
         part = parts[block]
         which, remaining = np.empty(num_classes + 1, np.uint32), np.empty(num_classes + 1, np.int64)
@@ -113,5 +117,3 @@ def _count(
             for s in range(start[m], start[m + 1]):
                 for z in range(count):
                     part[which[z], labels[s]] += own[s] * share * codes[z]
-    counts: np.ndarray = parts.sum(axis=0)
-    return counts
