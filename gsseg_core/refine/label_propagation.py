@@ -21,11 +21,9 @@ import numpy as np
 
 from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.simd import LANES, add_scaled, load_row, nothing, store_row
 from gsseg_core.spatial.knn import CHUNK
 from gsseg_core.spatial.neighbour_graph import NEIGHBOURS, Graph, graph_of
-
-CLASSES_AT_ONCE = 16
-"""Classes that are propagated at once; bounds the memory at 8 N of these in bytes, besides the codes themselves."""
 
 SETTLED = np.float32(3e-4)
 """A Gaussian is left alone while no probability around it changes by more than this in a step."""
@@ -115,12 +113,15 @@ def propagate(
         return out
     known: np.ndarray = codes[graph.order].max(axis=1, initial=0) > 0
     weight = np.where(known, evidence[graph.order] / settings.strength, 0).astype(np.float32)
-    moving = np.flatnonzero(weight < 100).astype(np.int32)
+    moving = weight < 100
+    readers = _readers(graph.indptr, graph.indices, moving)
     reached = _steps_to_reach(graph.indptr, graph.indices, known, settings.steps)
-    for first in range(0, codes.shape[1], CLASSES_AT_ONCE):
-        learnt = np.ascontiguousarray(codes[graph.order, first : first + CLASSES_AT_ONCE])
-        spread = _spread(graph, learnt, weight, moving, reached, settings.steps)
-        out[graph.order, first : first + CLASSES_AT_ONCE] = spread
+    for first in range(0, codes.shape[1], LANES):
+        some = codes[:, first : first + LANES]
+        learnt = np.zeros((len(codes), LANES), np.float32)
+        learnt[:, : some.shape[1]] = some[graph.order]
+        spread = _spread(graph, readers, learnt, weight, moving & (reached <= 1), reached, settings.steps)
+        out[graph.order, first : first + LANES] = spread[:, : some.shape[1]]
     # Classes settle apart from each other, so that the sum of a row is 1 only about as precisely as they do.
     ids = graph.order[moving]
     total = out[ids].sum(axis=1, keepdims=True)
@@ -129,62 +130,68 @@ def propagate(
 
 
 def _spread(
-    graph: Graph, learnt: np.ndarray, weight: np.ndarray, moving: np.ndarray, reached: np.ndarray, steps: int
-) -> np.ndarray:
-    """Step until the codes of some classes settle; `_step` has the shapes."""
-    old, new = learnt.copy(), learnt.copy()
-    was, now = np.zeros((2, len(learnt)), np.uint8)
-    last = int(reached[reached < NEVER].max(initial=0))  # until then zeros are where nothing has come yet
+    graph: Graph, readers: tuple[np.ndarray, np.ndarray], learnt: np.ndarray, weight: np.ndarray, awake: np.ndarray,
+    reached: np.ndarray, steps: int,
+) -> np.ndarray:  # fmt: skip
+    """Step until the codes of some classes settle, from the places, (N,), that are awake; `_step` has the shapes.
+
+    Who reads a place is as `_readers` lists it.
+    """
+    codes = learnt.copy()
     for step in range(steps):
-        _step(graph.indptr, graph.indices, graph.weights, learnt, weight, moving, reached, step, was, now, old, new)
-        old, new, was, now = new, old, now, was
-        if step >= last and not was.any():
+        places = np.flatnonzero(awake).astype(np.int32)
+        if len(places) == 0:
             break
-    return old
+        awake[:] = False
+        values, changed = _step(
+            graph.indptr, graph.indices, graph.weights, learnt, weight, reached, step, places, codes
+        )
+        _take(places, values, changed, *readers, codes, awake)
+    return codes
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
 def _step(
     indptr: np.ndarray, indices: np.ndarray, weights: np.ndarray, learnt: np.ndarray, weight: np.ndarray,
-    moving: np.ndarray, reached: np.ndarray, step: int, was: np.ndarray, now: np.ndarray, old: np.ndarray,
-    new: np.ndarray,
-) -> None:  # fmt: skip
-    """Compute the codes that move, from those before, wherever something around them has changed.
+    reached: np.ndarray, step: int, places: np.ndarray, codes: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Compute the codes of some places, (M, 16), from those around them, and tell which change, (M,).
 
-    Codes are by place, (N, C): as `learnt`, `old`, before this step, and `new`, after it. The evidence, `weight`, (N,),
-    is a multiple of the strength; `reached`, (N,) int32, is the step after which a code is known; `was` and `now`, (N,)
-    uint8, are what changed in the step before and what changes in this one. Only `new` and `now` are written, at the
-    places that move, (M,).
+    Codes are by place, (N, 16): as `learnt` and as they are. The evidence, `weight`, (N,), is a multiple of the
+    strength; `reached`, (N,) int32, is the step after which a code is known.
     """
     count = learnt.shape[1]
-    for chunk in nb.prange((moving.shape[0] + CHUNK - 1) // CHUNK):
-        sums = np.empty(count, np.float32)
-        for m in range(chunk * CHUNK, min((chunk + 1) * CHUNK, moving.shape[0])):
-            i = moving[m]
-            now[i] = 0
-            if reached[i] > step + 1:
-                continue
-            awake = reached[i] == step + 1 or step == 0
-            for e in range(indptr[i], indptr[i + 1]):
-                awake |= was[indices[e]] != 0
-            if not awake:
-                new[i] = old[i]
-                continue
+    values, changed = np.empty((places.shape[0], count), np.float32), np.empty(places.shape[0], np.bool_)
+    for chunk in nb.prange((places.shape[0] + CHUNK - 1) // CHUNK):
+        for m in range(chunk * CHUNK, min((chunk + 1) * CHUNK, places.shape[0])):
+            i = places[m]
             mass = weight[i]
-            for c in range(count):
-                sums[c] = weight[i] * learnt[i, c]
+            total = add_scaled(nothing(), load_row(learnt, i), weight[i])
             for e in range(indptr[i], indptr[i + 1]):
-                j = indices[e]
-                if reached[j] <= step:
+                if reached[indices[e]] <= step:
                     mass += weights[e]
-                    for c in range(count):
-                        sums[c] += weights[e] * old[j, c]
+                    total = add_scaled(total, load_row(codes, indices[e]), weights[e])
+            store_row(values, m, total)
             change = np.float32(0)
             for c in range(count):
-                value = sums[c] / mass
-                change = max(change, abs(value - old[i, c]))
-                new[i, c] = value
-            now[i] = change > SETTLED
+                values[m, c] /= mass
+                change = max(change, abs(values[m, c] - codes[i, c]))
+            changed[m] = change > SETTLED or reached[i] == step + 1
+    return values, changed
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _take(
+    places: np.ndarray, values: np.ndarray, changed: np.ndarray, indptr: np.ndarray, indices: np.ndarray,
+    codes: np.ndarray, awake: np.ndarray,
+) -> None:  # fmt: skip
+    """Write the codes of some places, and wake those that read what changed."""
+    for m in nb.prange(places.shape[0]):
+        for c in range(codes.shape[1]):
+            codes[places[m], c] = values[m, c]
+        if changed[m]:
+            for e in range(indptr[places[m]], indptr[places[m] + 1]):
+                awake[indices[e]] = True
 
 
 @nb.njit(nogil=True, cache=True)
@@ -207,3 +214,19 @@ def _steps_to_reach(indptr: np.ndarray, indices: np.ndarray, known: np.ndarray, 
             break
         waiting = waiting[:left]
     return reached
+
+
+@nb.njit(nogil=True, cache=True)
+def _readers(indptr: np.ndarray, indices: np.ndarray, moving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """List, for each place, the places that move and have it as a neighbour, as CSR rows."""
+    ends = np.zeros(moving.shape[0] + 1, np.int64)
+    for i in np.flatnonzero(moving):
+        for e in range(indptr[i], indptr[i + 1]):
+            ends[indices[e] + 1] += 1
+    ends = np.cumsum(ends)
+    readers, at = np.empty(ends[-1], np.int32), ends[:-1].copy()
+    for i in np.flatnonzero(moving):
+        for e in range(indptr[i], indptr[i + 1]):
+            readers[at[indices[e]]] = i
+            at[indices[e]] += 1
+    return ends, readers
