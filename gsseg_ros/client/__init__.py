@@ -5,17 +5,20 @@ from gsseg_ros.client.results import (
     LearnResult,
     LoadedScene,
     LoadedState,
+    MergedStates,
     PickedObject,
     RenderedView,
     SavedState,
     SegmentedObject,
     SegmentResult,
+    UpdatedScene,
     Viewpoint,
 )
 from gsseg_ros.client.segmentation_client import SegmentationClient
 from gsseg_ros.errors import NodeUnavailableError, SegmentationError
 
 __all__ = [
-    "Exported", "LearnResult", "LoadedScene", "LoadedState", "NodeUnavailableError", "PickedObject", "RenderedView",
-    "SavedState", "SegmentResult", "SegmentationClient", "SegmentationError", "SegmentedObject", "Viewpoint",
+    "Exported", "LearnResult", "LoadedScene", "LoadedState", "MergedStates", "NodeUnavailableError", "PickedObject",
+    "RenderedView", "SavedState", "SegmentResult", "SegmentationClient", "SegmentationError", "SegmentedObject",
+    "UpdatedScene", "Viewpoint",
 ]  # fmt: skip

@@ -229,12 +229,44 @@ class RenderedView:
 
 @dataclass(frozen=True, eq=False)
 class LoadedScene:
-    """A scene that the node has loaded: file, hash, size, and the box (3,), (3,) around it in the map frame, metres."""
+    """A scene that the node has loaded: file, hash, size, and the box (3,), (3,) around it in the map frame, metres.
+
+    Where votes were kept, also how many Gaussians were carried over, and by what they were found: "id" or "position".
+    """
 
     path: Path
     digest: str
     num_gaussians: int
     box: tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
+    num_carried: int | None = None
+    matched_by: str = ""
+
+
+@dataclass(frozen=True)
+class UpdatedScene:
+    """What a change of the scene did: its number, hash and size now, Gaussians that went and came, views, seconds.
+
+    Views are counted whose votes stayed, that were lifted anew, and that the change names and the node has not.
+    """
+
+    revision: int
+    digest: str
+    num_gaussians: int
+    num_removed: int
+    num_added: int
+    num_views_kept: int
+    num_views_lifted: int
+    num_views_unknown: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class MergedStates:
+    """What the node knows after a merge: class names by id, views in the votes, and how many of them came with it."""
+
+    class_names: dict[int, str]
+    num_views: int
+    num_merged: int
 
 
 @dataclass(frozen=True)

@@ -11,50 +11,25 @@ from __future__ import annotations
 
 import os
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Point
 from gsseg_msgs.action import Learn
-from gsseg_msgs.srv import Export, LoadScene, LoadState, Pick, RenderView, Reset, SaveState, Segment
-from lifecycle_msgs.msg import State
-from lifecycle_msgs.srv import GetState
+from gsseg_msgs.srv import Pick, RenderView, Segment
 from rclpy.action import ActionClient
-from rclpy.context import Context
 
 from gsseg_ros.client.answers import picked_object, rendered_view, segment_result
-from gsseg_ros.client.calls import Calls, LearnGoal, class_names, refinement
-from gsseg_ros.client.results import (
-    Exported,
-    LearnResult,
-    LoadedScene,
-    LoadedState,
-    PickedObject,
-    RenderedView,
-    SavedState,
-    SegmentResult,
-    Viewpoint,
-)
+from gsseg_ros.client.calls import LearnGoal, class_names, refinement
+from gsseg_ros.client.results import LearnResult, PickedObject, RenderedView, SegmentResult, Viewpoint
 from gsseg_ros.client.run_clouds import RunClouds
-from gsseg_ros.client.spinner import Spinner
-from gsseg_ros.conversions import array_from_point, arrays_from_cloud, mask_image, viewpoint_messages
-from gsseg_ros.errors import NodeUnavailableError
-
-_SERVICES = {
-    Segment: "segment", Pick: "pick", RenderView: "render_view", LoadScene: "load_scene", SaveState: "save_state",
-    LoadState: "load_state", Export: "export", Reset: "reset", GetState: "get_state",
-}  # fmt: skip
-
-ASK_SECONDS, POLL_SECONDS = 2.0, 0.2
-"""Until a question for the node's state is asked again, unanswered and answered."""
+from gsseg_ros.client.scene_requests import SceneRequests
+from gsseg_ros.conversions import arrays_from_cloud, mask_image, viewpoint_messages
 
 
-class SegmentationClient:
+class SegmentationClient(SceneRequests):
     """Talks to a segmentation node. Its methods block, and may be called from several threads.
 
     Every method raises `SegmentationError` where the node answers that it failed, and `NodeUnavailableError`, which is
@@ -73,109 +48,10 @@ class SegmentationClient:
         Seconds to look for the node before it is taken for absent.
     """
 
-    def __init__(
-        self,
-        node_name: str = "gsseg",
-        *,
-        context: Context | None = None,
-        domain_id: int | None = None,
-        find_timeout: float = 10.0,
-    ) -> None:
-        self._name = "/" + node_name.strip("/")
-        self._spinner = Spinner("gsseg_client", context, domain_id)
-        self._calls = Calls(self._spinner, self._name, find_timeout)
-        node = self._spinner.node
-        # The question for the state comes last: the node hears of them in this order, and an answer to someone it has
-        # not heard of yet is lost; so once it has told its state, none is.
+    def _reach(self, node: Any) -> None:
         self._learn: Any = ActionClient(node, Learn, f"{self._name}/learn")
-        self._clients = {kind: node.create_client(kind, f"{self._name}/{name}") for kind, name in _SERVICES.items()}
-        self._clouds = RunClouds(self._spinner, f"{self._name}/cloud")
-        self._diagnostics: Any = None
-        self._statuses: deque[Any] = deque(maxlen=10)
         self._learning: set[LearnGoal] = set()
-
-    def __enter__(self) -> SegmentationClient:
-        """Do nothing: it is ready."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close it."""
-        self.close()
-
-    def close(self) -> None:
-        """Take the client away; the node goes on."""
-        self._spinner.close()
-
-    def wait_until_active(self, timeout: float = 120.0) -> None:
-        """Wait until the node is there and active. At its first start after installing, kernels compile for a minute.
-
-        Raises
-        ------
-        NodeUnavailableError
-            It is not, within `timeout` seconds.
-        """
-        deadline = time.monotonic() + timeout
-        client, state = self._clients[GetState], "not answering"
-        if not self._spinner.wait_for(client.service_is_ready, timeout):
-            raise self._calls.absent(f"service {client.srv_name}", timeout)
-        while time.monotonic() < deadline:
-            # Asked again and again, for the node may have been started anew meanwhile.
-            asked = self._spinner.run(lambda: client.call_async(GetState.Request()))
-            if self._spinner.wait_for(asked.done, min(ASK_SECONDS, deadline - time.monotonic())):
-                state = asked.result().current_state.label
-                if asked.result().current_state.id == State.PRIMARY_STATE_ACTIVE:
-                    return
-                self._spinner.wait_for(lambda: False, min(POLL_SECONDS, deadline - time.monotonic()))
-            client.remove_pending_request(asked)
-        raise NodeUnavailableError(
-            f"{self._name} is {state} after {timeout:g} s; expected active: its log says why it could not be "
-            "configured, or it waits for a lifecycle manager (parameter autostart)"
-        )
-
-    def wait_for_views(self, count: int, timeout: float = 60.0, on_views: Callable[[int], object] | None = None) -> int:
-        """Wait until the node has fused a number of views; it reports that number once a second.
-
-        Parameters
-        ----------
-        count : int
-            Views since the scene was loaded or reset.
-        timeout : float
-            Seconds.
-        on_views : callable, optional
-            Called with their number whenever the node says it.
-
-        Returns
-        -------
-        int
-            Views fused.
-
-        Raises
-        ------
-        NodeUnavailableError
-            They were not, in time; the message says what the node has to say about its inputs.
-        """
-        deadline, views = time.monotonic() + timeout, 0
-        if self._diagnostics is None:
-            self._diagnostics = self._spinner.node.create_subscription(
-                DiagnosticArray, "/diagnostics", self._on_diagnostics, 10
-            )
-        said = None
-        self._statuses.clear()
-        while self._spinner.wait_for(lambda: self._statuses, deadline - time.monotonic()):
-            said = self._statuses.popleft()
-            values = {value.key: value.value for value in said.values}
-            views = int(values.get("views fused", 0))
-            if on_views is not None:
-                on_views(views)
-            if views >= count:
-                return views
-        if said is None:
-            raise self._calls.absent("its status on /diagnostics", timeout)
-        rejected = [f"{key}: {value}" for key, value in values.items() if key.startswith("rejected ")]
-        raise NodeUnavailableError(
-            f"{self._name} has fused {views} of {count} views after {timeout:g} s; it says: "
-            + "; ".join([said.message, *rejected])
-        )
+        self._clouds = RunClouds(self._spinner, f"{self._name}/cloud")
 
     def learn(
         self,
@@ -340,58 +216,3 @@ class SegmentationClient:
         )
         answer = self._call(RenderView, request, timeout)
         return rendered_view(answer)
-
-    def load_scene(self, path: str | os.PathLike[str] = "", *, timeout: float = 120.0) -> LoadedScene:
-        """Load another scene, and forget all views and what was learnt; by default the node's `scene_path` again."""
-        answer = self._call(LoadScene, LoadScene.Request(path=os.fspath(path)), timeout)
-        box = array_from_point(answer.box_min), array_from_point(answer.box_max)
-        return LoadedScene(Path(answer.path), answer.scene_hash, answer.num_gaussians, box)
-
-    def save_state(self, path: str | os.PathLike[str] = "", *, timeout: float = 60.0) -> SavedState:
-        """Save votes, views and class probabilities; by default in gsseg_state.npz in `data_root`."""
-        answer = self._call(SaveState, SaveState.Request(path=os.fspath(path)), timeout)
-        return SavedState(Path(answer.path), answer.num_bytes, answer.num_views)
-
-    def load_state(self, path: str | os.PathLike[str] = "", *, timeout: float = 60.0) -> LoadedState:
-        """Load a saved state in place of the present one."""
-        answer = self._call(LoadState, LoadState.Request(path=os.fspath(path)), timeout)
-        return LoadedState(Path(answer.path), dict(enumerate(answer.class_names)), answer.num_views)
-
-    def export(
-        self,
-        directory: str | os.PathLike[str] = "",
-        classes: Sequence[str | int] = (),
-        min_confidence: float = 0.0,
-        refine: bool | str = True,
-        filter: bool = True,
-        format: str = "",
-        collision: str = "",
-        *,
-        timeout: float = 120.0,
-    ) -> Exported:
-        """Write segmentation.npz, one PLY per class, and report.json; by default to gsseg_export in `data_root`.
-
-        `format` and `collision` are those of `gsseg segment`; by default as the node's parameter `export_format` says,
-        without meshes. Objects are cut to their silhouettes unless `refine` is "paper".
-        """
-        request = Export.Request(
-            directory=os.fspath(directory),
-            classes=class_names(classes),
-            min_confidence=float(min_confidence),
-            format=format,
-            collision=collision,
-            **refinement(refine, filter),
-        )
-        answer = self._call(Export, request, timeout)
-        folder = Path(answer.directory)
-        return Exported(folder, [folder / name for name in answer.files], answer.report)
-
-    def reset(self, *, timeout: float = 30.0) -> int:
-        """Forget all views and what was learnt, and clear the clouds; return how many views were forgotten."""
-        return int(self._call(Reset, Reset.Request(), timeout).num_views_dropped)
-
-    def _call(self, kind: Any, request: Any, timeout: float) -> Any:
-        return self._calls.call(self._clients[kind], request, timeout)
-
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        self._statuses.extend(status for status in message.status if status.name == self._name)

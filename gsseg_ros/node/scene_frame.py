@@ -16,7 +16,7 @@ from gsseg_core.errors import PoseError
 from gsseg_ros.conversions import matrix_from_pose, pose_from_matrix
 from gsseg_ros.errors import InvalidRequestError
 from gsseg_ros.frames import Similarity, rigid
-from gsseg_ros.node.parameters import SCALES
+from gsseg_ros.node.declarations import SCALES
 from gsseg_ros.qos import latched
 
 

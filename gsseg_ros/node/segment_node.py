@@ -25,7 +25,7 @@ from rclpy.signals import SignalHandlerOptions
 from gsseg_core.freed_memory import keep_freed_memory
 from gsseg_core.live.living_session import LivingSession
 from gsseg_core.warm_up import warm_up
-from gsseg_ros.node import diagnostics, parameters
+from gsseg_ros.node import declarations, diagnostics, parameters
 from gsseg_ros.node.complaints import SCENE_DELTA, Complaints
 from gsseg_ros.node.inputs import Inputs
 from gsseg_ros.node.learn_action import LearnAction
@@ -72,7 +72,7 @@ class SegmentNode(LifecycleNode):
             if service.srv_type is ChangeState:
                 service.callback = self._answered(service.callback)
         self.configuring = False
-        parameters.declare(self)
+        declarations.declare(self)
         self.workspace = Workspace(Settings.read(self), lambda: self.get_clock().now().to_msg())
         self.inputs: Inputs | None = None
         self.obstacles: Obstacles | None = None
@@ -247,7 +247,7 @@ class SegmentNode(LifecycleNode):
         return result
 
     def _take_parameters(self, changed: Sequence[Parameter]) -> None:
-        names = {parameter.name for parameter in changed} & parameters.AT_ONCE
+        names = {parameter.name for parameter in changed} & declarations.AT_ONCE
         if not names:
             return
         with self.workspace.placement.fusing:

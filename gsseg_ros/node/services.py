@@ -33,9 +33,10 @@ from gsseg_ros.node.output_folders import pinned_folder, require_own_folder, sta
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.picking import fill_answer, pick_object
 from gsseg_ros.node.reports import Selection, empty_report, finish, report_message, stage_timings
+from gsseg_ros.node.request_fields import checked_confidence, chosen_classes, refinement
 from gsseg_ros.node.scene_frame import placed, placed_by
 from gsseg_ros.node.viewpoints import Lookup, draw, viewpoint
-from gsseg_ros.node.workspace import Run, Workspace, checked_confidence, chosen_classes
+from gsseg_ros.node.workspace import Run, Workspace
 from gsseg_ros.object_messages import point_message
 from gsseg_ros.qos import requests
 
@@ -43,9 +44,6 @@ STATE_FILE, EXPORT_FOLDER = "gsseg_state.npz", "gsseg_export"
 
 _PUBLISHED = ("min_confidence", "skip_refinement", "skip_filter", "refine")
 """Fields of a request of ~/segment that decide what is published."""
-
-PAPER, CARVE = "paper", "carve"
-"""What a request may ask for after KNN clustering."""
 
 AT_WORK, WAITING = 2, 4
 """Most long requests that work at a time, and that wait besides; each holds a thread of the executor."""
@@ -97,30 +95,6 @@ def describe(error: Exception) -> str:
     if isinstance(error, GssegError):
         return str(error)
     return one_line(f"unexpected {type(error).__name__}: {error}") + f"\n{traceback.format_exc()}"
-
-
-def refinement(request: Any, workspace: Workspace) -> RefineSettings:
-    """Refinement as a request asks for it, with the node's k and beta.
-
-    Files are made to be kept, and worth the seconds that carving takes; what is asked for while the robot moves is not,
-    unless the request says so.
-
-    Raises
-    ------
-    InvalidRequestError
-        There is no such refinement.
-    """
-    settings, default = workspace.settings, CARVE if isinstance(request, Export.Request) else PAPER
-    if request.refine not in ("", PAPER, CARVE):
-        raise InvalidRequestError(f"refine is '{request.refine[:60]}'; expected {PAPER}, {CARVE}, or nothing")
-    outer = None if request.skip_refinement or request.skip_filter else request.refine or default
-    return RefineSettings(
-        k=settings.k,
-        beta=settings.beta,
-        cluster=not request.skip_refinement,
-        filter=outer == PAPER,
-        carve=outer == CARVE,
-    )
 
 
 class Services:
@@ -234,7 +208,7 @@ class Services:
         session, settings = self.workspace.session, self.workspace.settings
         with self.workspace.run("render_view") as run:
             self.workspace.number(run)
-            result = session.segmentation(refinement(request, self.workspace), run.watch)
+            result = session.segmentation(refinement(request, self.workspace.settings), run.watch)
             camera = viewpoint(request, settings, self._lookup())
             header = Header(stamp=run.stamp, frame_id=request.viewpoint_camera.header.frame_id)
             selection = Selection(session, result, sorted(result.class_names), 0.0, settings.scene_to_map)
@@ -351,7 +325,7 @@ class Services:
             self.clear(run)
 
     def _select(self, request: Any, run: Run) -> tuple[Selection, RefineSettings]:
-        session, refine = self.workspace.session, refinement(request, self.workspace)
+        session, refine = self.workspace.session, refinement(request, self.workspace.settings)
         threshold = checked_confidence(request)
         if session.has_codes:
             # Before the work: a wrong name should not have to wait for it.

@@ -6,7 +6,7 @@ import os
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +14,6 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 
-from gsseg_core.data.class_names import class_ids
 from gsseg_core.data.label_images import PER_VIEW
 from gsseg_core.data.label_map import read_new_names
 from gsseg_core.errors import PathNotAllowedError, SettingsError
@@ -28,7 +27,6 @@ from gsseg_ros.errors import (
     MissingFileError,
     NoSceneError,
     NotActiveError,
-    UnknownClassError,
 )
 from gsseg_ros.node.jobs import JobSlot, Requests
 from gsseg_ros.node.masks.label_space import LabelSpace, NewNames
@@ -372,30 +370,3 @@ class Workspace:
             return None
         inside = self.path(str(folder / request))
         return self.existing(str(inside) if os.path.exists(inside) else request)
-
-
-def chosen_classes(request: Any, class_names: Mapping[int, str]) -> list[int]:
-    """Ids of the classes that a request asks for, ascending; all if it names none.
-
-    Raises
-    ------
-    UnknownClassError
-        A name or number does not exist, or several classes have the name.
-    """
-    try:
-        return sorted(class_ids(request.classes, class_names) or class_names)
-    except SettingsError as error:
-        raise UnknownClassError(str(error)) from error
-
-
-def checked_confidence(request: Any) -> float:
-    """Threshold of a request.
-
-    Raises
-    ------
-    InvalidRequestError
-        It is not in [0, 1].
-    """
-    if not 0 <= request.min_confidence <= 1:
-        raise InvalidRequestError(f"min_confidence is {request.min_confidence}; expected 0 to 1")
-    return float(request.min_confidence)

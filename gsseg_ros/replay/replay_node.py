@@ -20,6 +20,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import CameraInfo, Image
 
 from gsseg_core.errors import GssegError, SettingsError
@@ -209,11 +210,20 @@ def _run(node: ReplayNode) -> int:
     return 0
 
 
+def _with_parameters(args: list[str] | None) -> list[str]:
+    """Replace the option `--grow` by the parameter that it stands for."""
+    args = list(sys.argv if args is None else args)
+    if "--grow" not in remove_ros_args(args):
+        return args
+    args.remove("--grow")
+    return [*args, "--ros-args", "-p", "grow:=true"]
+
+
 def main(args: list[str] | None = None) -> int:
     """Run the node; exit code 0 when done or stopped by a signal, 2 for bad input."""
     try:
         # rclpy's own handlers would take the context away in the middle of a publication.
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=_with_parameters(args), signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # arguments that ROS cannot parse; its class for that is not public
         print(f"replay_node: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

@@ -134,7 +134,7 @@ def test_each_camera_has_an_overlay_of_its_own(shared: Ros, parameters: dict[str
 
 @pytest.mark.parametrize("bad", [["front", "front"], ["a/b"], [""], ["1"], ["front "], ["a__b"]])
 def test_names_that_no_topic_can_have_are_refused(bad: list[str]) -> None:
-    from gsseg_ros.node.parameters import DECLARATIONS
+    from gsseg_ros.node.declarations import DECLARATIONS
 
     defaults = {declaration.name: declaration.default for declaration in DECLARATIONS}
     assert Settings.of({**defaults, "cameras": ["front", "left_2"]}).cameras == ("front", "left_2")

@@ -27,6 +27,7 @@ from rclpy.signals import SignalHandlerOptions
 from gsseg_core.errors import IntrinsicsError, PoseError
 from gsseg_core.export.pictures import palette
 from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.scene_delta import SceneDelta
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.client import SegmentationClient, Viewpoint
 
@@ -165,6 +166,24 @@ def test_what_was_learnt_can_be_saved_forgotten_and_loaded(learnt: Place) -> Non
     np.testing.assert_array_equal(client.segment().points, before.points)
     client.reset()
     assert failure(client.segment).name == "NO_CODES"
+
+
+def test_the_scene_is_changed_and_grown_and_states_are_added(learnt: Place) -> None:
+    client, count = learnt.client, len(balls_on_a_table()[0])
+    client.save_state("one.npz")
+    merged = client.merge_states("one.npz")
+    assert (merged.class_names, merged.num_merged) == (NAMES, merged.num_views)
+    changed = client.update_scene(SceneDelta(removed=np.arange(30)))
+    assert (changed.revision, changed.num_removed, changed.num_gaussians) == (1, 30, count - 30)
+    SceneDelta(removed=np.arange(30, 40)).save(learnt.folder / "delta.npz")
+    again = client.update_scene("delta.npz")
+    assert (again.revision, again.num_gaussians) == (2, count - 40) and again.digest != changed.digest
+    assert client.segment().report.num_gaussians == count - 40
+    grown = client.load_scene("data/scene.ply", keep_votes=True)
+    assert (grown.num_carried, grown.matched_by, grown.num_gaussians) == (count - 40, "position", count)
+    assert failure(lambda: client.update_scene(SceneDelta(revision=9, removed=np.array([-1 + 2**62])))).name == (
+        "INVALID_REQUEST"
+    )
 
 
 def test_an_export_says_which_files_it_wrote(learnt: Place) -> None:

@@ -14,7 +14,7 @@ import pytest
 import yaml
 from ros_helpers import REPOSITORY, Context, Node, next_domain
 
-from gsseg_ros.node.parameters import DECLARATIONS
+from gsseg_ros.node.declarations import DECLARATIONS
 
 FILE = REPOSITORY / "launch" / "segment.launch.py"
 Launched = Callable[..., list[SimpleNamespace]]

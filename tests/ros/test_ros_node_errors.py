@@ -23,7 +23,8 @@ from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 
 from gsseg_ros.errors import PathNotAllowedError
-from gsseg_ros.node.parameters import DECLARATIONS, Settings
+from gsseg_ros.node.declarations import DECLARATIONS
+from gsseg_ros.node.parameters import Settings
 from gsseg_ros.node.workspace import Workspace
 
 INTERFACES = {name: SERVICES[name].Response for name in (

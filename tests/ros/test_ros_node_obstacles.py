@@ -29,9 +29,9 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy, qos_profile_sensor_data
 from sensor_msgs.msg import PointCloud2
 
+from gsseg_ros.node import declarations, segment_node
 from gsseg_ros.node import obstacles as obstacles_module
-from gsseg_ros.node import parameters as node_parameters
-from gsseg_ros.node import segment_node
+from gsseg_ros.node.parameters import Settings
 
 FILE = REPOSITORY / "config/nav2_obstacles.yaml"
 CONFIG = yaml.safe_load(FILE.read_text())
@@ -196,13 +196,13 @@ def test_the_part_of_the_node_is_one_that_it_takes_and_the_manager_has_no_bond_w
     context.init(args=["--ros-args", "--params-file", str(FILE)], domain_id=next_domain())
     try:
         node = Node("gsseg", context=context)
-        node_parameters.declare(node)
-        settings = node_parameters.Settings.read(node)
+        declarations.declare(node)
+        settings = Settings.read(node)
         node.destroy_node()
     finally:
         context.shutdown()
     given = CONFIG["/**/gsseg"]["ros__parameters"]
-    assert given.keys() <= {declaration.name for declaration in node_parameters.DECLARATIONS}
+    assert given.keys() <= {declaration.name for declaration in declarations.DECLARATIONS}
     assert settings.obstacle_classes == tuple(given["obstacle_classes"]) and settings.autostart is False
     manager = CONFIG["lifecycle_manager_gsseg"]["ros__parameters"]
     assert (manager["node_names"], manager["bond_timeout"], manager["autostart"]) == (["gsseg"], 0.0, True)

@@ -17,7 +17,7 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import Parameter
 
-from gsseg_ros.node.parameters import AT_ONCE, DECLARATIONS
+from gsseg_ros.node.declarations import AT_ONCE, DECLARATIONS
 
 
 @pytest.fixture(scope="module")

@@ -167,7 +167,7 @@ def test_replay_launch_file_has_the_parameters_of_the_node_with_their_defaults()
 
 
 def test_parameters_file_has_every_parameter_at_its_default() -> None:
-    from gsseg_ros.node.parameters import DECLARATIONS
+    from gsseg_ros.node.declarations import DECLARATIONS
 
     file = yaml.safe_load((ROOT / "config" / "segment_node.yaml").read_text())
     assert list(file) == ["/**"]
@@ -183,14 +183,14 @@ def test_parameters_file_has_every_parameter_at_its_default() -> None:
 def test_a_node_accepts_the_parameters_file_as_it_stands(name: str, namespace: str) -> None:
     from ros_helpers import Context, Node, next_domain
 
-    from gsseg_ros.node import parameters
+    from gsseg_ros.node import declarations, parameters
 
     context = Context()
     file = str(ROOT / "config" / "segment_node.yaml")
     context.init(args=["--ros-args", "--params-file", file], domain_id=next_domain())
     try:
         node = Node(name, namespace=namespace, context=context)
-        parameters.declare(node)
+        declarations.declare(node)
         settings = parameters.Settings.read(node)
         node.destroy_node()
     finally:

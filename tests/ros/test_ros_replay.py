@@ -39,7 +39,7 @@ from gsseg_ros.conversions import (
     stamp_message,
     stamp_ns,
 )
-from gsseg_ros.replay.replay_node import _PARAMETERS, make_source
+from gsseg_ros.replay.replay_node import _with_parameters, make_source
 from gsseg_ros.replay.sources import BagSource, FolderSource, PhotoFileError
 
 KINDS = {"mask": Image, "camera_info": CameraInfo, "pose": PoseStamped, "image": Image}
@@ -310,6 +310,12 @@ def test_bad_parameters_are_one_error_that_says_what_was_expected(
 )
 def test_what_the_folder_does_not_go_with_is_one_error(folder: Path, parameters: dict[str, str], expected: str) -> None:
     assert expected in refused(data=folder, **parameters)
+
+
+def test_the_option_grow_is_the_parameter() -> None:
+    remapped = ["replay_node", "--ros-args", "-p", "data:=--grow"]
+    assert _with_parameters(remapped) == remapped
+    assert _with_parameters([*remapped[:1], "--grow", *remapped[1:]]) == [*remapped, "--ros-args", "-p", "grow:=true"]
 
 
 def test_arguments_that_ros_cannot_parse_are_refused_without_a_traceback(ros: Ros) -> None:

@@ -1,0 +1,156 @@
+"""The connection of a client to a segmentation node: its services, and waiting for the node and its views."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from diagnostic_msgs.msg import DiagnosticArray
+from gsseg_msgs.srv import (
+    Export,
+    LoadScene,
+    LoadState,
+    MergeStates,
+    Pick,
+    RenderView,
+    Reset,
+    SaveState,
+    Segment,
+    UpdateScene,
+)
+from lifecycle_msgs.msg import State
+from lifecycle_msgs.srv import GetState
+from rclpy.context import Context
+
+from gsseg_ros.client.calls import Calls
+from gsseg_ros.client.spinner import Spinner
+from gsseg_ros.errors import NodeUnavailableError
+
+_SERVICES = {
+    Segment: "segment", Pick: "pick", RenderView: "render_view", LoadScene: "load_scene", SaveState: "save_state",
+    LoadState: "load_state", Export: "export", Reset: "reset", UpdateScene: "update_scene",
+    MergeStates: "merge_states", GetState: "get_state",
+}  # fmt: skip
+
+ASK_SECONDS, POLL_SECONDS = 2.0, 0.2
+"""Until a question for the node's state is asked again, unanswered and answered."""
+
+
+Self = TypeVar("Self", bound="Connection")
+
+
+class Connection:
+    """Reaches one node; see `SegmentationClient`, whose arguments these are."""
+
+    def __init__(
+        self,
+        node_name: str = "gsseg",
+        *,
+        context: Context | None = None,
+        domain_id: int | None = None,
+        find_timeout: float = 10.0,
+    ) -> None:
+        self._name = "/" + node_name.strip("/")
+        self._spinner = Spinner("gsseg_client", context, domain_id)
+        self._calls = Calls(self._spinner, self._name, find_timeout)
+        node = self._spinner.node
+        # The question for the state comes last: the node hears of them in this order, and an answer to someone it has
+        # not heard of yet is lost; so once it has told its state, none is.
+        self._reach(node)
+        self._clients = {kind: node.create_client(kind, f"{self._name}/{name}") for kind, name in _SERVICES.items()}
+        self._diagnostics: Any = None
+        self._statuses: deque[Any] = deque(maxlen=10)
+
+    def _reach(self, node: Any) -> None:
+        """Make what else the node is reached by."""
+
+    def __enter__(self: Self) -> Self:
+        """Do nothing: it is ready."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close it."""
+        self.close()
+
+    def close(self) -> None:
+        """Take the client away; the node goes on."""
+        self._spinner.close()
+
+    def wait_until_active(self, timeout: float = 120.0) -> None:
+        """Wait until the node is there and active. At its first start after installing, kernels compile for a minute.
+
+        Raises
+        ------
+        NodeUnavailableError
+            It is not, within `timeout` seconds.
+        """
+        deadline = time.monotonic() + timeout
+        client, state = self._clients[GetState], "not answering"
+        if not self._spinner.wait_for(client.service_is_ready, timeout):
+            raise self._calls.absent(f"service {client.srv_name}", timeout)
+        while time.monotonic() < deadline:
+            # Asked again and again, for the node may have been started anew meanwhile.
+            asked = self._spinner.run(lambda: client.call_async(GetState.Request()))
+            if self._spinner.wait_for(asked.done, min(ASK_SECONDS, deadline - time.monotonic())):
+                state = asked.result().current_state.label
+                if asked.result().current_state.id == State.PRIMARY_STATE_ACTIVE:
+                    return
+                self._spinner.wait_for(lambda: False, min(POLL_SECONDS, deadline - time.monotonic()))
+            client.remove_pending_request(asked)
+        raise NodeUnavailableError(
+            f"{self._name} is {state} after {timeout:g} s; expected active: its log says why it could not be "
+            "configured, or it waits for a lifecycle manager (parameter autostart)"
+        )
+
+    def wait_for_views(self, count: int, timeout: float = 60.0, on_views: Callable[[int], object] | None = None) -> int:
+        """Wait until the node has fused a number of views; it reports that number once a second.
+
+        Parameters
+        ----------
+        count : int
+            Views since the scene was loaded or reset.
+        timeout : float
+            Seconds.
+        on_views : callable, optional
+            Called with their number whenever the node says it.
+
+        Returns
+        -------
+        int
+            Views fused.
+
+        Raises
+        ------
+        NodeUnavailableError
+            They were not, in time; the message says what the node has to say about its inputs.
+        """
+        deadline, views = time.monotonic() + timeout, 0
+        if self._diagnostics is None:
+            self._diagnostics = self._spinner.node.create_subscription(
+                DiagnosticArray, "/diagnostics", self._on_diagnostics, 10
+            )
+        said = None
+        self._statuses.clear()
+        while self._spinner.wait_for(lambda: self._statuses, deadline - time.monotonic()):
+            said = self._statuses.popleft()
+            values = {value.key: value.value for value in said.values}
+            views = int(values.get("views fused", 0))
+            if on_views is not None:
+                on_views(views)
+            if views >= count:
+                return views
+        if said is None:
+            raise self._calls.absent("its status on /diagnostics", timeout)
+        rejected = [f"{key}: {value}" for key, value in values.items() if key.startswith("rejected ")]
+        raise NodeUnavailableError(
+            f"{self._name} has fused {views} of {count} views after {timeout:g} s; it says: "
+            + "; ".join([said.message, *rejected])
+        )
+
+    def _call(self, kind: Any, request: Any, timeout: float) -> Any:
+        return self._calls.call(self._clients[kind], request, timeout)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        self._statuses.extend(status for status in message.status if status.name == self._name)
