@@ -39,7 +39,7 @@ from gsseg_ros.conversions import (
     stamp_message,
     stamp_ns,
 )
-from gsseg_ros.replay.replay_node import _with_parameters, make_source
+from gsseg_ros.replay.replay_node import _PARAMETERS, _with_parameters, make_source
 from gsseg_ros.replay.sources import BagSource, FolderSource, PhotoFileError
 
 KINDS = {"mask": Image, "camera_info": CameraInfo, "pose": PoseStamped, "image": Image}
