@@ -27,6 +27,9 @@ _HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fracti
 _HEADER_4 = 32  # from version 4 on; the offset of the table of streams follows those above
 _ANTIALIASED, _EXTENSIONS = 1, 2
 _COORDINATE_SYSTEM = 0xADBE0003
+# Deflate packs a thousand bytes into one at best. Real scenes are packed into half of their bytes, or a tenth where SH
+# are all zero: what is large and far denser was made to be inflated.
+_DENSEST, _SMALL, _DENSE = 1032, 1 << 26, 100
 _LOGITS = logits(np.arange(256) / 255).astype(np.float32)
 _COLOR_SCALE = 0.15  # of coefficients of degree 0, so that colours beyond [0, 1] fit
 # The axes of the file, by the number that the extension SPZ_ADOBE_coordinate_system says; 0 and none mean RUB.
@@ -118,6 +121,12 @@ def _header(content: bytes) -> _Header:
     return _Header(version, count, degree, bits, flags)
 
 
+def _check_packed(header: _Header, size: int) -> None:
+    """Raise `UnfitError`, before anything is inflated, if a file of this size would have to be packed too densely."""
+    claimed = header.gaussians * sum(header.sizes)
+    check_size(size * (_DENSEST if claimed <= _SMALL else _DENSE), claimed, f"{header.gaussians:,} Gaussians")
+
+
 def _rows(read: Read, count: int, size: int) -> npt.NDArray[np.uint8]:
     """Read an attribute of some Gaussians, (count, size)."""
     content = read(count * size)
@@ -131,8 +140,7 @@ def _inflate(file: Any) -> tuple[_Header, str, Iterator[Read]]:
     header = _header(stream.read(_HEADER.size))
     if header.version > 3:
         raise UnfitError(f"is SPZ of version {header.version} under gzip; expected 1 to 3")
-    # Deflate packs a thousand bytes into one at best: a small file cannot hold what it claims.
-    check_size(1032 * file.seek(0, 2), header.gaussians * sum(header.sizes), f"{header.gaussians:,} Gaussians")
+    _check_packed(header, file.seek(0, 2))
     file.seek(0)
     stream = gzip.GzipFile(fileobj=file)
     stream.read(_HEADER.size)
@@ -165,6 +173,9 @@ def _streams(file: BufferedReader, path: Path) -> tuple[_Header, str, Iterator[R
     system = _axes_said(file.read(table - _HEADER_4)) if header.flags & _EXTENSIONS else "RUB"
     file.seek(table)
     sizes = struct.unpack(f"<{2 * count}Q", file.read(16 * count))
+    place = file.tell()
+    _check_packed(header, file.seek(0, 2))
+    file.seek(place)
     if list(sizes[1::2]) != wanted:
         raise UnfitError(f"has streams of {sizes[1::2]} bytes; expected {wanted} for its Gaussians")
 

@@ -17,6 +17,7 @@ from ros_client_cases import (  # noqa: F401
     says_in_the_end,
     shared_fixture,
 )
+from scene_files import write_glb, write_gsplat, write_ksplat
 from small_scenes import NAMES, balls_on_a_table, ring
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
@@ -184,6 +185,25 @@ def test_the_scene_is_changed_and_grown_and_states_are_added(learnt: Place) -> N
     assert failure(lambda: client.update_scene(SceneDelta(revision=9, removed=np.array([-1 + 2**62])))).name == (
         "INVALID_REQUEST"
     )
+
+
+def test_scenes_of_other_formats_are_loaded_learnt_and_segmented(place: Place) -> None:
+    client, scene = place.client, balls_on_a_table()[0]
+    client.learn("data", "votes")
+    expected = client.segment()
+    for name, write in (("a.glb", write_glb), ("a.ksplat", write_ksplat(0)), ("a.pt", write_gsplat)):
+        write(place.folder / name, scene)
+        loaded = client.load_scene(name)
+        assert loaded.path == place.folder / name and loaded.num_gaussians == len(scene)
+        assert failure(client.segment).name == "NO_CODES"
+        client.learn("data", "votes")
+        result = client.segment()
+        assert list(result.objects) == list(expected.objects)
+        for thing in expected.objects.values():
+            assert len(result.objects[thing.name].points) == pytest.approx(len(thing.points), rel=0.02)
+    refused = failure(lambda: client.load_scene("data/cameras.json", keep_votes=True))
+    assert refused.name == "INVALID_FILE"
+    assert client.segment().report.scene_hash == loaded.digest
 
 
 def test_an_export_says_which_files_it_wrote(learnt: Place) -> None:

@@ -20,6 +20,7 @@ from scene_files import some_scene
 from test_scene_formats import CASES
 
 from gsseg_core.errors import GssegError, PathNotAllowedError, SceneFileError
+from gsseg_core.scene import spz
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 
@@ -82,6 +83,25 @@ def test_an_spz_that_claims_more_than_it_can_hold_is_refused_before_memory_is_ta
         refuse(path, match)
         path.write_bytes(struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, 0, 12, 0, 5, 32) + bytes(80))
         refuse(path, "claims|has streams of")
+
+
+@pytest.mark.parametrize("version", [3, 4])
+def test_an_spz_that_is_packed_as_no_scene_is_is_refused_before_it_is_inflated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: int
+) -> None:
+    path, scene = tmp_path / "a.spz", some_scene(10, 0)
+    if version == 3:
+        head = struct.pack("<4sIIBBBB", b"NGSP", 3, 40_000_000, 3, 12, 0, 0)
+        path.write_bytes(gzip.compress(head + bytes(20 << 20), 9))
+    else:
+        body = bytearray(scene_files.spz_4(scene_files.spz_body(scene, 4), scene))
+        body[8:12] = struct.pack("<I", 40_000_000)
+        for place in range(32, 32 + 16 * body[15], 16):
+            size = int.from_bytes(body[place + 8 : place + 16], "little")
+            body[place + 8 : place + 16] = struct.pack("<Q", size * 4_000_000)
+        path.write_bytes(body)
+    monkeypatch.setattr(spz, "_rows", lambda *_: pytest.fail("inflated"))
+    refuse(path, r"a\.spz: 40,000,000 Gaussians: [\d,]+ bytes are there; expected at least")
 
 
 def test_an_spz_that_holds_more_than_it_claims_is_not_inflated(tmp_path: Path) -> None:

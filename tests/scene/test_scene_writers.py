@@ -265,3 +265,32 @@ def test_a_palette_of_harmonics_stands_for_more_gaussians_than_it_has_entries(
     monkeypatch.setattr(sog, "_COARSE", 8)
     found = by_gaussforge(written(tmp_path, "sog", scene))
     assert np.sqrt(((found.sh[:, 1:] - scene.sh[:, 1:]) ** 2).mean()) < 0.01
+
+
+KILLED = """
+import os, signal, sys
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.scene_writers import SCENE_WRITERS, write_scene, writer_of
+
+scene = GaussianScene.load("scene.ply")
+for name, writer in SCENE_WRITERS.items():
+    writer_of(name)
+    for path in ("new" + writer.suffixes[0], "old" + writer.suffixes[0]):
+        if path.startswith("old"):
+            open(path, "w").write("as it was")
+        if not (child := os.fork()):
+            os.fsync = lambda file: os.kill(os.getpid(), signal.SIGKILL)
+            write_scene(scene, path, name)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL, path
+        assert not path.startswith("new") or not os.path.exists(path), path
+        assert not path.startswith("old") or open(path).read() == "as it was", path
+assert [name for name in os.listdir() if name.startswith(".gsseg-")]
+write_scene(scene, "last.ply")
+assert not [name for name in os.listdir() if name.startswith(".gsseg-")], os.listdir()
+"""
+
+
+def test_a_conversion_that_is_killed_leaves_nothing_half_written(tmp_path: Path) -> None:
+    some_scene(20, 1).save(tmp_path / "scene.ply")
+    done = subprocess.run([sys.executable, "-c", KILLED], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
