@@ -46,7 +46,7 @@ def workers(count: int) -> Iterator[str]:
 @pytest.fixture(name="address", scope="module")
 def address_fixture() -> Iterator[str]:
     """Workers for all tests that leave them as they were."""
-    with workers(3) as address:
+    with workers(2) as address:
         yield address
 
 

@@ -129,11 +129,11 @@ def test_the_result_reports_the_learnt_codes_before_refinement(robot: Robot, sce
 
 
 def test_feedback_tells_the_stages_and_how_far_they_are(running: Robot) -> None:
-    goal = running.goal(dataset_path="long", num_views=400, max_steps=3)
+    goal = running.goal(dataset_path="long", num_views=100, max_steps=3)
     status, result = running.outcome(goal)
     assert status == GoalStatus.STATUS_SUCCEEDED, result.error_msg
     assert goal.stages[:2] == ["observe", "em"] and goal.stages[-1] == "calibrate"
-    totals = {"observe": 400, "em": 3}
+    totals = {"observe": 100, "em": 3}
     for message in goal.feedback:
         assert 0 <= message.done <= message.total == totals.get(message.stage, message.total)
     for stage in goal.stages:
@@ -227,9 +227,9 @@ def halfway(robot: Robot, goal: Goal, stage: str, done: int) -> None:
     ("fields", "stage", "done"),
     [
         ({"dataset_path": "long"}, "observe", 0),
-        ({"dataset_path": "long"}, "observe", 500),
-        ({"dataset_path": "long", "learner": "votes"}, "observe", 100),
-        ({"dataset_path": "long", "num_views": 500}, "em", 0),
+        ({"dataset_path": "long"}, "observe", 100),
+        ({"dataset_path": "long", "learner": "votes"}, "observe", 20),
+        ({"dataset_path": "long", "num_views": 250}, "em", 0),
         ({"learner": "gradient", "max_steps": 1_000_000}, "gradient", 100),
     ],
 )
@@ -281,7 +281,7 @@ def test_while_it_learns_a_second_goal_is_busy_and_everything_else_is_answered(r
 def test_views_that_come_while_it_learns_are_not_lost_and_exports_are_cut_to_their_silhouettes(
     robot: Robot, scene: GaussianScene
 ) -> None:
-    goal = robot.begin(dataset_path="long", num_views=300)
+    goal = robot.begin(dataset_path="long", num_views=150)
     robot.drive(clean_views(2))
     assert robot.outcome(goal)[0] == GoalStatus.STATUS_SUCCEEDED
     robot.wait_for_status(lambda status: status.get("views kept") == "10", "ten views")

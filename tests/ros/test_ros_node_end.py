@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import signal
 from pathlib import Path
 from typing import Any
@@ -56,53 +57,42 @@ def saved(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Segmentation:
     return session.segmentation()
 
 
-def assert_state_loads(robot: Robot, saved: Segmentation, root: Path) -> None:
-    assert robot.done("load_state", path="state.npz").num_views == 150
-    found = robot.exported(root / "out" / "loaded")
-    np.testing.assert_array_equal(found.probabilities, saved.probabilities)
+def at_work(goal: Goal, stage: str, done: int) -> bool:
+    return any(message.stage == stage and message.done >= done for message in goal.feedback)
 
 
-def test_killed_while_it_learns_the_saved_state_loads_in_a_new_process(
+def test_killed_while_it_learns_or_saves_the_earlier_state_loads_in_a_new_process(
     ros: Ros, parameters: dict[str, Any], root: Path, saved: Segmentation
 ) -> None:
     before = (root / "state.npz").read_bytes()
-    moments: list[tuple[str, str, int]] = [("long", "observe", 0), ("long", "observe", 30), ("", "em", 1)]
-    for i, (dataset, stage, done) in enumerate(moments):
-        # A namespace for each, since what was killed takes a while to be forgotten.
-        robot = Robot(ros, f"/learns{i}").started(parameters)
-        assert_state_loads(robot, saved, root)
-        goal = robot.goal(dataset_path=dataset)
-
-        def reached(goal: Goal = goal, stage: str = stage, done: int = done) -> bool:
-            return any(message.stage == stage and message.done >= done for message in goal.feedback)
-
-        ros.wait_until(reached, f"{stage} {done}")
-        assert robot.process is not None and not goal.future.done()
-        robot.process.kill()
-    assert (root / "state.npz").read_bytes() == before
-    assert_state_loads(Robot(ros, "/afterwards").started(parameters), saved, root)
-
-
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
-def test_killed_while_it_saves_the_earlier_state_loads_in_a_new_process(
-    ros: Ros, parameters: dict[str, Any], root: Path, saved: Segmentation, share: float
-) -> None:
-    before = (root / "state.npz").read_bytes()
-    robot = Robot(ros, "/saves").started(parameters)
-    assert_state_loads(robot, saved, root)
 
     def written() -> list[int]:
         return [path.stat().st_size for path in root.glob(".gsseg-*.npz")]
 
-    answer = robot.send("save_state", path="state.npz")
-    ros.wait_until(lambda: any(size >= share * len(before) for size in written()), "the new file to grow")
-    assert robot.process is not None
-    robot.process.kill()
-    assert not answer.done()
-    assert written(), "it was killed before it was done"
-    assert (root / "state.npz").read_bytes() == before
+    learning: list[tuple[str, str, int]] = [("long", "observe", 0), ("long", "observe", 30), ("", "em", 1)]
+    for i, moment in enumerate([*learning, 0.0, 0.3, 0.7]):
+        # A namespace for each, since what was killed takes a while to be forgotten.
+        robot = Robot(ros, f"/killed{i}").started(parameters)
+        assert robot.done("load_state", path="state.npz").num_views == 150
+        assert robot.process is not None
+        if isinstance(moment, tuple):
+            dataset, stage, done = moment
+            goal = robot.goal(dataset_path=dataset)
+            ros.wait_until(functools.partial(at_work, goal, stage, done), f"{stage} {done}")
+            assert not goal.future.done()
+            robot.process.kill()
+        else:
+            least = moment * len(before)
+            answer = robot.send("save_state", path="state.npz")
+            ros.wait_until(lambda least=least: any(size >= least for size in written()), "the new file to grow")
+            robot.process.kill()
+            assert not answer.done()
+            assert written(), "it was killed before it was done"
+            for left in root.glob(".gsseg-*.npz"):
+                left.unlink()
+        assert (root / "state.npz").read_bytes() == before
 
-    robot = Robot(ros, "/loads").started(parameters)
-    assert_state_loads(robot, saved, root)
-    for left in root.glob(".gsseg-*.npz"):
-        left.unlink()
+    robot = Robot(ros, "/afterwards").started(parameters)
+    assert robot.done("load_state", path="state.npz").num_views == 150
+    found = robot.exported(root / "out" / "loaded")
+    np.testing.assert_array_equal(found.probabilities, saved.probabilities)
