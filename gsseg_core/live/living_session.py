@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -40,6 +40,8 @@ class Changed:
         What told which Gaussians those are: "id" or "position".
     num_views_kept, num_views_lifted : int
         Views whose votes are as they were, and those that were lifted anew.
+    scene : GaussianScene
+        What it made.
     num_views_unknown : int
         Views that the change names and that are not kept.
     """
@@ -51,6 +53,7 @@ class Changed:
     matched_by: str
     num_views_kept: int
     num_views_lifted: int
+    scene: GaussianScene = field(repr=False)
     num_views_unknown: int = 0
 
 
@@ -158,7 +161,7 @@ class LivingSession(LiveSession):
         num_carried = int((origin >= 0).sum())
         return Changed(
             after.revision, num_carried, len(before) - num_carried, len(after) - num_carried, "id",
-            len(self._live.views) - lifted, lifted,
+            len(self._live.views) - lifted, lifted, after.scene,
         )  # fmt: skip
 
     def load(self, path: Any, within: Path | None = None) -> int:

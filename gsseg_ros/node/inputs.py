@@ -263,9 +263,9 @@ class Inputs:
             for camera in self.cameras.values():
                 for paired in camera.pairing.take():
                     self.worker.submit(paired)
-        dropped = self.dropped
-        self._workspace.dropped.update(dropped - self._told)
-        self._told = dropped
+            dropped = self.dropped
+            self._workspace.dropped.update(dropped - self._told)
+            self._told = dropped
 
     @property
     def dropped(self) -> Counter[str]:

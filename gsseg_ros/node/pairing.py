@@ -20,7 +20,7 @@ _Key: TypeAlias = tuple[int, str]  # stamp and frame_id
 
 _CAMERA_INFOS_KEPT = 600  # Of each camera; at 60 Hz, those of ten seconds.
 _STAMPS_KEPT = 1000
-_CAMERAS_KEPT = 16
+CAMERAS_KEPT = 16
 _UNCLEAR_NS = 10 * SECOND
 _DEPTH_BYTES = 64 << 20  # At 30 Hz, VGA and 16 bit, those of three seconds.
 
@@ -234,7 +234,7 @@ class Pairing:
 
     def _await(self, stamp: int, mask: Any, era: object, frame_id: str) -> None:
         frames = self._seen.values.get(stamp, [])
-        if frame_id in frames or len(frames) >= _CAMERAS_KEPT:
+        if frame_id in frames or len(frames) >= CAMERAS_KEPT:
             self.dropped["repeated_stamp"] += 1
             return
         self.out_of_order += bool(self._seen.stamps) and stamp < self._seen.stamps[-1]
@@ -247,7 +247,7 @@ class Pairing:
     def _add_camera_info(self, stamp: int, message: Any, frame_id: str) -> None:
         infos = self._camera_infos.pop(frame_id, None) or History(_CAMERA_INFOS_KEPT)
         self._camera_infos[frame_id] = infos
-        if len(self._camera_infos) > _CAMERAS_KEPT:
+        if len(self._camera_infos) > CAMERAS_KEPT:
             del self._camera_infos[next(iter(self._camera_infos))]
         infos.add(stamp, message)
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 from gsseg_core.errors import GssegError
 from gsseg_core.scene.camera import Camera
 from gsseg_ros.frames import Similarity
+
+_Ways: TypeAlias = dict[str, tuple[Similarity, Similarity]]
 
 
 class Placed(Protocol):
@@ -54,7 +56,7 @@ class Placement:
     ) -> None:
         self.fusing, self.settled, self.refused = threading.RLock(), settled, refused
         self._owner = owner
-        self._moved_from: dict[str, tuple[Similarity, Similarity]] = {}  # By view, to where it has to follow.
+        self._moved_from: _Ways = {}  # By view, to where it has to follow.
         self._left: dict[str, Similarity] = {}  # By view that could not follow: where the scene was for it.
         self._running = False
 
@@ -68,14 +70,32 @@ class Placement:
             # To go nowhere costs as much as to go far, and rounds the camera.
             self._moved_from = {name: ways for name, ways in moved_from.items() if not ways[0].is_same(ways[1])}
             self._left = {}
-            if not self._running:
-                self._running = True
-                threading.Thread(target=self._follow, name="placement", daemon=True).start()
+            self._begin()
 
-    def forget(self) -> None:
-        """Leave all views where they are, before they are replaced."""
+    def bring(self, names: Iterable[str]) -> None:
+        """Have some views follow before anything else; whoever goes on from where they are then holds `fusing`."""
+        with self.fusing:
+            for name in set(names) & self._moved_from.keys():
+                self._follows(name)
+
+    def forget(self) -> tuple[_Ways, dict[str, Similarity]]:
+        """Leave all views where they are, before they are replaced; returns what `resume` takes if they are not."""
         # Without the lock: whoever replaces them must not wait for one that is being fused.
+        forgotten = self._moved_from, self._left
         self._moved_from, self._left = {}, {}
+        return forgotten
+
+    def resume(self, forgotten: tuple[_Ways, dict[str, Similarity]]) -> None:
+        """Have views follow after all."""
+        with self.fusing:
+            self._moved_from, self._left = forgotten[0] | self._moved_from, forgotten[1] | self._left
+            if self._moved_from:
+                self._begin()
+
+    def _begin(self) -> None:
+        if not self._running:
+            self._running = True
+            threading.Thread(target=self._follow, name="placement", daemon=True).start()
 
     def _follow(self) -> None:
         while self._next_follows():
@@ -88,18 +108,21 @@ class Placement:
             self._running, moved_from = False, self._moved_from  # Whatever is raised here, others may follow later.
             if not moved_from or not self._owner.has_scene:
                 return False
-            session = self._owner.session
-            name, (before, after) = next(iter(moved_from.items()))
-            try:
-                done = session.move_view(name, partial(_moved, before=before, after=after), session.era)
-            except GssegError as error:
-                self._left[name] = before
-                self.refused(f"a view cannot follow the scene and stays where it was: {error}")
-                done = True
-            if done:
-                del moved_from[name]
+            self._follows(next(iter(moved_from)))
             self._running = True
             return True
+
+    def _follows(self, name: str) -> None:
+        session, moved_from = self._owner.session, self._moved_from
+        before, after = moved_from[name]
+        try:
+            done = session.move_view(name, partial(_moved, before=before, after=after), session.era)
+        except GssegError as error:
+            self._left[name] = before
+            self.refused(f"a view cannot follow the scene and stays where it was: {error}")
+            done = True
+        if done:
+            del moved_from[name]
 
 
 def _moved(camera: Camera, before: Similarity, after: Similarity) -> Camera:

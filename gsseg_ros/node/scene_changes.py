@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TypeAlias
 
 from gsseg_msgs.msg import SceneDelta as SceneDeltaMessage
 from gsseg_msgs.srv import MergeStates, UpdateScene
@@ -16,10 +18,14 @@ from gsseg_core.live.living_session import Changed, LivingSession
 from gsseg_core.scene.scene_delta import SceneDelta
 from gsseg_ros.delta_messages import delta_from_message
 from gsseg_ros.errors import InvalidRequestError
+from gsseg_ros.node.pairing import CAMERAS_KEPT
 from gsseg_ros.node.services import Services, answered, explain, in_turn
 from gsseg_ros.qos import requests
 
 _STAMP = re.compile(r"[0-9]+")
+_CAMERA_NUMBERS = frozenset(map(str, range(2, CAMERAS_KEPT + 1)))
+
+_Key: TypeAlias = tuple[str, ...]
 
 
 class SceneChanges:
@@ -34,8 +40,6 @@ class SceneChanges:
         Those of the node: requests here take turns with theirs.
     complain : callable
         Told in one line what is wrong with a message of the topic.
-    show : callable
-        Called after each change: has objects published as after a view, while clouds wait for the next run.
     await_fused : callable
         Waits until masks of some stamps that have come are fused: a change may name keyframes that are just under way.
     """
@@ -44,11 +48,10 @@ class SceneChanges:
         self,
         services: Services,
         complain: Callable[[str], None],
-        show: Callable[[], None],
         await_fused: Callable[[set[str]], None],
     ) -> None:
         self.node, self.workspace, self.turns = services.node, services.workspace, services.turns
-        self._complain, self._show, self._await_fused = complain, show, await_fused
+        self._complain, self._show, self._await_fused = complain, services.show, await_fused
         group = ReentrantCallbackGroup()
         for interface, name, handler in (
             (UpdateScene, "update_scene", self.update_scene),
@@ -73,10 +76,10 @@ class SceneChanges:
             delta = delta_from_message(request.delta)
         with workspace.run("update_scene"):
             changed = self._update(session, delta)
-        response.revision, response.num_gaussians = changed.revision, len(session.scene)
+        response.revision, response.num_gaussians = changed.revision, len(changed.scene)
         for name in ("removed", "added", "views_kept", "views_lifted", "views_unknown"):
             setattr(response, f"num_{name}", getattr(changed, f"num_{name}"))
-        response.scene_hash, response.seconds = session.scene.digest, time.perf_counter() - started
+        response.scene_hash, response.seconds = changed.scene.digest, time.perf_counter() - started
 
     def on_scene_delta(self, message: SceneDeltaMessage) -> None:
         """Change the scene by a message of the topic."""
@@ -107,7 +110,11 @@ class SceneChanges:
         if stamps := {view for move in delta.moves for view in move.views if _STAMP.fullmatch(view)}:
             self._await_fused(stamps)
         try:
-            changed = session.update(_with_names(delta, session) if stamps else delta)
+            # Between what it is named by, where views are and what is fused, nothing else may happen.
+            with self.workspace.placement.fusing:
+                delta = _with_names(delta, session) if stamps else delta
+                self.workspace.placement.bring(view for move in delta.moves for view in move.views)
+                changed = session.update(delta)
         except (SceneDeltaError, EmptySceneError) as error:
             raise InvalidRequestError(str(error)) from error
         self._require_current(session)
@@ -122,14 +129,29 @@ class SceneChanges:
 
 
 def _with_names(delta: SceneDelta, session: LivingSession) -> SceneDelta:
-    """Replace stamps among the views of a change by the names of the views that carry them."""
-    stamped: dict[str, list[str]] = {}
-    for view in session.views:
-        # The name of a view ends in its stamp, and at one stamp in the number of its camera; see `pairing`.
-        for stamp in filter(_STAMP.fullmatch, view.name.split("_")[-2:]):
-            stamped.setdefault(stamp, []).append(view.name)
+    """Replace stamps among the views of a change by the names of the views that carry them.
+
+    Where time was set back, or the node was activated again, these are those of the last time of each camera.
+    """
+    stamped: dict[str, dict[_Key, tuple[_Key, list[str]]]] = {}
+    for name in session.view_names:
+        camera, time_of, stamp = _taken_apart(name)
+        rounds = stamped.setdefault(stamp, {})
+        if camera not in rounds or rounds[camera][0] != time_of:
+            rounds[camera] = (time_of, [])
+        rounds[camera][1].append(name)
 
     def named(views: tuple[str, ...]) -> tuple[str, ...]:
-        return tuple(name for view in views for name in stamped.get(view, [view]))
+        found = ([name for _, names in stamped.get(view, {}).values() for name in names] or [view] for view in views)
+        return tuple(itertools.chain.from_iterable(found))
 
     return replace(delta, moves=tuple(replace(move, views=named(move.views)) for move in delta.moves))
+
+
+def _taken_apart(name: str) -> tuple[_Key, _Key, str]:
+    """Take the name of a view apart, which `pairing` has put together: camera, activation and epoch, stamp."""
+    parts = name.split("_")
+    # At one stamp, views of one topic have the numbers of their cameras at the end.
+    if len(parts) > 3 and parts[-1] in _CAMERA_NUMBERS and all(map(_STAMP.fullmatch, parts[-3:])):
+        del parts[-1]
+    return tuple(parts[1:-2]), (*parts[:1], *parts[-2:-1]), parts[-1]

@@ -81,11 +81,10 @@ class SegmentNode(LifecycleNode):
         self._out_of_place = False  # Whether what is latched is from where the scene lay before.
         self.workspace.placement.settled = self._publish_again
         self.workspace.placement.refused = self.get_logger().warning
-        self._requests = Services(self, self.workspace, self._require_outputs, self._lookup)
+        self._requests = Services(self, self.workspace, self._require_outputs, self._lookup, self._show_change)
         self._changes = SceneChanges(
-            self._requests, lambda message: self._complaints.add(SCENE_DELTA, message), self._show_change,
-            self._await_fused,
-        )  # fmt: skip
+            self._requests, lambda message: self._complaints.add(SCENE_DELTA, message), self._await_fused
+        )
         self._learn = LearnAction(self, self.workspace, self._require_outputs)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._complaints = Complaints(self.get_logger().warning)

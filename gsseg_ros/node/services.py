@@ -110,6 +110,8 @@ class Services:
         The outputs, which exist while the node is configured.
     lookup : callable
         The transform lookup, which exists while the node is active with pose_source tf.
+    show : callable
+        Called after each change of the scene: objects are published as after a view, clouds wait for the next run.
     """
 
     def __init__(
@@ -118,8 +120,9 @@ class Services:
         workspace: Workspace,
         outputs: Callable[[], Outputs],
         lookup: Callable[[], Lookup | None],
+        show: Callable[[], None],
     ) -> None:
-        self.node, self.workspace = node, workspace
+        self.node, self.workspace, self.show = node, workspace, show
         self.turns = Turns(AT_WORK, WAITING)
         self._outputs, self._lookup = outputs, lookup
         self._published: Segment.Request | None = None  # What the run was asked for that is latched.
@@ -247,11 +250,12 @@ class Services:
                 response.matched_by = changed.matched_by
             else:
                 workspace.load_scene(path, within, place())
+            scene = workspace.session.scene
             self.clear(run)
-            session = workspace.session
-        corners = workspace.settings.scene_to_map.points_to_map(session.scene.means)
-        response.path, response.scene_hash = str(session.scene.path), session.scene.digest
-        response.num_gaussians = len(session.scene)
+            if request.keep_votes:
+                self.show()
+        corners = workspace.settings.scene_to_map.points_to_map(scene.means)
+        response.path, response.scene_hash, response.num_gaussians = str(scene.path), scene.digest, len(scene)
         response.box_min, response.box_max = (point_message(side(axis=0)) for side in (corners.min, corners.max))
         response.seconds = time.perf_counter() - started
 

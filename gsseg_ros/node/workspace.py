@@ -254,12 +254,19 @@ class Workspace:
         """Count a change of the scene."""
         counts = {"kept": changed.num_views_kept, "lifted anew": changed.num_views_lifted,
                   "named and not kept": changed.num_views_unknown}  # fmt: skip
-        self.changes.update({"made": 1, **{f"views {what}": count for what, count in counts.items()}})
+        with self._lock:
+            self.changes.update({"made": 1, **{f"views {what}": count for what, count in counts.items()}})
 
     def load_state(self, path: str | Path, within: Path | None = None) -> int:
         """Replace what is known of the scene by a saved state; return how many views are in it."""
-        self.placement.forget()  # Views of the state may have the names of some that are still to follow.
-        loaded = self.session.load(path, within)
+        on_their_way = (
+            self.placement.forget()
+        )  # Views of the state may have the names of some that are still to follow.
+        try:
+            loaded = self.session.load(path, within)
+        except Exception:
+            self.placement.resume(on_their_way)
+            raise
         self.forget_waiting()
         return loaded
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -125,3 +126,23 @@ def test_a_repair_that_finds_too_many_objects_changes_nothing() -> None:
     assert session.num_views == session.num_fused == len(VIEWS)
     session.max_classes = 256
     assert session.repair().changed, "which has not been done yet"
+
+
+def test_a_view_that_was_set_aside_is_saved_and_loaded_and_comes_back(tmp_path: Path) -> None:
+    session = PerViewSession(SCENE)
+    for view in VIEWS[:4]:
+        session.fuse(shuffled(view))
+    before, name = session.codes(), VIEWS[1].name
+    away = np.eye(4)
+    away[2, 3] = -1e4
+    far = replace(VIEWS[1].camera, world_to_camera=away)
+    session.move_view(name, lambda camera: far, session.era)
+    session.save(tmp_path / "state.npz")
+    other = PerViewSession(SCENE)
+    assert other.load(tmp_path / "state.npz") == 4 and other.view_names == session.view_names
+    np.testing.assert_array_equal(other.codes(), session.codes())
+    for each in (session, other):
+        each.repair()
+        assert each.move_view(name, lambda camera: VIEWS[1].camera, each.era)
+        assert each.view_names == [view.name for view in VIEWS[:4]] and each.num_fused == 4
+        np.testing.assert_array_equal(each.codes(), before)

@@ -32,7 +32,10 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 
+from gsseg_core.scene.scene_delta import GroupMove, SceneDelta
+from gsseg_core.scene.similarity import Similarity as CoreSimilarity
 from gsseg_ros.conversions import arrays_from_cloud, matrix_from_transform
+from gsseg_ros.delta_messages import message_from_delta
 from gsseg_ros.frames import Similarity
 from gsseg_ros.node.placement import Placement
 from gsseg_ros.node.scene_frame import SceneFrame, transform
@@ -267,10 +270,35 @@ def test_to_grow_and_to_be_put_elsewhere_is_all_or_nothing(
         refused = here.ask("load_scene", **asked)
         assert refused.error_code == refused.INVALID_REQUEST
         assert ("not now" if fails == "the place" else "tolerance is -1") in refused.error_msg
-        wait_until(lambda: not here.node.workspace.placement._running, "views that have nowhere to go")
+        assert not here.node.workspace.placement._moved_from, "views have nowhere to go"
         assert here.node.get_parameter("scene_to_map.scale").value == 1.0
         assert here.node.workspace.settings.scene_to_map.is_same(IDENTITY)
         assert session.living is before and all(now is was for now, was in zip(session.views, views, strict=True))
+
+
+def test_what_happens_before_all_views_have_followed_leaves_them_where_they_were_measured(
+    shared: Ros, parameters: dict[str, Any]
+) -> None:
+    with node_here(shared, parameters) as here:
+        views = clean_views(3)
+        here.fuse(views)
+        workspace, place = here.node.workspace, ASIDE
+        session, stamp = workspace.living_session, workspace.living_session.view_names[1].split("_")[-1]
+        (workspace.root / "broken.npz").write_bytes(b"no state")
+        far = Similarity.from_parameters(1.0, [9.0, 0, 0], [0.0, 0.0, 0.0, 1.0])
+        with workspace.placement.fusing:
+            here.node.set_parameters_atomically(parameters_of(place, 0.02))
+            refused = here.ask("load_state", path="broken.npz")
+            assert refused.error_code == refused.INVALID_FILE
+            move = GroupMove(0, CoreSimilarity(translation=np.array([50.0, 0, 0])), (stamp,))
+            here.done("update_scene", delta=message_from_delta(SceneDelta(moves=(move,))))
+            here.node.set_parameters_atomically(parameters_of(far, 0.0))
+            here.node.set_parameters_atomically(parameters_of(place, 0.02))
+        wait_until(lambda: not workspace.placement._moved_from, "the views to follow")
+        kept = session.views
+        assert [view.group for view in kept] == [None, 0, None]
+        expected = [view.camera.world_to_camera for view in placed_views(views, place)]
+        np.testing.assert_allclose([view.camera.world_to_camera for view in kept], expected, atol=1e-6)
 
 
 def test_the_static_transform_is_the_pose_of_the_scene_without_its_scale() -> None:

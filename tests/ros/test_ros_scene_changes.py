@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,7 @@ from gsseg_ros.conversions import stamp_message
 from gsseg_ros.delta_messages import delta_from_message, message_from_delta
 from gsseg_ros.errors import InvalidRequestError
 from gsseg_ros.node import diagnostics
+from gsseg_ros.node.scene_changes import _with_names
 from gsseg_ros.replay.growing import GrowingSource
 
 SCENE, _ = balls_on_a_table()
@@ -125,8 +127,12 @@ def test_a_keyframe_whose_mask_still_waits_for_its_pose_is_fused_before_the_chan
     np.testing.assert_array_equal(votes(session), as_refused(session))
 
 
-def test_a_file_changes_the_scene_and_a_grown_one_takes_votes_along(here: NodeHere) -> None:
+def test_a_file_changes_the_scene_and_a_grown_one_takes_votes_along(
+    here: NodeHere, monkeypatch: pytest.MonkeyPatch
+) -> None:
     session = here.node.workspace.living_session
+    shown: list[int | None] = []
+    monkeypatch.setattr(here.inputs.live, "changed", lambda: shown.append(session.living.revision))
     COPY.save(root(here) / "delta.npz")
     answer = here.done("update_scene", path="delta.npz")
     assert answer.num_added == len(SCENE)
@@ -135,6 +141,7 @@ def test_a_file_changes_the_scene_and_a_grown_one_takes_votes_along(here: NodeHe
     assert (loaded.num_carried, loaded.matched_by) == (2 * len(SCENE) - 10, "id")
     np.testing.assert_array_equal(votes(session), as_refused(session))
     assert here.node.workspace.session is session and session.num_fused == 4
+    assert shown == [1, None], "of what is latched objects come anew"
     assert here.ask("load_scene", path="grown.ply", keep_votes=True, tolerance=-1.0).error_code % 100 == 3
 
 
@@ -172,6 +179,42 @@ def test_a_change_whose_scene_was_replaced_while_its_file_was_read_is_not_answer
     answer = here.ask("update_scene", path="late.npz")
     assert answer.error_code == 11003 and "another scene was loaded meanwhile" in answer.error_msg
     assert len(here.node.workspace.session.scene) == len(SCENE) and not here.node.workspace.changes
+
+
+def test_an_answer_is_of_its_own_change_whatever_another_client_changes_at_once(
+    here: NodeHere, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session, count = here.node.workspace.living_session, here.node.workspace.count
+    monkeypatch.setattr(
+        here.node.workspace, "count", lambda c: (count(c), session.update(SceneDelta(removed=np.array([1]))))
+    )
+    answer = here.done("update_scene", delta=message_from_delta(SceneDelta(removed=np.array([0]))))
+    assert session.living.revision == 2
+    assert (answer.revision, answer.num_gaussians) == (1, len(SCENE) - 1)
+    assert answer.scene_hash == SCENE.subset(np.arange(1, len(SCENE))).digest != session.scene.digest
+
+
+def test_a_stamp_names_the_newest_views_that_carry_it_and_no_round_of_time() -> None:
+    names = [
+        "0a_0_0",
+        "0a_0_0_2",
+        "0a_0_5000",
+        "0a_1_0",
+        "0a_left_0_7000",
+        "0a_cam_1_0_7000",
+        "x",
+        "0b_0_5000",
+        "0b_0_5000_2",
+    ]
+    known: Any = SimpleNamespace(view_names=names)
+
+    def named(*views: str) -> tuple[str, ...]:
+        return _with_names(SceneDelta(moves=(GroupMove(0, Similarity(), views),)), known).moves[0].views
+
+    assert named("0") == ("0a_1_0",)
+    assert named("5000", "x") == ("0b_0_5000", "0b_0_5000_2", "x")
+    assert named("7000") == ("0a_left_0_7000", "0a_cam_1_0_7000")
+    assert named("1", "2") == ("1", "2")
 
 
 def test_a_delta_out_of_turn_is_complained_of_once_and_changes_nothing(
