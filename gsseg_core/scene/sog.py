@@ -122,7 +122,8 @@ def _pixels(name: object, load: Load, count: int) -> Pixels:
 
 
 def _numbers(values: Any, what: str, count: int | None = None) -> npt.NDArray[np.float32]:
-    numbers = np.asarray(values, np.float32).reshape(-1)
+    with np.errstate(over="ignore"):  # What is infinite then is reported by the scene.
+        numbers = np.asarray(values, np.float32).reshape(-1)
     if count is not None and len(numbers) != count:
         raise UnfitError(f"has {len(numbers)} numbers in {what}; expected {count}")
     return numbers

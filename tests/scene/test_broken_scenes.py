@@ -19,7 +19,7 @@ import torch
 from scene_files import some_scene
 from test_scene_formats import CASES
 
-from gsseg_core.errors import GssegError, PathNotAllowedError, SceneFileError
+from gsseg_core.errors import GssegError, PathNotAllowedError, SceneFileError, SceneValueError
 from gsseg_core.scene import spz
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -161,6 +161,11 @@ def test_sog_that_inflates_is_refused_before_it_does(tmp_path: Path) -> None:
         (b'"shape": [100', b'"shape": ["a"', "count is 'a'; expected a whole number"),
         (b'"quats"', b'"quat"', "truncated or not a SOG scene .lacks 'quats'"),
         (b"{", b"[{", "not valid JSON"),
+        (
+            b'"mins": [',
+            b'"mins": [1e300, 1e300, 1e300], "more": [',
+            "Gaussians have NaN, infinite or too large",
+        ),
     ],
 )
 def test_sog_whose_words_do_not_fit_is_refused(tmp_path: Path, before: bytes, after: bytes, match: str) -> None:
@@ -168,6 +173,13 @@ def test_sog_whose_words_do_not_fit_is_refused(tmp_path: Path, before: bytes, af
     path = tmp_path / "meta.json"
     path.write_bytes(path.read_bytes().replace(before, after, 1))
     refuse(path, match)
+
+
+def test_sog_with_numbers_too_large_for_floats_is_refused_without_a_warning(tmp_path: Path) -> None:
+    scene_files.unzipped(path := tmp_path / "meta.json", some_scene(100, 1))
+    path.write_bytes(path.read_bytes().replace(b'"mins": [', b'"mins": [1e300, 1e300, 1e300], "more": [', 1))
+    with pytest.raises(SceneValueError, match=r"meta\.json: 100 of 100 Gaussians have NaN, infinite or too large"):
+        GaussianScene.load(path)
 
 
 def test_an_image_of_sog_that_leads_elsewhere_is_refused(tmp_path: Path) -> None:
