@@ -1,11 +1,12 @@
-"""Measure what docs/few_views.md shows, and write it: few labelled views, and one object from one mask or one click.
+"""Measure what docs/few_views.md shows, and write it: few labelled views; one object from a mask or two, or a click.
 
 Usage: python benchmarks/few_views.py [--quick] [--held-out] [--data FOLDER] [--out docs/few_views.md]
 
-FOLDER holds `replica_apartment/` (default: the environment variable GSSEG_DATA, else ../shared/data); without it, only
-the demo scene is measured. Plots go to `pictures/` beside the document. `--quick` has one draw of views and fewer
-counts; `--held-out` scores on every seventh train view, kept out of learning, in place of the test views, as when the
-settings were chosen. Both write to `results_out/` alone.
+FOLDER holds the scenes (default: the environment variable GSSEG_DATA, else ../shared/data); those that are absent are
+left out. How many views must be labelled is measured on the demo scene and the apartment, single objects on all. Plots
+go to `pictures/` beside the document. `--quick` has one draw of views and fewer counts; `--held-out` scores on every
+seventh train view, kept out of learning, in place of the test views, as when the settings were chosen. Both write to
+`results_out/` alone.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.metrics import Evaluation
-from gsseg_core.objects.pick import Pick, pick_clicks, pick_mask
+from gsseg_core.objects.pick import Pick, pick_clicks, pick_mask, pick_masks
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.refine.label_propagation import GraphSettings, propagate
@@ -44,6 +45,7 @@ from gsseg_core.segmentation import Segmentation
 from gsseg_core.spatial.neighbour_graph import graph_of
 from gsseg_core.warm_up import warm_up
 
+CURVED = ("Demo scene", "Replica apartment")
 COUNTS = (1, 2, 4, 8, 16, 32)
 DRAWS = 3
 LEAST = 300
@@ -57,7 +59,10 @@ WAYS = {
     "mask, lifted only": "the mask, what its view sees",
     "mask, graph": "the mask, and the graph for the rest",
     "click": "one click in its middle",
+    "two masks": "two masks, the second of the view that is proposed",
+    "two masks, random": "two masks, the second of a random view that shows the object",
 }
+SCENES = ("shelf", "kitchen_table", "workbench")
 
 
 @dataclass(frozen=True)
@@ -80,7 +85,7 @@ class Bench:
 def main() -> int:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default=DATA, type=Path, help="folder that holds replica_apartment/")
+    parser.add_argument("--data", default=DATA, type=Path, help="folder that holds the scenes")
     parser.add_argument("--out", type=Path, help="document to write")
     parser.add_argument("--quick", action="store_true", help="one draw of views, fewer counts")
     parser.add_argument("--held-out", action="store_true", help="score on held-out train views")
@@ -91,11 +96,12 @@ def main() -> int:
     start = time.perf_counter()
     draws, counts = (1, COUNTS[::2]) if options.quick else (DRAWS, COUNTS)
     with tempfile.TemporaryDirectory() as folder:
-        benches = open_benches(Path(folder), options.data / "replica_apartment", options.held_out)
+        benches = open_benches(Path(folder), options.data, options.held_out)
         one_view = "\n\n".join(f"{bench.name}:\n\n{pick_all(bench)}" for bench in benches)
-        curves = {bench.name: measure_curve(bench, counts, draws) for bench in benches}
+        curves = {bench.name: measure_curve(bench, counts, draws) for bench in benches if bench.name in CURVED}
     draw_curves(out.parent / "pictures/few_views.svg", curves)
-    tables = "\n\n".join(f"{bench.name}:\n\n{curve_table(curves[bench.name], len(bench.train))}" for bench in benches)
+    counted = [bench for bench in benches if bench.name in curves]
+    tables = "\n\n".join(f"{bench.name}:\n\n{curve_table(curves[bench.name], len(bench.train))}" for bench in counted)
     minutes = f"{(time.perf_counter() - start) / 60:.0f}"
     scored = "every seventh train view, kept out of learning" if options.held_out else "the test views"
     content = [
@@ -110,16 +116,20 @@ def main() -> int:
 
 
 def open_benches(folder: Path, real: Path, held_out: bool) -> list[Bench]:
-    """Make the demo scene and open the real one, if it is there."""
+    """Make the demo scene and open the others, those that are there."""
     demo = build_demo(folder)
     data = Dataset(folder, "labels_true")
     objects = {view.name: view.read_labels() for view in data.views()}
     benches = [split("Demo scene", demo.scene, data, objects, held_out)]
-    if real.is_dir():
-        scene, data = GaussianScene.load(real / "scene.ply"), Dataset(real)
-        benches.append(split("Replica apartment", scene, data, instances(scene, data.views()), held_out))
-    else:
-        print(f"{real}: not there; set GSSEG_DATA or --data to the folder that holds replica_apartment/")
+    for name in ("replica_apartment", *SCENES):
+        if not (real / name).is_dir():
+            print(f"{real / name}: not there, and so not measured")
+            continue
+        scene, data = GaussianScene.load(real / name / "scene.ply"), Dataset(real / name)
+        objects = {view.name: view.read_labels() for view in data.views()}
+        if name == "replica_apartment":
+            objects = instances(scene, data.views())
+        benches.append(split(name.replace("_", " ").capitalize(), scene, data, objects, held_out))
     return benches
 
 
@@ -194,14 +204,20 @@ def pick_all(bench: Bench) -> str:
     wanted = [k for k in shown_objects(bench) if any((bench.objects[view.name] == k).any() for view in bench.test)]
     wanted = wanted[:: -(-len(wanted) // MOST)]
     for k in wanted:
-        view = max(bench.train, key=lambda view: int((bench.objects[view.name] == k).sum()))
-        labels = (bench.objects[view.name] == k).astype(np.int32)
-        prompt = View.from_arrays(view.camera, labels)
-        inside = ndimage.distance_transform_edt(np.pad(labels, 1))[1:-1, 1:-1]
-        row, column = np.unravel_index(int(inside.argmax()), labels.shape)
-        picks["mask, lifted only"].append(pick_mask(bench.scene, prompt, GraphSettings(strength=0)))
-        picks["mask, graph"].append(pick_mask(bench.scene, prompt))
-        picks["click"].append(pick_clicks(bench.scene, view.camera, [(int(row), int(column))]))
+        shown = {view.name: (bench.objects[view.name] == k).astype(np.int32) for view in bench.train}
+        prompts = {view.name: View.from_arrays(view.camera, shown[view.name]) for view in bench.train}
+        first = prompts[max(shown, key=lambda name: int(shown[name].sum()))]
+        inside = ndimage.distance_transform_edt(np.pad(shown[first.name], 1))[1:-1, 1:-1]
+        row, column = np.unravel_index(int(inside.argmax()), inside.shape)
+        picks["mask, lifted only"].append(pick_mask(bench.scene, first, GraphSettings(strength=0)))
+        picks["mask, graph"].append(pick_mask(bench.scene, first))
+        picks["click"].append(pick_clicks(bench.scene, first.camera, [(int(row), int(column))]))
+        others = [prompt for prompt in prompts.values() if prompt is not first]
+        following = others[picks["mask, graph"][-1].next_view(bench.scene, [other.camera for other in others])]
+        picks["two masks"].append(pick_masks(bench.scene, [first, following]))
+        showing = [other for other in others if shown[other.name].any()] or others
+        drawn = showing[np.random.default_rng(k).integers(len(showing))]
+        picks["two masks, random"].append(pick_masks(bench.scene, [first, drawn]))
     for way, made in picks.items():
         ious = score_picks(bench, wanted, made)
         share = [float((ious >= least).mean()) for least in (0.5, 0.75, 0.9)]

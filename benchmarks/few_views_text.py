@@ -29,11 +29,12 @@ The live session and the ROS node do without the graph: from so few views their 
 
 ONE_VIEW = """## One object from one view
 
-`gsseg pick SCENE.ply --data DATASET --view STEM --mask FILE --out DIR`, or `--click COLUMN ROW`; in Python `pick_mask`
-and `pick_clicks`. Each object is shown in the train view in which it is largest (at least {least} px), once by its true
-mask and once by a click on the pixel farthest from its outline, and scored in {scored}: where its blended
-membership is at least one half, against its true pixels, summed over these views. In the apartment, whose ids are
-shared by objects that are far apart, these are told apart as in [ids.md](ids.md).
+`gsseg pick SCENE.ply --data DATASET --view STEM --mask FILE --out DIR`, with more pairs of `--view` and `--mask` for
+more masks; in Python `pick_mask`, `pick_masks` and `pick_clicks`. Each object is shown in the train view in which it is
+largest (at least {least} px), once by its true mask and once by a click on the pixel farthest from its outline, and
+scored in {scored}: where its blended membership is at least one half, against its true pixels, summed over these
+views. In the apartment, whose ids are shared by objects that are far apart, these are told apart as in
+[ids.md](ids.md).
 
 {tables}
 
@@ -42,10 +43,15 @@ the rows below it the evidence against what is far for the object's size ([metho
 masks flood rooms behind what they show, whose Gaussians a ray reaches with a thousandth of its light, and which no
 pixel contradicts. Its amount was chosen on held-out train views of both scenes.
 
+The **next view** is the one that sees the most of what is in doubt: the standard deviation of each Gaussian's
+membership, as far as neighbours guessed it (`Pick.next_view`). The command names it, and writes the scene as seen from
+there to `next.png`, for any segmenter; give its mask by another `--view` and `--mask`. Chosen on held-out
+train views of these scenes among six such sums.
+
 A click becomes a mask in its view, by regions of one colour and direction that merge until all is one; the
 longest-lived around the click is taken (`gsseg_core.objects.clicks`). It knows nothing of what people call an object: a
-drawer may last longer than the cupboard, or a wall and its picture be one. `--click` again adds a region, and `--not
-COLUMN ROW` says what is not of the object; with more than one click nothing has been measured yet. Where there is a 2D
+drawer may last longer than the cupboard, or a wall and its picture be one. So the command takes no clicks: in
+[the viewer](viewer.md#corrections) a click that went wrong is seen and corrected at once. Where there is a 2D
 segmenter, put the click through it, and give its mask.
 
 What a mask's view does not show, as the other end of a corner sofa, is guessed from what is near and looks alike.

@@ -35,8 +35,8 @@ SEGMENT = ("segment", "{scene}", "--data", "{data}", "--out", "{out}", "--quiet"
 VOTES = (*SEGMENT, "--learner", "votes")
 PER_VIEW = (*SEGMENT, "--ids", "per-view")
 RENDER = ("render", "{scene}", "--data", "{data}", "--segmentation", "{npz}", "--out", "{new}", "--quiet")
-CLICK = ("pick", "{scene}", "--data", "{data}", "--view", "view0", "--click", "8", "6", "--out", "{new}", "--quiet")
-MASK = (*CLICK[:6], "--mask", "{data}/labels/view0.png", *CLICK[-3:])
+_PICK = ("pick", "{scene}", "--data", "{data}", "--view", "view0", "--mask", "{data}/labels/view0.png")
+MASK = (*_PICK, "--out", "{new}", "--quiet")
 REMOVE = ("remove", "{scene}", "--segmentation", "{npz}", "--class", "red ball", "--out", "{new}/rest.ply")
 EVAL = ("eval", "--pred", "{data}/labels", "--truth", "{data}/truth/labels")
 LOAD_STATE = ("load_state",)
@@ -189,7 +189,7 @@ def _label_map(folder: Path) -> None:
 def _scene(name: str, file: str, write: fuzz_scenes.Write, mutations: tuple[Mutation, ...]) -> Kind:
     """Give the kind of a scene of another format."""
     place = f"{{data}}/{file}"
-    commands = (("doctor", place), *((command[0], place, *command[2:]) for command in (VOTES, CLICK)))
+    commands = (("doctor", place), *((command[0], place, *command[2:]) for command in (VOTES, MASK)))
     return Kind(name, fuzz_scenes.written(file, write), (file,), mutations, commands)
 
 
@@ -214,10 +214,10 @@ def _bent_nerfstudio(folder: Path) -> None:
 
 
 _LABELS = ("labels/view0.png",)
-_LENSES, _BENT = ("sparse/0/cameras.txt",), (SEGMENT, CLICK, RENDER)
-_ALL_CAMERAS = (SEGMENT, VOTES, CLICK, CLICK, RENDER)
+_LENSES, _BENT = ("sparse/0/cameras.txt",), (SEGMENT, MASK, RENDER)
+_ALL_CAMERAS = (SEGMENT, VOTES, MASK, MASK, RENDER)
 KINDS = (
-    Kind("scene.ply", _as_it_is, ("scene.ply",), PLY, (SEGMENT, CLICK, CLICK, REMOVE, RENDER)),
+    Kind("scene.ply", _as_it_is, ("scene.ply",), PLY, (SEGMENT, MASK, MASK, REMOVE, RENDER)),
     *(_scene(*row) for row in fuzz_scenes.FORMATS),
     Kind("cameras.json", _as_it_is, ("cameras.json",), JSON, _ALL_CAMERAS),
     Kind("transforms.json", _nerfstudio, ("transforms.json",), JSON, _ALL_CAMERAS),

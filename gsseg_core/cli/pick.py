@@ -4,40 +4,39 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from gsseg_core.cli.shared import add_collision, add_format, add_scene, load_kernels
 from gsseg_core.cli.terminal import tell
 from gsseg_core.errors import SettingsError
 from gsseg_core.progress import progress_bars
 from gsseg_core.scene.scene_writers import DEFAULT
+from gsseg_core.text import quoted
 
 DESCRIPTION = """
-Finds the Gaussians of one object that is shown in one view, by a mask (best) or by clicks, and writes it as
-DIR/object.ply, or another file, with the indices in DIR/pick.npz and a picture of the view. Needs no other masks.
+Finds the Gaussians of one object that is shown by a mask of one view, or of a few, and writes it as DIR/object.ply, or
+another file, with the indices in DIR/pick.npz and a picture of the first view. Needs no other masks. Which view's mask
+would tell most beside these is printed, and the scene as seen from there is DIR/next.png, for any segmenter. By clicks,
+objects are corrected in `gsseg view`.
 """
 EXAMPLES = """
   gsseg pick scene.ply --data DATASET --view 0001 --mask chair.png --out chair
+  gsseg pick scene.ply --data DATASET --view 0001 --mask a.png \\
+             --view 0042 --mask b.png --out chair
   gsseg pick scene.ply --data DATASET --view 0001 --mask coco.json \\
              --label chair --out chair
-  gsseg pick scene.ply --data DATASET --view 0001 --click 160 120 --out cup
-  gsseg pick scene.ply --data D --view 0001 --click 16 12 --not 20 12 --out cup
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the command takes."""
     add_scene(parser)
-    parser.add_argument("--view", required=True, metavar="STEM", help="the view in which it is shown")
-    how = parser.add_mutually_exclusive_group(required=True)
+    view = "the view in which it is shown; several, each with its --mask, add up"
+    parser.add_argument("--view", required=True, action="append", metavar="STEM", dest="views", help=view)
     mask = "label image of the view, or masks of another program, as COCO: all that is not 0 is the object"
-    how.add_argument("--mask", metavar="PATH", help=mask)
-    pixel: dict[str, Any] = {"nargs": 2, "type": int, "action": "append", "metavar": ("COLUMN", "ROW")}
-    how.add_argument("--click", **pixel, help="a pixel of the object; several add up")
-    parser.add_argument("--not", **pixel, dest="outside", default=[], help="with --click: a pixel that is not of it")
-    label = "with --mask: the object is this label alone, an id or the name that another program's masks have"
+    parser.add_argument("--mask", required=True, action="append", metavar="PATH", dest="masks", help=mask)
+    label = "the object is this label alone, an id or the name that another program's masks have"
     parser.add_argument("--label", help=label)
-    parser.add_argument("--out", required=True, metavar="DIR", help="gets object.ply, pick.npz and pick.png")
+    parser.add_argument("--out", required=True, metavar="DIR", help="gets object.ply, pick.npz, pick.png and next.png")
     add_format(parser.add_argument, DEFAULT)
     add_collision(parser.add_argument, "the object, as object.obj and in USD")
 
@@ -51,17 +50,21 @@ def run(options: argparse.Namespace) -> int:
     from gsseg_core.export.pictures import overlay, palette, save_png
     from gsseg_core.export.view_pictures import background_image
     from gsseg_core.files.run_folder import staged_run
-    from gsseg_core.objects.pick import pick_clicks, pick_mask, read_object_mask
+    from gsseg_core.objects.pick import pick_masks, read_object_mask
     from gsseg_core.raster.backends import make_operator
     from gsseg_core.scene.gaussian_scene import GaussianScene
     from gsseg_core.scene.scene_writers import SCENE_WRITERS, SceneObject, check_format, write_objects, write_scene
 
     dataset = Dataset(options.data)
     names = [camera.name for camera in dataset.cameras]
-    if options.view not in names:
-        raise SettingsError(f"{options.data}: has no view {options.view!r}; expected a stem such as {min(names)!r}")
-    if options.mask and options.outside:
-        raise SettingsError("--not goes with --click; found it with --mask, which says itself what is not the object")
+    for view in options.views:
+        if view not in names:
+            raise SettingsError(f"{options.data}: has no view {view!r}; expected a stem such as {min(names)!r}")
+    if len(options.views) != len(options.masks) or len({*options.views}) != len(options.views):
+        raise SettingsError(
+            f"found --view {len(options.views)} times, of {len({*options.views})} views, and --mask "
+            f"{len(options.masks)} times; expected one mask for each view"
+        )
     check_format(options.format)
     check_collision(options.collision)
     writer = SCENE_WRITERS[options.format]
@@ -72,16 +75,15 @@ def run(options: argparse.Namespace) -> int:
         placed = place(
             scene, dataset, align=options.align, dataparser=options.dataparser, device=options.device, progress=progress
         )
-    camera = placed.dataset.cameras[names.index(options.view)]
-    with staged_run(out, "pick", places=(file, "object.obj", "pick.npz", "pick.png")) as run:
-        if options.mask:
-            view = View.from_arrays(camera, read_object_mask(options.mask, camera, options.label))
-            picked = pick_mask(scene, view, device=options.device)
-        else:
-            inside, outside = ([(row, column) for column, row in clicks] for clicks in (options.click, options.outside))
-            picked = pick_clicks(scene, camera, inside, outside, device=options.device)
-        shown = picked.silhouette(scene, camera, device=options.device)
-        image = background_image(scene, make_operator(scene, camera, options.device))
+    cameras = dict(zip(names, placed.dataset.cameras, strict=True))
+    with staged_run(out, "pick", places=(file, "object.obj", "pick.npz", "pick.png", "next.png")) as run:
+        views = [
+            View.from_arrays(cameras[name], read_object_mask(mask, cameras[name], options.label))
+            for name, mask in zip(options.views, options.masks, strict=True)
+        ]
+        picked = pick_masks(scene, views, device=options.device)
+        shown = picked.silhouette(scene, views[0].camera, device=options.device)
+        image = background_image(scene, make_operator(scene, views[0].camera, options.device))
         kind, part = options.collision, scene.subset(picked.ids)
         mesh = collision_mesh(scene, picked.ids, picked.membership, kind) if kind else None
         if mesh is not None:
@@ -92,5 +94,13 @@ def run(options: argparse.Namespace) -> int:
             write_scene(part, run.folder / file, options.format, run.id)
         picked.save(run.folder / "pick.npz", run.id)
         save_png(run.folder / "pick.png", overlay(image, shown.astype(int), palette(2)), run.id)
+        unseen = [camera for name, camera in cameras.items() if name not in options.views]
+        if unseen:
+            following = unseen[picked.next_view(scene, unseen, device=options.device)]
+            image = background_image(scene, make_operator(scene, following, options.device))
+            save_png(run.folder / "next.png", image, run.id)
     tell(f"{len(picked.ids):,} of {len(scene):,} Gaussians: {out}/{file}, pick.npz, and pick.png to look at")
+    if unseen:
+        lens = "" if following.undistortion is None else ", without its lens: masks are of the photo"
+        tell(f"a mask of view {quoted(following.name)} would tell most: {out}/next.png is the scene from there{lens}")
     return 0

@@ -1,11 +1,11 @@
-"""One object from one view: from a mask, from scribbles, or from clicks.
+"""One object from one view or a few: from masks, from scribbles, or from clicks.
 
 A mask says of one view what is the object (1), what is not (0), and where nothing is said (-1). The view's operator
-carries that to the Gaussians, W^T onehot(y) px of each. What the view does not show takes its neighbours' answer along
-the graph of the scene (`gsseg_core.refine.label_propagation`): the back of a chair hangs together with its front, and
-the wall behind it with the wall beside it.
+carries that to the Gaussians, W^T onehot(y) px of each; votes of several views add up. What no view shows takes its
+neighbours' answer along the graph of the scene (`gsseg_core.refine.label_propagation`): the back of a chair hangs
+together with its front, and the wall behind it with the wall beside it.
 
-Two things would make a mask flood rooms that its view does not show. A thousandth of the light of a pixel comes from
+Two things would make a mask flood rooms that no view shows. A thousandth of the light of a pixel comes from
 behind what it shows, and no pixel says otherwise of a Gaussian that is hidden so: its share of the votes is that of the
 object, whole. And where no vote is near, neighbours agree on whatever reaches them. So each Gaussian has a little
 evidence against the object besides what was seen, the more, the farther away it lies for the object's own size:
@@ -61,11 +61,14 @@ class Pick:
     ----------
     membership : (N,) float32
         How sure it is that each Gaussian belongs to the object, in [0, 1]; 0 where nothing is known.
+    evidence : (N,) float32
+        Labelled pixels that the membership of each stands on, in px.
     scene_digest : str
         Which scene it belongs to.
     """
 
     membership: np.ndarray
+    evidence: np.ndarray
     scene_digest: str
 
     @property
@@ -81,6 +84,23 @@ class Pick:
         seen: np.ndarray = make_operator(scene, camera, device).render(self.membership[:, None])[..., 0] >= 0.5
         return seen
 
+    def next_view(self, scene: GaussianScene, cameras: Sequence[Camera], *, device: str = "cpu") -> int:
+        """Find the camera whose mask would tell most: where the most of what is in doubt is seen, in px.
+
+        In doubt is how far a membership m may be off, its standard deviation sqrt(m (1 - m)), as far as it was guessed
+        from neighbours and not seen: s / (s + e), with e the evidence and s the strength of the neighbours.
+
+        Raises
+        ------
+        SettingsError
+            There are no cameras.
+        """
+        if not cameras:
+            raise SettingsError("found no camera to choose from; expected a view that has no mask yet")
+        guessed = GRAPH.strength / (GRAPH.strength + self.evidence)
+        doubt = (np.sqrt(self.membership * (1 - self.membership)) * guessed)[:, None]
+        return int(np.argmax([make_operator(scene, camera, device).render(doubt).sum() for camera in cameras]))
+
     def save(self, path: str | os.PathLike[str], run: str | None = None) -> None:
         """Write `ids`, `membership`, and the scene's digest and the `run` in the header, as one npz, atomically.
 
@@ -94,15 +114,22 @@ class Pick:
 
 
 def pick_mask(scene: GaussianScene, view: View, settings: GraphSettings = GRAPH, *, device: str = "cpu") -> Pick:
-    """Pick the object that a mask of one view shows.
+    """Pick the object that a mask of one view shows; parameters and errors are those of `pick_masks`."""
+    return pick_masks(scene, [view], settings, device=device)
+
+
+def pick_masks(
+    scene: GaussianScene, views: Sequence[View], settings: GraphSettings = GRAPH, *, device: str = "cpu"
+) -> Pick:
+    """Pick the object that masks of some views show.
 
     Parameters
     ----------
     scene : GaussianScene
         N Gaussians.
-    view : View
-        Its labels are 1 for the object, 0 for what is not it, -1 where nothing is said; so scribbles will do, of both
-        kinds. Make one by `View.from_arrays(camera, labels)`.
+    views : sequence of View
+        Labels are 1 for the object, 0 for what is not it, -1 where nothing is said; so scribbles will do, of both
+        kinds. Make one by `View.from_arrays(camera, labels)`. A view that shows nothing of the object has 0 alone.
     settings : GraphSettings
         How what was seen spreads to what was not.
 
@@ -111,24 +138,30 @@ def pick_mask(scene: GaussianScene, view: View, settings: GraphSettings = GRAPH,
     NoUsableViewsError
         No Gaussian is seen in a pixel of the object, or none in one that is not it: then nothing says where it ends.
     SettingsError
-        There are other labels.
+        There are other labels, or no views.
     """
-    labels = view.read_labels()
-    if labels.max() > 1:
-        raise SettingsError(f"view '{view.name}': labels up to {labels.max()}; expected 1 (object), 0 (not it), -1")
-    observation = make_operator(scene, view.camera, device).observe(labels)
+    if not views:
+        raise SettingsError("found no masks to pick an object by; expected at least one view")
     votes = np.zeros((len(scene), 2), np.float32)
-    votes[observation.ids[:, None], observation.classes] = observation.dense(observation.votes())
+    for view in views:
+        labels = view.read_labels()
+        if labels.max() > 1:
+            raise SettingsError(f"view '{view.name}': labels up to {labels.max()}; expected 1 (object), 0 (not it), -1")
+        observation = make_operator(scene, view.camera, device).observe(labels)
+        votes[observation.ids[:, None], observation.classes] += observation.dense(observation.votes())
     for k, what in enumerate(("not the object", "the object")):
         if not votes[:, k].any():
+            names = ", ".join(f"'{view.name}'" for view in views[:9])
             raise NoUsableViewsError(
-                f"view '{view.name}': no Gaussian is seen in a pixel with the label {k} ({what}); expected pixels of "
-                "both kinds, or a click"
+                f"{'view' if len(views) == 1 else 'views'} {names}: no Gaussian is seen in a pixel with the label {k} "
+                f"({what}); expected pixels of both kinds"
             )
+    seen = votes.sum(axis=1)
     votes[:, 0] += FAR * _distance(scene.means, votes[:, 1])
     evidence = votes.sum(axis=1)
     shares = np.divide(votes, evidence[:, None], out=np.zeros_like(votes), where=evidence[:, None] > 0)
-    return Pick(propagate(graph_of(scene, settings.k), shares, evidence, settings)[:, 1].copy(), scene.digest)
+    membership = propagate(graph_of(scene, settings.k), shares, evidence, settings)[:, 1].copy()
+    return Pick(membership, seen, scene.digest)
 
 
 def pick_clicks(

@@ -13,6 +13,7 @@ from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.live.session import LiveSession
+from gsseg_core.objects.clicks import click_labels
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -59,6 +60,22 @@ def region(camera: Camera, label_map: np.ndarray, column: float, row: float, lab
     _check_inside(camera, column, row)
     parts, _ = ndimage.label(label_map == label_map[int(row), int(column)])
     return _view(camera, parts == parts[int(row), int(column)], label)
+
+
+def looks_alike(
+    scene: GaussianScene, camera: Camera, column: float, row: float, label: int, *, device: str = "cpu"
+) -> View:
+    """Draw the region of one colour and direction around a pixel, whatever its label; see `disc`.
+
+    Raises
+    ------
+    SettingsError
+        As `disc` does.
+    NoUsableViewsError
+        The pixel shows no Gaussian.
+    """
+    _check_inside(camera, column, row)
+    return _view(camera, click_labels(scene, camera, [(int(row), int(column))], device=device) == 1, label)
 
 
 class Corrections:

@@ -21,7 +21,7 @@ from gsseg_core.export.collision import KINDS
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.scene_writers import SCENE_WRITERS
 from gsseg_core.text import counted, html_text, printable
-from gsseg_core.viewer.corrections import box, disc, region
+from gsseg_core.viewer.corrections import box, disc, looks_alike, region
 from gsseg_core.viewer.model import MODES, ClassRow
 from gsseg_core.viewer.picking import Picked, ViewVote
 from gsseg_core.viewer.picture import BANDS
@@ -35,7 +35,7 @@ LONGEST_NAME = 80
 """Characters of a name; of a longer one, the first."""
 
 ONLY, REMOVE = "only this", "remove"
-REGION, DISC = "the whole region", "a disc"
+REGION, DISC, ALIKE = "the whole region", "a disc", "all that looks alike there"
 _OFF = (73, 80, 87)
 _STYLE = "padding: 0 0.75em 0.75em; font-size: 0.875em; overflow-wrap: anywhere"
 _NO_MESH = "none"
@@ -145,7 +145,7 @@ class Panel:
         self._target = gui.add_dropdown("class", self._target_names())
         self._new = gui.add_text("new class", "")
         self._on(gui.add_button("add the class", icon=viser.Icon.PLUS).on_click, lambda _: self._add_class())
-        self._tool = gui.add_dropdown("a click means", (REGION, DISC))
+        self._tool = gui.add_dropdown("a click means", (REGION, ALIKE, DISC))
         self._radius = gui.add_slider("disc, % of height", 0.5, 20.0, 0.5, 3.0)
         undo = gui.add_button("take the last one back", icon=viser.Icon.ARROW_BACK_UP)
         self._on(undo.on_click, lambda _: self._undo())
@@ -248,6 +248,9 @@ class Panel:
         """Correct what a click hit, in pixels of the camera."""
         if self._tool.value == REGION:
             self._correct(region(camera, self._state.label_map(camera), column, row, self._label()))
+        elif self._tool.value == ALIKE:
+            scene, device = self._state.model.scene, self._state.device
+            self._correct(looks_alike(scene, camera, column, row, self._label(), device=device))
         else:
             radius = _number(self._radius, 0, 100) / 100 * camera.height
             self._correct(disc(camera, column, row, radius, self._label()))

@@ -126,8 +126,8 @@ def test_every_command_that_renders_takes_the_number_of_a_gpu(line: str) -> None
 
 
 def test_what_may_look_like_an_option_is_still_taken_for_what_it_is() -> None:
-    options = build_parser().parse_args(["pick", "s", "--data", "d", "--view=--a", "--click", "-3", "5", "--ou", "o"])
-    assert options.view == "--a" and options.click == [[-3, 5]] and options.out == "o"
+    options = build_parser().parse_args(["pick", "s", "--data", "d", "--view=--a", "--mask", "-3", "--ou", "o"])
+    assert options.views == ["--a"] and options.masks == ["-3"] and options.out == "o"
 
 
 def test_progress_is_shown_and_quiet_hides_it(place: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,8 +1,9 @@
-"""One object from one view: a mask or a click in it gives the object in 3D, and what it hides is not the object."""
+"""One object from one view or a few: a mask in it gives the object in 3D, and what it hides is not the object."""
 
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from gsseg_core.cli.main import main
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.data.view import View
 from gsseg_core.errors import MaskFormatError, MaskSizeError, NoUsableViewsError, SettingsError
-from gsseg_core.objects.pick import Pick, pick_mask, read_object_mask
+from gsseg_core.objects.pick import Pick, pick_mask, pick_masks, read_object_mask
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -93,6 +94,24 @@ def test_prompts_that_say_nothing_are_refused() -> None:
         pick_mask(SCENE, other)
 
 
+def test_a_second_mask_adds_to_the_first_and_the_view_that_tells_most_is_not_the_same_again() -> None:
+    around = small_scenes.ring(5)
+    masks = [
+        View.from_arrays(camera, (small_scenes.true_labels(SCENE, TRUTH, camera) == 2).astype(int)) for camera in around
+    ]
+    first = pick_mask(SCENE, masks[0])
+    following = first.next_view(SCENE, around)
+    assert following != 0
+    both, turned = (pick_masks(SCENE, pair) for pair in ([masks[0], masks[following]], [masks[following], masks[0]]))
+    assert iou_of_gaussians(both, 2) >= iou_of_gaussians(first, 2)
+    np.testing.assert_allclose(both.membership, turned.membership, atol=1e-4)
+    assert (both.evidence >= first.evidence).all()
+    with pytest.raises(SettingsError, match="expected a view that has no mask yet"):
+        first.next_view(SCENE, [])
+    with pytest.raises(SettingsError, match="expected at least one view"):
+        pick_masks(SCENE, [])
+
+
 def test_drawn_masks_are_read_black_and_white_or_by_label(tmp_path: Path) -> None:
     small = Camera("small", 4, 1, np.eye(3), np.eye(4))
     write_mask(tmp_path / "drawn.png", np.array([[-1, 0, 0, 0]]), 8)  # written as 255, white
@@ -132,18 +151,21 @@ def test_the_command_writes_a_ply_and_the_ids(tmp_path: Path, capsys: pytest.Cap
     by_mask = ["--mask", str(data / "labels/view0.png"), "--label", "1", "--out", str(tmp_path / "mask")]
     assert main(start + by_mask) == 0
     with np.load(tmp_path / "mask/pick.npz") as file:
-        ids, header = file["ids"], json.loads(str(file["header"]))
-        assert file["membership"].shape == (len(SCENE),)
+        ids, membership, header = file["ids"], file["membership"], json.loads(str(file["header"]))
+        assert membership.shape == (len(SCENE),)
     scene = GaussianScene.load(data / "scene.ply")
     assert header.pop("run") and header == {"format": "gsseg-pick-1", "scene": scene.digest}
     np.testing.assert_array_equal(GaussianScene.load(tmp_path / "mask/object.ply").means, scene.means[ids])
     assert (tmp_path / "mask/pick.png").is_file()
-    rows, columns = np.nonzero(LABELS == 1)
-    by_click = ["--click", str(columns[len(rows) // 2]), str(rows[len(rows) // 2]), "--out", str(tmp_path / "click")]
-    assert main([*start, *by_click, "--not", "0", "0"]) == 0
-    assert "Gaussians" in capsys.readouterr().out
-    assert main([*start[:5], "nowhere", "--click", "0", "0", "--out", str(tmp_path)]) == 2
-    assert "has no view 'nowhere'" in capsys.readouterr().err
+    told = re.search(r"a mask of view '(view\d)' would tell most", capsys.readouterr().out)
+    assert told and (tmp_path / "mask/next.png").is_file()
+    again = told[1]
+    assert main([*start, *by_mask[:4], "--view", again, "--mask", str(data / f"labels/{again}.png"), *by_mask[4:]]) == 0
+    with np.load(tmp_path / "mask/pick.npz") as file:
+        assert not np.array_equal(file["membership"], membership)
+    for wrong, expected in (("nowhere", "has no view 'nowhere'"), ("view0", "of 1 views, and --mask 1 times")):
+        assert main([*start, "--view", wrong, *by_mask]) == 2
+        assert expected in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("scene_format", "file"), [("spz", "object.spz"), ("usd", "object.usdc")])

@@ -12,7 +12,7 @@ from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import REMOVED, UNOBSERVED
-from gsseg_core.viewer.corrections import Corrections, box, disc, region, share_seen
+from gsseg_core.viewer.corrections import Corrections, box, disc, looks_alike, region, share_seen
 from gsseg_core.viewer.model import Labelling
 from gsseg_core.viewer.picking import ViewVotes, pick
 
@@ -91,6 +91,8 @@ def test_what_was_drawn_is_labelled_and_all_else_is_unknown() -> None:
     assert (square[12:20, 10:30] == 3).all() and (square == 3).sum() == 20 * 8
     row, column = (int(i) for i in np.argwhere(LABELS == 1)[0])
     assert np.array_equal(region(CAMERA, LABELS, column, row, 2).read_labels() == 2, LABELS == 1)
+    alike = looks_alike(SCENE, CAMERA, column, row, 2).read_labels()
+    assert set(np.unique(alike)) == {UNKNOWN, 2} and alike[row, column] == 2
     with pytest.raises(SettingsError, match=r"pixel is \(column 64, row 3\); expected one of the 64 x 48"):
         disc(CAMERA, 64, 3, 1, 1)
 
