@@ -46,7 +46,8 @@ pixel contradicts. Its amount was chosen on held-out train views of both scenes.
 The **next view** is the one that sees the most of what is in doubt: the standard deviation of each Gaussian's
 membership, as far as neighbours guessed it (`Pick.next_view`). The command names it, and writes the scene as seen from
 there to `next.png`, for any segmenter; give its mask by another `--view` and `--mask`. Chosen on held-out
-train views of these scenes among six such sums.
+train views of these scenes among six such sums. It knows no truth, as the random view does that is drawn among those
+that show the object; on the mean over the scenes both tell as much.
 
 A click becomes a mask in its view, by regions of one colour and direction that merge until all is one; the
 longest-lived around the click is taken (`gsseg_core.objects.clicks`). It knows nothing of what people call an object: a
