@@ -10,12 +10,15 @@ from hypothesis.extra import numpy as arrays
 from scipy import ndimage
 from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, mean_iou
 
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.demo.mask_errors import resize
 from gsseg_core.errors import SettingsError
-from gsseg_core.learn.em.boundary_alignment import _boundary_strengths, _nearest_regions, align_boundaries, scene_edges
+from gsseg_core.learn.em.boundary_alignment import _boundary_strengths, _nearest_regions, align_boundaries
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
+from gsseg_core.learn.em.mask_offset import move_mask
 from gsseg_core.learn.em.rejected_regions import connected_pixels
+from gsseg_core.learn.em.scene_edges import scene_edges
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -64,6 +67,39 @@ def test_right_outlines_stay_where_they_are() -> None:
     np.testing.assert_array_equal(align_boundaries(labels, edges_of(labels), FARTHEST), labels)
 
 
+@pytest.mark.parametrize("offset", [(0, 2), (-3, 4), (8, -8)])
+def test_a_mask_beside_its_image_is_moved_as_a_whole(offset: tuple[int, int]) -> None:
+    labels = discs()
+    aligned = align_boundaries(move_mask(labels, offset), edges_of(labels), FARTHEST)
+    there = move_mask(move_mask(np.zeros_like(labels), offset), (-offset[0], -offset[1])) == 0
+    np.testing.assert_array_equal(aligned, np.where(there, labels, UNKNOWN))
+
+
+def test_objects_drawn_too_wide_in_a_mask_beside_its_image_get_their_outlines_back() -> None:
+    labels, shifts = discs(), {3: 2, 4: -2}
+    wrong = move_mask(drawn_too_wide(labels, shifts), (4, 3))
+    aligned = align_boundaries(wrong, edges_of(labels), FARTHEST)
+    known = aligned >= 0
+    assert (aligned != labels)[known].sum() < 0.25 * (wrong != labels)[known].sum()
+
+
+@given(SMALL_MASKS, st.integers(-8, 8), st.integers(-8, 8))
+def test_a_moved_mask_keeps_what_stays_in_the_image(labels: np.ndarray, rows: int, columns: int) -> None:
+    moved = move_mask(labels, (rows, columns))
+    for (y, x), label in np.ndenumerate(moved):
+        inside = 0 <= y - rows < labels.shape[0] and 0 <= x - columns < labels.shape[1]
+        assert label == (labels[y - rows, x - columns] if inside else UNKNOWN)
+
+
+def test_a_little_evidence_moves_nothing() -> None:
+    labels = discs()
+    wrong = drawn_too_wide(labels, {2: 3})
+    edges = edges_of(labels)
+    assert (align_boundaries(wrong, edges, FARTHEST) != wrong).any()
+    faint = np.full_like(edges, 0.1) + 0.2 * edges * (edges > 0.5)
+    np.testing.assert_array_equal(align_boundaries(wrong, faint, FARTHEST), wrong)
+
+
 def test_without_edges_nothing_moves() -> None:
     labels = discs()
     np.testing.assert_array_equal(align_boundaries(labels, np.zeros(labels.shape, np.float32), FARTHEST), labels)
@@ -71,7 +107,7 @@ def test_without_edges_nothing_moves() -> None:
 
 def test_where_edges_are_no_stronger_along_boundaries_than_elsewhere_nothing_moves() -> None:
     labels = discs()
-    posters = ndimage.gaussian_filter(np.random.default_rng(2).random(labels.shape, np.float32), 1)
+    posters = 12 * ndimage.gaussian_filter(np.random.default_rng(2).random(labels.shape, np.float32), 1)
     assert (align_boundaries(labels, posters, FARTHEST, telling=0) != labels).any()
     np.testing.assert_array_equal(align_boundaries(labels, posters, FARTHEST), labels)
 

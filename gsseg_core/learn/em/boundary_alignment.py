@@ -1,9 +1,10 @@
 """Boundary alignment: boundaries of a mask are moved to where the scene itself has edges of colour or depth.
 
 The model: each region A of a mask, connected pixels of one label, was drawn s_A px too wide all around, s_A a whole
-number from -S to S. Where two regions touch, their boundary then lies s_A - s_B px too far inside B. With E
-the strength of the scene's edges, f_AB(b) its mean over the pixels on both sides of the boundary of A and B, moved b px
-into A, and n_AB how many these are at b = 0, the log of the posterior of all shifts of a view is, but for a constant,
+number from -S to S. Where two regions touch, their boundary then lies s_A - s_B px too far inside B. With f_AB(b) the
+mean strength of the scene's edges (`gsseg_core.learn.em.scene_edges`) over the pixels on both sides of the boundary of
+A and B, moved b px into A, and n_AB how many these are at b = 0, the log of the posterior of all shifts of a view is,
+but for a constant,
 
     sum_AB SHARPNESS sqrt(n_AB / LENGTH) f_AB(s_A - s_B) + sum_A log p(s_A).
 
@@ -11,23 +12,25 @@ The posterior is approximated by one factor per region (mean field), each in tur
 The prior p is the view's own and symmetric, re-estimated in every round: in a mask with true boundaries most shifts are
 found to be 0, so p favours 0, and the rest stays, too, unless the edges are clear.
 
-E is the gradient of the luminance plus the second differences of the inverse depth, each in units of its 95th
-percentile over the view. On a plane, inverse depth is linear in the image, so that only creases and steps are left.
-Depth alone is too blurred to locate boundaries: a scene of one colour has no edges. And where edges are no stronger
-along the boundaries than elsewhere, as on a wall of posters, no boundary is moved. docs/method.md has the reasons.
+Three hypotheses on a mask are compared by the evidence for each, its log-likelihood: that it is right, exact; that
+regions were drawn too wide or too narrow, by the bound that the mean field maximises, sum_q log-posterior + entropy of
+q; and that the mask as a whole lies beside its image (`gsseg_core.learn.em.mask_offset`), with regions right or not.
+The first stands unless another is clearly likelier. So true masks stay as they are, and a mask whose pose is off is
+moved as a whole, and not bent to edges that are not its own. Where edges are no stronger along the boundaries than
+elsewhere, as on a wall of posters, nothing is moved. docs/method.md has the reasons.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import starts
 from gsseg_core.kernel_cache import called_by_kernels
+from gsseg_core.learn.em.mask_offset import LOG_OFFSETS, likeliest_offset, move_mask
 from gsseg_core.learn.em.rejected_regions import connected_pixels
-from gsseg_core.raster.view_operator import ViewOperator
-from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.scene.scene_cache import PerScene
 
 SHARPNESS = 3.0
 """Log-likelihood of edges of one unit in the mean, in nats, where `LENGTH` pixels lie along the boundary."""
@@ -45,27 +48,14 @@ VANISHED = -20.0
 TELLING = 1.75
 """Nothing is moved unless edges within S px of the boundaries are this many times as strong as in the whole view."""
 
+CLEAR = 4.0  # nats by which another hypothesis must be likelier than that nothing has to be moved
+
 BAND = 64  # rows of the image that are gone through at once
 ROUNDS = 6  # of the mean field, each with a better prior
-STRONGEST = 2.0  # edges count at most so much, in units of the view's 95th percentile
-
-_LIGHT: PerScene[np.ndarray] = PerScene()
-
-
-def scene_edges(operator: ViewOperator, scene: GaussianScene) -> np.ndarray:
-    """Strength of the edges of colour and depth of a view, (H, W) float32, at least 0; see above for units."""
-    camera, light = operator.camera, _LIGHT.of(scene, lambda: scene.colors().mean(axis=1))
-    if light.min() == light.max():
-        return np.zeros((camera.height, camera.width), np.float32)
-    ahead = camera.world_to_camera[2].astype(np.float32)
-    channels = _luminance_and_inverse_depth(scene.means, light, operator.ids, ahead)
-    light_edges, depth_edges = _differences(*operator.blend_seen(channels))
-    edges: np.ndarray = _in_units(light_edges) + _in_units(depth_edges)
-    return edges
 
 
 def align_boundaries(labels: np.ndarray, edges: np.ndarray, farthest: int, telling: float = TELLING) -> np.ndarray:
-    """Align the boundaries of a mask with edges of the scene.
+    """Align a mask and its boundaries with edges of the scene.
 
     Parameters
     ----------
@@ -81,32 +71,54 @@ def align_boundaries(labels: np.ndarray, edges: np.ndarray, farthest: int, telli
     Returns
     -------
     (H, W) int32
-        A new mask.
+        A new mask; unknown, too, along the sides that it was moved away from.
     """
+    here = _align_regions(labels, edges, farthest, telling)
+    if here.offset == (0, 0):
+        return here.labels
+    moved = _align_regions(move_mask(labels, here.offset), edges, farthest, telling)
+    return moved.labels if moved.tells and moved.evidence - LOG_OFFSETS > here.evidence + CLEAR else here.labels
+
+
+class _Alignment(NamedTuple):
+    """A mask with its boundaries aligned, where as a whole it stays in its place."""
+
+    labels: np.ndarray  # (H, W) int32
+    evidence: float  # log-likelihood of the edges, in nats
+    tells: bool  # whether edges are stronger along the boundaries than elsewhere
+    offset: tuple[int, int]  # rows and columns by which the mask as a whole may rather have to be moved
+
+
+def _align_regions(labels: np.ndarray, edges: np.ndarray, farthest: int, telling: float) -> _Alignment:
+    """Align the boundaries of a mask that as a whole stays in its place; `align_boundaries` says what is what."""
     region, first, area = connected_pixels(labels)
     other, ring = _nearest_regions(region, 2 * farthest)
     pairs, pair, lengths, strengths = _boundary_strengths(region, other, ring, edges, len(area), 2 * farthest)
-    near = slice(farthest, 3 * farthest)  # a boundary may lie this far from its edge
-    if strengths[:, near].sum() < telling * edges.mean() * lengths[:, near].sum():
-        return labels.copy()
     moving = lengths[:, 2 * farthest - 1 : 2 * farthest + 1].min(axis=1) >= SHORTEST
-    shifts = _shifts(pairs[moving], _edge_log_likelihood(lengths[moving], strengths[moving]), len(area), farthest)
+    along, weights = _lengths_and_weights(lengths)
+    beside = np.flatnonzero((ring.ravel() == 1) & np.append(moving, False)[pair])
+    offset = likeliest_offset(beside, (weights / along)[pair[beside]], edges)
+    log_likelihood = _edge_log_likelihood(lengths[moving], strengths[moving])
+    still = float(log_likelihood[:, 2 * farthest - 1].sum())
+    near = slice(farthest, 3 * farthest)  # a boundary may lie this far from its edge
+    tells = bool(strengths[:, near].sum() >= telling * edges.mean() * lengths[:, near].sum())
+    aligned = labels.copy()
+    if not tells:
+        return _Alignment(aligned, still, tells, offset)
+    shifts, evidence = _shifts(pairs[moving], log_likelihood, len(area), farthest)
+    if evidence <= still + CLEAR:
+        return _Alignment(aligned, still, tells, offset)
     most = 2 * farthest - 1
     moved = np.where(moving, np.clip(shifts[pairs[:, 0]] - shifts[pairs[:, 1]], -most, most), 0)
-    aligned: np.ndarray = labels.copy()
     _move(region, other, ring, pair, pairs, moved, labels.ravel()[first], aligned)
-    return aligned
+    return _Alignment(aligned, evidence, tells, offset)
 
 
-def _in_units(edges: np.ndarray) -> np.ndarray:
-    some = edges[::2, ::2].ravel()  # every fourth pixel will do
-    rank = 95 * (some.size - 1) // 100
-    unit = np.partition(some, rank)[rank]
-    return np.minimum(edges / unit, np.float32(STRONGEST)) if unit > 0 else np.zeros_like(edges)
+def _shifts(touching: np.ndarray, log_likelihood: np.ndarray, count: int, farthest: int) -> tuple[np.ndarray, float]:
+    """Find by how much each region was drawn too wide, (R,) int64, in px; `_mean_field_round` has the shapes.
 
-
-def _shifts(touching: np.ndarray, log_likelihood: np.ndarray, count: int, farthest: int) -> np.ndarray:
-    """Find by how much each region was drawn too wide, (R,) int64, in px; `_mean_field_round` has the shapes."""
+    Returns the evidence for it, too, in nats: the bound of the log-likelihood that the mean field maximises.
+    """
     prior = np.full(2 * farthest + 1, 0.25 / farthest)
     prior[farthest] = 0.5
     posterior, touches = np.tile(prior, (count, 1)), np.zeros(count, bool)
@@ -120,7 +132,19 @@ def _shifts(touching: np.ndarray, log_likelihood: np.ndarray, count: int, farthe
         prior = (counts + counts[::-1]) / 2 + 1
         prior /= prior.sum()
     found: np.ndarray = np.where(touches, posterior.argmax(axis=1) - farthest, 0)
-    return found
+    shift, most = np.arange(2 * farthest + 1), 2 * farthest - 1
+    moves = np.clip(shift[:, None] - shift, -most, most) + most
+    of_pairs = np.einsum("pi,pj,pij->", *posterior[touching.T], log_likelihood[:, moves])
+    likely = posterior[touches]
+    of_shifts = (likely * (np.log(prior) - np.log(np.maximum(likely, 1e-300)))).sum()
+    return found, float(of_pairs + of_shifts)
+
+
+def _lengths_and_weights(lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels along each boundary, of both sides, (P,), and what edges of one unit are worth there, (P,), in nats."""
+    middle = lengths.shape[1] // 2
+    along = np.maximum(lengths[:, middle - 1] + lengths[:, middle], 1)
+    return along, SHARPNESS * np.sqrt(np.minimum(along, LONGEST) / LENGTH)
 
 
 def _edge_log_likelihood(lengths: np.ndarray, strengths: np.ndarray) -> np.ndarray:
@@ -130,10 +154,7 @@ def _edge_log_likelihood(lengths: np.ndarray, strengths: np.ndarray) -> np.ndarr
     """
     there = np.minimum(lengths[:, 1:], lengths[:, :-1]) >= SHORTEST
     mean = (strengths[:, 1:] + strengths[:, :-1]) / np.maximum(lengths[:, 1:] + lengths[:, :-1], 1)
-    middle = lengths.shape[1] // 2
-    length = np.minimum(lengths[:, middle - 1] + lengths[:, middle], LONGEST)
-    log_likelihood = SHARPNESS * np.sqrt(length / LENGTH)[:, None] * mean
-    return np.where(there, log_likelihood, VANISHED)
+    return np.where(there, _lengths_and_weights(lengths)[1][:, None] * mean, VANISHED)
 
 
 @nb.njit(nogil=True, cache=True)
@@ -158,47 +179,6 @@ def _mean_field_round(
                     field[i] += other[j] * log_likelihood[pair, min(max(sign * (i - j), -middle), middle) + middle]
         field = np.exp(field - field.max())
         posterior[region] = field / field.sum()
-
-
-@nb.njit(parallel=True, nogil=True, cache=True)
-def _luminance_and_inverse_depth(
-    means: np.ndarray, light: np.ndarray, ids: np.ndarray, ahead: np.ndarray  # (N, 3), (N,), (M,), (4,) row of depths
-) -> np.ndarray:  # fmt: skip
-    """Luminance and inverse depth of some Gaussians, (M, 2) float32."""
-    channels = np.empty((ids.shape[0], 2), np.float32)
-    for m in nb.prange(ids.shape[0]):
-        i = ids[m]
-        depth = means[i, 0] * ahead[0] + means[i, 1] * ahead[1] + means[i, 2] * ahead[2] + ahead[3]
-        channels[m, 0] = light[i]
-        channels[m, 1] = 1 / max(depth, np.float32(1e-6))  # what is behind the camera is not drawn
-    return channels
-
-
-@nb.njit(parallel=True, nogil=True, cache=True)
-def _differences(image: np.ndarray, left_over: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Length of the gradient of luminance, and second differences of inverse depth, (H, W) float32 each.
-
-    The image (H, W, 2) holds the two; it is divided in place by what of each ray is not left over, (H, W).
-    """
-    height, width = left_over.shape
-    light_edges, depth_edges = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
-    for y in nb.prange(height):
-        for x in range(width):
-            # Means over what is seen; where that is little, the background is dark and far away.
-            seen = max(1 - left_over[y, x], np.float32(0.5))
-            image[y, x, 0] /= seen
-            image[y, x, 1] /= seen
-    for y in nb.prange(height):
-        up, down = max(y - 1, 0), min(y + 1, height - 1)
-        for x in range(width):
-            left, right = max(x - 1, 0), min(x + 1, width - 1)
-            dy, dx = image[down, x, 0] - image[up, x, 0], image[y, right, 0] - image[y, left, 0]
-            light_edges[y, x] = np.sqrt(dx * dx + dy * dy)
-            here = 2 * image[y, x, 1]
-            across = image[y, left, 1] + image[y, right, 1] - here if left < x < right else np.float32(0)
-            along = image[up, x, 1] + image[down, x, 1] - here if up < y < down else np.float32(0)
-            depth_edges[y, x] = abs(across) + abs(along)
-    return light_edges, depth_edges
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)

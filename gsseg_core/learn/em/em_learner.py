@@ -32,11 +32,12 @@ from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn.em import em_kernels as kernels
-from gsseg_core.learn.em.boundary_alignment import align_boundaries, scene_edges
+from gsseg_core.learn.em.boundary_alignment import align_boundaries
 from gsseg_core.learn.em.confusion_model import ErrorModel
 from gsseg_core.learn.em.em_kernels import ViewPairs
 from gsseg_core.learn.em.leave_one_out import leave_one_out_counts, subtract_votes
 from gsseg_core.learn.em.rejected_regions import find_rejected, split_regions
+from gsseg_core.learn.em.scene_edges import scene_edges
 from gsseg_core.learn.learner import VOTE_UNIT, Learner, Progress, silent
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.observation import Observation
