@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 
 from gsseg_core.data.view import View
-from gsseg_core.demo.table_scene import Part, furnish
+from gsseg_core.demo.furniture import Part, furnish
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.depth import surface
 from gsseg_core.raster.depth_gating import gate_view

@@ -18,7 +18,7 @@ from gsseg_core.export.pictures import overlay, palette
 PICTURES = Path(__file__).parents[1] / "pictures"
 VIEW = "0003"  # for testing: nothing was learnt from it
 TRAIN_VIEW = "0013"
-LEAD_VIEW = "0021"
+LEAD_VIEW = "0030"
 WRONG_VIEWS = ("0013", "0004", "0020", "0030")
 GAP = 8
 PANEL = (480, 360)

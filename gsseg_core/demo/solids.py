@@ -147,10 +147,11 @@ class Cone:
         return _nearest(*hits)
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Which points are inside; of a cup, in its base."""
-        p, z = points[..., :2], points[..., 2]
-        inside: np.ndarray = (z >= 0) & (z <= (WALL if self.hollow else self.height))
-        return inside & (dot(p, p) <= (self.bottom + self._slope * z) ** 2)
+        """Which points are inside; of a cup, in its wall or its base."""
+        z, radius = points[..., 2], np.hypot(points[..., 0], points[..., 1])
+        outer = self.bottom + self._slope * z
+        inside: np.ndarray = (z >= 0) & (z <= self.height) & (radius <= outer)
+        return inside & ((z <= WALL) | (radius >= outer - WALL)) if self.hollow else inside
 
     def sample(self, u: np.ndarray, inset: float) -> tuple[np.ndarray, np.ndarray]:
         """Surface points and normals."""

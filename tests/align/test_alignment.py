@@ -206,7 +206,7 @@ def test_what_is_a_little_off_is_brought_closer(with_photos: Path, scene: Gaussi
 
 
 def test_without_photos_a_similarity_is_refused_with_the_way_out(demo: Path, scene: GaussianScene) -> None:
-    quick = replace(SETTINGS, views=2, survivors=0.01, picture_px=48)
+    quick = replace(SETTINGS, views=4, survivors=0.01, picture_px=48)
     with pytest.raises(AlignmentError, match="expected photos of the views in images/"):
         find_alignment(scene, Dataset(demo).moved(DISTURBED.camera).views("train"), quick)
 

@@ -11,7 +11,8 @@ from lens_cases import COEFFICIENTS
 from gsseg_core.data.camera_files import read_cameras
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN, write_mask
-from gsseg_core.demo.table_scene import CLASS_NAMES, Part, _cast_view, furnish
+from gsseg_core.demo.furniture import CLASS_NAMES, Part, furnish
+from gsseg_core.demo.table_scene import _cast_view
 from gsseg_core.files.json_files import write_json
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.metrics import Evaluation

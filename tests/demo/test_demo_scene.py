@@ -12,8 +12,9 @@ import pytest
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import read_mask
 from gsseg_core.demo import table_scene
+from gsseg_core.demo.furniture import CLASS_NAMES
 from gsseg_core.demo.solids import WALL, Box, Cone, Ellipsoid, Solid
-from gsseg_core.demo.table_scene import CLASS_NAMES, FLOATER, DemoScene, build_demo
+from gsseg_core.demo.table_scene import FLOATER, DemoScene, build_demo
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 

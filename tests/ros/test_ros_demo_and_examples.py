@@ -21,7 +21,7 @@ from small_scenes import NAMES, write_dataset
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from gsseg_core.data.label_images import read_mask
-from gsseg_core.demo.table_scene import CLASS_NAMES
+from gsseg_core.demo.furniture import CLASS_NAMES
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_ros.child_nodes import ChildError, ChildNodes
 
