@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from ros_datasets import copied, write_long_dataset
 from ros_helpers import PATIENCE, Ros
-from ros_robot import CLASSES, core_session, private_ros
+from ros_robot import CLASSES, Robot, core_session, private_ros
 from small_scenes import balls_on_a_table, clean_views, write_dataset
 
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -75,6 +75,26 @@ def shared_fixture(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ros]:
     """A context for the nodes of a whole test file; `ros` is one for a single test."""
     with private_ros(tmp_path_factory.mktemp("ros")) as ros:
         yield ros
+
+
+@pytest.fixture(name="running", scope="module")
+def running_fixture(shared: Ros, parameters: dict[str, Any]) -> Robot:
+    """A node in a process of its own, active, for a whole test file."""
+    return Robot(shared).started(parameters)
+
+
+@pytest.fixture(name="idle", scope="module")
+def idle_fixture(shared: Ros, parameters: dict[str, Any]) -> Robot:
+    """A node in a process of its own that does not start by itself, for a whole test file."""
+    robot = Robot(shared)
+    robot.start({**parameters, "autostart": False}).wait_for("autostart is false")
+    return robot
+
+
+@pytest.fixture(name="robot")
+def idle_robot_fixture(idle: Robot) -> Robot:
+    """That node, not configured, whatever the test before has made of it."""
+    return idle.brought_down()
 
 
 @pytest.fixture(name="node")

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ros_fixtures import shared_fixture  # noqa: F401
+from ros_fixtures import running_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros, ros_fixture  # noqa: F401
 from ros_robot import Robot
 from small_scenes import balls_on_a_table, clean_views, write_dataset
@@ -26,11 +26,6 @@ from gsseg_msgs.msg import SegmentationReport
 def parameters(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     data = write_dataset(tmp_path_factory.mktemp("root") / "data")
     return {"scene_path": data / "scene.ply", "data_root": data.parent, "ids": "per-view"}
-
-
-@pytest.fixture(scope="module")
-def running(shared: Ros, parameters: dict[str, Any]) -> Robot:
-    return Robot(shared).started(parameters)
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ros_fixtures import parameters_fixture, root_fixture, shared_fixture  # noqa: F401
+from ros_fixtures import idle_fixture, idle_robot_fixture, parameters_fixture, root_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros, ros_fixture  # noqa: F401
 from ros_robot import SERVICES, Robot
 from small_scenes import clean_views
@@ -18,19 +18,6 @@ from action_msgs.msg import GoalStatus
 from gsseg_msgs.action import Learn
 
 REQUESTS = ("segment", "pick", "render_view", "load_scene", "save_state", "load_state", "export", "reset")
-
-
-@pytest.fixture(scope="module")
-def running(shared: Ros, parameters: dict[str, Any]) -> Robot:
-    robot = Robot(shared)
-    robot.start({**parameters, "autostart": False}).wait_for("autostart is false")
-    return robot
-
-
-@pytest.fixture
-def robot(running: Robot) -> Robot:
-    """A node that is not configured, shared by the tests of this file."""
-    return running.brought_down()
 
 
 def publishers(robot: Robot, topic: str) -> int:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
+from ros_fixtures import parameters_fixture, root_fixture, running_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros, ros_fixture  # noqa: F401
 from ros_robot import LATCHED, Robot, core_session
 from small_scenes import clean_views
@@ -28,11 +28,6 @@ from gsseg_ros.conversions import pose_from_matrix
 from gsseg_ros.frames import rigid
 from gsseg_ros.node.live_outputs import OBJECTS_PERIOD
 from gsseg_ros.object_messages import box_from_object
-
-
-@pytest.fixture(scope="module")
-def running(shared: Ros, parameters: dict[str, Any]) -> Robot:
-    return Robot(shared).started(parameters)
 
 
 @pytest.fixture

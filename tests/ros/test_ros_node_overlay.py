@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
-from ros_helpers import Ros, wait_until
+from ros_fixtures import parameters_fixture, root_fixture, running_fixture, scene_fixture, shared_fixture  # noqa: F401
+from ros_helpers import wait_until
 from ros_robot import CLASSES, LATCHED, Robot, core_session, messages
 from small_scenes import balls_on_a_table, clean_views
 
@@ -36,11 +36,6 @@ from gsseg_ros.frames import Similarity
 from gsseg_ros.node import live_outputs
 from gsseg_ros.node.live_outputs import LiveOutputs
 from gsseg_ros.node.pairing import Paired
-
-
-@pytest.fixture(scope="module")
-def running(shared: Ros, parameters: dict[str, Any]) -> Robot:
-    return Robot(shared).started(parameters)
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from ros_fixtures import parameters_fixture, root_fixture, shared_fixture  # noqa: F401
+from ros_fixtures import idle_fixture, idle_robot_fixture, parameters_fixture, root_fixture, shared_fixture  # noqa: F401
 from ros_helpers import REPOSITORY, Ros, ros_fixture  # noqa: F401
 from ros_robot import CLASSES, Robot
 from small_scenes import clean_views
@@ -18,19 +18,6 @@ from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import Parameter
 
 from gsseg_ros.node.declarations import AT_ONCE, DECLARATIONS
-
-
-@pytest.fixture(scope="module")
-def running(shared: Ros, parameters: dict[str, Any]) -> Robot:
-    robot = Robot(shared)
-    robot.start({**parameters, "autostart": False}).wait_for("autostart is false")
-    return robot
-
-
-@pytest.fixture
-def robot(running: Robot) -> Robot:
-    """A node that is not configured, shared by the tests of this file."""
-    return running.brought_down()
 
 
 def test_every_parameter_is_typed_described_and_ranged(robot: Robot) -> None:

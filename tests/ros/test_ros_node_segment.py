@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from ros_checks import TOKENS, counts, latched_clouds
-from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
-from ros_helpers import Ros
+from ros_fixtures import parameters_fixture, root_fixture, running_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_robot import CLASSES, LATCHED, SERVICES, Learn, Robot, core_session, viewpoint
 from small_scenes import NAMES, clean_views
 
@@ -25,11 +24,6 @@ from gsseg_msgs.msg import ObjectArray, SegmentationReport
 from sensor_msgs.msg import Image, PointCloud2
 
 from gsseg_ros.conversions import arrays_from_cloud, labels_from_image
-
-
-@pytest.fixture(scope="module")
-def running(shared: Ros, parameters: dict[str, Any]) -> Robot:
-    return Robot(shared).started(parameters)
 
 
 @pytest.fixture

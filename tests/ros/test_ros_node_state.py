@@ -10,8 +10,7 @@ import numpy as np
 import plyfile
 import pytest
 from ros_checks import counts, latched_clouds, limited
-from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
-from ros_helpers import Ros
+from ros_fixtures import parameters_fixture, root_fixture, running_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_robot import CLASSES, RELIABLE, SERVICES, Robot, assert_same, core_session, viewpoint
 from small_scenes import clean_views, ring
 
@@ -29,11 +28,6 @@ from gsseg_msgs.msg import SceneDelta as SceneDeltaMessage
 from gsseg_msgs.msg import SegmentationReport
 
 from gsseg_ros.delta_messages import message_from_delta
-
-
-@pytest.fixture(scope="module")
-def running(shared: Ros, parameters: dict[str, Any]) -> Robot:
-    return Robot(shared).started(parameters)
 
 
 @pytest.fixture
