@@ -41,13 +41,13 @@ views. In the apartment, whose ids are shared by objects that are far apart, the
 Of more than 40 objects, 40 are taken evenly. "What its view sees" has no graph (`GraphSettings(strength=0)`), but like
 the rows below it the evidence against what is far for the object's size ([method.md](method.md#the-graph)). Without,
 masks flood rooms behind what they show, whose Gaussians a ray reaches with a thousandth of its light, and which no
-pixel contradicts. Its amount was chosen on held-out train views of both scenes.
+pixel contradicts. Its amount was chosen on held-out train views of the demo and the apartment.
 
 The **next view** is the one that sees the most of what is in doubt: the standard deviation of each Gaussian's
 membership, as far as neighbours guessed it (`Pick.next_view`). The command names it, and writes the scene as seen from
 there to `next.png`, for any segmenter; give its mask by another `--view` and `--mask`. Chosen on held-out
-train views of these scenes among six such sums. It knows no truth, as the random view does that is drawn among those
-that show the object; on the mean over the scenes both tell as much.
+train views of four of these scenes, not the apartment, among six such sums. It knows no truth, as the random view does
+that is drawn among those that show the object; on the mean over the scenes both tell as much.
 
 A click becomes a mask in its view, by regions of one colour and direction that merge until all is one; the
 longest-lived around the click is taken (`gsseg_core.objects.clicks`). It knows nothing of what people call an object: a

@@ -144,7 +144,7 @@ def test_an_object_of_one_gaussian_that_sticks_out_stays() -> None:
     scene, truth = many_classes(9)
     camera = look_at("above", np.array([0.1, 0.1, 3.5]), 120, 90, 125.0)
     shown = true_labels(scene, truth, camera)
-    shares = kept_shares(scene, truth, [Silhouette.of(scene, make_operator(scene, camera), shown)])
+    shares = kept_shares(scene, truth, [Silhouette.of(scene, make_operator(scene, camera), shown)], steps=5)
     assert (shares.kept[1:] < 0.5).any() and not sticking_out(shares.kept, truth).any()
 
 
