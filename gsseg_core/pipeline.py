@@ -14,7 +14,7 @@ from gsseg_core.align.placing import Placed, place
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.hints import mask_hint
 from gsseg_core.data.label_images import GLOBAL, PER_VIEW, write_mask
-from gsseg_core.data.view import View, spread
+from gsseg_core.data.view import QUALITIES, View, spread
 from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.export.class_files import class_places, mesh_file_name, write_classes
 from gsseg_core.export.collision import collision_meshes
@@ -115,6 +115,7 @@ def segment(
     label_map: str | os.PathLike[str] | None = None,
     align: bool = False,
     dataparser: str | os.PathLike[str] | None = None,
+    quality: str = "full",
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Learn from the train views of a dataset, refine, and write everything into `out`.
@@ -157,6 +158,8 @@ def segment(
         Renames, merges and ignores classes of the masks; see `gsseg_core.data.label_map`.
     align, dataparser
         Where the cameras are in the scene, as for `gsseg_core.align.placing.place`; see docs/frames.md.
+    quality : str
+        One of `QUALITIES`: of which pixels of the views to learn; see docs/memory.md.
 
     Returns
     -------
@@ -168,12 +171,10 @@ def segment(
     GssegError
         Whatever is wrong with the input; see `gsseg_core.errors`. What was in `out` before is whole and unchanged.
     """
-    if memory_budget is None:
-        memory_budget = default_budget()
     settings = RunSettings(
-        learner, str(labels), views, device, memory_budget, seed, scheduler, ids,
-        refine or RefineSettings(), GraphSettings() if graph else None, granularity, scene_format, collision,
-        None if label_map is None else str(label_map),
+        learner, str(labels), views, device, default_budget() if memory_budget is None else memory_budget, seed,
+        scheduler, ids, refine or RefineSettings(), GraphSettings() if graph else None, granularity, scene_format,
+        collision, None if label_map is None else str(label_map), quality,
     )  # fmt: skip
     watch = Stopwatch()
     settings.check()
@@ -279,7 +280,7 @@ def _learn(
             settings.learner, inputs.scene, max(inputs.class_names) + 1, seed=settings.seed, device=settings.device,
             memory_budget=settings.memory_budget, client=client,
         )  # fmt: skip
-        learner.observe_all(inputs.train, progress)
+        learner.observe_all([view.smaller(QUALITIES[settings.quality]) for view in inputs.train], progress)
     with watch.stage("learn"):
         try:
             learner.fit(progress)
@@ -341,7 +342,8 @@ def _picture(
     """Write the pictures; what the report page can use of them is kept."""
     views, folder, images = assessment.views, run.folder / "pictures", ViewImages(inputs.scene, device)
     checks = list(assessment.checks or ())
-
+    if assessment.checks is None:  # What is compared then is drawn in full size.
+        views = {view.name: view for view in inputs.train if view.name in views}
     for drawn in shown:
         images.keep(drawn.view, drawn.image)
         if assessment.checks is None and drawn.view.name in views:

@@ -41,6 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("learning").add_argument
     add("--learner", choices=tuple(LEARNERS), default=DEFAULT, help="default: %(default)s")
     add("--views", type=int, metavar="N", help="learn from N train views, spread evenly (default: all)")
+    pixels = "learn from all pixels, or from every second or fourth of each row and column, for speed (default: full)"
+    add("--quality", choices=("full", "half", "quarter"), default="full", help=pixels)
     add("--seed", type=int, default=0, help="for learners that draw at random (default: %(default)s)")
     budget = "memory for prepared views; more of them go to a temporary file (default: an eighth of what is free)"
     add("--memory-budget", type=int, metavar="MIB", help=budget)
@@ -83,7 +85,7 @@ def run(options: argparse.Namespace) -> int:
             seed=options.seed, scheduler=options.scheduler, ids=options.ids, granularity=options.granularity,
             label_map=options.label_map,
             scene_format=options.format, collision=options.collision, align=options.align,
-            dataparser=options.dataparser, progress=progress,
+            dataparser=options.dataparser, quality=options.quality, progress=progress,
         )  # fmt: skip
     from gsseg_core.text import segment_summary
 

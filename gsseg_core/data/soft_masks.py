@@ -58,6 +58,10 @@ class SeenLabels(NamedTuple):
         """Make the mask of a pinhole view of the one drawn on its image, by nearest pixels; `UNKNOWN` outside it."""
         return self._of(undistortion.sample(self.labels, UNKNOWN))
 
+    def every(self, step: int) -> SeenLabels:
+        """Keep every step-th pixel of each row and column, from pixel step // 2 on."""
+        return self._of(self.labels[step // 2 :: step, step // 2 :: step])
+
     def hidden(self, pixels: npt.NDArray[np.bool_]) -> SeenLabels:
         """Make some pixels (H, W) unknown."""
         return self._of(np.where(pixels, np.int32(UNKNOWN), self.labels))

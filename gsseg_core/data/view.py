@@ -19,9 +19,12 @@ from gsseg_core.data.soft_masks import PackedMask, SeenLabels, combine_detection
 from gsseg_core.errors import GssegError, MaskFormatError, SettingsError, UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.npz_files import Header
-from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.camera import Camera, smaller_camera
 
 T = TypeVar("T")
+
+QUALITIES = {"full": 1, "half": 2, "quarter": 4}
+"""Names of the pixels of a view to learn from: all, or every second or fourth of each row and column."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,6 +170,16 @@ class View:
         view = cls(camera, class_names=class_names)
         view._check_seen(seen, f"view '{camera.name}'")
         return replace(view, _mask=PackedMask(seen))
+
+    def smaller(self, step: int) -> View:
+        """Make the view of every step-th pixel of each row and column; the view itself where that is all, or none.
+
+        What a pixel sees is a question to the scene and to the mask, so nothing is averaged: see `smaller_camera`.
+        """
+        if step == 1 or min(self.camera.width, self.camera.height) <= step // 2:
+            return self
+        mask = None if self._mask is None else PackedMask(self._mask.unpack().every(step))
+        return replace(self, camera=smaller_camera(self.camera, step), _mask=mask)
 
     @property
     def name(self) -> str:

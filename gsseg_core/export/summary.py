@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsseg_core.data.label_images import IDS, PER_VIEW
+from gsseg_core.data.view import QUALITIES
 from gsseg_core.errors import SettingsError
 from gsseg_core.export.collision import check_collision
 from gsseg_core.learn.registry import check_learner
@@ -31,7 +32,8 @@ class RunSettings:
 
     Attributes
     ----------
-    learner, labels, views, device, memory_budget, seed, scheduler, ids, granularity, scene_format, collision, label_map
+    learner, labels, views, device, memory_budget, seed, scheduler, ids, granularity, scene_format, collision,
+    label_map, quality
         As `gsseg_core.pipeline.segment` takes them; `ids` is None until the masks were opened, if they are to tell.
     refine : RefineSettings
         The refinement.
@@ -55,6 +57,7 @@ class RunSettings:
     scene_format: str = DEFAULT
     collision: str | None = None
     label_map: str | None = None
+    quality: str = "full"
     learner_settings: Any = None
 
     def check(self) -> None:
@@ -66,6 +69,8 @@ class RunSettings:
             raise SettingsError(f"granularity is {self.granularity}; expected a share between 0 and 1")
         if self.granularity is not None and self.ids not in (PER_VIEW, None):
             raise SettingsError("granularity is for ids that are a view's own; expected ids per-view")
+        if self.quality not in QUALITIES:
+            raise SettingsError(f"quality is {self.quality!r}; expected one of {', '.join(QUALITIES)}")
         check_format(self.scene_format)
         check_collision(self.collision)
         if self.label_map is not None and self.ids == PER_VIEW:

@@ -47,20 +47,20 @@ class ViewImages:
 
     def __init__(self, scene: GaussianScene, device: str = "cpu") -> None:
         self.scene, self.device = scene, device
-        self._images: dict[str, np.ndarray] = {}
+        self._images: dict[tuple[str, int], np.ndarray] = {}
 
     def keep(self, view: View, rendered: np.ndarray) -> None:
         """Keep a rendering (H, W, 3) uint8 that has been made anyway, unless there is a photo."""
         if view.image_path is None:
-            self._images[view.name] = rendered
+            self._images[view.name, view.camera.width] = rendered
 
     def at_hand(self, view: View) -> bool:
         """Whether nothing needs to be rendered."""
-        return view.name in self._images or view.image_path is not None
+        return (view.name, view.camera.width) in self._images or view.image_path is not None
 
     def of(self, view: View) -> np.ndarray:
         """Give the image, (H, W, 3) uint8 of the camera's size."""
-        image = self._images.get(view.name)
+        image = self._images.get((view.name, view.camera.width))
         if image is None:
             image = read_photo(view)
         if image is None:

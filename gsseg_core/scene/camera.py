@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -10,6 +10,7 @@ import numpy.typing as npt
 from gsseg_core.errors import IntrinsicsError, MaskSizeError, PoseError
 from gsseg_core.files.input_files import check_pixels
 from gsseg_core.files.limits import LIMITS
+from gsseg_core.scene.lens import MODELS_BY_NAME, Lens
 from gsseg_core.scene.undistortion import Undistortion
 from gsseg_core.text import clipped
 
@@ -176,3 +177,21 @@ def undistorted_camera(
     with np.errstate(all="ignore"):  # A camera refuses what is NaN or too large.
         pose = lens_to_view @ world_to_lens
     return Camera(name, undistortion.width, undistortion.height, undistortion.K, pose, undistortion)
+
+
+def smaller_camera(camera: Camera, step: int) -> Camera:
+    """Make the camera whose pixels are every step-th of each row and column, from pixel step // 2 on.
+
+    Its pixels' centres are those of the pixels that are kept, so that masks and photos drawn on the image fit.
+    """
+    width, height = (max(-((step // 2 - side) // step), 1) for side in (camera.width, camera.height))
+    whole = camera.undistortion or Undistortion(
+        Lens(MODELS_BY_NAME["PINHOLE"], camera.width, camera.height, (camera.fx, camera.fy), (camera.cx, camera.cy)),
+        camera.width, camera.height, (camera.fx, camera.fy), (camera.cx, camera.cy),
+    )  # fmt: skip
+    aside = (step - 1) / 2 - step // 2
+    small = replace(
+        whole, width=width, height=height, focal=(camera.fx / step, camera.fy / step),
+        principal=((camera.cx + aside) / step, (camera.cy + aside) / step),
+    )  # fmt: skip
+    return replace(camera, width=width, height=height, K=small.K, undistortion=small)
