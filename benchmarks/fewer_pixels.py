@@ -30,7 +30,7 @@ MADE = {"garden": True, "room": False}
 def score(
     scene: GaussianScene, learn: list[View], truth: list[View], num_classes: int, step: int
 ) -> tuple[float, float]:
-    """Learn from every step-th pixel; mIoU of label maps of whole views, and seconds of CPU."""
+    """Learn from every step-th pixel; give mIoU of label maps of whole views, and seconds of CPU."""
     learner, start = EMLearner(scene, num_classes), time.process_time()
     learner.observe_all([view.smaller(step) for view in learn])
     learner.fit()
@@ -42,13 +42,13 @@ def score(
 
 
 def held_out(root: Path, labels: str) -> tuple[list[View], list[View]]:
-    """Views to learn from, and others of the train views with true masks."""
+    """Choose views to learn from, and others of the train views with true masks."""
     train, truth = (Dataset(root, folder).numbered().views("train") for folder in (labels, "labels"))
     return [view for i, view in enumerate(train) if i % EVERY != EVERY // 2], truth[EVERY // 2 :: EVERY]
 
 
 def cases(options: argparse.Namespace) -> Iterator[tuple[Path, str, list[View], list[View]]]:
-    """Each dataset with each kind of masks, views to learn from, and views to score."""
+    """List each dataset with each kind of masks, views to learn from, and views to score."""
     for root in options.scenes:
         for labels in MASKS:
             yield root, labels, *held_out(root, labels)
