@@ -1,4 +1,4 @@
-"""Make docs/pictures/viewer.jpg: the viewer on the demo scene, in a real browser, after a click on the bowl.
+"""Make docs/pictures/viewer.jpg: the viewer on the demo scene, in a real browser, after a click on the apple.
 
 Usage: python docs/gen/viewer_picture.py  (after `gsseg demo`, which leaves its files in demo_out/)
 """
@@ -24,7 +24,7 @@ from gsseg_core.viewer.viewer import Viewer
 from gsseg_core.viewer.viewpoint import camera_of
 
 ROOT = Path(__file__).parents[2]
-BOWL = 2
+APPLE = 8
 
 
 def main(demo: Path = ROOT / "demo_out", out: Path = ROOT / "docs/pictures/viewer.jpg") -> None:
@@ -40,14 +40,14 @@ def main(demo: Path = ROOT / "demo_out", out: Path = ROOT / "docs/pictures/viewe
         opened_page(browser, 1280, 800, tolerated="computeBoundingSphere") as page,
     ):
         page.goto(viewer.url)
-        page.get_by_role("button", name="bowl").wait_for(timeout=120_000)
+        page.get_by_role("button", name="apple").wait_for(timeout=120_000)
         page.wait_for_timeout(20_000)  # The picture fades in, and the slowest machine draws it without a GPU.
         warning = page.get_by_text("Software WebGL rendering detected")
         if warning.count():
             page.locator(".mantine-Notification-closeButton").first.click()
         client = next(iter(viewer.server.get_clients().values()))
         camera = camera_of(client)
-        (uv,), _ = camera.project(np.median(scene.means[result.labels == BOWL], axis=0, keepdims=True))
+        (uv,), _ = camera.project(np.median(scene.means[result.labels == APPLE], axis=0, keepdims=True))
         page.mouse.click(float(uv[0]), float(uv[1]))
         page.get_by_text("views voted for it").wait_for(timeout=120_000)
         page.wait_for_timeout(3_000)

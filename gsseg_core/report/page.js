@@ -1,6 +1,15 @@
 // The 3D preview of report.html: Gaussians as opaque elliptic discs, WebGL 2, no library.
 // Without WebGL 2 it leaves the page as it is, with a picture in the preview's place.
 "use strict";
+for (const field of document.querySelectorAll(".search")) {
+  field.hidden = false;
+  field.addEventListener("input", () => {
+    const wanted = field.value.trim().toLowerCase();
+    for (const row of document.querySelectorAll(field.dataset.rows)) {
+      row.hidden = !row.querySelector("bdi").textContent.toLowerCase().includes(wanted);
+    }
+  });
+}
 (() => {
   const canvas = document.querySelector(".stage canvas");
   const gl = canvas.getContext("webgl2", { antialias: true, alpha: false });
@@ -88,7 +97,7 @@
   gl.useProgram(program);
   const uniform = (name) => gl.getUniformLocation(program, name);
 
-  const RECORD = 20;  // bytes; gsseg_core/report_preview.py writes them
+  const RECORD = 20;  // bytes; gsseg_core/report/preview.py writes them
   gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
   gl.bufferData(gl.ARRAY_BUFFER, new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]), gl.STATIC_DRAW);
   gl.enableVertexAttribArray(0);
@@ -191,12 +200,15 @@
 
   const boxes = [...document.querySelectorAll(".legend input")];
   function showClasses() {
-    for (const box of boxes) classes[4 * box.dataset.label + 3] = box.checked ? 255 : 0;
+    for (const box of boxes) {
+      const first = Number(box.dataset.label), last = first === data.removed ? data.colors.length : first + 1;
+      for (let k = first; k < last; k++) classes[4 * k + 3] = box.checked ? 255 : 0;
+    }
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, 256, rows, 0, gl.RGBA, gl.UNSIGNED_BYTE, classes);
     redraw();
   }
   for (const box of boxes) {
-    box.checked = !data.hidden.includes(Number(box.dataset.label));
+    box.checked = true;
     box.addEventListener("change", showClasses);
   }
   function check(wanted) {

@@ -20,13 +20,15 @@ LOOKS = 8
 """Views from which the preview can be looked at."""
 MOST_THUMBNAILS = 200
 """Classes with a picture, those with the most Gaussians: the page should stay small."""
+MANY = 15
+"""More classes than this are listed in small rows, so that 40 fit on a screen."""
 BINS = 25
 MATRIX_CLASSES = 24
 """The matrix shows this many of the classes that are confused most."""
 PAIRS = 10
 WORST = 8
 
-_NO_CLASS = ((UNOBSERVED, "seen by no mask", (128, 131, 138)), (REMOVED, "taken out", (214, 64, 159)))
+_NO_CLASS = ((UNOBSERVED, "seen by no mask", (128, 131, 138)), (REMOVED, "taken out", (128, 131, 138)))
 
 Content = Mapping[str, Any]
 
@@ -93,11 +95,13 @@ def preview(run: PageInputs) -> Content:
             **shown.header(),
             "cameras": look_from(cameras, shown),
             "up": up_of(view.camera for view in views.values()),
-            "colors": [*run.colors.tolist(), *(color for _, _, color in _NO_CLASS)],
-            "hidden": [first + 1],
+            # What refinement took out is drawn as what it covers most: in a colour of its own it would be a stain.
+            "colors": [*run.colors.tolist(), _NO_CLASS[0][2], *run.colors.tolist()],
+            "removed": first + 1,
         },
         "records": shown.as_text(),
         "legend": [entry for entry in legend if entry[3]],
+        "many": MANY,
         "cameras": [camera.name for camera in cameras],
         "poster": jpeg_uri(poster, 640) if poster is not None else "",
         "extent": f"{len(shown.records):,} of {len(scene):,} Gaussians" if shown.left_out else "All Gaussians",
@@ -133,7 +137,7 @@ def classes(run: PageInputs) -> Content:
         for k, entry in enumerate(entries)
         if k or entry["gaussians"]  # Masks need not show any background.
     ]
-    return {"classes": rows, "num_views": len(evidence.checks), "held_out": evidence.held_out}
+    return {"classes": rows, "many": MANY, "num_views": len(evidence.checks), "held_out": evidence.held_out}
 
 
 def confusion(run: PageInputs) -> Content | None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from gsseg_core.data.class_names import BACKGROUND_NAME, class_name
 from gsseg_core.errors import StateFileError, UnknownLabelError
-from gsseg_core.export.pictures import palette
+from gsseg_core.export.pictures import FILL, palette
 from gsseg_core.files.json_files import read_json
 from gsseg_core.files.npz_files import SHARES_TOLERANCE
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -193,7 +193,10 @@ class ViewModel:
         # What refinement took out lies across an edge: in one colour it would be a stain on what it covers.
         out, probabilities = self.labelling.labels == REMOVED, self.labelling.probabilities
         by_class[out] = np.rint(probabilities[out] @ colors[: probabilities.shape[1]])
-        return by_class
+        # Light and shade stay, as in the overlays.
+        grey = self._true_colors.mean(axis=1, keepdims=True, dtype=np.float32)
+        shaded: np.ndarray = np.rint(grey + FILL * (by_class - grey)).astype(np.uint8)
+        return shaded
 
     @property
     def _palette(self) -> np.ndarray:

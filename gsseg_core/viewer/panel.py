@@ -22,7 +22,7 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.scene_writers import SCENE_WRITERS
 from gsseg_core.text import counted, html_text, printable
 from gsseg_core.viewer.corrections import box, disc, looks_alike, region
-from gsseg_core.viewer.model import MODES, ClassRow
+from gsseg_core.viewer.model import MODES, ClassRow, ViewModel
 from gsseg_core.viewer.picking import Picked, ViewVote
 from gsseg_core.viewer.picture import BANDS
 from gsseg_core.viewer.state import ViewerState
@@ -34,11 +34,19 @@ MOST_CLASSES, MOST_VIEWS = 5, 8
 LONGEST_NAME = 80
 """Characters of a name; of a longer one, the first."""
 
-ONLY, REMOVE = "only this", "remove"
+SWITCH, ONLY, REMOVE = "switch it on or off", "only this", "remove"
 REGION, DISC, ALIKE = "the whole region", "a disc", "all that looks alike there"
 _OFF = (73, 80, 87)
 _STYLE = "padding: 0 0.75em 0.75em; font-size: 0.875em; overflow-wrap: anywhere"
 _NO_MESH = "none"
+_IN_COLUMNS = """<style>
+div:has(> .gsseg-columns) { display: none }
+div:has(> div > .gsseg-columns) { display: grid; grid-template-columns: repeat(2, minmax(0, 1fr)); padding: 0 4px }
+div:has(> div > .gsseg-columns) > div { margin: 0 2px !important; padding: 0 0 3px !important }
+div:has(> div > .gsseg-columns) button { height: 20px !important; padding: 0 4px !important; font-size: 11px }
+div:has(> div > .gsseg-columns) .mantine-Button-inner { justify-content: start }
+</style><i class="gsseg-columns"></i>"""
+"""viser knows no columns. Where its page is built otherwise, the rows stand below each other."""
 _ASK = "Click on something in the picture to ask what it is."
 
 Event = viser.GuiEvent[Any]
@@ -61,7 +69,7 @@ class Panel:
 
     def __init__(self, gui: viser.GuiApi, state: ViewerState, viewpoint: Viewpoint, live: bool) -> None:
         self._gui, self._state, self._viewpoint = gui, state, viewpoint
-        self._rows: dict[int, tuple[ClassRow, viser.GuiButtonHandle, viser.GuiButtonGroupHandle]] = {}
+        self._rows: dict[int, tuple[ClassRow, viser.GuiButtonHandle]] = {}
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="medium")
         gui.set_panel_label("gsseg")
         self._answer = gui.add_html(_paragraph(_ASK))
@@ -93,7 +101,11 @@ class Panel:
         hint = "above 0: show what has at least this probability of a shown class, whatever its label is"
         probability = gui.add_slider("probability", 0.0, 1.0, 1 / BANDS, 0.0, hint=hint)
         show_all = gui.add_button("show all", icon=viser.Icon.EYE)
+        self._press = gui.add_dropdown("a press on a class", (SWITCH, ONLY, REMOVE))
+        self._search = gui.add_text("search", "")
         self._list = gui.add_folder("classes")
+        with self._list:
+            gui.add_html(_IN_COLUMNS)
 
         def choose_mode(_: Event) -> None:
             try:
@@ -115,6 +127,7 @@ class Panel:
         self._on(confidence.on_update, lambda _: set_threshold("min_confidence", confidence))
         self._on(probability.on_update, lambda _: set_threshold("min_probability", probability))
         self._on(show_all.on_click, show)
+        self._on(self._search.on_update, lambda _: self._filter())
 
     def _build_views(self) -> None:
         gui, views = self._gui, self._state.views
@@ -160,19 +173,20 @@ class Panel:
 
         self._on(self._gui.add_button(text, icon=viser.Icon.DOWNLOAD).on_click, send)
 
-    def _add_row(self, row: ClassRow) -> tuple[viser.GuiButtonHandle, viser.GuiButtonGroupHandle]:
-        button = self._gui.add_button(**_look(row), hint="switch it on or off")
-        group = self._gui.add_button_group("", (ONLY, REMOVE))
+    def _add_row(self, row: ClassRow) -> viser.GuiButtonHandle:
+        button = self._gui.add_button(**_look(row), hint=f"{_shown(row.name)}: {counted(row.size, 'Gaussian')}")
 
-        def pressed(event: Event) -> None:
-            if event.target.value == ONLY:
-                self._state.change(lambda model: model.isolate(row.label))
-            elif event.target.value == REMOVE:
-                self._state.change(lambda model: model.remove(row.label))
+        def pressed(_: Event) -> None:
+            action = {ONLY: ViewModel.isolate, REMOVE: ViewModel.remove}.get(self._press.value, ViewModel.toggle)
+            self._state.change(lambda model: action(model, row.label))
 
-        self._on(button.on_click, lambda _: self._state.change(lambda model: model.toggle(row.label)))
-        self._on(group.on_click, pressed)
-        return button, group
+        self._on(button.on_click, pressed)
+        return button
+
+    def _filter(self) -> None:
+        """List only the classes whose name has what is searched for."""
+        for row, button in self._rows.values():
+            button.visible = self._search.value.strip().lower() in row.name.lower()
 
     def _on(self, register: Callable[[Callable[[Any], None]], object], action: Callable[[Event], object]) -> None:
         """Have a widget call an action, `register` being its `on_click` or `on_update`; errors are told."""
@@ -188,19 +202,19 @@ class Panel:
     def show_classes(self, rows: Sequence[ClassRow]) -> None:
         """List the classes; widgets that are right already stay."""
         listed = [(row.label, row.name) for row in rows]
-        if listed != [(row.label, row.name) for row, _, _ in self._rows.values()]:
-            for _, button, group in self._rows.values():
+        if listed != [(row.label, row.name) for row, _ in self._rows.values()]:
+            for _, button in self._rows.values():
                 button.remove()
-                group.remove()
             with self._list:
-                self._rows = {row.label: (row, *self._add_row(row)) for row in rows}
+                self._rows = {row.label: (row, self._add_row(row)) for row in rows}
+            self._filter()
             self._target.options = self._target_names()
         for row in rows:
-            known, button, group = self._rows[row.label]
+            known, button = self._rows[row.label]
             if row != known:
                 for key, value in _look(row).items():
                     setattr(button, key, value)
-                self._rows[row.label] = row, button, group
+                self._rows[row.label] = row, button
 
     def show_picked(self, picked: Picked | None, votes: Sequence[ViewVote] | None) -> None:
         """Answer a click: the Gaussian that it hit, and the votes for that, if they are known."""

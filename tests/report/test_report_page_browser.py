@@ -99,6 +99,14 @@ def test_preview_turns_moves_zooms_and_cuts(opened: Page) -> None:
         assert changed(one, other) > 0.01
 
 
+def test_a_search_leaves_the_classes_whose_names_have_the_word(opened: Page) -> None:
+    for section, rows in (("#classes", ".classes tbody tr"), ("#preview", ".legend li")):
+        opened.locator(f"{section} .search").fill("SCRIPT")
+        assert 0 < opened.locator(f"{rows}:visible").count() < opened.locator(rows).count()
+        opened.locator(f"{section} .search").fill("")
+        assert opened.locator(f"{rows}:visible").count() == opened.locator(rows).count() > 1
+
+
 def test_nasty_names_do_nothing(opened: Page) -> None:
     assert opened.title() == "gsseg: scene.ply"
     assert opened.locator("script").count() == 3

@@ -20,6 +20,7 @@ from small_scenes import NAMES, balls_on_a_table, clean_views, write_dataset
 
 from gsseg_core.cli.main import main
 from gsseg_core.errors import SettingsError
+from gsseg_core.export.pictures import FILL
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.viewer.access import listen
@@ -62,8 +63,9 @@ class Shown:
 
     def looks_like(self, label: int) -> bool:
         """Whether the colour of a class is anywhere in the picture."""
-        off = np.abs(self.picture() - self.viewer.state.model.color(label)).max(axis=2)
-        return int((off < 12).sum()) > 40
+        hue = self.picture() - self.picture().mean(axis=2, keepdims=True)
+        color = np.array(self.viewer.state.model.color(label))
+        return int((np.abs(hue - FILL * (color - color.mean())).max(axis=2) < 12).sum()) > 40
 
     def pixel_of(self, label: int) -> tuple[float, float]:
         """Where the middle of a class is on the page."""
@@ -73,6 +75,11 @@ class Shown:
 
     def press(self, name: str, nth: int = 0) -> None:
         self.page.get_by_role("button", name=name).nth(nth).click()
+
+    def pressing(self, did: str, does: str) -> None:
+        """Choose what a press on a class does."""
+        self.page.locator(f"input[role=combobox][value='{did}']").click()
+        self.page.get_by_role("option", name=does).click()
 
     def tab(self, name: str) -> None:
         self.page.get_by_role("tab", name=name).click()
@@ -128,14 +135,29 @@ def test_a_class_toggle_changes_the_picture_and_sends_no_gaussian(
 
 
 def test_a_class_is_isolated_and_another_is_removed(shown: Shown) -> None:
-    rows = [row.label for row in shown.viewer.state.model.rows()]
-    shown.press("only this", rows.index(2))
+    mug = f"{NAMES[2]} {int((TRUTH == 2).sum())}"
+    shown.pressing("switch it on or off", "only this")
+    shown.press(mug)
     shown.wait(lambda: shown.looks_like(2) and not shown.looks_like(1), "the mug alone")
-    shown.press("remove", rows.index(2))
+    shown.pressing("only this", "remove")
+    shown.press(mug)
     shown.wait(lambda: not shown.looks_like(2), "nothing")
     assert 2 in shown.viewer.state.model.removed
+    shown.pressing("remove", "switch it on or off")
     shown.press("show all")
     shown.wait(lambda: shown.looks_like(1) and shown.looks_like(2), "all classes")
+
+
+def test_a_search_leaves_the_classes_whose_names_have_the_word(shown: Shown) -> None:
+    field, ball = (
+        shown.page.locator(".mantine-TextInput-input:visible"),
+        shown.page.get_by_role("button", name="red ball 60"),
+    )
+    field.fill("MUG")
+    ball.wait_for(state="hidden", timeout=PATIENCE * 1000)
+    assert shown.page.get_by_role("button", name="cup/mug 60").is_visible()
+    field.fill("")
+    ball.wait_for(timeout=PATIENCE * 1000)
 
 
 def test_a_slider_acts_at_once(shown: Shown) -> None:
