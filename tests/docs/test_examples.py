@@ -85,14 +85,11 @@ def test_masks_of_a_segmenter_that_knows_no_objects_are_segmented_per_view(tmp_p
         found = file["labels"]
     with np.load(data / "truth.npz") as file:
         truth = file["labels"]
-    # Each of most objects is one found class: half of what either has is of both.
-    best = [
-        max(
-            ((found == k) & (truth == t)).sum() / ((found == k) | (truth == t)).sum() for k in range(1, found.max() + 1)
-        )
-        for t in range(1, 9)
-    ]
-    assert sum(iou > 0.5 for iou in best) >= 5, best
+    # Objects are printed, and areas of one colour are found: what is found as one is of one object for the most part.
+    seen = (found > 0) & (truth > 0) & (truth < 9)
+    shared = np.zeros((found.max() + 1, truth.max() + 1), np.int64)
+    np.add.at(shared, (found[seen], truth[seen]), 1)
+    assert shared.max(axis=1).sum() > 0.7 * shared.sum(), shared
 
 
 def test_masks_from_photos_says_what_is_missing_without_photos(tmp_path: Path) -> None:
