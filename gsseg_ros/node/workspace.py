@@ -259,9 +259,8 @@ class Workspace:
 
     def load_state(self, path: str | Path, within: Path | None = None) -> int:
         """Replace what is known of the scene by a saved state; return how many views are in it."""
-        on_their_way = (
-            self.placement.forget()
-        )  # Views of the state may have the names of some that are still to follow.
+        # Views of the state may have the names of some that are still to follow.
+        on_their_way = self.placement.forget()
         try:
             loaded = self.session.load(path, within)
         except Exception:
