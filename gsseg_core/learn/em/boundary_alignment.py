@@ -74,9 +74,10 @@ def align_boundaries(labels: np.ndarray, edges: np.ndarray, farthest: int, telli
         A new mask; unknown, too, along the sides that it was moved away from.
     """
     here = _align_regions(labels, edges, farthest, telling)
-    if here.offset == (0, 0):
+    offset = likeliest_offset(here.beside, here.weights, edges)
+    if offset == (0, 0):
         return here.labels
-    moved = _align_regions(move_mask(labels, here.offset), edges, farthest, telling)
+    moved = _align_regions(move_mask(labels, offset), edges, farthest, telling)
     return moved.labels if moved.tells and moved.evidence - LOG_OFFSETS > here.evidence + CLEAR else here.labels
 
 
@@ -86,7 +87,8 @@ class _Alignment(NamedTuple):
     labels: np.ndarray  # (H, W) int32
     evidence: float  # log-likelihood of the edges, in nats
     tells: bool  # whether edges are stronger along the boundaries than elsewhere
-    offset: tuple[int, int]  # rows and columns by which the mask as a whole may rather have to be moved
+    beside: np.ndarray  # (P,) int64, pixels along the boundaries as they were, counted row by row
+    weights: np.ndarray  # (P,) what edges of one unit are worth in each of them, in nats
 
 
 def _align_regions(labels: np.ndarray, edges: np.ndarray, farthest: int, telling: float) -> _Alignment:
@@ -97,21 +99,21 @@ def _align_regions(labels: np.ndarray, edges: np.ndarray, farthest: int, telling
     moving = lengths[:, 2 * farthest - 1 : 2 * farthest + 1].min(axis=1) >= SHORTEST
     along, weights = _lengths_and_weights(lengths)
     beside = np.flatnonzero((ring.ravel() == 1) & np.append(moving, False)[pair])
-    offset = likeliest_offset(beside, (weights / along)[pair[beside]], edges)
+    weights = (weights / along)[pair[beside]]
     log_likelihood = _edge_log_likelihood(lengths[moving], strengths[moving])
     still = float(log_likelihood[:, 2 * farthest - 1].sum())
     near = slice(farthest, 3 * farthest)  # a boundary may lie this far from its edge
     tells = bool(strengths[:, near].sum() >= telling * edges.mean() * lengths[:, near].sum())
     aligned = labels.copy()
     if not tells:
-        return _Alignment(aligned, still, tells, offset)
+        return _Alignment(aligned, still, tells, beside, weights)
     shifts, evidence = _shifts(pairs[moving], log_likelihood, len(area), farthest)
     if evidence <= still + CLEAR:
-        return _Alignment(aligned, still, tells, offset)
+        return _Alignment(aligned, still, tells, beside, weights)
     most = 2 * farthest - 1
     moved = np.where(moving, np.clip(shifts[pairs[:, 0]] - shifts[pairs[:, 1]], -most, most), 0)
     _move(region, other, ring, pair, pairs, moved, labels.ravel()[first], aligned)
-    return _Alignment(aligned, evidence, tells, offset)
+    return _Alignment(aligned, evidence, tells, beside, weights)
 
 
 def _shifts(touching: np.ndarray, log_likelihood: np.ndarray, count: int, farthest: int) -> tuple[np.ndarray, float]:
