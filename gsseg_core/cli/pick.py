@@ -12,6 +12,8 @@ from gsseg_core.progress import progress_bars
 from gsseg_core.scene.scene_writers import DEFAULT
 from gsseg_core.text import quoted
 
+CANDIDATES = 24  # cameras of which the next view is chosen, spread over all: neighbours in a capture see much the same
+
 DESCRIPTION = """
 Finds the Gaussians of one object that is shown by a mask of one view, or of a few, and writes it as DIR/object.ply, or
 another file, with the indices in DIR/pick.npz and a picture of the first view. Needs no other masks. Which view's mask
@@ -45,7 +47,7 @@ def run(options: argparse.Namespace) -> int:
     """Pick, and say what was written."""
     from gsseg_core.align.placing import place
     from gsseg_core.data.dataset import Dataset
-    from gsseg_core.data.view import View
+    from gsseg_core.data.view import View, spread
     from gsseg_core.export.collision import check_collision, collision_mesh
     from gsseg_core.export.pictures import overlay, palette, save_png
     from gsseg_core.export.view_pictures import background_image
@@ -96,6 +98,7 @@ def run(options: argparse.Namespace) -> int:
         save_png(run.folder / "pick.png", overlay(image, shown.astype(int), palette(2)), run.id)
         unseen = [camera for name, camera in cameras.items() if name not in options.views]
         if unseen:
+            unseen = spread(unseen, CANDIDATES)
             following = unseen[picked.next_view(scene, unseen, device=options.device)]
             image = background_image(scene, make_operator(scene, following, options.device))
             save_png(run.folder / "next.png", image, run.id)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -98,6 +99,7 @@ def test_other_threads_go_on_while_a_frozen_subscriber_is_waited_for(shared: Ros
             ours.publish_clouds(chosen, Header())
             assert child.stdout is not None and child.stdout.readline() == "heard\n"
             child.send_signal(signal.SIGSTOP)
+            os.waitid(os.P_PID, child.pid, os.WSTOPPED | os.WNOWAIT)  # all of its threads, before they acknowledge
             gaps, done = [], threading.Event()
 
             def tick() -> None:
