@@ -158,9 +158,10 @@ Machine: {machine}.
 
 `replica_apartment` is one floor of a real scanned apartment (Replica `apartment_0`): 126,507 Gaussians trained by
 OpenSplat, 40 objects, 105 views of 320 x 320 to learn from and 14 to score on. The other three are made up, of free
-splats of objects that touch, stand on and hide each other, and were trained anew from photos of that: 33,000 to 95,000
-Gaussians, 12 to 16 objects, 66 and 12 views. The wrong masks have 15 % of the objects missed and 10 % under another id in every
-view, and edges off by up to 3 px. Scores are of the test views against the true masks; no learner saw either.
+splats of objects that touch, stand on and hide each other, and were trained anew from photos of that: 33,000 to
+95,000 Gaussians, 12 to 16 objects, 66 and 12 views. The wrong masks have 15 % of the objects missed and 10 % under
+another id in every view, and edges off by up to 3 px. Scores are of the test views against the true masks; no learner
+saw either.
 
 The settings of `em` were chosen on train views that were held out from learning, but not all: `least_agreement`,
 `majority` and `tolerance` on the test views of the apartment and of an earlier demo, with masks drawn wrong in many
