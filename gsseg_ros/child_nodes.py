@@ -11,7 +11,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,9 @@ from gsseg_core.errors import GssegError
 
 STOP_SECONDS = 10.0
 """How long a child gets to end by itself."""
+
+_CLAIMANT = 119
+"""Number of a process in its domain that DDS gives to none, as no machine has so many there; its port is a claim."""
 
 NODES = {"segment_node": "gsseg_ros.node.segment_node", "replay_node": "gsseg_ros.replay.replay_node"}
 """What `python -m` runs for each node."""
@@ -93,7 +96,7 @@ class ChildNodes:
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        self.domain_id = free_domain()
+        self.domain_id, self._claim = claimed_domain(random.sample(range(1, 101), 100))
         self.environment = {
             "ROS_DOMAIN_ID": str(self.domain_id),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
@@ -124,28 +127,49 @@ class ChildNodes:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End all children."""
+        """End all children, and leave their domain to others."""
         deadline = time.monotonic() + STOP_SECONDS
         for child in self._children:
             child.interrupt()
         for child in self._children:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 child.wait(max(0.0, deadline - time.monotonic()))
+        self._claim.close()
 
 
-def free_domain() -> int:
-    """Find a ROS domain in which no process of this machine is, 1 to 100."""
-    domains = random.sample(range(1, 101), 100)
-    return next(filter(is_free, domains), domains[0])
+def claimed_domain(candidates: Iterable[int]) -> tuple[int, socket.socket]:
+    """Take the first ROS domain in which no process of this machine is, until the socket that is returned closes.
+
+    Who only looks, and joins later, may meet another there who did the same meanwhile.
+
+    Raises
+    ------
+    ChildError
+        There is none.
+    """
+    for domain in candidates:
+        claim = _bound(domain, _CLAIMANT)
+        if claim is None:
+            continue
+        if all(_is_free(domain, process) for process in range(4)):  # The first may have left before the others.
+            return domain, claim
+        claim.close()
+    raise ChildError("in each ROS domain from 1 to 100 there is a process of this machine; expected one that is free")
 
 
-def is_free(domain: int) -> bool:
-    """Whether no process of this machine is in a ROS domain."""
-    for process in range(4):  # The first may have left before the others.
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                # The port that DDS gives to this process of a domain for being found.
-                probe.bind(("", 7400 + 250 * domain + 10 + 2 * process))
-            except OSError:
-                return False
-    return True
+def _is_free(domain: int, process: int) -> bool:
+    probe = _bound(domain, process)
+    if probe is not None:
+        probe.close()
+    return probe is not None
+
+
+def _bound(domain: int, process: int) -> socket.socket | None:
+    """Take the port that DDS gives to a process of a domain for being found; None if it is taken."""
+    bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        bound.bind(("", 7400 + 250 * domain + 10 + 2 * process))
+    except OSError:
+        bound.close()
+        return None
+    return bound

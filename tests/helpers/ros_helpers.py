@@ -18,20 +18,21 @@ import itertools
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 from patience import PATIENCE
 
-from gsseg_ros.child_nodes import NODES, is_free
+from gsseg_ros.child_nodes import NODES, claimed_domain
 
 try:
     # Set before any message class is imported: only then do they check their fields.
@@ -55,10 +56,25 @@ _WORKER, _WORKERS = (
 )
 
 
-def next_domain() -> int:
-    """A ROS domain from 1 to 100 that no other worker of this run has, nor a demo, and that is not used again soon."""
+def next_domain() -> tuple[int, socket.socket]:
+    """Take a domain from 1 to 100 that no worker of this run has, nor a demo, and that is not used again soon.
+
+    It is held until the socket closes; a context with a node holds it too.
+    """
     share = 100 // _WORKERS
-    return next(filter(is_free, (_WORKER * share + count % share + 1 for count in _counter)))
+    return claimed_domain(_WORKER * share + count % share + 1 for count in _counter)
+
+
+@contextmanager
+def private_context(*args: str) -> Iterator[Context]:
+    """A ROS context, made with these arguments, in a domain of its own."""
+    (domain, claim), context = next_domain(), Context()
+    with claim:
+        context.init(args=list(args), domain_id=domain)
+        try:
+            yield context
+        finally:
+            context.shutdown()
 
 
 def own_domain() -> int:
@@ -148,7 +164,7 @@ class Ros:
     """A ROS context of its own in a domain of its own, with a node that a thread spins."""
 
     def __init__(self, folder: Path, domain: int | None = None) -> None:
-        self.domain = next_domain() if domain is None else domain
+        self.domain, claim = next_domain() if domain is None else (domain, nullcontext())
         self.environment = {
             **os.environ,
             "ROS_DOMAIN_ID": str(self.domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
@@ -156,8 +172,9 @@ class Ros:
             "RCUTILS_COLORIZED_OUTPUT": "0",
         }  # fmt: skip
         self.context = Context()
-        self.context.init(args=[], domain_id=self.domain)
-        self.node = Node("test", context=self.context, use_global_arguments=False)
+        with claim:
+            self.context.init(args=[], domain_id=self.domain)
+            self.node = Node("test", context=self.context, use_global_arguments=False)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
         self._processes: list[Process] = []

@@ -23,7 +23,7 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 from gsseg_core.data.label_images import read_mask
 from gsseg_core.demo.furniture import CLASS_NAMES
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_ros.child_nodes import ChildError, ChildNodes
+from gsseg_ros.child_nodes import ChildError, ChildNodes, claimed_domain
 
 EXAMPLES = sorted((REPOSITORY / "examples").glob("*.py"))
 PYTHONPATH = {"PYTHONPATH": str(REPOSITORY), "PYTHONUNBUFFERED": "1"}
@@ -150,6 +150,18 @@ def test_a_child_that_cannot_start_is_named_with_what_it_said(tmp_path: Path) ->
         with pytest.raises(ChildError, match=r"replay_node ended with code 2; the last line of its log .*nowhere"):
             _ = child.done
         assert nodes.logs == [tmp_path / "logs/replay_node.log"]
+
+
+def test_two_that_start_children_at_once_never_share_a_domain(tmp_path: Path) -> None:
+    with ChildNodes(tmp_path) as first:
+        claimed, claim = claimed_domain([first.domain_id, *range(1, 101)])
+        claim.close()
+        assert claimed != first.domain_id
+        with pytest.raises(ChildError, match=r"in each ROS domain .* expected one that is free"):
+            claimed_domain([first.domain_id])
+    again, claim = claimed_domain([first.domain_id])
+    claim.close()
+    assert again == first.domain_id
 
 
 # Examples

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 import yaml
-from ros_helpers import REPOSITORY, Context, Node, next_domain
+from ros_helpers import REPOSITORY, Node, private_context
 
 from gsseg_ros.node.declarations import DECLARATIONS
 
@@ -74,16 +74,12 @@ def launched(monkeypatch: pytest.MonkeyPatch) -> Launched:
 def resolved(node: SimpleNamespace, name: str, topics: list[str]) -> list[str]:
     """Full names of topics as ROS makes them of a node's name, namespace and remappings."""
     rules = [text for source, target in node.remappings for text in ("-r", f"{source}:={target}")]
-    context = Context()
-    context.init(args=[], domain_id=next_domain())
-    try:
+    with private_context() as context:
         there = Node(
             getattr(node, "name", name), namespace=node.namespace, context=context, use_global_arguments=False,
             cli_args=["--ros-args", *rules],
         )  # fmt: skip
         return [there.resolve_topic_name(topic) for topic in topics]
-    finally:
-        context.shutdown()
 
 
 def shown() -> list[str]:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
-from ros_helpers import REPOSITORY, Context, Node, Ros, next_domain
+from ros_helpers import REPOSITORY, Node, Ros, private_context
 from ros_node_here import NodeHere, node_here
 from ros_robot import core_session
 from small_scenes import clean_views
@@ -192,15 +192,11 @@ def test_nav2_as_configured_marks_every_cell_in_reach_and_as_it_comes_none(costm
 
 
 def test_the_part_of_the_node_is_one_that_it_takes_and_the_manager_has_no_bond_with_it() -> None:
-    context = Context()
-    context.init(args=["--ros-args", "--params-file", str(FILE)], domain_id=next_domain())
-    try:
+    with private_context("--ros-args", "--params-file", str(FILE)) as context:
         node = Node("gsseg", context=context)
         declarations.declare(node)
         settings = Settings.read(node)
         node.destroy_node()
-    finally:
-        context.shutdown()
     given = CONFIG["/**/gsseg"]["ros__parameters"]
     assert given.keys() <= {declaration.name for declaration in declarations.DECLARATIONS}
     assert settings.obstacle_classes == tuple(given["obstacle_classes"]) and settings.autostart is False

@@ -181,20 +181,15 @@ def test_parameters_file_has_every_parameter_at_its_default() -> None:
 
 @pytest.mark.parametrize(("name", "namespace"), [("gsseg", ""), ("front", "/robot")])
 def test_a_node_accepts_the_parameters_file_as_it_stands(name: str, namespace: str) -> None:
-    from ros_helpers import Context, Node, next_domain
+    from ros_helpers import Node, private_context
 
     from gsseg_ros.node import declarations, parameters
 
-    context = Context()
-    file = str(ROOT / "config" / "segment_node.yaml")
-    context.init(args=["--ros-args", "--params-file", file], domain_id=next_domain())
-    try:
+    with private_context("--ros-args", "--params-file", str(ROOT / "config" / "segment_node.yaml")) as context:
         node = Node(name, namespace=namespace, context=context)
         declarations.declare(node)
         settings = parameters.Settings.read(node)
         node.destroy_node()
-    finally:
-        context.shutdown()
     assert (settings.pose_source, settings.max_views, settings.class_names) == ("topic", 200, ())
 
 
