@@ -78,13 +78,16 @@ def started(desk: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Started]:
 @pytest.mark.parametrize(
     "page", [page for page in PAGES if page != MASKS and any(block.runs for block in blocks_of(page))]
 )
-def test_every_block_of_a_page_runs(page: str, desk: Path, started: Started, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_block_of_a_page_runs(
+    page: str, desk: Path, started: Started, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
     skip_without_libraries(page)
     ros = needs_ros(page)
     if ros:
-        helpers = pytest.importorskip("ros_helpers", exc_type=ImportError)
+        domain, claim = pytest.importorskip("ros_helpers", exc_type=ImportError).next_domain()
+        request.addfinalizer(claim.close)
         for name, value in {
-            "ROS_DOMAIN_ID": str(helpers.next_domain()), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
             "ROS_LOG_DIR": str(desk / "ros_log"),
         }.items():  # fmt: skip
             monkeypatch.setenv(name, value)
