@@ -202,7 +202,8 @@ def main() -> int:
     if not lines:
         return 0
     head = ["scene", "parts; merged; missing", "found", "level told", "IoU there", *(f"at {level}" for level in LEVELS)]
-    said = f"Behind the best level of each: {100 * np.mean(behind):.1f} points on the mean, {100 * max(behind):.1f} at most"
+    mean, most = 100 * np.mean(behind), 100 * max(behind)
+    said = f"Behind the best level of each: {mean:.1f} points on the mean, {most:.1f} at most."
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(markdown(head, lines) + f"\n\n{said}\n", encoding="utf-8")
     print(said, options.out, sep="\n")
