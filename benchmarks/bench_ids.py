@@ -244,10 +244,9 @@ def cut(labels: np.ndarray, random: np.random.Generator) -> np.ndarray:
 
 def merged(labels: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """Merge some objects with one that they touch, each with one at most."""
-    sides = [(labels[1:], labels[:-1]), (labels[:, 1:], labels[:, :-1])]
-    touching = np.concatenate([np.stack([one.ravel(), two.ravel()], axis=1) for one, two in sides])
-    touching = np.unique(touching[(touching > 0).all(axis=1) & (touching[:, 0] != touching[:, 1])], axis=0)
+    touching = neighbours(labels)
     touching = np.concatenate([touching, touching[:, ::-1]])
+    touching = touching[(touching > 0).all(axis=1)]
     out, free = labels.copy(), np.ones(int(labels.max()) + 1, bool)
     for k in np.unique(labels[labels > 0]):
         # Each pair takes two objects.
@@ -258,6 +257,14 @@ def merged(labels: np.ndarray, random: np.random.Generator) -> np.ndarray:
             out[out == k] = other
             free[[k, other]] = False
     return out
+
+
+def neighbours(labels: np.ndarray) -> np.ndarray:  # (H, W)
+    """List the pairs of labels that lie side by side, the smaller first, (P, 2)."""
+    sides = [(labels[1:], labels[:-1]), (labels[:, 1:], labels[:, :-1])]
+    pairs = np.concatenate([np.stack([one.ravel(), two.ravel()], axis=1) for one, two in sides])
+    unique: np.ndarray = np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
+    return unique
 
 
 def instances(scene: GaussianScene, views: list[View]) -> Masks:

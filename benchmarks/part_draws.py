@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from bench_ids import Masks, labels_of, object_ious, rng
+from bench_ids import Masks, labels_of, neighbours, object_ious, rng
 from machine import DATA
 from results import markdown, points
 from scipy.cluster.vq import kmeans2
@@ -33,8 +33,8 @@ from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.photos import read_photo
 from gsseg_core.data.view import View
-from gsseg_core.objects.association import AssociationSettings
-from gsseg_core.objects.object_table import ObjectTable
+from gsseg_core.objects.association import AssociationSettings, associate
+from gsseg_core.objects.lifted_segments import Lifted
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
@@ -105,9 +105,8 @@ def _split(inside: np.ndarray, lab: np.ndarray, most: int, random: np.random.Gen
 
 
 def _with_merged(parts: np.ndarray, background: np.ndarray, random: np.random.Generator, share: float) -> np.ndarray:
-    sides = [(parts[1:], parts[:-1]), (parts[:, 1:], parts[:, :-1])]
-    pairs = np.concatenate([np.stack([a.ravel(), b.ravel()], axis=1) for a, b in sides])
-    pairs = np.unique(np.sort(pairs[(pairs >= 0).all(axis=1) & (pairs[:, 0] != pairs[:, 1])], axis=1), axis=0)
+    pairs = neighbours(parts)
+    pairs = pairs[(pairs >= 0).all(axis=1)]
     pairs = pairs[background[pairs[:, 0]] == background[pairs[:, 1]]]
     table = np.arange(len(background) + 1)
     table[-1] = UNKNOWN
@@ -121,37 +120,30 @@ class Trial:
     """A scene with one draw of its masks, lifted once."""
 
     def __init__(self, scene: GaussianScene, views: Sequence[View], tests: Sequence[View], last: int) -> None:
-        self.scene, self.views, self.tests = scene, views, tests
+        self.scene, self.tests = scene, tests
         self.truth: Masks = {
             name: np.where(labels <= last, np.minimum(labels, 0), labels)
             for name, labels in labels_of(list(tests)).items()
         }
         self.num_objects = len(np.unique(np.concatenate([labels[labels > 0] for labels in self.truth.values()])))
-        self.table = ObjectTable(scene)
-        for view in views:
-            self.table.add(view)
-        self.seen = {
-            view.name: (observation, observation.votes())
-            for view in views
-            for observation in [make_operator(scene, view.camera).observe(view.read_labels())]
-        }
+        self.observations = {view.name: make_operator(scene, view.camera).observe(view.read_labels()) for view in views}
+        self.lifted = {name: Lifted.of(observation) for name, observation in self.observations.items()}
 
     def score(self, settings: AssociationSettings) -> tuple[float, int, float]:
         """IoU of the objects one to one, how many were found, and the level."""
-        self.table.settings = settings
-        self.table.solve()
-        votes = np.zeros((len(self.scene), max(self.table.class_names) + 1), np.float32)
-        for view in self.views:
-            observation, each = self.seen[view.name]
-            alignment = self.table.alignment(view.name).objects
-            number = np.array([alignment.get(int(k), -1) for k in observation.classes])[observation.labels]
-            rows = observation.ids[observation.rows]
-            np.add.at(votes, (rows[number >= 0], number[number >= 0]), each[number >= 0])
+        objects, level = associate(self.lifted, settings)
+        votes = np.zeros((len(self.scene), max(int(each.max()) for each in objects.values()) + 1), np.float32)
+        for name, observation in self.observations.items():
+            number = np.full(int(observation.classes.max()) + 1, UNKNOWN)
+            number[self.lifted[name].ids] = objects[name]
+            column = number[observation.classes][observation.labels]
+            shown = column != UNKNOWN
+            np.add.at(votes, (observation.ids[observation.rows][shown], column[shown]), observation.votes()[shown])
         codes = votes / np.maximum(votes.sum(axis=1, keepdims=True), 1e-9)
         result = Segmentation.from_codes(self.scene, codes, {})
         found = {view.name: result.render(make_operator(self.scene, view.camera)).labels for view in self.tests}
-        ious, objects = object_ious(self.truth, found)
-        return float(ious.mean()), objects, self.table.summary()["granularity"]
+        ious, count = object_ious(self.truth, found)
+        return float(ious.mean()), count, level
 
 
 def _photo(view: View) -> np.ndarray:
