@@ -6,7 +6,6 @@ before anything that imports numba.
 
 from __future__ import annotations
 
-import gc
 import os
 import resource
 import select
@@ -73,7 +72,6 @@ def in_child(job: Callable[[], int | None], folder: Path, seconds: float) -> End
     started = time.perf_counter()
     child = os.fork()
     if child == 0:
-        gc.freeze()  # What the parent has not collected yet may wait for threads that no child has.
         os._exit(_do(job, paths))
     in_time = _ended_within(child, seconds)
     if not in_time:

@@ -29,7 +29,7 @@ class Interrupter:
         copy = os.fork()
         if copy == 0:
             sys.meta_path.remove(self)
-            signal.alarm(60)
+            signal.alarm(300)
             os.kill(os.getpid(), signal.SIGINT)
         else:
             Interrupter.codes[name] = os.waitstatus_to_exitcode(os.waitpid(copy, 0)[1])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import gc
 import os
 import resource
 import signal
@@ -12,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from clean_process import in_clean_process
 
 from gsseg_core.errors import GssegError, PathTakenError, SettingsError, WriteError
 from gsseg_core.files.atomic import check_writable, write_atomically
@@ -108,12 +108,12 @@ def test_a_link_to_a_file_stays_and_the_file_is_replaced(tmp_path: Path) -> None
     assert len(list((tmp_path / "real").iterdir())) == 1
 
 
+@in_clean_process
 def test_a_temporary_file_of_a_dead_process_is_removed_by_the_next_and_one_of_a_live_process_is_not(
     tmp_path: Path,
 ) -> None:
     child = os.fork()
     if not child:
-        gc.freeze()  # What other tests left is the parent's to collect.
         with write_atomically(tmp_path / "a.ply") as temporary:
             temporary.write_text("half")
             os.kill(os.getpid(), signal.SIGKILL)

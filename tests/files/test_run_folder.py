@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import gc
 import json
 import os
 import shutil
@@ -14,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from clean_process import in_clean_process
 from test_atomic import small_files_only
 
 from gsseg_core.errors import PathTakenError, SettingsError, WriteError
@@ -43,11 +43,10 @@ def hidden(out: Path) -> list[str]:
 
 
 def killed_at(count: int, work: Callable[[], object]) -> bool:
-    """Say whether some work, in another process, was killed: before its `count`-th change of the name of a file."""
+    """Say whether some work, in a fork, was killed: before its `count`-th change of the name of a file."""
     child = os.fork()
     if child:
         return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
-    gc.freeze()  # What other tests left is the parent's to collect: a ROS node here would wait for threads it has not.
     calls = 0
 
     def counted(function: Callable[..., object]) -> Callable[..., object]:
@@ -68,10 +67,9 @@ def killed_at(count: int, work: Callable[[], object]) -> bool:
         os._exit(0)
 
 
-def test_after_a_kill_at_any_step_all_files_are_of_one_run_and_the_next_run_cleans_up(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(os, "fsync", lambda _: None)  # The machine goes on, and it takes most of the time.
+@in_clean_process
+def test_after_a_kill_at_any_step_all_files_are_of_one_run_and_the_next_run_cleans_up(tmp_path: Path) -> None:
+    os.fsync = lambda _: None  # The machine goes on, and it takes most of the time.
     out, before, after = tmp_path / "out", 0, 0
     write(out, FIRST)
     (out / "classes" / "1_mine.ply").write_text("mine")
@@ -100,10 +98,9 @@ def test_after_a_kill_at_any_step_all_files_are_of_one_run_and_the_next_run_clea
     assert before > 10 and after > 10 and not was_killed
 
 
-def test_a_move_that_is_killed_again_while_it_is_finished_is_finished_in_the_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(os, "fsync", lambda _: None)
+@in_clean_process
+def test_a_move_that_is_killed_again_while_it_is_finished_is_finished_in_the_end(tmp_path: Path) -> None:
+    os.fsync = lambda _: None
     out = tmp_path / "out"
     write(out, FIRST)
     step = 1

@@ -19,7 +19,7 @@ import pytest
 
 MARKER = "processes"
 STARTERS = {"browser", "children", "distributed", "forked", "gsseg_ros.child_nodes", "multiprocessing", "subprocess"}
-EVENTS = {"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.system", "os.exec"}
+EVENTS = {"subprocess.Popen", "os.posix_spawn", "os.system", "os.exec"}
 HERE = str(Path(__file__).parents[1])
 _may_start = True
 
@@ -68,7 +68,9 @@ def starts(function: Any) -> bool:
 
 
 def refuse_events(event: str, arguments: tuple[Any, ...]) -> None:
-    """Fail the test that starts a process though nobody could see that it would: an audit hook of Python."""
+    """Fail the test that forks, or starts a process though nobody could see that it would: an audit hook of Python."""
+    if event in ("os.fork", "os.forkpty"):
+        pytest.fail("it forks the process of all tests, whose threads a child lacks: see helpers/clean_process.py")
     if not _may_start and event in EVENTS and arguments[:1] != ("uname",):  # Of Python's own module platform.
         pytest.fail(f"it starts a process ({event}) and so needs @pytest.mark.{MARKER}: {arguments[:2]}")
 
