@@ -7,14 +7,24 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows, largest
 from gsseg_core.data.class_names import class_name
+from gsseg_core.data.object_tree import ObjectTree, check_granularity
 from gsseg_core.data.view import spread
-from gsseg_core.files.npz_files import UnfitError, check_shares, class_names_of, open_npz, temperature_of, write_npz
+from gsseg_core.errors import SettingsError
+from gsseg_core.files.npz_files import (
+    NpzArrays,
+    UnfitError,
+    check_shares,
+    class_names_of,
+    open_npz,
+    temperature_of,
+    write_npz,
+)
 from gsseg_core.files.run_folder import settle
 from gsseg_core.learn.temperature import tempered
 from gsseg_core.raster.backends import make_operator
@@ -25,12 +35,14 @@ from gsseg_core.refine.silhouette_carving import Silhouette, carve
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import neighbours_of
-from gsseg_core.text import clipped
+from gsseg_core.text import clipped, quoted
 
 UNOBSERVED, REMOVED = -1, -2
 """Labels of Gaussians that no view spoke for, and of those that the filter took out."""
 
 FORMAT = "gsseg-segmentation-1"
+TREE_ARRAYS = ("parents", "agreement", "leaves")
+"""Of an `ObjectTree`, in the file of a segmentation."""
 
 
 class LabelMap(NamedTuple):
@@ -67,6 +79,8 @@ class Segmentation:
         At which the probabilities are; 1 where they are those that blend, as they were learnt.
     ids : (N,) int64 or None
         Ids of the Gaussians that stay while the scene changes, if it has any; see docs/living_map.md.
+    tree : ObjectTree or None
+        Parts and wholes of the classes, where these are objects that were found from ids of each view's own.
     """
 
     labels: np.ndarray
@@ -77,6 +91,7 @@ class Segmentation:
     learnt: np.ndarray
     temperature: float = 1.0
     ids: np.ndarray | None = None
+    tree: ObjectTree | None = None
 
     @classmethod
     def from_codes(
@@ -131,6 +146,33 @@ class Segmentation:
         """
         change = temperature / self.temperature
         return replace(self, probabilities=tempered(self.probabilities, change), temperature=temperature)
+
+    def at(self, granularity: float | None) -> Segmentation:
+        """Cut the tree: the segmentation whose classes are its nodes at a granularity; by default, the objects.
+
+        What is an object there keeps its id and name. What a Gaussian has of its own object goes to its own part, what
+        it has of another to the largest part of that.
+
+        Raises
+        ------
+        SettingsError
+            There is no tree, or the granularity is not in [0, 1].
+        """
+        if granularity is None:
+            return self
+        check_granularity(granularity)
+        if (tree := self.tree) is None:
+            raise SettingsError("granularity is for objects that were found from ids of each view's own; found no tree")
+        names = tree.names(self.class_names)
+        probabilities, nodes = tree.shares_at(granularity, self.probabilities, tree.leaves)
+        return replace(
+            self,
+            labels=tree.labels_at(granularity, self.labels),
+            probabilities=probabilities,
+            class_names={node: names[node] for node in nodes},
+            learnt=tree.shares_at(granularity, self.learnt, tree.leaves[self.clustered])[0],
+            tree=None,
+        )
 
     def selected(self, classes: Collection[int], min_confidence: float = 0.0) -> Segmentation:
         """Keep the labels of some classes, and there only of Gaussians at least so sure; the others are removed."""
@@ -231,7 +273,7 @@ class Segmentation:
         return CSRRows.from_dense(codes), bool(codes[:, 0].any())
 
     def save(self, path: str | os.PathLike[str], run: str | None = None) -> None:
-        """Write labels, probabilities, confidence, class ids and names as one npz, atomically; ids where there are any.
+        """Write labels, probabilities, confidence, class ids and names as one npz, atomically; ids and tree, if any.
 
         `run` is the id of the run that it belongs to, for the header.
 
@@ -244,6 +286,9 @@ class Segmentation:
                   "temperature": self.temperature, **({} if run is None else {"run": run})}  # fmt: skip
         names = ("labels", "probabilities", "class_ids", "confidence", "clustered", "learnt")
         arrays = {name: getattr(self, name) for name in names}
+        if self.tree is not None:
+            header["granularity"] = self.tree.level
+            arrays |= {f"tree_{name}": getattr(self.tree, name) for name in TREE_ARRAYS}
         write_npz(path, header, **arrays, **({} if self.ids is None else {"ids": self.ids}))
 
     @classmethod
@@ -282,4 +327,18 @@ class Segmentation:
                 raise UnfitError("array class_ids holds other ids than class_names of its header; expected the same")
             check_shares("probabilities", probabilities)
             check_shares("learnt", learnt)
-        return cls(labels, probabilities, names, scene.digest, clustered, learnt, temperature, scene.ids)
+            tree = _read_tree(file, header, n, k)
+        return cls(labels, probabilities, names, scene.digest, clustered, learnt, temperature, scene.ids, tree)
+
+
+def _read_tree(file: NpzArrays, header: dict[str, Any], num_gaussians: int, num_classes: int) -> ObjectTree | None:
+    """Read the tree of a segmentation, if it has one."""
+    if "tree_parents" not in file.names:
+        return None
+    parents = file.expect("tree_parents", np.int32, (None,))
+    agreement = file.expect("tree_agreement", np.float32, (len(parents),))
+    leaves = file.expect("tree_leaves", np.int32, (num_gaussians,))
+    level = header.get("granularity")
+    if type(level) is not float:
+        raise UnfitError(f"granularity is {quoted(level)}; expected a number in (0, 1)")
+    return ObjectTree(parents, agreement, leaves, num_classes, level)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from small_scenes import NAMES, NUM_CLASSES, OUT_OF_SIGHT, balls_on_a_table, clean_views, ring, taught
 
-from gsseg_core.errors import StateFileError, StateMismatchError, WriteError
+from gsseg_core.data.object_tree import ObjectTree
+from gsseg_core.errors import SettingsError, StateFileError, StateMismatchError, WriteError
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.settings import PAPER, UNREFINED, RefineSettings
@@ -128,3 +129,59 @@ def test_a_failed_save_leaves_the_earlier_file_whole(tmp_path: Path, monkeypatch
     with pytest.raises(WriteError, match="No space left"):
         refined().save(path)
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
+def with_parts() -> Segmentation:
+    """Class 1 has two parts, 4 and 5; 2 and 3 make a whole, 6."""
+    parents, agreement = [-1, -1, 6, 6, 1, 1, -1], [1, 0.7, 1, 1, 1, 1, 0.3]
+    leaves = np.where(TRUTH == 1, 4 + np.arange(len(TRUTH)) % 2, TRUTH).astype(np.int32)
+    tree = ObjectTree(np.array(parents, np.int32), np.array(agreement, np.float32), leaves, NUM_CLASSES, 0.5)
+    return replace(Segmentation.from_codes(SCENE, CODES, NAMES, UNREFINED), tree=tree)
+
+
+def test_levels_are_segmentations_whose_classes_are_the_nodes_there() -> None:
+    objects = with_parts()
+    assert objects.at(None) is objects
+    same, fine, coarse = objects.at(0.5), objects.at(0.9), objects.at(0.2)
+    np.testing.assert_array_equal(same.labels, objects.labels)
+    assert same.class_names == objects.class_names
+    assert list(fine.class_names.values()) == ["background", NAMES[2], NAMES[3], f"{NAMES[1]}.1", f"{NAMES[1]}.2"]
+    assert list(coarse.class_names) == [0, 1, 6] and coarse.class_names[6] == "whole_001"
+    for level in (same, fine, coarse):
+        np.testing.assert_array_equal(level.class_ids[level.probabilities.argmax(axis=1)], level.labels)
+        seen = level.render(make_operator(SCENE, ring(1)[0])).labels
+        assert set(np.unique(seen).tolist()) <= set(level.class_names)
+    assert (objects.counts()[2] + objects.counts()[3]) == coarse.counts()[6]
+
+
+def test_levels_need_a_tree() -> None:
+    with pytest.raises(SettingsError, match="no tree"):
+        replace(with_parts(), tree=None).at(0.5)
+    with pytest.raises(SettingsError, match="granularity"):
+        with_parts().at(1.5)
+
+
+def test_the_tree_is_saved_with_the_segmentation(tmp_path: Path) -> None:
+    objects = with_parts()
+    objects.save(tmp_path / "s.npz")
+    loaded = Segmentation.load(tmp_path / "s.npz", SCENE).tree
+    assert loaded is not None and objects.tree is not None and loaded.level == 0.5
+    for name in ("parents", "agreement", "leaves"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(objects.tree, name))
+
+
+@pytest.mark.parametrize(
+    ("array", "value", "message"),
+    [
+        ("parents", np.array([-1, 4, -1, -1, 1, 1, -1], np.int32), "circle"),
+        ("agreement", np.ones(3, np.float32), "tree_agreement"),
+        ("leaves", np.full(len(TRUTH), 9, np.int32), "leaves"),
+        ("leaves", np.zeros(3, np.int32), "tree_leaves"),
+    ],
+)
+def test_a_damaged_tree_is_told(tmp_path: Path, array: str, value: np.ndarray, message: str) -> None:
+    objects = with_parts()
+    object.__setattr__(objects.tree, array, value)
+    objects.save(tmp_path / "s.npz")
+    with pytest.raises(StateFileError, match=message):
+        Segmentation.load(tmp_path / "s.npz", SCENE)

@@ -16,8 +16,12 @@ from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.objects.association import AssociationSettings, associate
 from gsseg_core.objects.lifted_segments import Lifted, Profiles, sums
+from gsseg_core.objects.tree_growing import grow_tree
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.segmentation import REMOVED, Segmentation
+
+_UNTOLD = 0.5  # granularity of the objects before all views were looked at together
 
 
 @dataclass(frozen=True)
@@ -194,6 +198,15 @@ class ObjectTable:
         progress("associate", 1, 1)
         changed = [name for name in solved if name not in before or (before[name] != solved[name]).any()]
         return Repair(changed, successors)
+
+    def with_tree(self, segmentation: Segmentation) -> Segmentation:
+        """Add parts and wholes to a segmentation whose classes are these objects, by the views that are kept."""
+        labels, probabilities = segmentation.labels, segmentation.probabilities
+        # What refinement took out covers an object still.
+        classes = np.where(labels == REMOVED, probabilities.argmax(axis=1), labels)
+        level = _UNTOLD if self._agreement is None else self._agreement
+        tree = grow_tree(self.scene.means, classes, probabilities.shape[1], self._lifted, level, self.settings)
+        return replace(segmentation, tree=tree)
 
     def relabelled(self, view: View) -> View:
         """Return a view as it came, with the numbers of objects for labels; ids that lie on no Gaussian are unknown.

@@ -1,0 +1,238 @@
+"""Parts, objects and wholes as a tree of nodes, and the levels at which it can be cut.
+
+Nodes below the number of classes K are the classes: node k is class k, on every level where it is not cut or put
+together with others. Nodes from K on are parts, inside one class each, and wholes, made of several. Every Gaussian lies
+in a leaf. A node is one thing at each granularity up to its agreement, which nowhere falls on the way from the root to
+a leaf; so every level is a union of the nodes of each finer one, and the level of the objects is one of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from gsseg_core.data.class_names import class_name
+from gsseg_core.errors import SettingsError
+from gsseg_core.files.npz_files import UnfitError
+
+PART, OBJECT, WHOLE = "part", "object", "whole"
+"""What a node can be."""
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectTree:
+    """Which parts the objects of a scene have, and which wholes they make.
+
+    Attributes
+    ----------
+    parents : (M,) int32
+        Node that each node is a part of; -1 for those that are of none.
+    agreement : (M,) float32
+        Share of the views' say, in [0, 1], by which all that a node holds has one id; 1 for leaves.
+    leaves : (N,) int32
+        Leaf of each Gaussian; -1 where it is of no class.
+    num_classes : int
+        K; the first nodes are the classes, the background among them.
+    level : float
+        Granularity of the classes, in (0, 1).
+    """
+
+    parents: np.ndarray
+    agreement: np.ndarray
+    leaves: np.ndarray
+    num_classes: int
+    level: float
+
+    def __post_init__(self) -> None:
+        """Raise `UnfitError` unless it is a tree whose nodes are nested as the docstring of the module says."""
+        m, k = len(self.parents), self.num_classes
+        nodes = np.arange(m)
+        has = self.parents >= 0
+        if not (1 <= k <= m and len(self.agreement) == m and 0 < self.level < 1):
+            raise UnfitError(f"tree has {m} nodes, {k} classes, level {self.level:g}; expected 1 <= classes <= nodes")
+        if ((self.parents < -1) | (self.parents >= m) | (self.parents == nodes)).any() or (self._root < 0).any():
+            raise UnfitError("parents of the tree are no nodes of it, or go round in a circle")
+        if not ((self.agreement >= 0) & (self.agreement <= 1)).all():
+            raise UnfitError("agreement of the tree is outside [0, 1]")
+        if (self.agreement[self.parents[has]] > self.agreement[has]).any():
+            raise UnfitError("agreement of the tree falls from a node to its part; expected that it grows")
+        kinds = self._classes
+        if (has & (nodes < k) & (kinds[self.parents] >= 0)).any() or (self.agreement[:k] < self._level).any():
+            raise UnfitError("a class of the tree is part of another; expected them to be on one level")
+        if (self.agreement[kinds < 0] >= self._level).any():
+            raise UnfitError("a whole of the tree holds no two objects at its level")
+        if ((self.leaves < -1) | (self.leaves >= m)).any() or (kinds[self.leaves[self.leaves >= 0]] < 0).any():
+            raise UnfitError("leaves of the tree are no parts or objects of it")
+
+    def __len__(self) -> int:
+        """Count the nodes, M."""
+        return len(self.parents)
+
+    @property
+    def _level(self) -> np.float32:
+        return np.float32(self.level)
+
+    @cached_property
+    def _root(self) -> np.ndarray:  # (M,); -1 for nodes on a circle
+        top = _climbed(np.where(self.parents >= 0, self.parents, np.arange(len(self))))
+        return np.where(self.parents[top] < 0, top, -1)
+
+    @cached_property
+    def _classes(self) -> np.ndarray:
+        """Class that each node is, or is inside of, (M,) int32; -1 for wholes."""
+        nodes = np.arange(len(self))
+        at = _climbed(np.where((nodes >= self.num_classes) & (self.parents >= 0), self.parents, nodes))
+        return np.where(at < self.num_classes, at, -1).astype(np.int32)
+
+    def class_of(self, node: int) -> int:
+        """Class that a node is, or is inside of; -1 for a whole."""
+        return int(self._classes[node])
+
+    def kind(self, node: int) -> str:
+        """`PART`, `OBJECT` or `WHOLE`."""
+        return OBJECT if node < self.num_classes else PART if self._classes[node] >= 0 else WHOLE
+
+    def parts(self, node: int) -> list[int]:
+        """Nodes that a node is made of, in the order of their numbers; none of a leaf."""
+        return np.flatnonzero(self.parents == node).tolist()
+
+    def whole(self, node: int) -> int | None:
+        """Node that a node is a part of; None if of none."""
+        parent = int(self.parents[node])
+        return parent if parent >= 0 else None
+
+    @cached_property
+    def granularities(self) -> tuple[float, ...]:
+        """One granularity for each different cut, ascending: from the wholes over the objects to the parts.
+
+        That of the objects is `level`.
+        """
+        inner = np.unique(self.agreement[np.unique(self.parents[self.parents >= 0])]).tolist()
+        coarse, fine = [h for h in inner if h < self._level], [h for h in inner if self._level <= h < 1]
+        return (*coarse, self.level, *((a + b) / 2 for a, b in pairwise([*fine, 1.0])))
+
+    def cut(self, granularity: float) -> np.ndarray:
+        """Tell what stands for each node at a granularity: the largest that holds it and is one there, (M,) int32.
+
+        Nodes that come apart there stand for themselves; no Gaussian lies in them alone.
+
+        Raises
+        ------
+        SettingsError
+            The granularity is not in [0, 1].
+        """
+        check_granularity(granularity)
+        one = (self.parents >= 0) & (self.agreement[self.parents] >= np.float32(granularity))
+        return _climbed(np.where(one, self.parents, np.arange(len(self)))).astype(np.int32)
+
+    def labels_at(self, granularity: float, labels: np.ndarray) -> np.ndarray:
+        """Node of each Gaussian at a granularity, (N,) int32, for their classes (N,); those of no class stay so.
+
+        A Gaussian that was given to another class than its leaf's belongs to the largest leaf of that.
+        """
+        table = self.cut(granularity)
+        known = np.maximum(labels, 0)
+        own = (self.leaves >= 0) & (self._classes[self.leaves] == known)
+        leaf = np.where(own, self.leaves, self._largest_leaf[known])
+        return np.where(labels >= 0, table[leaf], labels).astype(np.int32)
+
+    @cached_property
+    def _largest_leaf(self) -> np.ndarray:
+        """Leaf with the most Gaussians of each class, (K,) int32."""
+        count = np.bincount(self.leaves[self.leaves >= 0], minlength=len(self))
+        count[np.unique(self.parents[self.parents >= 0])] = -1
+        order = np.lexsort([-np.arange(len(self)), count])
+        order = order[(self._classes[order] >= 0) & (count[order] >= 0)]
+        largest = np.zeros(self.num_classes, np.int32)
+        largest[self._classes[order]] = order
+        return largest
+
+    def shares_at(self, granularity: float, shares: np.ndarray, leaves: np.ndarray) -> tuple[np.ndarray, list[int]]:
+        """Bring class probabilities (n, K) of Gaussians with the leaves (n,) to a granularity.
+
+        What a Gaussian has of its leaf's class goes to its own part, what it has of others to their largest.
+
+        Returns
+        -------
+        shares : (n, K') float32
+            By node.
+        nodes : list of int
+            The nodes of that level, ascending: first what classes stay.
+        """
+        table = self.cut(granularity)
+        tops = table[self._leaf_nodes]
+        nodes = np.unique(np.append(tops, 0))
+        column = np.zeros(len(self), np.int64)
+        column[nodes] = np.arange(len(nodes))
+        usual = column[table[self._largest_leaf]]
+        out = np.zeros((len(shares), len(nodes)), np.float32)
+        for k, to in enumerate(usual.tolist()):
+            out[:, to] += shares[:, k]
+        rows = np.flatnonzero(leaves >= 0)
+        of_class, own = self._classes[leaves[rows]], column[table[leaves[rows]]]
+        moved = own != usual[of_class]
+        rows, of_class, own = rows[moved], of_class[moved], own[moved]
+        out[rows, usual[of_class]] -= shares[rows, of_class]
+        out[rows, own] += shares[rows, of_class]
+        return np.maximum(out, 0), nodes.tolist()
+
+    @cached_property
+    def _leaf_nodes(self) -> np.ndarray:
+        return np.setdiff1d(np.arange(len(self)), self.parents)
+
+    def names(self, class_names: Mapping[int, str]) -> dict[int, str]:
+        """Names of all nodes: those of classes, `object_003.2` for their parts, `whole_001` for wholes."""
+        names = {k: class_name(class_names, k) for k in range(self.num_classes)}
+        wholes = [node for node in range(self.num_classes, len(self)) if self._classes[node] < 0]
+        names |= {node: f"whole_{i:03d}" for i, node in enumerate(wholes, start=1)}
+        todo = list(range(self.num_classes))
+        while todo:
+            node = todo.pop()
+            parts = self.parts(node)
+            names |= {part: f"{names[node]}.{i}" for i, part in enumerate(parts, start=1)}
+            todo += parts
+        return dict(sorted(names.items()))
+
+    def describe(self, class_names: Mapping[int, str]) -> list[dict[str, object]]:
+        """List the nodes that are no classes for `report.json`: parts and wholes."""
+        names, count = self.names(class_names), self._sizes
+        return [
+            {
+                "id": node,
+                "name": names[node],
+                "kind": self.kind(node),
+                "part_of": self.whole(node),
+                "made_of": self.parts(node),
+                "agreement": round(float(self.agreement[node]), 4),
+                "gaussians": int(count[node]),
+            }
+            for node in range(self.num_classes, len(self))
+        ]
+
+    @cached_property
+    def _sizes(self) -> np.ndarray:
+        """Gaussians of each node, of all its parts together, (M,) int64."""
+        count = np.bincount(self.leaves[self.leaves >= 0], minlength=len(self))
+        total, at = np.zeros(len(self), np.int64), np.arange(len(self))
+        while len(at):
+            np.add.at(total, at, count)
+            on = self.parents[at] >= 0
+            at, count = self.parents[at[on]], count[on]
+        return total
+
+
+def check_granularity(granularity: float) -> None:
+    """Raise `SettingsError` unless it is in [0, 1]."""
+    if not 0 <= granularity <= 1:
+        raise SettingsError(f"granularity is {granularity}; expected a share in [0, 1]")
+
+
+def _climbed(up: np.ndarray) -> np.ndarray:  # (M,)
+    """Follow from each node where `up` leads, to the end; a circle is followed for a while."""
+    for _ in range(len(up).bit_length()):
+        up = up[up]
+    return up

@@ -1,0 +1,338 @@
+"""Which parts objects have and which wholes they make, by what the views say that the objects were found from.
+
+A segment is one id of one view, lifted to the Gaussians. For a region R, any set of Gaussians, view v has the shares
+p_Rb of what it sees of R that it calls b; two regions are one there with the probability sum_b p_Rb p_Sb, and their
+agreement is the mean of that over the views, each counting by how much it sees of both. That holds for pieces of one
+object and for whole objects alike, so that one tree has all of them:
+
+1. Each object is cut into cells of a few Gaussians that lie together, and these merge, the most agreed first. "Beside
+   each other" in one view and "both inside" in the next are votes on the same pair: what some views cut up and others
+   show whole becomes parts that agree by the share of the views that show it whole.
+2. Objects merge in the same way, by how often views have them under one id.
+3. A region stays if three views or more show it as a segment: under one id that is it more than anything else, by an
+   IoU above one half. What no view shows, as a rim of mixed Gaussians, goes to what it agrees with most.
+4. Every Gaussian goes to the part of its object that the ids on it speak for; one that no view has seen, to that of the
+   nearest that was seen.
+
+Gaussians merge, not segments: so levels are nested whatever an id covers, and the objects are those that were learnt.
+Nothing depends on the order of views or ids.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy import sparse
+
+from gsseg_core.data.object_tree import ObjectTree
+from gsseg_core.objects.association import AssociationSettings
+from gsseg_core.objects.lifted_segments import Lifted, sums
+
+SEVERAL = 3
+"""Views that have to show a part or a whole."""
+
+_CELL, _MOST_CELLS = 8, 256  # Gaussians of a cell; cells of an object, of which a larger one has larger cells
+_ITSELF = 0.5  # IoU above which a segment is a region: it can be so of no other one beside it
+_STEPS = 10  # agreements are told apart by a tenth
+
+
+@dataclass(eq=False)
+class _Region:
+    """A node of the tree while it grows."""
+
+    agreement: float = 1.0  # by which its parts are one
+    parts: list[_Region] = field(default_factory=list)
+    row: int = -1  # of its shares, among those of all regions
+    size: int = 0  # Gaussians, of a leaf
+    number: int = -1
+
+    def leaves(self) -> list[_Region]:
+        return [leaf for part in self.parts for leaf in part.leaves()] or [self]
+
+    @property
+    def total(self) -> int:
+        return sum(leaf.size for leaf in self.leaves())
+
+
+def grow_tree(
+    means: np.ndarray,
+    classes: np.ndarray,
+    num_classes: int,
+    views: Mapping[str, Lifted],
+    level: float,
+    settings: AssociationSettings | None = None,
+) -> ObjectTree:
+    """Find the parts of objects, and the wholes that they make.
+
+    Parameters
+    ----------
+    means : (N, 3) float32
+        Where the Gaussians are.
+    classes : (N,) int
+        Object of each; 0 is the background, which has no parts, and below 0 is none.
+    num_classes : int
+        Largest object that there may be, and one more for the background.
+    views : mapping from name to Lifted
+        In any order; the names only break ties.
+    level : float
+        Agreement down to which segments were put together, the granularity of the objects.
+    settings : AssociationSettings, optional
+        What of a view counts how much.
+    """
+    segments = _Segments.of(views, len(means), settings or AssociationSettings())
+    objects = [_Region(row=k) for k in range(num_classes)]
+    places = np.where(classes >= 0, 0, -1)  # among the leaves of its object
+    members = [np.flatnonzero(classes == k) for k in range(num_classes)]
+    for k in range(1, num_classes):
+        rows, own = segments.on(members[k])
+        regions, shares = _regions(means[members[k]], rows, own)
+        tops = _kept(regions, own.showing(regions, shares))
+        found = _stepped(tops[0] if len(tops) == 1 else _Region(0.0, tops), level, 1.0)
+        if found.parts:
+            places[members[k]] = _nearest_part(means[members[k]], rows, own, shares[[r.row for r in found.leaves()]])
+            objects[k] = found
+    for k, object_ in enumerate(objects):
+        for place, leaf in enumerate(object_.leaves()):
+            leaf.size = int(np.count_nonzero(places[members[k]] == place))
+    return _numbered(objects, _wholes(objects, members, segments, level), classes, places, level)
+
+
+@dataclass(frozen=True, eq=False)
+class _Segments:
+    """Segments of all views but their backgrounds, and how views compare regions by them."""
+
+    weights: sparse.csr_matrix  # (N, S), px
+    view: np.ndarray  # (S,): ascending, without gaps
+    size: np.ndarray  # (S,), px
+    settings: AssociationSettings
+
+    @classmethod
+    def of(cls, views: Mapping[str, Lifted], num_gaussians: int, settings: AssociationSettings) -> _Segments:
+        blocks = [sparse.csr_matrix((0, num_gaussians), dtype=np.float32)]
+        for name in sorted(views):
+            one = views[name]
+            entries = one.weights.data, one.gaussians[one.weights.indices], one.weights.indptr
+            blocks.append(sparse.csr_matrix(entries, shape=(len(one), num_gaussians))[one.ids != 0])
+        stacked, counts = sparse.vstack(blocks, format="csr"), [block.shape[0] for block in blocks]
+        view = np.unique(np.repeat(np.arange(len(blocks)), counts), return_inverse=True)[1]
+        return cls(stacked.T.tocsr(), view, sums(stacked, 1), settings)
+
+    def on(self, gaussians: np.ndarray) -> tuple[sparse.csr_matrix, _Segments]:
+        """Rows of some Gaussians (n, S'), and the segments that are on them."""
+        rows = self.weights[gaussians]
+        used = np.unique(rows.indices)
+        view = np.unique(self.view[used], return_inverse=True)[1]
+        return rows[:, used], _Segments(self.weights, view, self.size[used], self.settings)
+
+    def seen(self, regions: np.ndarray) -> np.ndarray:
+        """Sum up what each view sees of regions (R, S), in px, (R, views)."""
+        return np.add.reduceat(regions, self._firsts, axis=1) if len(self.view) else regions
+
+    @property
+    def _firsts(self) -> np.ndarray:
+        return np.flatnonzero(np.diff(self.view, prepend=-1))
+
+    def votes(self, regions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Shares of regions (R, S) that each view's ids have, as far as the view counts, and how far, (R, views)."""
+        settings, seen = self.settings, self.seen(regions)
+        full = np.minimum(settings.full_sight * seen.max(axis=1, keepdims=True, initial=0), settings.plenty)
+        counts = np.minimum(seen / np.maximum(full, 1e-9), 1) * seen / (seen + settings.full_sight_px)
+        return regions * (counts / np.maximum(seen, 1e-9))[:, self.view], counts
+
+    def showing(self, regions: Sequence[_Region], shares: np.ndarray) -> np.ndarray:
+        """Tell which views show a region as a segment, (R, views) bool, of all there are with their shares (R, S).
+
+        A segment is one region of those that hold each other: the one that fits it best, the larger one if both do.
+        """
+        if not len(self.view):
+            return np.zeros((len(regions), 0), bool)
+        seen = self.seen(shares)
+        overlap = shares / np.maximum(seen[:, self.view] + self.size - shares, 1e-9)
+        fits = overlap > _ITSELF
+        for region in regions:
+            for part in region.parts:
+                fits[part.row] &= overlap[part.row] > overlap[region.row]
+                fits[region.row] &= overlap[region.row] >= overlap[part.row]
+        return np.logical_or.reduceat(fits, self._firsts, axis=1) & (seen >= self.settings.full_sight_px)
+
+
+def _regions(means: np.ndarray, rows: sparse.csr_matrix, segments: _Segments) -> tuple[list[_Region], np.ndarray]:
+    """Merge the cells of an object: all regions on the way, parts before wholes, and their shares (R, S)."""
+    seen = np.flatnonzero(np.diff(rows.indptr))
+    cell = _cells(means[seen], max(_CELL, len(seen) / _MOST_CELLS))
+    return _merge(_summed(rows[seen], cell), segments)
+
+
+def _summed(rows: sparse.csr_matrix, groups: np.ndarray) -> np.ndarray:
+    """Add up rows (n, S) by group (n,), (groups, S) float64."""
+    shape = (int(groups.max(initial=-1)) + 1, len(groups))
+    grouping = sparse.csr_matrix((np.ones(len(groups)), (groups, np.arange(len(groups)))), shape=shape)
+    return np.asarray((grouping @ rows).toarray())
+
+
+def _cells(points: np.ndarray, size: float) -> np.ndarray:
+    """Group points (n, 3) by halving the longer side of their box until groups are of this size at most, (n,)."""
+    cell, parts, count = np.zeros(len(points), np.int64), [np.arange(len(points))], 0
+    while parts:
+        part = parts.pop()
+        if len(part) <= size:
+            cell[part], count = count, count + 1
+            continue
+        order = part[np.argsort(points[part, np.ptp(points[part], axis=0).argmax()], kind="stable")]
+        parts += [order[: len(order) // 2], order[len(order) // 2 :]]
+    return cell
+
+
+def _merge(shares: np.ndarray, segments: _Segments) -> tuple[list[_Region], np.ndarray]:
+    """Merge regions (R, S), in every round those that agree with each other more than with any third.
+
+    Returns
+    -------
+    regions : list
+        All there were, parts before what is made of them.
+    shares : (len(regions), S)
+    """
+    settings, regions, every = segments.settings, [_Region(row=row) for row in range(len(shares))], [shares]
+    shares, at = shares.copy(), np.arange(len(shares))  # what is left, each in the place of its first region
+    votes, counts = (columns.T.copy() for columns in segments.votes(shares))  # (S, R) and (views, R)
+
+    def agreement(rows: np.ndarray) -> np.ndarray:
+        # As sparse products, they have the same bits whatever number of threads there is.
+        both = sparse.csr_matrix(counts[:, rows].T) @ counts
+        agreed: np.ndarray = sparse.csr_matrix(votes[:, rows].T) @ votes / (both + settings.doubt)
+        agreed[both < settings.evidence] = 0
+        agreed[np.arange(len(rows)), rows] = 0
+        return agreed
+
+    agreed = agreement(at)
+    while len(at):
+        best = agreed.argmax(axis=1)
+        first = np.flatnonzero(
+            (best[best] == np.arange(len(at))) & (best > np.arange(len(at))) & (agreed.max(axis=1) > 0)
+        )
+        if not len(first):
+            break
+        second = best[first]
+        for a, b, by in zip(at[first], at[second], agreed[first, second].tolist(), strict=True):
+            regions.append(_Region(by, [regions[a], regions[b]], len(regions)))
+        at[first] = np.arange(len(regions) - len(first), len(regions))
+        shares[first] += shares[second]
+        every.append(shares[first])
+        votes[:, first], counts[:, first] = (columns.T for columns in segments.votes(shares[first]))
+        votes[:, second], counts[:, second], agreed[second], agreed[:, second] = 0, 0, 0, 0
+        agreed[first] = agreement(first)
+        agreed[:, first] = agreed[first].T
+    return regions, np.concatenate(every)
+
+
+def _kept(regions: Sequence[_Region], showing: np.ndarray, objects: Sequence[_Region] = ()) -> list[_Region]:
+    """Keep of all regions what several views show; `objects`, for the first regions, are kept in any case."""
+    kept, waiting = dict[int, list[_Region]](), dict[int, np.ndarray]()
+    for region in regions:
+        found = [(kept.pop(part.row), waiting.pop(part.row)) for part in region.parts]
+        parts, views = [one for each, _ in found for one in each], showing[region.row]
+        alive = [few for each, few in found if each or few.any()]
+        if len(alive) == 1:  # Then it is the same but for a rim, and views that show the one mean the other as well.
+            views = views | alive[0]
+        shown, nobody = np.count_nonzero(views) >= SEVERAL, np.zeros_like(views)
+        if region.row < len(objects):
+            kept[region.row], waiting[region.row] = [objects[region.row]], nobody
+        elif not shown:
+            kept[region.row], waiting[region.row] = parts, views
+        else:
+            same = parts[0] if len(parts) == 1 else _Region(region.agreement if parts else 1.0, parts)
+            kept[region.row], waiting[region.row] = [_Region(same.agreement, same.parts, region.row)], nobody
+    return [region for each in kept.values() for region in each]
+
+
+def _stepped(region: _Region, least: float, most: float) -> _Region:
+    """Round agreements down to steps within bounds, none above those of its parts; parts of the same one are one."""
+    if not region.parts:
+        return region
+    inner = [_stepped(part, least, most) for part in region.parts]
+    own = float(np.clip(np.floor(region.agreement * _STEPS) / _STEPS, least, most))
+    own = min([own, *(part.agreement for part in inner)])
+    parts = [p for part in inner for p in (part.parts if part.parts and part.agreement == own else [part])]
+    return _Region(own, parts, region.row)
+
+
+def _nearest_part(
+    means: np.ndarray, rows: sparse.csr_matrix, segments: _Segments, parts: np.ndarray
+) -> np.ndarray:  # (n,) index of a part
+    """Give each Gaussian of an object to one of its parts (P, S), by the ids on it or else by its neighbour's."""
+    from scipy.spatial import cKDTree
+
+    shares = parts / np.maximum(segments.seen(parts), 1e-9)[:, segments.view]
+    place = np.asarray((rows @ shares.T).argmax(axis=1))
+    seen = np.diff(rows.indptr) > 0
+    if not seen.all():
+        place[~seen] = place[seen][cKDTree(means[seen]).query(means[~seen])[1]]
+    return place
+
+
+def _wholes(
+    objects: Sequence[_Region], members: Sequence[np.ndarray], segments: _Segments, level: float
+) -> list[_Region]:
+    """Put objects together that several views show as one; leaves have the numbers of objects for rows."""
+    present = [k for k in range(1, len(objects)) if len(members[k])]
+    groups, where = np.concatenate([[], *(np.full(len(members[k]), i) for i, k in enumerate(present))]), members[1:]
+    shares = _summed(segments.weights[np.concatenate([[], *where]).astype(np.int64)], groups.astype(np.int64))
+    regions, shares = _merge(shares, segments)
+    tops = _kept(regions, segments.showing(regions, shares), [_Region(row=k) for k in present])
+    below = float(np.nextafter(np.float32(level), np.float32(0)))
+    todo, found = [_stepped(region, 0.0, below) for region in tops], list[_Region]()
+    while todo:  # What hardly a view has under one id is no whole.
+        region = todo.pop()
+        if region.parts and region.agreement > 0:
+            found.append(region)
+        else:
+            todo += region.parts
+    return sorted(found, key=lambda region: -sum(len(members[leaf.row]) for leaf in region.leaves()))
+
+
+def _numbered(
+    objects: Sequence[_Region], wholes: Sequence[_Region], classes: np.ndarray, places: np.ndarray, level: float
+) -> ObjectTree:
+    """Give the nodes numbers, those with the most Gaussians first, and every Gaussian that of its leaf."""
+    parents, agreement = [-1] * len(objects), [1.0] * len(objects)
+
+    def add(region: _Region, number: int) -> None:
+        region.number, agreement[number] = number, region.agreement
+        first = len(parents)
+        parents.extend([number] * len(region.parts))
+        agreement.extend([1.0] * len(region.parts))
+        for place, part in enumerate(region.parts):
+            add(part, first + place)
+
+    leaves = np.where(classes >= 0, classes, -1).astype(np.int32)
+    for k, region in enumerate(objects):
+        before = region.leaves()
+        add(_pruned(region), k)
+        if region.parts:
+            mine = classes == k
+            leaves[mine] = np.array([leaf.number for leaf in before])[places[mine]]
+
+    def put_together(region: _Region, whole: int) -> None:
+        if region.parts:
+            parents.append(whole)
+            agreement.append(region.agreement)
+            whole = len(parents) - 1
+            for part in region.parts:
+                put_together(part, whole)
+        else:
+            parents[region.row] = whole
+
+    for region in wholes:
+        put_together(region, -1)
+    return ObjectTree(np.array(parents, np.int32), np.array(agreement, np.float32), leaves, len(objects), level)
+
+
+def _pruned(region: _Region) -> _Region:
+    """Leave out, in place, parts without Gaussians; a part that is the only one left is the whole."""
+    parts = sorted((_pruned(part) for part in region.parts if part.total), key=lambda part: -part.total)
+    if len(parts) == 1:
+        parts, region.agreement = parts[0].parts, parts[0].agreement
+    region.parts = parts
+    return region

@@ -1,0 +1,143 @@
+"""Parts and wholes grow from what views say together: which ones, at which level, and in any order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from per_view_ids import shuffled, with_labels
+from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, true_labels
+
+from gsseg_core.data.object_tree import ObjectTree
+from gsseg_core.data.view import View
+from gsseg_core.learn.vote_learner import VoteLearner
+from gsseg_core.objects.association import AssociationSettings
+from gsseg_core.objects.lifted_segments import Lifted
+from gsseg_core.objects.object_table import ObjectTable, find_objects, object_name
+from gsseg_core.objects.tree_growing import grow_tree
+from gsseg_core.raster.backends import make_operator
+from gsseg_core.refine.settings import UNREFINED
+from gsseg_core.segmentation import Segmentation
+
+SCENE, TRUTH = balls_on_a_table()
+VIEWS = clean_views(12)
+TOP = 10 + NUM_CLASSES
+
+
+def halved(ball: int) -> np.ndarray:
+    """True labels with the upper half of a ball under a number of its own."""
+    high = SCENE.means[:, 2] > np.median(SCENE.means[ball == TRUTH, 2])
+    return np.where((ball == TRUTH) & high, TOP, TRUTH)
+
+
+def seen_as(view: View, truth: np.ndarray) -> View:
+    return shuffled(with_labels(view, true_labels(SCENE, truth, view.camera)))
+
+
+def grown(views: Sequence[View], level: float = 0.4) -> ObjectTree:
+    lifted = {v.name: Lifted.of(make_operator(SCENE, v.camera).observe(v.read_labels())) for v in views}
+    return grow_tree(SCENE.means, TRUTH, NUM_CLASSES, lifted, level)
+
+
+def test_an_object_that_some_views_cut_up_has_parts() -> None:
+    views = [seen_as(view, halved(1) if i % 2 else TRUTH) for i, view in enumerate(VIEWS)]
+    tree = grown(views)
+    assert [len(tree.parts(k)) for k in range(NUM_CLASSES)] == [0, 2, 0, 0] and len(tree) == NUM_CLASSES + 2
+    assert tree.agreement[1] == pytest.approx(0.5, abs=0.1)
+    ball = TRUTH == 1
+    upper = tree.leaves[ball] == np.bincount(tree.leaves[ball & (halved(1) == TOP)]).argmax()
+    assert (upper == (halved(1)[ball] == TOP)).mean() > 0.9
+
+
+def test_parts_of_parts_are_nested() -> None:
+    quarters = np.where(
+        (halved(1) == TOP) & (SCENE.means[:, 0] > np.median(SCENE.means[TRUTH == 1, 0])), TOP + 1, halved(1)
+    )
+    views = [seen_as(view, [TRUTH, halved(1), quarters][i % 3]) for i, view in enumerate(VIEWS)]
+    tree = grown(views, level=0.2)
+    assert len(tree.parts(1)) == 2
+    assert sorted(len(tree.parts(part)) for part in tree.parts(1)) == [0, 2]
+
+
+def test_what_a_view_or_two_cut_up_has_no_parts() -> None:
+    views = [seen_as(view, halved(1) if i < 2 else TRUTH) for i, view in enumerate(VIEWS)]
+    assert len(grown(views)) == NUM_CLASSES
+
+
+def test_objects_that_some_views_have_under_one_id_make_a_whole() -> None:
+    views = [seen_as(view, np.where(TRUTH == 2, 1, TRUTH) if i % 3 == 0 else TRUTH) for i, view in enumerate(VIEWS)]
+    tree = grown(views)
+    assert tree.parents.tolist() == [-1, NUM_CLASSES, NUM_CLASSES, -1, -1]
+    assert tree.agreement[NUM_CLASSES] == pytest.approx(0.3, abs=0.1)
+
+
+def test_views_that_agree_on_objects_make_neither_parts_nor_wholes() -> None:
+    tree = grown([shuffled(view) for view in VIEWS])
+    assert len(tree) == NUM_CLASSES and tree.granularities == (tree.level,)
+    np.testing.assert_array_equal(tree.leaves, TRUTH)
+
+
+def test_without_views_objects_are_all_there_is() -> None:
+    np.testing.assert_array_equal(grown([]).leaves, TRUTH)
+
+
+def test_the_tree_has_the_same_bits_in_any_order_of_views_and_ids() -> None:
+    truths = [TRUTH, halved(1), halved(2), np.where(TRUTH == 3, 2, TRUTH)]
+    views = [seen_as(view, truths[i % 4]) for i, view in enumerate(VIEWS)]
+    expected = grown(views)
+    assert len(expected) > NUM_CLASSES
+    for seed in (1, 2):
+        order = np.random.default_rng(seed).permutation(len(views))
+        found = grown([shuffled(views[i], seed) for i in order])
+        for name in ("parents", "agreement", "leaves"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+
+
+def test_every_node_is_shown_by_several_views() -> None:
+    """The slow reading of what a segment has to be: it fits the node better than either of what merged to it."""
+    views = [seen_as(view, halved(1) if i % 2 else TRUTH) for i, view in enumerate(VIEWS)]
+    tree = grown(views)
+    lifted = {v.name: Lifted.of(make_operator(SCENE, v.camera).observe(v.read_labels())) for v in views}
+    for part in tree.parts(1):
+        inside = np.isin(tree.leaves, [part])
+        shown = 0
+        for one in lifted.values():
+            dense = one.weights.toarray()[one.ids > 0]
+            there = inside[one.gaussians]
+            mine = dense[:, there].sum(axis=1)
+            shown += bool((mine / (dense.sum(axis=1) + mine.sum() - mine)).max() > 0.5)
+        assert shown >= 3
+
+
+def test_an_object_table_adds_the_tree_to_a_segmentation() -> None:
+    views = [seen_as(view, halved(1) if i % 2 else TRUTH) for i, view in enumerate(VIEWS)]
+    table = find_objects(SCENE, views, AssociationSettings(agreement=0.4))
+    learner = VoteLearner(SCENE, len(table.class_names))
+    learner.observe_all([table.relabelled(view) for view in views])
+    learner.fit()
+    objects = Segmentation.from_codes(SCENE, learner.codes_, table.class_names)
+    result = table.with_tree(objects)
+    assert result.tree is not None and result.tree.level == 0.4 and len(result.tree) == NUM_CLASSES + 2
+    np.testing.assert_array_equal(result.at(0.4).labels, objects.labels)
+    fine = result.at(0.9)
+    (cut,) = (k for k in range(NUM_CLASSES) if result.tree.parts(k))
+    assert sorted(set(fine.class_names) - set(objects.class_names)) == [NUM_CLASSES, NUM_CLASSES + 1]
+    assert fine.class_names[NUM_CLASSES] == f"object_{cut:03d}.1" and cut not in fine.class_names
+    np.testing.assert_array_equal(np.isin(fine.labels, [NUM_CLASSES, NUM_CLASSES + 1]), objects.labels == cut)
+    np.testing.assert_allclose(fine.probabilities.sum(axis=1), objects.probabilities.sum(axis=1), atol=1e-6)
+
+
+def test_views_that_came_one_by_one_make_the_same_tree() -> None:
+    views = [seen_as(view, halved(1) if i % 2 else TRUTH) for i, view in enumerate(VIEWS)]
+    codes = np.eye(NUM_CLASSES, dtype=np.float32)[TRUTH]
+    found = []
+    for order in (views, views[::-1]):
+        table = ObjectTable(SCENE)
+        for view in order:
+            table.match(view)
+        names = {k: object_name(k) for k in range(NUM_CLASSES)}
+        found.append(table.with_tree(Segmentation.from_codes(SCENE, codes, names, UNREFINED)).tree)
+    np.testing.assert_array_equal(found[0].leaves, found[1].leaves)
+    np.testing.assert_array_equal(found[0].agreement, found[1].agreement)
+    assert len(found[0]) == NUM_CLASSES + 2
