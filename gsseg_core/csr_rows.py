@@ -65,12 +65,14 @@ class CSRRows(NamedTuple):
         return united, united_other
 
     def scattered(self, ids: np.ndarray, count: int) -> CSRRows:  # (N,) distinct
-        """Scatter row i to row ids[i] of `count` rows; the others are empty."""
-        source = np.full(count, -1, np.int64)
-        source[ids] = np.arange(len(ids))
+        """Scatter row i to row ids[i] of `count` rows; the others are empty. Ascending rows keep their entries."""
         indptr = np.zeros(count + 1, np.int64)
         indptr[1:][ids] = np.diff(self.indptr)
         np.cumsum(indptr, out=indptr)
+        if (ids[1:] > ids[:-1]).all():
+            return self._replace(indptr=indptr)
+        source = np.full(count, -1, np.int64)
+        source[ids] = np.arange(len(ids))
         _, indices, data = self.take(source[source >= 0])
         return CSRRows(indptr, indices, data)
 

@@ -16,7 +16,7 @@ from gsseg_core.data.hints import mask_hint
 from gsseg_core.data.label_images import GLOBAL, PER_VIEW, write_mask
 from gsseg_core.data.view import QUALITIES, View, spread
 from gsseg_core.errors import NoUsableViewsError, SettingsError
-from gsseg_core.export.class_files import class_places, mesh_file_name, write_classes
+from gsseg_core.export.class_files import class_paths, class_places, mesh_file_name, write_classes
 from gsseg_core.export.collision import collision_meshes
 from gsseg_core.export.pictures import save_png
 from gsseg_core.export.summary import RunReport, RunSettings
@@ -318,7 +318,8 @@ def _write(
     with watch.stage("export"):
         behind(named.save, folder / "segmentation.npz", run.id)
         meshes = collision_meshes(scene, named, settings.collision) if settings.collision else {}
-        files = write_classes(scene, named, folder / "classes", run.id, settings.scene_format, meshes)
+        files = class_paths(named, folder / "classes", settings.scene_format)
+        behind(write_classes, scene, named, folder / "classes", run.id, settings.scene_format, meshes)
     with watch.stage("pictures"):
         shown = [drawn[view.name] for view in inputs.pictured]
         images, evidence, pictures = _picture(run, inputs, assessment, result, shown, settings.device, behind)
@@ -352,7 +353,7 @@ def _picture(
     pictures = write_pictures(result, shown, folder, run.id, save)
     if assessment.checks:
         pictures.append(folder / "worst_views.png")
-        save(pictures[-1], draw_worst_views(inputs.scene, views, assessment.checks, device=device), run.id)
+        save(pictures[-1], draw_worst_views(images.rendered, views, assessment.checks), run.id)
     return images, Evidence(checks, views, assessment.checks is not None), pictures
 
 

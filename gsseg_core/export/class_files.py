@@ -79,8 +79,7 @@ def write_classes(
 ) -> dict[int, Path]:
     """Write the files of `export_classes` into a folder of a run with this id, with these meshes to collide with."""
     confidence, meshes, names = segmentation.confidence, meshes or {}, segmentation.class_names
-    present = np.flatnonzero(segmentation.counts()).tolist()
-    paths = {k: folder / class_file_name(k, names[k], scene_format) for k in present}
+    paths = class_paths(segmentation, folder, scene_format)
     for k, mesh in meshes.items():
         mesh.save(folder / mesh_file_name(k, names[k]), run)
     if SCENE_WRITERS[scene_format].together:
@@ -139,6 +138,12 @@ def _objects(
     """All classes that have Gaussians, as objects of one file."""
     present = np.unique(labels[labels >= 0]).tolist()
     return [SceneObject(scene.subset(labels == k), k, class_names[k], (meshes or {}).get(k)) for k in present]
+
+
+def class_paths(segmentation: Segmentation, folder: Path, scene_format: str) -> dict[int, Path]:
+    """Which file `write_classes` writes for each class that has Gaussians."""
+    names, present = segmentation.class_names, np.flatnonzero(segmentation.counts()).tolist()
+    return {k: folder / class_file_name(k, names[k], scene_format) for k in present}
 
 
 def class_places(class_names: Mapping[int, str], scene_format: str, collision: str | None) -> list[str]:

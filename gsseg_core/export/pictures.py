@@ -73,14 +73,20 @@ def overlay(image: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.nda
     colors : ndarray (K, 3) uint8
         `palette(K)`.
     """
-    named = labels > 0
-    tint = colors[np.maximum(labels, 0)].astype(np.float32)
-    grey = image.mean(axis=-1, keepdims=True, dtype=np.float32)
-    blend = np.where(named[..., None], grey + FILL * (tint - grey), 0.35 * image + 0.65 * (0.75 * grey + 30))
+    named, own = labels > 0, np.maximum(labels, 0)
+    seen = image.astype(np.float32)
+    grey = (seen[..., 0] + seen[..., 1] + seen[..., 2]) / 3
+    # Of a named pixel, its grey and its tint; of another, what was seen, greyed: one sum for both.
+    tints = FILL * colors.astype(np.float32)
+    tints[:1] = 0.65 * 30
+    blend = seen
+    blend *= np.where(named, np.float32(0), np.float32(0.35))[..., None]
+    blend += (np.where(named, np.float32(1 - FILL), np.float32(0.65 * 0.75)) * grey)[..., None]
+    blend += tints[own]
     line = outline(labels)
-    blend[line & named] = np.minimum(1.12 * tint[line & named], 255)
+    blend[line & named] = np.minimum(1.12 * colors[own[line & named]], 255)
     blend[line & ~named] *= 0.45
-    picture: np.ndarray = blend.round().astype(np.uint8)
+    picture: np.ndarray = np.rint(blend, out=blend).astype(np.uint8)
     return picture
 
 

@@ -152,19 +152,17 @@ def write_overview(
 
 
 def draw_worst_views(
-    scene: GaussianScene,
+    images_of: Callable[[View], np.ndarray],
     views: Mapping[str, View],
     checks: Sequence[ViewCheck],
     count: int = WORST,
-    *,
-    device: str = "cpu",
 ) -> np.ndarray:
     """Draw the worst views: the mask, what the other views predict, and in red where the two differ; (H, W, 3) uint8.
 
     Parameters
     ----------
-    scene : GaussianScene
-        What the views show.
+    images_of : function of a View
+        Gives the colours of the scene from there, (H, W, 3) uint8.
     views : mapping from name to View
         At least those that were checked.
     checks : sequence of ViewCheck
@@ -176,8 +174,7 @@ def draw_worst_views(
     colors = palette(len(checks[0].counts))
     for check in worst_views(checks, count):
         view = views[check.name]
-        image = background_image(scene, make_operator(scene, view.camera, device))
-        mask, predicted = view.read_labels(), check.prediction()
+        image, mask, predicted = images_of(view), view.read_labels(), check.prediction()
         different = ((mask != predicted) & (mask != UNKNOWN) & (predicted != UNKNOWN)).astype(np.int32)
         images += [overlay(image, mask, colors), overlay(image, predicted, colors)]
         images.append(overlay(image, different, _DIFFERENT))

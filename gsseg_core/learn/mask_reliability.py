@@ -193,9 +193,11 @@ def compare_mask(
     # Where a partial mask names no class, it says "none of these", its last word.
     unnamed = (seen.labels >= 0) & (labels < 0) if evidence is not None and evidence.has_none_of_these else np.False_
     known = (labels >= 0) | unnamed
-    classes = np.unique(labels[labels >= 0]).astype(np.int32) if evidence is None else evidence.vocabulary
+    occurs = np.bincount(labels[labels >= 0]) > 0
+    classes = np.flatnonzero(occurs).astype(np.int32) if evidence is None else evidence.vocabulary
     both = known & (predicted >= 0)
-    words = np.where(labels >= 0, np.searchsorted(classes[classes >= 0], labels), len(classes) - 1)
-    cells = predicted[both] * np.int64(len(classes)) + words[both]
+    word = np.full(len(occurs) + 1, len(classes) - 1)  # of each label; the last one is of -1, no name
+    word[:-1] = np.searchsorted(classes[classes >= 0], np.arange(len(occurs)))
+    cells = predicted[both] * np.int64(len(classes)) + word[labels[both]]
     counts = np.bincount(cells, minlength=num_classes * len(classes)).reshape(num_classes, len(classes))
     return ViewCheck(view.name, int(known.sum()), classes, counts, PackedLabels(predicted), evidence)

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
+from gsseg_core.csr_rows import largest
 from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.simd import LANES, add_scaled, load_row, nothing, store_row
@@ -111,22 +112,48 @@ def propagate(
     out = codes.copy()
     if settings.strength == 0 or settings.steps == 0:
         return out
-    known: np.ndarray = codes[graph.order].max(axis=1, initial=0) > 0
+    known: np.ndarray = (largest(codes)[0] > 0)[graph.order]
     weight = np.where(known, evidence[graph.order] / settings.strength, 0).astype(np.float32)
     moving = weight < 100
     readers = _readers(graph.indptr, graph.indices, moving)
     reached = _steps_to_reach(graph.indptr, graph.indices, known, settings.steps)
+    total = np.zeros(len(codes), np.float32)
     for first in range(0, codes.shape[1], LANES):
-        some = codes[:, first : first + LANES]
-        learnt = np.zeros((len(codes), LANES), np.float32)
-        learnt[:, : some.shape[1]] = some[graph.order]
+        learnt = _gather(codes, graph.order, first)
         spread = _spread(graph, readers, learnt, weight, moving & (reached <= 1), reached, settings.steps)
-        out[graph.order, first : first + LANES] = spread[:, : some.shape[1]]
+        _scatter(spread, graph.order, first, out, total)
     # Classes settle apart from each other, so that the sum of a row is 1 only about as precisely as they do.
-    ids = graph.order[moving]
-    total = out[ids].sum(axis=1, keepdims=True)
-    out[ids] = np.divide(out[ids], total, out=out[ids], where=total > 0)
+    _scale(out, graph.order, np.where(moving & (total > 0), total, np.float32(1)))
     return out
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _gather(codes: np.ndarray, order: np.ndarray, first: int) -> np.ndarray:  # (N, K), (N,)
+    """Take sixteen columns of the codes, in the order of places: (N, 16), with zeros after the last column."""
+    some, count = np.zeros((codes.shape[0], LANES), np.float32), min(codes.shape[1] - first, LANES)
+    for i in nb.prange(order.shape[0]):
+        for c in range(count):
+            some[i, c] = codes[order[i], first + c]
+    return some
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _scatter(some: np.ndarray, order: np.ndarray, first: int, out: np.ndarray, total: np.ndarray) -> None:
+    """Put such columns back into all codes (N, K), and add their sum to that of each place, (N,)."""
+    count = min(out.shape[1] - first, LANES)
+    for i in nb.prange(order.shape[0]):
+        for c in range(count):
+            out[order[i], first + c] = some[i, c]
+            total[i] += some[i, c]
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _scale(codes: np.ndarray, order: np.ndarray, total: np.ndarray) -> None:
+    """Divide the codes of each place, (N, K), by a number, (N,)."""
+    for i in nb.prange(order.shape[0]):
+        if total[i] != 1:
+            for k in range(codes.shape[1]):
+                codes[order[i], k] /= total[i]
 
 
 def _spread(

@@ -60,11 +60,15 @@ class ViewImages:
 
     def of(self, view: View) -> np.ndarray:
         """Give the image, (H, W, 3) uint8 of the camera's size."""
+        photo = None if (view.name, view.camera.width) in self._images else read_photo(view)
+        return self.rendered(view) if photo is None else photo
+
+    def rendered(self, view: View) -> np.ndarray:
+        """Give the colours of the scene, (H, W, 3) uint8, also where there is a photo."""
         image = self._images.get((view.name, view.camera.width))
         if image is None:
-            image = read_photo(view)
-        if image is None:
             image = background_image(self.scene, make_operator(self.scene, view.camera, self.device))
+            self.keep(view, image)
         return image
 
 

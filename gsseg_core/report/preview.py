@@ -109,7 +109,9 @@ def look_from(cameras: Iterable[Camera], preview: Preview) -> list[dict[str, Any
         `name`; `eye` and `target` (3,), in scene units; `fov`, vertical, in radians.
     """
     low, high = preview.low, preview.high
-    means = low + preview.records["position"] * ((high - low) / 65535)
+    # A distance is a quantile of depths: one in eight of many says it as well.
+    some = preview.records[:: 8 if len(preview.records) > MOST_GAUSSIANS // 8 else 1]
+    means = low + some["position"] * ((high - low) / 65535)
     places = []
     for camera in cameras:
         (uv, depth), size = camera.project(means), (camera.width, camera.height)
@@ -142,14 +144,20 @@ def _draw(weights: np.ndarray, labels: np.ndarray, most: int) -> np.ndarray:
     if len(weights) <= most:
         return np.arange(len(weights))
     keys = np.random.default_rng(0).exponential(size=len(weights)) / np.maximum(weights, np.finfo(float).tiny)
-    order = np.argsort(keys, kind="stable")
-    # Place of each one among those of its class, the most wanted first.
-    by_class = order[np.argsort(labels[order], kind="stable")]
-    starts = np.flatnonzero(np.diff(labels[by_class], prepend=labels[by_class[0]] - 1))
-    place = np.empty(len(weights), np.int64)
-    place[by_class] = np.arange(len(weights)) - np.repeat(starts, np.diff(np.append(starts, len(weights))))
-    first = place[order] < FEWEST_OF_CLASS
-    return np.sort(np.concatenate([order[first], order[~first]])[:most])
+    wanted = np.zeros(len(weights), bool)
+    for label in np.flatnonzero(np.bincount(labels - labels.min())) + labels.min():
+        own = np.flatnonzero(labels == label)
+        wanted[own[_smallest(keys[own], FEWEST_OF_CLASS)]] = True
+    first = np.flatnonzero(wanted)
+    if len(first) > most:
+        return np.sort(first[_smallest(keys[first], most)])
+    others = np.flatnonzero(~wanted)
+    return np.sort(np.concatenate([first, others[_smallest(keys[others], most - len(first))]]))
+
+
+def _smallest(keys: np.ndarray, count: int) -> np.ndarray:
+    """Find the places of so many of the smallest keys, in any order; of all, if there are no more."""
+    return np.argpartition(keys, count)[:count] if count < len(keys) else np.arange(len(keys))
 
 
 def _quantised(values: np.ndarray, low: Any, high: Any, largest: int) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 
 from gsseg_core.kernel_cache import called_by_kernels
 from gsseg_core.scene.spherical_harmonics import C0, MAX_DEGREE
+from gsseg_core.simd import prefetch
 
 _C0, _C1, _C2 = np.float32(C0), np.float32(sqrt(3 / (4 * pi))), np.float32(sqrt(15 / (4 * pi)))
 _C2_MIDDLE, _C2_HALF = np.float32(sqrt(5 / (16 * pi))), np.float32(sqrt(15 / (16 * pi)))
@@ -19,6 +20,7 @@ _TWO, _THREE, _FOUR = np.float32(2), np.float32(3), np.float32(4)
 _BANDS = (MAX_DEGREE + 1) ** 2
 _LEAST = np.finfo(np.float32).tiny  # of a length
 _CHUNKS = 64
+_AHEAD = 12  # Gaussians between the one that is worked on and the one that is fetched from memory
 
 
 @called_by_kernels
@@ -55,16 +57,26 @@ def seen_colors(
     """Colours of some Gaussians seen from a point, (M, 3) float32 in [0, 1]: 0.5 and what their harmonics add up to."""
     bands, others, count = (degree + 1) ** 2, (coefficients.shape[1] - 3) // 3, ids.shape[0]
     out = np.empty((count, 3), np.float32)
+    second, third = coefficients[:, 16:], coefficients[:, 32:]
     for chunk in nb.prange(_CHUNKS):
         harmonics = np.empty(_BANDS, np.float32)
         for m in range(chunk * count // _CHUNKS, (chunk + 1) * count // _CHUNKS):
-            i = ids[m]
+            # A row of coefficients is up to four cache lines, anywhere in memory: it is asked for before it is needed.
+            i, later = ids[m], ids[min(m + _AHEAD, count - 1)]
+            prefetch(means, later)
+            prefetch(coefficients, later)
+            prefetch(second, later)
+            prefetch(third, later)
             x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
             inverse = np.float32(1) / max(np.sqrt(x * x + y * y + z * z), _LEAST)
             _evaluate(x * inverse, y * inverse, z * inverse, degree, harmonics)
-            for c in range(3):
-                total = harmonics[0] * coefficients[i, c]
-                for b in range(1, bands):
-                    total += harmonics[b] * coefficients[i, 2 + c * others + b]
+            red, green, blue = (
+                harmonics[0] * coefficients[i, 0], harmonics[0] * coefficients[i, 1], harmonics[0] * coefficients[i, 2]
+            )  # fmt: skip
+            for b in range(1, bands):
+                red += harmonics[b] * coefficients[i, 2 + b]
+                green += harmonics[b] * coefficients[i, 2 + others + b]
+                blue += harmonics[b] * coefficients[i, 2 + 2 * others + b]
+            for c, total in enumerate((red, green, blue)):
                 out[m, c] = min(max(total + np.float32(0.5), np.float32(0)), np.float32(1))
     return out

@@ -17,6 +17,7 @@ from gsseg_core.data.view import View
 from gsseg_core.export.view_pictures import draw_worst_views
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.mask_reliability import ViewCheck, check_views, reliability_report, worst_views
+from gsseg_core.report.pictures import ViewImages
 
 SCENE, _ = balls_on_a_table()
 CLEAN = clean_views(12)
@@ -124,6 +125,7 @@ def test_the_same_views_give_the_same_figures() -> None:
 
 def test_picture_has_a_row_of_three_for_each_of_the_worst_views() -> None:
     learner = learner_with_bad_frames()
-    one, two = (draw_worst_views(SCENE, learner.views, list(checks().values()), count) for count in (1, 2))
+    images, every = ViewImages(SCENE), list(checks().values())
+    one, two = (draw_worst_views(images.rendered, learner.views, every, count) for count in (1, 2))
     assert one.dtype == np.uint8 and one.shape[1] == two.shape[1] > 3 * 64
     assert two.shape[0] - one.shape[0] > 48

@@ -216,30 +216,32 @@ class EMLearner(Learner):
 
         The spatial prior is left out, too, so rows sum to less where no other view has seen anything.
         """
-        codes, operator = self._codes_without(view), self._blender(view, only_labelled)
+        codes, background, operator = self._without(view, only_labelled)
         image, left_over = operator.blend_rows(codes, self.num_classes)
-        if (codes.indices == 0).any():
+        if background:
             image[..., 0] += left_over
         return image
 
     def classes_without(self, view: View, only_labelled: bool = False) -> np.ndarray:
         """Tell the class of each pixel by `predict_without`, without an image of all classes."""
-        codes, operator = self._codes_without(view), self._blender(view, only_labelled)
-        return operator.strongest(codes, self.num_classes, bool((codes.indices == 0).any())).labels()
+        codes, background, operator = self._without(view, only_labelled)
+        return operator.strongest(codes, self.num_classes, background).labels()
 
-    def _codes_without(self, view: View) -> CSRRows:
-        """Take the last step of `fit` once more, without a view's mask: all codes, N rows."""
+    def _without(self, view: View, only_labelled: bool) -> tuple[CSRRows, bool, ViewOperator]:
+        """Take the last step of `fit` once more, without a view's mask: codes, N rows, and what to blend them with.
+
+        If only its labelled pixels count, what they see is at hand, and all other rows are empty. Between the two is
+        told whether any code has a share of the background.
+        """
         assert self._last_step is not None, "expected fit() first"
         codes, gradient = self._last_step
         observation, no_prior = self.observation(view.name), np.zeros_like(codes.data)
         stepped = codes_without(observation, self.error_models_[view.name], codes, gradient, no_prior)
-        return codes.with_rows(observation.ids, stepped)
-
-    def _blender(self, view: View, only_labelled: bool) -> ViewOperator:
-        """Make the operator of a view, or take what its labelled pixels see from where it is kept."""
+        background = bool((codes.indices == 0).any())
         if only_labelled:
-            return self.observation(view.name).operator(view.camera, len(self.scene))
-        return self._operator_of(view)
+            seen = stepped.scattered(observation.ids, len(self.scene))
+            return seen, background, observation.operator(view.camera, len(self.scene))
+        return codes.with_rows(observation.ids, stepped), background, self._operator_of(view)
 
     def rejected_share(self, view: View) -> float:
         """Share of a view's labelled pixels that lie in rejected regions."""

@@ -9,6 +9,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
+from gsseg_core.kernel_cache import called_by_kernels
 from gsseg_core.raster.constants import AHEAD
 from gsseg_core.raster.cpu.blending import (
     aim_next,
@@ -49,8 +50,9 @@ def render(tiles: Tiles, codes: CSRRows, channels: int) -> tuple[np.ndarray, np.
     stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
         tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
-        values = np.zeros((TILE, channels, TILE), np.float32)
-        _put(tiles, tile, values, _blend_codes(tiles, tile, codes, values), out, left_over)
+        values, rays = np.zeros((TILE, channels, TILE), np.float32), np.empty((TILE, TILE), np.float32)
+        _blend_codes(tiles, tile, codes, values, rays)
+        _put(tiles, tile, values, rays, out, left_over)
     return out, left_over
 
 
@@ -64,36 +66,68 @@ def strongest(tiles: Tiles, codes: CSRRows, channels: int, background: bool) -> 
     stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
         tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
-        values = np.zeros((TILE, channels, TILE), np.float32)
-        rays = _blend_codes(tiles, tile, codes, values)
+        values, rays = np.zeros((TILE, channels, TILE), np.float32), np.empty((TILE, TILE), np.float32)
+        best, known = np.zeros((TILE, TILE), np.int32), np.empty((TILE, TILE), np.float32)
+        _blend_codes(tiles, tile, codes, values, rays)
+        _compare(values, rays, background, best, known)
         left, top = corner_of(tiles, tile)
         for r in range(min(TILE, tiles.height - top)):
             for c in range(min(TILE, tiles.width - left)):
                 b, lane = in_block(r, c)
-                most = values[b, 0, lane] + (rays[b, lane] if background else np.float32(0))
-                best, known = 0, most
-                for k in range(1, channels):
-                    value = values[b, k, lane]
-                    known += value
-                    if value > most:
-                        best, most = k, value
-                out[top + r, left + c], total[top + r, left + c] = best, known
+                out[top + r, left + c], total[top + r, left + c] = best[b, lane], known[b, lane]
     return out, total
 
 
-@nb.njit
-def _blend_codes(tiles: Tiles, tile: int, codes: CSRRows, values: np.ndarray) -> np.ndarray:  # (16, K, 16) added to
-    """Blend the codes of a tile; returns its final transmittance, (16, 16) by block."""
-    records, channels, n = blend_tile(tiles, tile), values.shape[1], 0
-    for e in range(len(records.ends)):
-        g = tiles.entries[tiles.start[tile] + e]
-        for i in range(n, records.ends[e]):
-            weight, begin = load_row(records.weights, i), np.int64(records.blocks[i]) * channels
-            for z in range(codes.indptr[g], codes.indptr[g + 1]):
-                k = begin + np.int64(codes.indices[z])
-                store_row(values, k, add_scaled(load_row(values, k), weight, codes.data[z]))
-        n = records.ends[e]
-    return records.rays
+@called_by_kernels
+def _compare(
+    values: np.ndarray, rays: np.ndarray, background: bool,  # (16, K, 16), (16, 16)
+    best: np.ndarray, known: np.ndarray,  # (16, 16) in: zeros, out: column of the largest; (16, 16) out: sum of all
+) -> None:  # fmt: skip
+    """Find the strongest column of each pixel of a tile; what is left over of a ray counts to the background."""
+    most = np.empty(TILE, np.float32)
+    for b in range(TILE):
+        for lane in range(TILE):
+            most[lane] = values[b, 0, lane] + (rays[b, lane] if background else np.float32(0))
+            known[b, lane] = most[lane]
+        for k in range(1, values.shape[1]):
+            for lane in range(TILE):  # without a branch, so that the compiler takes the lanes together
+                value = values[b, k, lane]
+                known[b, lane] += value
+                best[b, lane] = np.int32(k) if value > most[lane] else best[b, lane]
+                most[lane] = max(value, most[lane])
+
+
+@called_by_kernels(fastmath={"contract"}, error_model="numpy")
+def _blend_codes(
+    tiles: Tiles, tile: int, codes: CSRRows,
+    values: np.ndarray, rays: np.ndarray,  # (16, K, 16) in: zeros; (16, 16) out: final transmittance, by block
+) -> None:  # fmt: skip
+    """Blend the codes of a tile; weights are used where they are made."""
+    last, channels, (indptr, indices, data) = tiles.start[tile + 1], values.shape[1], codes
+    lines = np.empty((2, 2, TILE), np.float32)
+    left, top, live = open_rays(tiles, tile, rays)
+    ahead = aim_next(tiles, tiles.start[tile] - 1, last, left, top, lines)
+    for e in range(tiles.start[tile], last):
+        g = tiles.entries[e]
+        # Rows are anywhere in memory: they are asked for before they are needed.
+        prefetch(indptr, tiles.entries[min(e + 2 * AHEAD, last - 1)])
+        later = indptr[tiles.entries[min(e + AHEAD, last - 1)]]
+        prefetch(indices, later)
+        prefetch(data, later)
+        first, end = indptr[g], indptr[g + 1]
+        reached, own, wide = ahead & live, lines[e % 2], tiles.table[g, WIDTH]
+        ahead = aim_next(tiles, e, last, left, top, lines)
+        while reached:
+            b = first_bit(reached)
+            reached &= reached - 1
+            weight, bits = blend_block(rays, b, own, wide)
+            for z in range(first, end):
+                k = np.int64(b) * channels + np.int64(indices[z])
+                store_row(values, k, add_scaled(load_row(values, k), weight, data[z]))
+            if not bits & OPEN:
+                live &= ~(1 << b)
+        if not live:
+            return
 
 
 @nb.njit(parallel=True, nogil=True, cache=True, fastmath={"contract"}, error_model="numpy")
