@@ -2,7 +2,7 @@
 
 Masks are replayed over DDS by `replay_node`; requests come from this process. Nothing else should run meanwhile.
 
-Usage: python benchmarks/bench_ros.py [--views 2000] [--only rate,segment,million,cancel,memory,labels]
+Usage: python benchmarks/bench_ros.py [--views 2000] [--only rate,segment,million,cancel,memory,labels,real]
 The real scene is looked for where GSSEG_DATA says, else in ../shared/data beside the checkout.
 """
 
@@ -35,6 +35,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from room import build_room
 from sensor_msgs.msg import PointCloud2
+from workloads import RoomSize, write_room
 
 from gsseg_core import pipeline
 from gsseg_core.data.label_images import write_mask
@@ -172,6 +173,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--views", type=int, default=2000, help="of the memory test")
     parser.add_argument("--only", default="rate,segment,cancel,labels,memory,million")
+    parser.add_argument("--real-data", type=Path, help="of `real`; written there unless it exists")
     options = parser.parse_args()
     wanted = options.only.split(",")
     print(
@@ -181,13 +183,15 @@ def main() -> None:
         folder = Path(name)
         robot = Robot(91, folder)
         if DATA.is_dir():
-            real_scene(robot, [name for name in wanted if name not in ("million", "memory")], folder)
+            real_scene(robot, [name for name in wanted if name not in ("million", "memory", "real")], folder)
             if "memory" in wanted:
                 memory(robot, options.views)
         else:
             print(f"skipped: real data not found at {DATA}")
         if "million" in wanted:
             million(robot, folder)
+        if "real" in wanted:
+            real_size(robot, options.real_data or folder / "real")
 
 
 def real_scene(robot: Robot, wanted: list[str], folder: Path) -> None:
@@ -295,6 +299,17 @@ def million(robot: Robot, folder: Path) -> None:
         seconds, result = robot.learn()
         print(f"learn: {seconds:.1f} s, {result.num_steps} steps on {result.report.num_views} views")
         segment(robot, "the same after learn", 7)
+
+
+def real_size(robot: Robot, data: Path) -> None:
+    """Fuse masks of 1280 x 720 at 5 Hz into 3 million Gaussians of 20 classes, and segment: times, and peak memory."""
+    if not data.exists():
+        write_room(data, RoomSize(3_000_000, 40, 20, 1280, 720, sh_degree=1))
+    with robot.running("segment_node", {"scene_path": str(data / "scene.ply")}) as process:
+        fuse(robot, str(data), 5.0)
+        segment(robot, "3,000,000 Gaussians, 20 classes", 5)
+        status = Path(f"/proc/{process.pid}/status").read_text()
+        print(f"peak resident memory of the node: {int(status.split('VmHWM:')[1].split()[0]) / 2**20:.2f} GiB")
 
 
 def _nanoseconds(stamp: Any) -> int:
