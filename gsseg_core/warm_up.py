@@ -9,6 +9,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from gsseg_core.learn.em.boundary_alignment import align_boundaries
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.refine.label_propagation import spread_if_scarce
 from gsseg_core.refine.settings import PAPER
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -120,16 +122,20 @@ def _learn_something(device: str) -> None:
     passing.fit()
     learner = EMLearner(scene, 2, EMSettings(max_steps=2), device=device)
     learner.observe(view)
+    # Another view like it, and one whose regions these contradict.
+    learner.observe(View.from_arrays(replace(camera, name="again"), labels))
+    learner.observe(View.from_arrays(replace(camera, name="wrong"), 1 - labels))
     learner.fit()
     learner.predict_without(view)
 
 
 def refine_something(device: str = "cpu") -> None:
-    """Do all with a small scene that needs nothing learnt: align boundaries, refine, carve and render."""
+    """Do all with a small scene that needs nothing learnt: align boundaries, spread labels, refine, carve, render."""
     scene, camera, labels = _square()
     align_boundaries(labels, np.ones(labels.shape, np.float32), EMSettings.edge_px, telling=0)
     share = np.clip(0.5 + scene.means[:, 0], 0.05, 0.95)  # Unsure in the middle, where neighbours decide.
     codes = np.stack([1 - share, share], axis=1).astype(np.float32)
+    spread_if_scarce(scene, codes, np.zeros(len(codes)))
     result = Segmentation.from_codes(scene, codes, {0: "left", 1: "right"}, PAPER).carved(scene, [camera])
     operator = make_operator(scene, camera, device)
     result.render(operator)

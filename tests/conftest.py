@@ -57,6 +57,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_collection_finish() -> None:
     """Take what has been imported for all tests as there to stay; Python would look through it again and again."""
+    assert "forked" not in sys.modules, "benchmarks/forked.py sets how numba runs, for programs of its own"
     gc.freeze()
 
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -84,10 +85,11 @@ def test_warm_up_says_nothing_where_the_kernels_are_there() -> None:
 def test_after_warm_up_nothing_is_compiled_any_more(tmp_path: Path, what: str) -> None:
     data, out = str(write_dataset(tmp_path / "data")), str(tmp_path / "out")
     scene = str(Path(data) / "scene.ply")
+    shutil.copy(f"{data}/labels/view1.png", f"{data}/labels/view0.png")  # It is wrong there.
     work = {
         "segment": f"""
     from gsseg_core.cli.main import main
-    assert main(["segment", {scene!r}, "--data", {data!r}, "--out", {out!r}, "--no-graph", "--quiet"]) == 0""",
+    assert main(["segment", {scene!r}, "--data", {data!r}, "--out", {out!r}, "--quiet"]) == 0""",
         "fuse": f"""
     from gsseg_core.data.dataset import Dataset
     from gsseg_core.live.session import LiveSession

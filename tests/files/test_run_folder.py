@@ -8,7 +8,6 @@ import os
 import shutil
 import signal
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -270,7 +269,5 @@ def test_a_broken_manifest_makes_the_files_somebody_elses(tmp_path: Path, text: 
 
 def test_a_lock_that_is_never_released_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_folder, "_PATIENCE", 0.1)
-    started = time.monotonic()
     with run_folder._locked(tmp_path), pytest.raises(WriteError, match="another process of gsseg"):
         write(tmp_path, FIRST)
-    assert time.monotonic() - started < 30

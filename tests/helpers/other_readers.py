@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.spherical_harmonics import basis
@@ -75,7 +76,7 @@ def by_splat_transform(path: Path) -> Read:
     """Read whatever PlayCanvas's converter does, by way of a PLY; it turns what it reads to the axes of PLYs."""
     ply = path.with_name("by_splat_transform.ply")
     command = [splat_transform(), "-q", "-w", str(path), str(ply)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
     assert done.returncode == 0, done.stderr
     return Read.of(GaussianScene.load(ply))
 

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 MARKER = "processes"
-STARTERS = {"browser", "children", "distributed", "forked", "gsseg_ros.child_nodes", "multiprocessing", "subprocess"}
+STARTERS = {"browser", "children", "distributed", "gsseg_ros.child_nodes", "multiprocessing", "subprocess"}
 EVENTS = {"subprocess.Popen", "os.posix_spawn", "os.system", "os.exec"}
 HERE = str(Path(__file__).parents[1])
 _may_start = True
