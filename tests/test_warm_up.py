@@ -66,6 +66,7 @@ def test_the_first_compilation_is_shared_with_a_second_process_and_no_third(monk
     assert not started
 
 
+@pytest.mark.processes
 def test_the_second_process_does_not_outlive_the_first(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))  # Where it has more than a minute's work to do.
     (process,) = warming._start_beside()

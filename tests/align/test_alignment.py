@@ -152,6 +152,7 @@ def test_the_conventions_are_the_24_rotations_from_axes_to_axes() -> None:
     assert Convention().parts == []
 
 
+@pytest.mark.usefixtures("few_views")
 @pytest.mark.parametrize(
     ("folder", "convention"),
     [

@@ -30,14 +30,18 @@ TRAIN, TEST = slice(0, 36, 4), slice(1, 36, 6)
 def cast(parts: list[Part], lens: Lens, camera: Camera) -> np.ndarray:
     """Labels (H, W) that a lens sees at the place of a camera: of the first solid on each pixel's own ray."""
     columns, rows = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
-    rays = lens.rays(np.stack([columns, rows], axis=-1)) @ camera.world_to_camera[:3, :3]
-    nearest, labels = np.full(columns.shape, np.inf), np.zeros(columns.shape, np.int32)
+    rays = lens.rays(np.stack([columns, rows], axis=-1))
+    labels = np.where(np.isnan(rays).any(axis=-1), UNKNOWN, np.int32(0))
+    ahead = rays[..., 2] > 0.5 * np.linalg.norm(rays, axis=-1)  # All objects are within 60 degrees of where it looks.
+    seen = rays[ahead] @ camera.world_to_camera[:3, :3]
+    nearest, found = np.full(len(seen), np.inf), np.zeros(len(seen), np.int32)
     for part in parts:
         if part.label:
-            distance = part.hit(camera.center, rays)
-            labels[distance < nearest] = part.label
+            distance = part.hit(camera.center, seen)
+            found[distance < nearest] = part.label
             nearest = np.fmin(nearest, distance)
-    return np.where(np.isnan(rays).any(axis=-1), UNKNOWN, labels)
+    labels[ahead] = found
+    return labels
 
 
 def lens_of_demo(name: str) -> Lens:
