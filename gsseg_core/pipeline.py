@@ -42,7 +42,7 @@ from gsseg_core.progress import Progress, Stopwatch, silent
 from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, spread_if_scarce
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.report.findings import Evidence
-from gsseg_core.report.page import write_report_page
+from gsseg_core.report.page import load_templates, write_report_page
 from gsseg_core.report.pictures import ViewImages
 from gsseg_core.report.sections import PageInputs
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -285,8 +285,7 @@ def _learn(
         try:
             learner.fit(progress)
         except NoUsableViewsError as error:
-            blank = set(learner.rejected.values()) == {NO_MASK}
-            names = [view.camera.image for view in inputs.train]
+            blank, names = set(learner.rejected.values()) == {NO_MASK}, [view.camera.image for view in inputs.train]
             hint = mask_hint(inputs.root, settings.labels, names) if blank else ""
             raise NoUsableViewsError(f"{inputs.root}: {error}{hint}") from error
     return learner
@@ -316,6 +315,7 @@ def _write(
     scene, folder = inputs.scene, run.folder
     named = result if inputs.class_ids is None else result.with_ids(inputs.class_ids)
     with watch.stage("export"):
+        behind(load_templates)
         behind(named.save, folder / "segmentation.npz", run.id)
         meshes = collision_meshes(scene, named, settings.collision) if settings.collision else {}
         files = class_paths(named, folder / "classes", settings.scene_format)
@@ -378,8 +378,7 @@ def render(
     list of pathlib.Path
         The label maps.
     """
-    scene = GaussianScene.load(scene_path)
-    dataset = Dataset(data)
+    scene, dataset = GaussianScene.load(scene_path), Dataset(data)
     result = Segmentation.load(segmentation_path, scene)
     ids, numbered = result.class_ids, result.numbered()
     placed = place(scene, dataset, align=align, dataparser=dataparser, device=device, progress=progress)

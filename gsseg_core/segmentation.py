@@ -209,10 +209,10 @@ class Segmentation:
             return result
         return replace(result, probabilities=self.probabilities[:, order], learnt=self.learnt[:, order])
 
-    @property
+    @cached_property
     def confidence(self) -> np.ndarray:
         """Largest probability of each Gaussian, (N,) float32; 0 where unobserved."""
-        return np.asarray(self.probabilities.max(axis=1))
+        return np.asarray(largest(np.ascontiguousarray(self.probabilities))[0])
 
     def counts(self) -> np.ndarray:
         """Count the Gaussians of each class by id, (num_classes,) int64."""

@@ -90,6 +90,19 @@ def overlay(image: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.nda
     return picture
 
 
+def shown_at(px: int, image: np.ndarray, *labels: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Thin out a picture (H, W, 3) uint8 and label maps of its size that are shown with at most so many px a side.
+
+    What is left has at least that many, so that a line drawn on it is still seen.
+    """
+    step = max(image.shape[:2]) // px
+    if step < 2:
+        return image, *labels
+    centres = (np.minimum(np.arange(0, size, step) + step // 2, size - 1) for size in image.shape[:2])
+    kept = np.ix_(*centres)
+    return np.asarray(Image.fromarray(image).reduce(step)), *(each[kept] for each in labels)
+
+
 def contact_sheet(images: Sequence[np.ndarray], captions: Sequence[str], columns: int) -> np.ndarray:
     """Lay pictures out in rows, each with its caption below it.
 

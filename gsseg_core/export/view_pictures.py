@@ -13,7 +13,7 @@ import numpy as np
 
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
-from gsseg_core.export.pictures import contact_sheet, legend, overlay, palette, save_png
+from gsseg_core.export.pictures import CELL_PX, contact_sheet, legend, overlay, palette, save_png, shown_at
 from gsseg_core.learn.mask_reliability import WORST, ViewCheck, worst_views
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.depth import colours_and_depth, surface_of
@@ -174,7 +174,7 @@ def draw_worst_views(
     colors = palette(len(checks[0].counts))
     for check in worst_views(checks, count):
         view = views[check.name]
-        image, mask, predicted = images_of(view), view.read_labels(), check.prediction()
+        image, mask, predicted = shown_at(CELL_PX, images_of(view), view.read_labels(), check.prediction())
         different = ((mask != predicted) & (mask != UNKNOWN) & (predicted != UNKNOWN)).astype(np.int32)
         images += [overlay(image, mask, colors), overlay(image, predicted, colors)]
         images.append(overlay(image, different, _DIFFERENT))

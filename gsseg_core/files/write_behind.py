@@ -17,9 +17,9 @@ WriteBehind = Callable[Concatenate[Callable[Arguments, object], Arguments], None
 def writing_behind() -> Iterator[WriteBehind[...]]:
     """Give a function that has files written by another thread, one after the other; all are when the body has ended.
 
-    To compress and to wait for the disk takes little of the cores that the body works on. Only what writes belongs
-    there: nothing else may change what it is given. The first error of a writer is raised with the next call, or at the
-    end.
+    To compress and to wait for the disk takes little of the cores that the body works on. Only what writes, or gets
+    something ready for that, belongs there: nothing else may change what it is given. The first error of a writer is
+    raised with the next call, or at the end.
     """
     with ThreadPoolExecutor(1, "gsseg-write") as thread:
         waiting: list[Future[object]] = []

@@ -23,7 +23,7 @@ from gsseg_core.progress import Progress as Progress
 from gsseg_core.progress import silent as silent
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.observation import Observation
-from gsseg_core.raster.view_operator import Strongest, ViewOperator
+from gsseg_core.raster.view_operator import PixelGrid, Strongest, ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 VOTE_UNIT = 2.0**-24  # votes are counted in whole multiples of this many px, so that adding and taking back are exact
@@ -209,7 +209,11 @@ class Learner(ABC):
 
         That is, where most of a ray ends on Gaussians that only this view has seen.
         """
-        return Strongest.of(self.predict_without(view, only_labelled)).labels()
+        return self.strongest_without(view, only_labelled).labels()
+
+    def strongest_without(self, view: View, only_labelled: bool = False, grid: PixelGrid | None = None) -> Strongest:
+        """Tell the same, and the probabilities of the pixels of a grid."""
+        return Strongest.of(self.predict_without(view, only_labelled), grid)
 
     def rejected_share(self, view: View) -> float:
         """Share of a view's labelled pixels whose label `fit` has not used, in [0, 1]."""

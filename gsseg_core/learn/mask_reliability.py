@@ -21,8 +21,7 @@ from gsseg_core.data.label_images import UNKNOWN, PackedLabels
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View, spread
 from gsseg_core.learn.learner import Learner, Progress, silent
-from gsseg_core.learn.temperature import VIEWS, Sample, sample_pixels
-from gsseg_core.raster.view_operator import Strongest
+from gsseg_core.learn.temperature import VIEWS, Sample, grid_of, sample_grid
 
 WORST = 4  # views that are trusted least, as pictures show them
 
@@ -91,7 +90,7 @@ class MaskChecker:
     def sample(self, view: View) -> Sample:
         """Take pixels of a view's mask with their predicted probabilities, to fit the temperature to."""
         if view.name not in self._samples:
-            self._sample(view, self.learner.predict_without(view, only_labelled=True), view.read_seen())
+            self._predict(view, view.read_seen())
         return self._samples[view.name]
 
     def check_all(self, progress: Progress = silent) -> list[ViewCheck]:
@@ -115,18 +114,18 @@ class MaskChecker:
     def _check(self, view: View) -> ViewCheck:
         """Compare a view's mask with what is predicted where it says something."""
         learner, seen = self.learner, view.read_seen()
-        if view.name in self._sampled:  # which needs the probabilities, not the classes alone
-            image = learner.predict_without(view, only_labelled=True)
-            self._sample(view, image, seen)
-            predicted = Strongest.of(image).labels()
-        else:
-            predicted = learner.classes_without(view, only_labelled=True)
+        sampled = view.name in self._sampled
+        predicted = self._predict(view, seen) if sampled else learner.classes_without(view, only_labelled=True)
         predicted[seen.labels < 0] = UNKNOWN
         check = compare_mask(view, predicted, learner.num_classes, seen)
         return replace(check, rejected=learner.rejected_share(view))
 
-    def _sample(self, view: View, image: np.ndarray, seen: SeenLabels) -> None:  # (H, W, K)
-        self._samples[view.name] = sample_pixels(image, seen.named())
+    def _predict(self, view: View, seen: SeenLabels) -> np.ndarray:
+        """Tell the class of each pixel, (H, W) int32, and keep the probabilities of some."""
+        grid = grid_of(view.camera.height, view.camera.width)
+        found = self.learner.strongest_without(view, only_labelled=True, grid=grid)
+        self._samples[view.name] = sample_grid(found.some, grid.of(seen.named()))
+        return found.labels()
 
 
 def check_views(learner: Learner, progress: Progress = silent) -> list[ViewCheck]:

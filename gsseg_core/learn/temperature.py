@@ -19,10 +19,14 @@ expectation-maximisation, with a prior of `RIGHT` times the pixels of each class
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
+
+from gsseg_core.raster.view_operator import PixelGrid
 
 LOWEST, HIGHEST = 0.2, 5.0  # temperatures that are tried
 VIEWS = 16  # views whose masks the temperature is fitted to, at most
@@ -33,6 +37,7 @@ RIGHT = 0.3
 OUTLIERS = 1e-3  # share of pixels that carry any label of the view by chance
 _PRECISION = 0.02  # of the logarithm of the temperature
 _TINY = 1e-12
+_ROWS = 1 << 16  # of which powers are taken at a time
 
 
 def tempered(
@@ -47,6 +52,21 @@ def tempered(
     """
     if temperature == 1:
         return shares
+    if shares.ndim != 2 or len(shares) <= _ROWS:
+        return _tempered(shares, temperature)
+    # Part after part, several at once: what lies between stays small.
+    parts = [slice(first, first + _ROWS) for first in range(0, len(shares), _ROWS)]
+    out = np.empty(shares.shape, np.float32)
+
+    def temper(part: slice) -> None:
+        out[part] = _tempered(shares[part], temperature)
+
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        list(threads.map(temper, parts))
+    return out
+
+
+def _tempered(shares: np.ndarray, temperature: float) -> np.ndarray:
     peak = shares.max(axis=-1, keepdims=True, initial=0)
     powers: np.ndarray = np.divide(shares, peak, out=np.zeros(shares.shape, np.float32), where=shares > 0)
     np.power(powers, np.float32(1 / temperature), out=powers, where=powers > 0)
@@ -65,18 +85,26 @@ class Sample(NamedTuple):
     seen: np.ndarray  # (P,) int64: label of each pixel, as its column in `shares`, ascending
 
 
+def grid_of(height: int, width: int) -> PixelGrid:
+    """Choose the pixels of a view that the temperature is fitted to."""
+    step = max(1, int(np.ceil(np.sqrt(height * width / PIXELS))))
+    while -(-height // step) * -(-width // step) > PIXELS:
+        step += 1
+    return PixelGrid(min(step, height, width) // 2, step)
+
+
 def sample_pixels(image: np.ndarray, labels: np.ndarray) -> Sample:
     """Take the pixels of a view that the temperature is fitted to: a grid, where label and prediction are known.
 
     The image, (H, W, K), is blended of codes that have not seen the mask, (H, W) int32 and negative where unknown.
     """
-    height, width = labels.shape
-    step = max(1, int(np.ceil(np.sqrt(height * width / PIXELS))))
-    while -(-height // step) * -(-width // step) > PIXELS:
-        step += 1
-    start = min(step, height, width) // 2
-    grid = np.s_[start::step, start::step]
-    shares, seen = image[grid].reshape(-1, image.shape[2]), labels[grid].ravel()
+    grid = grid_of(*labels.shape)
+    return sample_grid(grid.of(image), grid.of(labels))
+
+
+def sample_grid(image: np.ndarray, labels: np.ndarray) -> Sample:  # (R, C, K), (R, C)
+    """Do the same, with what both are in these pixels."""
+    shares, seen = image.reshape(-1, image.shape[2]), labels.ravel()
     total = shares.sum(axis=1)
     known = np.flatnonzero((seen >= 0) & (total > 0.5))
     known = known[np.argsort(seen[known], kind="stable")]

@@ -141,8 +141,13 @@ def add_votes(
     units: float, sign: int,  # per vote; a power of 2
 ) -> None:  # fmt: skip
     """Add a view's votes to those of other views, or take them away, exactly: in whole units."""
+    cells = total.reshape(-1)
     for m in nb.prange(ids.shape[0]):
-        prefetch(total, ids[min(m + AHEAD, ids.shape[0] - 1)])
+        # A row may be several cache lines: what is asked for is the one with the first label's class.
+        later = min(m + AHEAD, ids.shape[0] - 1)
+        first = label_votes.indptr[labels[min(start[later], labels.shape[0] - 1)]]
+        column = label_votes.indices[first] if first < len(label_votes.indices) else 0
+        prefetch(cells, np.int64(ids[later]) * total.shape[1] + np.int64(column))
         row = total[ids[m]]
         for s in range(start[m], start[m + 1]):
             for j in range(label_votes.indptr[labels[s]], label_votes.indptr[labels[s] + 1]):

@@ -30,16 +30,29 @@ class Blended(NamedTuple):
     transmittance: np.ndarray  # (H, W) float32: what is left of each ray after the last Gaussian, in [0, 1]
 
 
+class PixelGrid(NamedTuple):
+    """Some pixels of a view: each `step`-th one of each row and column, from the `first`, below the step, on."""
+
+    first: int
+    step: int
+
+    def of(self, image: np.ndarray) -> np.ndarray:  # (H, W, ...)
+        """Take these pixels of an image."""
+        return image[self.first :: self.step, self.first :: self.step]
+
+
 class Strongest(NamedTuple):
     """The class that a view shows most of in each pixel."""
 
     classes: np.ndarray  # (H, W) int32: the column of the largest blended probability
     known: np.ndarray  # (H, W) float32: what is known of the pixel, the sum of its probabilities
+    some: np.ndarray  # (R, C, K) float32: all probabilities of the pixels of a grid; R and C are 0 without one
 
     @classmethod
-    def of(cls, image: np.ndarray) -> Strongest:  # (H, W, K)
+    def of(cls, image: np.ndarray, grid: PixelGrid | None = None) -> Strongest:  # (H, W, K)
         """Find it in an image of probabilities."""
-        return cls(image.argmax(axis=2).astype(np.int32), image.sum(axis=2))
+        some = image[:0, :0] if grid is None else grid.of(image)
+        return cls(image.argmax(axis=2).astype(np.int32), image.sum(axis=2), some)
 
     def labels(self) -> np.ndarray:
         """Class of each pixel of which more than half is known, (H, W) int32; `UNKNOWN` elsewhere."""
@@ -100,7 +113,7 @@ class ViewOperator(ABC):
         """Do the same for codes (N, K) of which only the entries that are not zero are at hand."""
         return self.blend_seen(codes.take(self.ids).dense(num_classes))
 
-    def strongest(self, codes: CSRRows, num_classes: int, background: bool) -> Strongest:
+    def strongest(self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid | None = None) -> Strongest:
         """Find the class of each pixel, from codes (N, K) of which only the entries that are not zero are at hand.
 
         What a ray has left over is `background`, class 0, or else nothing.
@@ -108,7 +121,7 @@ class ViewOperator(ABC):
         image, left_over = self.blend_rows(codes, num_classes)
         if background:
             image[..., 0] += left_over
-        return Strongest.of(image)
+        return Strongest.of(image, grid)
 
     def adjoint(self, residual: np.ndarray) -> np.ndarray:
         """Carry anything that a pixel carries, as labels or a loss's gradient, back to the Gaussians: W^T r.

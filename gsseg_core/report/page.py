@@ -36,6 +36,9 @@ SECTIONS: Mapping[str, tuple[str, Callable[[PageInputs], sections.Content | None
 """Sections of the page by anchor: title, and what is handed to the macro of that name; None leaves the section out."""
 
 
+TEMPLATE = "page.html.j2"
+
+
 def write_report_page(path: str | os.PathLike[str], run: PageInputs) -> None:
     """Write the page, atomically; its links to PLYs are relative to it.
 
@@ -60,7 +63,7 @@ def report_page(run: PageInputs) -> str:
     )
     return (
         environment()
-        .get_template("page.html.j2")
+        .get_template(TEMPLATE)
         .render(
             report={"run": None, **report},
             name=os.path.basename(report["scene"]["path"]),
@@ -91,6 +94,12 @@ def environment() -> Environment:
     made.filters.update(percent=percent, thousands="{:,}".format)
     made.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
     return made
+
+
+def load_templates() -> None:
+    """Compile the templates now, so that who writes a page later does not wait for that."""
+    for name in (TEMPLATE, "sections.html.j2", "charts.html.j2"):  # each imports the next
+        environment().get_template(name)
 
 
 def _hash(content: str) -> str:

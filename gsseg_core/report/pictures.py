@@ -13,7 +13,7 @@ from PIL import Image
 from gsseg_core.data.label_images import UNKNOWN, PackedLabels
 from gsseg_core.data.photos import read_photo
 from gsseg_core.data.view import View
-from gsseg_core.export.pictures import outline, overlay
+from gsseg_core.export.pictures import outline, overlay, shown_at
 from gsseg_core.export.view_pictures import background_image
 from gsseg_core.learn.mask_reliability import ViewCheck
 from gsseg_core.raster.backends import make_operator
@@ -72,9 +72,14 @@ class ViewImages:
         return image
 
 
-def draw_triple(check: ViewCheck, view: View, images: ViewImages, colors: np.ndarray) -> Triple:
-    """Lay a view's mask and what is predicted over its image, in colours (K, 3) of classes; show where they differ."""
-    image, mask, predicted = images.of(view), view.read_labels(), check.prediction()
+def draw_triple(
+    check: ViewCheck, view: View, images: ViewImages, colors: np.ndarray, largest: int = PICTURE_PX
+) -> Triple:
+    """Lay a view's mask and what is predicted over its image, in colours (K, 3) of classes; show where they differ.
+
+    Large ones are thinned out, to be shown with at most `largest` px a side.
+    """
+    image, mask, predicted = shown_at(largest, images.of(view), view.read_labels(), check.prediction())
     grey = image.mean(axis=2, keepdims=True)
     unknown = (mask == UNKNOWN) | (predicted == UNKNOWN)
     tint = np.where(unknown[..., None], _UNKNOWN, np.where((mask != predicted)[..., None], _DIFFER, _AGREE))

@@ -18,6 +18,8 @@ from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 
 LOOKS = 8
 """Views from which the preview can be looked at."""
+POSTER_PX = 640
+"""Most px a side of the picture that is there until the preview is."""
 MOST_THUMBNAILS = 200
 """Classes with a picture, those with the most Gaussians: the page should stay small."""
 MANY = 15
@@ -85,7 +87,9 @@ def preview(run: PageInputs) -> Content:
         run.evidence.checks, key=lambda check: (-check.counts.any(axis=1).sum(), -np.nan_to_num(check.reliability))
     )
     cameras = [views[check.name].camera for check in ranked[:LOOKS]]
-    poster = draw_triple(ranked[0], views[ranked[0].name], run.images, run.colors).prediction if ranked else None
+    poster = None
+    if ranked:
+        poster = draw_triple(ranked[0], views[ranked[0].name], run.images, run.colors, POSTER_PX).prediction
     counts = segmentation.counts()
     legend = [(k, name, run.colors[k].tolist(), counts[k]) for k, name in segmentation.class_names.items()]
     for i, (label, name, color) in enumerate(_NO_CLASS):
@@ -103,7 +107,7 @@ def preview(run: PageInputs) -> Content:
         "legend": [entry for entry in legend if entry[3]],
         "many": MANY,
         "cameras": [camera.name for camera in cameras],
-        "poster": jpeg_uri(poster, 640) if poster is not None else "",
+        "poster": jpeg_uri(poster, POSTER_PX) if poster is not None else "",
         "extent": f"{len(shown.records):,} of {len(scene):,} Gaussians" if shown.left_out else "All Gaussians",
     }
 

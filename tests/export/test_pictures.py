@@ -10,7 +10,17 @@ from PIL import Image
 
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import WriteError
-from gsseg_core.export.pictures import BACKGROUND, CELL_PX, PAPER, contact_sheet, legend, overlay, palette, save_png
+from gsseg_core.export.pictures import (
+    BACKGROUND,
+    CELL_PX,
+    PAPER,
+    contact_sheet,
+    legend,
+    overlay,
+    palette,
+    save_png,
+    shown_at,
+)
 
 
 def test_colours_are_all_different_and_the_first_is_the_background() -> None:
@@ -69,6 +79,17 @@ def test_large_pictures_are_shrunk_onto_a_contact_sheet() -> None:
     sheet = contact_sheet([wide, small], ["wide", "small"], columns=2)
     assert sheet.shape[1] < 2 * CELL_PX + 50
     assert (sheet == 200).all(axis=-1).sum() == 160 * CELL_PX and (sheet == 90).all(axis=-1).sum() == 90 * 120
+
+
+def test_pictures_are_thinned_out_no_further_than_they_are_shown() -> None:
+    labels = np.zeros((250, 401), int)
+    labels[:, 200:] = 1
+    image = np.where(labels[..., None] == 1, 255, 0).astype(np.uint8).repeat(3, axis=2)
+    assert shown_at(300, image, labels)[0] is image
+    thin, fewer = shown_at(100, image, labels)
+    assert thin.shape == (63, 101, 3) and fewer.shape == (63, 101)
+    assert (thin[:, :50] == 0).all() and (thin[:, 50:] == 255).all()
+    np.testing.assert_array_equal(fewer, thin[..., 0] // 255)
 
 
 def test_a_legend_has_a_swatch_for_every_class_in_as_many_columns_as_it_takes() -> None:

@@ -142,12 +142,19 @@ def test_wrong_masks_make_votes_less_sure_than_they_are_right() -> None:
     assert calibrate(fitted(VoteLearner)).temperature < 0.8
 
 
+def test_many_shares_are_tempered_like_few() -> None:
+    shares = np.random.default_rng(0).dirichlet([0.3, 1, 2], 150_000).astype(np.float32)
+    parts = [tempered(shares[first : first + 1000], 0.7) for first in range(0, len(shares), 1000)]
+    np.testing.assert_array_equal(tempered(shares, 0.7), np.concatenate(parts))
+
+
 def test_checked_views_are_not_rendered_again(monkeypatch: pytest.MonkeyPatch) -> None:
     learner = fitted(EMLearner)
     assert isinstance(learner, EMLearner)
     checker = MaskChecker(learner)
     checker.check_all()
     monkeypatch.setattr(EMLearner, "predict_without", None)
+    monkeypatch.setattr(EMLearner, "strongest_without", None)
     found = calibrate(learner, checker)
     monkeypatch.undo()
     assert found == calibrate(learner)

@@ -15,6 +15,7 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.errors import MaskSizeError, SceneValueError, SettingsError
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu import blending as blend
+from gsseg_core.raster.view_operator import PixelGrid
 from gsseg_core.scene.camera import Camera
 
 SIZES = [(37, 21), (16, 16), (33, 50), (70, 5), (1, 1), (1, 40)]
@@ -83,10 +84,13 @@ def test_the_strongest_class_is_the_largest_of_all_that_are_rendered(backend, ch
     codes = rng.choice([0, 0.25, 1], (len(scene), channels)).astype(np.float32)
     image, left_over = operator.blend(codes)
     image[..., 0] += left_over if background else 0
-    found = operator.strongest(CSRRows.from_dense(codes), channels, background)
+    grid = PixelGrid(2, 5)
+    found = operator.strongest(CSRRows.from_dense(codes), channels, background, grid)
     assert found.classes.dtype == np.int32 and found.known.dtype == np.float32
     np.testing.assert_array_equal(found.classes, image.argmax(axis=2))
     np.testing.assert_allclose(found.known, image.sum(axis=2), atol=1e-5)
+    np.testing.assert_allclose(found.some, image[2::5, 2::5], atol=1e-6)
+    assert operator.strongest(CSRRows.from_dense(codes), channels, background).some.shape == (0, 0, channels)
     np.testing.assert_array_equal(found.labels(), np.where(found.known > 0.5, found.classes, -1))
 
 

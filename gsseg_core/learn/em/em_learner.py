@@ -41,7 +41,7 @@ from gsseg_core.learn.em.scene_edges import scene_edges
 from gsseg_core.learn.learner import VOTE_UNIT, Learner, Progress, silent
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.observation import Observation
-from gsseg_core.raster.view_operator import ViewOperator
+from gsseg_core.raster.view_operator import PixelGrid, Strongest, ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import neighbours_of
 
@@ -222,10 +222,10 @@ class EMLearner(Learner):
             image[..., 0] += left_over
         return image
 
-    def classes_without(self, view: View, only_labelled: bool = False) -> np.ndarray:
+    def strongest_without(self, view: View, only_labelled: bool = False, grid: PixelGrid | None = None) -> Strongest:
         """Tell the class of each pixel by `predict_without`, without an image of all classes."""
         codes, background, operator = self._without(view, only_labelled)
-        return operator.strongest(codes, self.num_classes, background).labels()
+        return operator.strongest(codes, self.num_classes, background, grid)
 
     def _without(self, view: View, only_labelled: bool) -> tuple[CSRRows, bool, ViewOperator]:
         """Take the last step of `fit` once more, without a view's mask: codes, N rows, and what to blend them with.

@@ -57,12 +57,16 @@ def render(tiles: Tiles, codes: CSRRows, channels: int) -> tuple[np.ndarray, np.
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def strongest(tiles: Tiles, codes: CSRRows, channels: int, background: bool) -> tuple[np.ndarray, np.ndarray]:
+def strongest(
+    tiles: Tiles, codes: CSRRows, channels: int, background: bool, first: int, step: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find the column of the largest blended code in each pixel, (H, W) int32, the first of equal ones, and the sum.
 
-    What a ray has left over is added to column 0, if that is the background. No image of all columns is written.
+    What a ray has left over is added to column 0, if that is the background. No image of all columns is written, but
+    for each step-th pixel of rows and columns, from the first on: (R, C, K).
     """
     out, total = np.empty((tiles.height, tiles.width), np.int32), np.empty((tiles.height, tiles.width), np.float32)
+    some = np.empty((len(range(first, tiles.height, step)), len(range(first, tiles.width, step)), channels), np.float32)
     stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
         tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
@@ -75,7 +79,14 @@ def strongest(tiles: Tiles, codes: CSRRows, channels: int, background: bool) -> 
             for c in range(min(TILE, tiles.width - left)):
                 b, lane = in_block(r, c)
                 out[top + r, left + c], total[top + r, left + c] = best[b, lane], known[b, lane]
-    return out, total
+        for r in range((first - top) % step, min(TILE, tiles.height - top), step):
+            for c in range((first - left) % step, min(TILE, tiles.width - left), step):
+                if top + r >= first and left + c >= first:
+                    b, lane = in_block(r, c)
+                    for k in range(channels):
+                        some[(top + r) // step, (left + c) // step, k] = values[b, k, lane]
+                    some[(top + r) // step, (left + c) // step, 0] += rays[b, lane] if background else np.float32(0)
+    return out, total, some
 
 
 @called_by_kernels

@@ -18,7 +18,7 @@ from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_OPACITY, WIDTH
 from gsseg_core.raster.cpu.tiling import TILE, Tiles, assign
 from gsseg_core.raster.observation import Observation, VoteShares
-from gsseg_core.raster.view_operator import Blended, Strongest, ViewOperator
+from gsseg_core.raster.view_operator import Blended, PixelGrid, Strongest, ViewOperator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -70,9 +70,10 @@ class TileOperator(ViewOperator):
         """Blend codes without their zeros."""
         return Blended(*products.render(self._tiles, codes.take(self.ids), num_classes))
 
-    def strongest(self, codes: CSRRows, num_classes: int, background: bool) -> Strongest:
+    def strongest(self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid | None = None) -> Strongest:
         """Find the class of each pixel, tile by tile, without an image of all classes."""
-        return Strongest(*products.strongest(self._tiles, codes.take(self.ids), num_classes, background))
+        first, step = grid or (1 << 30, 1 << 30)  # of which no image has a pixel
+        return Strongest(*products.strongest(self._tiles, codes.take(self.ids), num_classes, background, first, step))
 
     def _adjoint(self, residual: np.ndarray) -> np.ndarray:
         out = np.zeros((self.num_gaussians, residual.shape[2]), np.float32)

@@ -17,7 +17,7 @@ from gsseg_core.simd import LANES
 TILE = LANES
 """Side of a tile in px. One row of a tile is one vector register of sixteen float32."""
 
-TYPICAL = 4  # tiles that a Gaussian touches, at first; where they touch more on average, they are listed once more
+TYPICAL = 8  # tiles that a Gaussian touches, at first; where they touch more on average, they are listed once more
 
 _LEAST = np.float32(LOG_ALPHA_MIN)
 
