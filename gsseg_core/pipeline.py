@@ -19,7 +19,7 @@ from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.export.class_files import class_paths, class_places, mesh_file_name, write_classes
 from gsseg_core.export.collision import collision_meshes
 from gsseg_core.export.pictures import save_png
-from gsseg_core.export.summary import RunReport, RunSettings
+from gsseg_core.export.summary import RunReport, RunSettings, class_table
 from gsseg_core.export.view_pictures import (
     Drawn,
     draw_views,
@@ -36,7 +36,6 @@ from gsseg_core.learn.calibrate import Calibration, calibrate
 from gsseg_core.learn.learner import NO_MASK, Learner, default_budget
 from gsseg_core.learn.mask_reliability import MaskChecker, ViewCheck, compare_mask, reliability_report
 from gsseg_core.learn.registry import make_learner
-from gsseg_core.objects.association import AssociationSettings
 from gsseg_core.objects.object_table import ObjectTable, find_objects
 from gsseg_core.progress import Progress, Stopwatch, silent
 from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, spread_if_scarce
@@ -122,16 +121,15 @@ def segment(
 
     Parameters
     ----------
-    scene_path : path
-        A scene of any format in `gsseg_core.scene.scene_formats`.
-    data : path
-        Dataset folder.
+    scene_path, data : path
+        A scene of any format in `gsseg_core.scene.scene_formats`, and the folder of the dataset.
     out : path
         Gets `segmentation.npz`, `classes/`, `pictures/`, and at last `report.html` and `report.json`.
-    labels : path
-        The masks: their sub-folder of the dataset, or a file or folder of another program, see docs/formats.md.
-    learner : str
-        One of `LEARNERS`.
+    labels, label_map : path
+        The masks: their sub-folder of the dataset, or a file or folder of another program, see docs/formats.md; and
+        what renames, merges and ignores classes of them, see `gsseg_core.data.label_map`.
+    learner, quality : str
+        One of `LEARNERS`; and one of `QUALITIES`: of which pixels of the views to learn, see docs/memory.md.
     views : int, optional
         Learn from this many train views, spread evenly; from all by default.
     refine : RefineSettings, optional
@@ -148,18 +146,13 @@ def segment(
         One of `IDS`: whether an id means the same in every view, or the objects are to be found; by default, as the
         format of the masks has it.
     granularity : float, optional
-        Of these objects, between 0 and 1: ids of views are one object where the views agree by more than this on that;
-        by default, the views tell. See docs/ids.md.
-    scene_format : str
-        Of the files in `classes/`, one of `SCENE_WRITERS`; see docs/formats.md.
-    collision : str, optional
-        Kind of meshes to collide with, one of `gsseg_core.export.collision.KINDS`, for each object; none by default.
-    label_map : path, optional
-        Renames, merges and ignores classes of the masks; see `gsseg_core.data.label_map`.
+        Of these objects, in [0, 1]: where the tree of parts and wholes is cut for what is written into `classes/` and
+        `pictures/`; the objects by default. See docs/ids.md.
+    scene_format, collision : str
+        Of the files in `classes/`, one of `SCENE_WRITERS`, see docs/formats.md; and kind of meshes to collide with for
+        each object, one of `gsseg_core.export.collision.KINDS`, none by default.
     align, dataparser
         Where the cameras are in the scene, as for `gsseg_core.align.placing.place`; see docs/frames.md.
-    quality : str
-        One of `QUALITIES`: of which pixels of the views to learn; see docs/memory.md.
 
     Returns
     -------
@@ -193,7 +186,7 @@ def segment(
                 inputs = _inputs(scene, placed, settings)
             if settings.ids == PER_VIEW:
                 with watch.stage("associate"):
-                    inputs = _associate(inputs, settings, progress)
+                    inputs = _associate(inputs, device, progress)
             run.claim(segment_places(inputs.class_names, inputs.pictured, settings))
             fitted = _learn(inputs, settings, client, watch, progress)
             assessment = _assess(fitted, inputs.class_names, watch, progress)
@@ -216,6 +209,7 @@ def segment(
             drawn |= {one.view.name: one for one in draw_views(inputs.scene, result, left, device=device)}
         with watch.stage("refine"):
             result = result.calibrated(assessment.calibration.temperature)
+            result = inputs.objects.with_tree(result) if inputs.objects else result
         with ExitStack() as writing:
             behind = writing.enter_context(writing_behind())
             report = _write(run, inputs, assessment, result, drawn, settings, watch, behind)
@@ -263,12 +257,11 @@ def _ids(dataset: Dataset, settings: RunSettings) -> str:
     return PER_VIEW
 
 
-def _associate(inputs: Inputs, settings: RunSettings, progress: Progress) -> Inputs:
+def _associate(inputs: Inputs, device: str, progress: Progress) -> Inputs:
     """Find which ids of the views are the same object, and number the objects."""
-    association = AssociationSettings(agreement=settings.granularity)
-    objects = find_objects(inputs.scene, inputs.train, association, device=settings.device, progress=progress)
-    train = [objects.relabelled(view) for view in inputs.train]
-    return replace(inputs, train=train, class_names=objects.class_names, objects=objects)
+    found = find_objects(inputs.scene, inputs.train, device=device, progress=progress)
+    train = [found.relabelled(view) for view in inputs.train]
+    return replace(inputs, train=train, class_names=found.class_names, objects=found)
 
 
 def _learn(
@@ -312,33 +305,37 @@ def _write(
     settings: RunSettings, watch: Stopwatch, behind: WriteBehind[...],
 ) -> RunReport:  # fmt: skip
     """Write all files of a run but `report.json`, some of them behind the work, and report it."""
-    scene, folder = inputs.scene, run.folder
+    scene, folder, level = inputs.scene, run.folder, result.at(settings.granularity)
     named = result if inputs.class_ids is None else result.with_ids(inputs.class_ids)
+    exported = named if level is result else level
     with watch.stage("export"):
         behind(load_templates)
+        if level is not result:
+            run.claim(segment_places(level.class_names, inputs.pictured, settings))
         behind(named.save, folder / "segmentation.npz", run.id)
-        meshes = collision_meshes(scene, named, settings.collision) if settings.collision else {}
-        files = class_paths(named, folder / "classes", settings.scene_format)
-        behind(write_classes, scene, named, folder / "classes", run.id, settings.scene_format, meshes)
+        meshes = collision_meshes(scene, exported, settings.collision) if settings.collision else {}
+        files = class_paths(exported, folder / "classes", settings.scene_format)
+        behind(write_classes, scene, exported, folder / "classes", run.id, settings.scene_format, meshes)
     with watch.stage("pictures"):
         shown = [drawn[view.name] for view in inputs.pictured]
-        images, evidence, pictures = _picture(run, inputs, assessment, result, shown, settings.device, behind)
+        images, evidence, pictures = _picture(run, inputs, assessment, result, level, shown, settings.device, behind)
     report = RunReport.of(
-        scene, named, run=run.id, views=assessment.report, settings=settings.as_dict(), seconds=watch.seconds,
+        scene, exported, run=run.id, views=assessment.report, settings=settings.as_dict(), seconds=watch.seconds,
         objective=assessment.objective, calibration=assessment.calibration.as_dict(), prepared_views=assessment.memory,
-        ids=None if inputs.objects is None else inputs.objects.summary(), masks=inputs.masks, frame=inputs.frame,
+        ids=inputs.objects and inputs.objects.summary(result), masks=inputs.masks, frame=inputs.frame,
         files={k: str(path.relative_to(folder)) for k, path in files.items()},
-        meshes={k: f"classes/{mesh_file_name(k, named.class_names[k])}" for k in meshes},
+        meshes={k: f"classes/{mesh_file_name(k, exported.class_names[k])}" for k in meshes},
         pictures=[str(path.relative_to(folder)) for path in pictures],
     )  # fmt: skip
     with watch.stage("report page"):
-        write_report_page(folder / "report.html", PageInputs(report.as_dict(), scene, result, evidence, images))
+        told = report if level is result else replace(report, classes=class_table(scene, result))
+        write_report_page(folder / "report.html", PageInputs(told.as_dict(), scene, result, evidence, images))
     return replace(report, page="report.html", seconds=watch.seconds)
 
 
 def _picture(
-    run: StagedRun, inputs: Inputs, assessment: Assessment, result: Segmentation, shown: Iterable[Drawn], device: str,
-    behind: WriteBehind[...],
+    run: StagedRun, inputs: Inputs, assessment: Assessment, result: Segmentation, level: Segmentation,
+    shown: Iterable[Drawn], device: str, behind: WriteBehind[...],
 ) -> tuple[ViewImages, Evidence, list[Path]]:  # fmt: skip
     """Write the pictures; what the report page can use of them is kept."""
     views, folder, images = assessment.views, run.folder / "pictures", ViewImages(inputs.scene, device)
@@ -350,7 +347,9 @@ def _picture(
         if assessment.checks is None and drawn.view.name in views:
             checks.append(compare_mask(views[drawn.view.name], drawn.labels, result.num_classes))
     save = partial(behind, save_png)
-    pictures = write_pictures(result, shown, folder, run.id, save)
+    if level is not result:  # What is compared with the masks are objects, as they are.
+        shown = draw_views(inputs.scene, level, inputs.pictured, device=device)
+    pictures = write_pictures(level, shown, folder, run.id, save)
     if assessment.checks:
         pictures.append(folder / "worst_views.png")
         save(pictures[-1], draw_worst_views(images.rendered, views, assessment.checks), run.id)

@@ -174,6 +174,17 @@ class Segmentation:
             tree=None,
         )
 
+    @property
+    def node_names(self) -> dict[int, str]:
+        """Names of the classes by id, and of the parts and wholes of the tree, if there is one."""
+        return self.class_names if self.tree is None else self.tree.names(self.class_names)
+
+    def members(self, node: int) -> np.ndarray:
+        """Tell which Gaussians belong to a class, or to a part or whole by its id in the tree, (N,) bool."""
+        if self.tree is None or node < self.tree.num_classes:
+            return np.asarray(self.labels == node)
+        return np.isin(self.tree.labels_at(1.0, self.labels), [node, *self.tree.inside(node)])
+
     def selected(self, classes: Collection[int], min_confidence: float = 0.0) -> Segmentation:
         """Keep the labels of some classes, and there only of Gaussians at least so sure; the others are removed."""
         kept = np.isin(self.labels, list(classes)) & (self.confidence >= min_confidence)

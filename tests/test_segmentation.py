@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from parts_of_balls import tree_of_balls
 from small_scenes import NAMES, NUM_CLASSES, OUT_OF_SIGHT, balls_on_a_table, clean_views, ring, taught
 
-from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.errors import SettingsError, StateFileError, StateMismatchError, WriteError
 from gsseg_core.learn.vote_learner import VoteLearner
+from gsseg_core.objects.removal import left_without
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.settings import PAPER, UNREFINED, RefineSettings
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
@@ -133,10 +134,7 @@ def test_a_failed_save_leaves_the_earlier_file_whole(tmp_path: Path, monkeypatch
 
 def with_parts() -> Segmentation:
     """Class 1 has two parts, 4 and 5; 2 and 3 make a whole, 6."""
-    parents, agreement = [-1, -1, 6, 6, 1, 1, -1], [1, 0.7, 1, 1, 1, 1, 0.3]
-    leaves = np.where(TRUTH == 1, 4 + np.arange(len(TRUTH)) % 2, TRUTH).astype(np.int32)
-    tree = ObjectTree(np.array(parents, np.int32), np.array(agreement, np.float32), leaves, NUM_CLASSES, 0.5)
-    return replace(Segmentation.from_codes(SCENE, CODES, NAMES, UNREFINED), tree=tree)
+    return replace(Segmentation.from_codes(SCENE, CODES, NAMES, UNREFINED), tree=tree_of_balls())
 
 
 def test_levels_are_segmentations_whose_classes_are_the_nodes_there() -> None:
@@ -152,6 +150,16 @@ def test_levels_are_segmentations_whose_classes_are_the_nodes_there() -> None:
         seen = level.render(make_operator(SCENE, ring(1)[0])).labels
         assert set(np.unique(seen).tolist()) <= set(level.class_names)
     assert (objects.counts()[2] + objects.counts()[3]) == coarse.counts()[6]
+
+
+def test_parts_and_wholes_can_be_asked_for_and_removed_by_name() -> None:
+    objects = with_parts()
+    assert objects.node_names == {**NAMES, 4: f"{NAMES[1]}.1", 5: f"{NAMES[1]}.2", 6: "whole_001"}
+    np.testing.assert_array_equal(objects.members(4) | objects.members(5), TRUTH == 1)
+    np.testing.assert_array_equal(objects.members(6), np.isin(TRUTH, [2, 3]))
+    np.testing.assert_array_equal(left_without(SCENE, objects, [4, 6]), ~(objects.members(4) | (TRUTH >= 2)))
+    with pytest.raises(SettingsError, match="asked to remove class 9, which has no Gaussians"):
+        left_without(SCENE, objects, [9])
 
 
 def test_levels_need_a_tree() -> None:

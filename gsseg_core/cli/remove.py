@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the command takes."""
     parser.add_argument("scene", metavar="SCENE", help="trained 3DGS scene, of any format that gsseg reads")
     parser.add_argument("--segmentation", required=True, metavar="FILE", help="segmentation.npz of this scene")
-    classes = "id or name of a class to leave out, a number being an id; may be given several times"
+    classes = "id or name of a class, part or whole to leave out, a number being an id; may be given several times"
     parser.add_argument("--class", dest="classes", action="append", required=True, metavar="NAME", help=classes)
     parser.add_argument("--out", required=True, metavar="FILE", help="file to write")
     add_format(parser.add_argument, None, "what the suffix of FILE says, else ply")
@@ -32,6 +32,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Remove, and say what is left."""
+    from dataclasses import replace
+
+    import numpy as np
+
     from gsseg_core.data.class_names import class_ids, listed
     from gsseg_core.export.class_files import write_selection
     from gsseg_core.export.collision import check_collision, collision_meshes
@@ -39,7 +43,7 @@ def run(options: argparse.Namespace) -> int:
     from gsseg_core.objects.removal import left_without
     from gsseg_core.scene.gaussian_scene import GaussianScene
     from gsseg_core.scene.scene_writers import check_format, format_of
-    from gsseg_core.segmentation import Segmentation
+    from gsseg_core.segmentation import REMOVED, Segmentation
     from gsseg_core.text import clipped, counted
 
     check_writable(options.out)
@@ -48,11 +52,12 @@ def run(options: argparse.Namespace) -> int:
     check_collision(options.collision)
     scene = GaussianScene.load(options.scene)
     segmentation = Segmentation.load(options.segmentation, scene)
-    chosen = class_ids(options.classes, segmentation.class_names)
+    names = segmentation.node_names
+    chosen = class_ids(options.classes, names)
     rest = left_without(scene, segmentation, chosen)
-    meshes = collision_meshes(scene, segmentation, options.collision) if options.collision else {}
-    meshes = {k: mesh for k, mesh in meshes.items() if k not in chosen}
+    left = replace(segmentation, labels=np.where(rest, segmentation.labels, np.int32(REMOVED)))
+    meshes = collision_meshes(scene, left, options.collision) if options.collision else {}
     write_selection(scene, rest, segmentation.labels, segmentation.class_names, options.out, scene_format, meshes)
-    removed = listed(f"{k} ({clipped(segmentation.class_names[k])})" for k in chosen)
+    removed = listed(f"{k} ({clipped(names[k])})" for k in chosen)
     tell(f"without {removed}: {int(rest.sum()):,} of {counted(len(scene), 'Gaussian')} in {options.out}")
     return 0

@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--ids", choices=("global", "per-view"),
         help="whether an id means the same in every view, or holds in its own view only (default: as the masks have)",
     )  # fmt: skip
-    level = "per-view ids: more makes parts of objects, less puts objects together (default: what the views tell)"
+    level = "per-view ids: what is written, from 0, objects put together, to 1, all their parts (default: the objects)"
     parser.add_argument("--granularity", type=float, metavar="G", help=level)
     add = parser.add_argument_group("learning").add_argument
     add("--learner", choices=tuple(LEARNERS), default=DEFAULT, help="default: %(default)s")

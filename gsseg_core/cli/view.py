@@ -90,7 +90,8 @@ def _show(options: argparse.Namespace, listener: Listener, viewer_module: Module
         labelling = Labelling.unknown(len(scene), dataset.class_names if dataset else None)
     source = open_source("ros", scene) if options.ros else None
     mode = BY_CLASS if options.segmentation or options.ros else TRUE_COLOURS
-    model = ViewModel(scene, labelling, mode=mode, class_ids=tuple(class_ids or ()))
+    tree = segmentation.tree if segmentation and not options.ros else None  # A node tells labels alone.
+    model = ViewModel(scene, labelling, mode=mode, class_ids=tuple(class_ids or ()), tree=tree)
     viewer = viewer_module.Viewer(
         model, views, reliability, source, listener=listener, draw=options.draw, device=options.device
     )

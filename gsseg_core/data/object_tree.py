@@ -2,8 +2,8 @@
 
 Nodes below the number of classes K are the classes: node k is class k, on every level where it is not cut or put
 together with others. Nodes from K on are parts, inside one class each, and wholes, made of several. Every Gaussian lies
-in a leaf. A node is one thing at each granularity up to its agreement, which nowhere falls on the way from the root to
-a leaf; so every level is a union of the nodes of each finer one, and the level of the objects is one of them.
+in a leaf. A node is one thing at each granularity up to its agreement, which grows on the way from the root to a leaf;
+so every level is a union of the nodes of each finer one, and the level of the objects is one of them.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
@@ -58,8 +59,8 @@ class ObjectTree:
             raise UnfitError("parents of the tree are no nodes of it, or go round in a circle")
         if not ((self.agreement >= 0) & (self.agreement <= 1)).all():
             raise UnfitError("agreement of the tree is outside [0, 1]")
-        if (self.agreement[self.parents[has]] > self.agreement[has]).any():
-            raise UnfitError("agreement of the tree falls from a node to its part; expected that it grows")
+        if (self.agreement[self.parents[has]] >= self.agreement[has]).any():
+            raise UnfitError("agreement of the tree does not grow from a node to its parts")
         kinds = self._classes
         if (has & (nodes < k) & (kinds[self.parents] >= 0)).any() or (self.agreement[:k] < self._level).any():
             raise UnfitError("a class of the tree is part of another; expected them to be on one level")
@@ -114,6 +115,22 @@ class ObjectTree:
         inner = np.unique(self.agreement[np.unique(self.parents[self.parents >= 0])]).tolist()
         coarse, fine = [h for h in inner if h < self._level], [h for h in inner if self._level <= h < 1]
         return (*coarse, self.level, *((a + b) / 2 for a, b in pairwise([*fine, 1.0])))
+
+    def level_name(self, granularity: float) -> str:
+        """Name a level for people: "objects", "parts at 0.45", "wholes at 0.10"."""
+        if granularity == self.level:
+            return "objects"
+        return f"{'parts' if granularity > self.level else 'wholes'} at {granularity:.2f}"
+
+    def opened(self, node: int) -> float:
+        """Give the coarsest granularity at which a node that has parts is in its parts."""
+        return next(g for g in self.granularities if np.float32(g) > self.agreement[node])
+
+    def closed(self, node: int) -> float:
+        """Give a granularity at which a node is one thing: of an object that of all objects, else the finest."""
+        if node < self.num_classes:
+            return self.level
+        return max(g for g in self.granularities if np.float32(g) <= self.agreement[node])
 
     def cut(self, granularity: float) -> np.ndarray:
         """Tell what stands for each node at a granularity: the largest that holds it and is one there, (M,) int32.
@@ -197,9 +214,23 @@ class ObjectTree:
             todo += parts
         return dict(sorted(names.items()))
 
-    def describe(self, class_names: Mapping[int, str]) -> list[dict[str, object]]:
-        """List the nodes that are no classes for `report.json`: parts and wholes."""
-        names, count = self.names(class_names), self._sizes
+    def inside(self, node: int) -> list[int]:
+        """All nodes inside a node, each before what is inside of it."""
+        return [one for part in self.parts(node) for one in (part, *self.inside(part))]
+
+    def sizes(self, labels: np.ndarray) -> np.ndarray:
+        """Count the Gaussians of each node, (M,) int64, for their classes (N,)."""
+        count = np.bincount(self.labels_at(1.0, labels)[labels >= 0], minlength=len(self))
+        total, at = np.zeros(len(self), np.int64), np.arange(len(self))
+        while len(at):
+            np.add.at(total, at, count)
+            on = self.parents[at] >= 0
+            at, count = self.parents[at[on]], count[on]
+        return total
+
+    def describe(self, class_names: Mapping[int, str], sizes: np.ndarray) -> list[dict[str, Any]]:
+        """List the nodes that are no classes for `report.json`, parts and wholes; `sizes` has the Gaussians of all."""
+        names = self.names(class_names)
         return [
             {
                 "id": node,
@@ -208,21 +239,10 @@ class ObjectTree:
                 "part_of": self.whole(node),
                 "made_of": self.parts(node),
                 "agreement": round(float(self.agreement[node]), 4),
-                "gaussians": int(count[node]),
+                "gaussians": int(sizes[node]),
             }
             for node in range(self.num_classes, len(self))
         ]
-
-    @cached_property
-    def _sizes(self) -> np.ndarray:
-        """Gaussians of each node, of all its parts together, (M,) int64."""
-        count = np.bincount(self.leaves[self.leaves >= 0], minlength=len(self))
-        total, at = np.zeros(len(self), np.int64), np.arange(len(self))
-        while len(at):
-            np.add.at(total, at, count)
-            on = self.parents[at] >= 0
-            at, count = self.parents[at[on]], count[on]
-        return total
 
 
 def check_granularity(granularity: float) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsseg_core.data.label_images import IDS, PER_VIEW
+from gsseg_core.data.object_tree import check_granularity
 from gsseg_core.data.view import QUALITIES
 from gsseg_core.errors import SettingsError
 from gsseg_core.export.collision import check_collision
@@ -65,10 +66,10 @@ class RunSettings:
         check_learner(self.learner, self.scheduler)
         if self.ids not in (*IDS, None):
             raise SettingsError(f"ids is {self.ids!r}; expected one of {', '.join(IDS)}")
-        if self.granularity is not None and not 0 < self.granularity < 1:
-            raise SettingsError(f"granularity is {self.granularity}; expected a share between 0 and 1")
-        if self.granularity is not None and self.ids not in (PER_VIEW, None):
-            raise SettingsError("granularity is for ids that are a view's own; expected ids per-view")
+        if self.granularity is not None:
+            check_granularity(self.granularity)
+            if self.ids not in (PER_VIEW, None):
+                raise SettingsError("granularity is for ids that are a view's own; expected ids per-view")
         if self.quality not in QUALITIES:
             raise SettingsError(f"quality is {self.quality!r}; expected one of {', '.join(QUALITIES)}")
         check_format(self.scene_format)
@@ -155,7 +156,7 @@ class RunReport:
             scene={"path": str(scene.path), "gaussians": len(scene), "digest": scene.digest},
             objective=objective,
             gaussians=gaussian_counts(result),
-            classes=_class_table(scene, result, files, meshes or {}),
+            classes=class_table(scene, result, files, meshes),
             pictures=pictures,
             versions={"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
             **others,
@@ -177,9 +178,14 @@ def gaussian_counts(result: Segmentation) -> dict[str, int]:
     }
 
 
-def _class_table(
-    scene: GaussianScene, result: Segmentation, files: Mapping[int, str], meshes: Mapping[int, str]
+def class_table(
+    scene: GaussianScene,
+    result: Segmentation,
+    files: Mapping[int, str] | None = None,
+    meshes: Mapping[int, str] | None = None,
 ) -> list[dict[str, Any]]:
+    """List the classes, with the file of each, and of the mesh to collide with it, where there is one."""
+    files, meshes = files or {}, meshes or {}
     counts, boxes, labelled = result.counts(), object_boxes(scene, result), result.labels >= 0
     total = np.bincount(result.labels[labelled], result.confidence[labelled], result.num_classes)
     return [

@@ -18,6 +18,7 @@ from gsseg_core.live.results import Outcome, Rejection
 from gsseg_core.live.session import LiveSession
 from gsseg_core.objects.object_table import ObjectTable, Repair, object_name
 from gsseg_core.scene.camera import Camera
+from gsseg_core.segmentation import Segmentation
 
 
 class PerViewSession(LiveSession):
@@ -32,6 +33,7 @@ class PerViewSession(LiveSession):
     """
 
     _LABEL, _REMEDY = "would show the first of object", ""
+    _with_tree: tuple[Segmentation, Segmentation] | None = None  # a result, and the same with its tree
 
     @property
     def class_names(self) -> dict[int, str]:
@@ -109,6 +111,26 @@ class PerViewSession(LiveSession):
             self._version += 1
         return repair
 
+    def at_level(self, result: Segmentation, granularity: float) -> Segmentation:
+        """Cut a result of `segmentation` at a level of the tree of parts and wholes, by the views that are kept now.
+
+        Where the scene has changed since, it stays as it is.
+
+        Raises
+        ------
+        SettingsError
+            The granularity is not in [0, 1].
+        """
+        with self._lock:
+            scene = self.scene_of(result)
+            if scene is not self.scene:
+                return result
+            if self._with_tree is None or self._with_tree[0] is not result:
+                self._with_tree = result, self._table.with_tree(result)
+            level = self._with_tree[1].at(granularity)
+            self._scenes[level] = scene
+        return level
+
     def learn(self, learner: str = "em", dataset: Dataset | None = None, **settings: Any) -> Outcome:
         """Repair, then learn class probabilities from the views kept. The repair stays, even if learning is ended.
 
@@ -136,6 +158,7 @@ class PerViewSession(LiveSession):
     def _forget(self) -> None:
         super()._forget()
         self._table = ObjectTable(self.scene, device=self.device)
+        self._with_tree = None
 
     def _drop_old_views(self) -> None:
         super()._drop_old_views()

@@ -237,8 +237,9 @@ class ObjectTable:
             split=len(shown) - len(np.unique(shown)),
         )
 
-    def summary(self) -> dict[str, Any]:
-        """Put together what `report.json` says of the ids."""
+    def summary(self, result: Segmentation) -> dict[str, Any]:
+        """Put together what `report.json` says of the ids, and of the parts and wholes of a result."""
+        tree = result.tree
         alignments = {name: asdict(self.alignment(name)) for name in sorted(self._objects)}
         return {
             "objects": self.num_objects,
@@ -248,6 +249,7 @@ class ObjectTable:
             "split": sum(alignment["split"] for alignment in alignments.values()),
             "settings": asdict(self.settings),
             "views": alignments,
+            **({} if tree is None else {"tree": tree.describe(result.class_names, tree.sizes(result.labels))}),
         }
 
     def _lift(self, view: View) -> Lifted | None:

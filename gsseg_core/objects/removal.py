@@ -23,7 +23,7 @@ def without_objects(scene: GaussianScene, segmentation: Segmentation, classes: C
     Parameters
     ----------
     classes : collection of int
-        Ids, at least one.
+        Ids, at least one; those of parts and wholes, too.
 
     Raises
     ------
@@ -37,13 +37,14 @@ def without_objects(scene: GaussianScene, segmentation: Segmentation, classes: C
 
 def left_without(scene: GaussianScene, segmentation: Segmentation, classes: Collection[int]) -> np.ndarray:
     """Tell which Gaussians of a scene `without_objects` leaves, (N,) bool; it raises the same errors."""
-    counts = segmentation.counts()
-    empty = [k for k in classes if not 0 <= k < len(counts) or not counts[k]]
+    gone = {k: segmentation.members(k) for k in classes}
+    empty = [k for k, members in gone.items() if not members.any()]
     if empty or not classes:
         found = f"class {empty[0]}, which has no Gaussians" if empty else "no class"
-        present = listed(f"{k} ({clipped(segmentation.class_names[k])})" for k in np.flatnonzero(counts).tolist())
-        raise SettingsError(f"{scene.path or 'scene'}: asked to remove {found}; expected some of: {present}")
-    kept: np.ndarray = ~np.isin(segmentation.labels, list(classes))
+        present = np.flatnonzero(segmentation.counts()).tolist()
+        names = listed(f"{k} ({clipped(segmentation.class_names[k])})" for k in present)
+        raise SettingsError(f"{scene.path or 'scene'}: asked to remove {found}; expected some of: {names}")
+    kept: np.ndarray = ~np.logical_or.reduce(list(gone.values()))
     if not kept.any():
         without = counted(len(classes), "class", "classes")
         raise EmptySceneError(f"{scene.path or 'scene'}: nothing is left without {without}; expected to keep some")

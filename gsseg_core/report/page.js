@@ -130,7 +130,6 @@ for (const field of document.querySelectorAll(".search")) {
 
   // One texel a class: its colour, and whether it is shown. 256 in a row.
   const rows = Math.ceil(data.colors.length / 256), classes = new Uint8Array(1024 * rows);
-  data.colors.forEach((color, k) => classes.set([...color, 255], 4 * k));
   function makeTexture(unitIndex, filter) {
     gl.activeTexture(gl.TEXTURE0 + unitIndex);
     gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
@@ -198,15 +197,32 @@ for (const field of document.querySelectorAll(".search")) {
     pending = true;
   }
 
-  const boxes = [...document.querySelectorAll(".legend input")];
+  const boxes = [...document.querySelectorAll(".legend input")], unobserved = data.removed - 1;
+  const levelSlider = document.querySelector(".level"), legend = document.querySelector(".legend");
+  const inColumns = legend.classList.contains("many");
+  const level = () => levelSlider && data.levels[levelSlider.value];
   function showClasses() {
-    for (const box of boxes) {
-      const first = Number(box.dataset.label), last = first === data.removed ? data.colors.length : first + 1;
-      for (let k = first; k < last; k++) classes[4 * k + 3] = box.checked ? 255 : 0;
-    }
+    const nodes = level()?.nodes, on = new Map(boxes.map((box) => [Number(box.dataset.label), box.checked]));
+    data.colors.forEach((color, k) => {
+      // What was taken out is drawn as what it covers.
+      const label = k < unobserved ? k : k - data.removed, node = label < 0 ? unobserved : nodes ? nodes[label] : label;
+      const shown = on.get(k < unobserved ? node : Math.min(k, data.removed)) ?? true;
+      classes.set([...data.colors[node], shown ? 255 : 0], 4 * k);
+    });
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, 256, rows, 0, gl.RGBA, gl.UNSIGNED_BYTE, classes);
     redraw();
   }
+  function showLevel() {
+    const { name, shown } = level();
+    document.querySelector(".level-name").textContent = name;
+    for (const box of boxes) {
+      const label = Number(box.dataset.label);
+      box.closest("li").classList.toggle("elsewhere", label < unobserved && !shown.includes(label));
+    }
+    legend.classList.toggle("many", inColumns && name === "objects");  // Names of parts are long.
+    check(() => true);
+  }
+  levelSlider?.addEventListener("input", showLevel);
   for (const box of boxes) {
     box.checked = true;
     box.addEventListener("change", showClasses);
@@ -299,5 +315,6 @@ for (const field of document.querySelectorAll(".search")) {
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
   document.documentElement.classList.add("js");
   look(0);
+  if (levelSlider) levelSlider.value = levelSlider.defaultValue;  // Some browsers keep it when a page is loaded again.
   showClasses();
 })();

@@ -37,7 +37,7 @@ class Preview:
     ----------
     records : (M,) RECORD
         Positions within `low` to `high`, scales as logarithms within `log_scales`, quaternions w, x, y, z; labels as
-        in the segmentation, K where unobserved, and where removed K + 1 more than the most probable class.
+        in the segmentation, `first` where unobserved, and where removed `first` + 1 more than the most probable class.
     low, high : (3,) float64
         The box that holds them, in scene units.
     log_scales : (2,) float64
@@ -66,8 +66,10 @@ class Preview:
         return base64.b64encode(self.records.tobytes()).decode("ascii")
 
 
-def make_preview(scene: GaussianScene, segmentation: Segmentation, most: int = MOST_GAUSSIANS) -> Preview:
-    """Choose the Gaussians that show most of the scene, and quantise them.
+def make_preview(
+    scene: GaussianScene, segmentation: Segmentation, most: int = MOST_GAUSSIANS, first: int | None = None
+) -> Preview:
+    """Choose the Gaussians that show most of the scene, and quantise them; `first` is the number of classes by default.
 
     Those that lie far from all others are left out. Of the others, `most` are drawn at random, large and opaque ones
     rather than small and faint ones, always the same; they are made larger so that surfaces stay closed. A class keeps
@@ -87,8 +89,8 @@ def make_preview(scene: GaussianScene, segmentation: Segmentation, most: int = M
     # Gaussians thinner than a thousandth of a pixel of any screen look like those that are not.
     logs = np.log(np.clip(scene.scales[picked] * min(growth, 3.0), 1e-5 * extent, extent))
     log_scales = np.array([logs.min(), logs.max()] if len(logs) else [0.0, 1.0], np.float64)
-    covered = 1 + segmentation.probabilities[picked].argmax(axis=1)
-    others = segmentation.num_classes + np.where(labels[chosen] == UNOBSERVED, 0, covered)
+    covered = 1 + segmentation.class_ids[segmentation.probabilities[picked].argmax(axis=1)]
+    others = (segmentation.num_classes if first is None else first) + np.where(labels[chosen] == UNOBSERVED, 0, covered)
     records = np.zeros(len(picked), RECORD)
     records["position"] = _quantised(means, low, high, 65535)
     records["label"] = np.where(labels[chosen] < 0, others, labels[chosen])

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.export.pictures import palette
 from gsseg_core.report.findings import TRUSTED, Evidence, class_ious, largest_confusions, most_confused
 from gsseg_core.report.pictures import PICTURE_PX, THUMBNAIL_PX, ViewImages, draw_triple, jpeg_uri, thumbnails
@@ -72,6 +73,16 @@ class PageInputs:
         """IoU of each class with the masks, (K,), NaN for a class that is nowhere; None where no mask was checked."""
         return None if self.confusion is None else class_ious(self.confusion)
 
+    @cached_property
+    def nodes(self) -> list[tuple[int, str, int]]:
+        """Number, name and Gaussians of each class, and after them of its parts and wholes."""
+        tree, names, counts = self.segmentation.tree, self.segmentation.class_names, self.segmentation.counts()
+        classes = [(k, name, int(counts[k])) for k, name in names.items()]
+        if tree is None:
+            return classes
+        others = tree.describe(names, tree.sizes(self.segmentation.labels))
+        return classes + [(one["id"], one["name"], one["gaussians"]) for one in others]
+
     @property
     def reliability(self) -> list[Mapping[str, Any]]:
         """What `report.json` says of the reliability of views, the worst first; empty where that is not known."""
@@ -80,8 +91,12 @@ class PageInputs:
 
 def preview(run: PageInputs) -> Content:
     """Gaussians to look at in 3D, what to colour and hide, and where to look from."""
-    scene, segmentation, views, first = run.scene, run.segmentation, run.evidence.views, run.segmentation.num_classes
-    shown = make_preview(scene, segmentation)
+    scene, segmentation, views, tree = run.scene, run.segmentation, run.evidence.views, run.segmentation.tree
+    first, colors, levels = segmentation.num_classes, run.colors, list[dict[str, Any]]()
+    if tree is not None and len(tree.granularities) > 1:
+        first, colors = len(tree), palette(len(tree))
+        levels = [_level(tree, granularity) for granularity in tree.granularities]
+    shown = make_preview(scene, segmentation.at(1.0) if levels else segmentation, first=first)
     # The more classes a view shows, the better it is to begin with.
     ranked = sorted(
         run.evidence.checks, key=lambda check: (-check.counts.any(axis=1).sum(), -np.nan_to_num(check.reliability))
@@ -90,26 +105,38 @@ def preview(run: PageInputs) -> Content:
     poster = None
     if ranked:
         poster = draw_triple(ranked[0], views[ranked[0].name], run.images, run.colors, POSTER_PX).prediction
-    counts = segmentation.counts()
-    legend = [(k, name, run.colors[k].tolist(), counts[k]) for k, name in segmentation.class_names.items()]
+    legend = [
+        {"label": k, "name": name, "color": colors[k].tolist(), "count": count, "now": k < segmentation.num_classes}
+        for k, name, count in run.nodes
+    ]
     for i, (label, name, color) in enumerate(_NO_CLASS):
-        legend.append((first + i, name, color, (segmentation.labels == label).sum()))
+        count = int((segmentation.labels == label).sum())
+        legend.append({"label": first + i, "name": name, "color": color, "count": count, "now": True})
     return {
         "data": {
             **shown.header(),
             "cameras": look_from(cameras, shown),
             "up": up_of(view.camera for view in views.values()),
             # What refinement took out is drawn as what it covers most: in a colour of its own it would be a stain.
-            "colors": [*run.colors.tolist(), _NO_CLASS[0][2], *run.colors.tolist()],
+            "colors": [*colors.tolist(), _NO_CLASS[0][2], *colors.tolist()],
             "removed": first + 1,
+            "levels": levels,
         },
         "records": shown.as_text(),
-        "legend": [entry for entry in legend if entry[3]],
+        "legend": [entry for entry in legend if entry["count"]],
         "many": MANY,
+        "objects": next((i for i, level in enumerate(levels) if level["name"] == "objects"), None),
         "cameras": [camera.name for camera in cameras],
         "poster": jpeg_uri(poster, POSTER_PX) if poster is not None else "",
         "extent": f"{len(shown.records):,} of {len(scene):,} Gaussians" if shown.left_out else "All Gaussians",
     }
+
+
+def _level(tree: ObjectTree, granularity: float) -> dict[str, Any]:
+    """Name a level, list the nodes that it shows, and for each node the one that stands for it."""
+    table = tree.cut(granularity)
+    shown = np.unique(table[tree.leaves[tree.leaves >= 0]])
+    return {"name": tree.level_name(granularity), "shown": shown.tolist(), "nodes": table.tolist()}
 
 
 def views_shown(run: PageInputs) -> Content | None:
@@ -126,7 +153,7 @@ def views_shown(run: PageInputs) -> Content | None:
 
 def classes(run: PageInputs) -> Content:
     """Size, confidence, agreement with the masks, and a picture of each class."""
-    entries, evidence, ious = run.report["classes"], run.evidence, run.ious
+    entries, evidence, ious, tree = run.report["classes"], run.evidence, run.ious, run.segmentation.tree
     largest = sorted(range(len(entries)), key=lambda k: -entries[k]["gaussians"])[:MOST_THUMBNAILS]
     found = thumbnails(largest, evidence, run.images, run.colors)
     views = evidence.views_showing(len(run.colors)) if evidence.checks else None
@@ -137,6 +164,8 @@ def classes(run: PageInputs) -> Content:
             "picture": (found[k][0], jpeg_uri(found[k][1], THUMBNAIL_PX)) if k in found else None,
             "views": None if views is None else int(views[k]),
             "iou": None if ious is None or np.isnan(ious[k]) else float(ious[k]),
+            "whole": None if tree is None or (whole := tree.whole(k)) is None else run.nodes[whole][1],
+            "parts": [] if tree is None else [run.nodes[part][1:] for part in tree.inside(k)],
         }
         for k, entry in enumerate(entries)
         if k or entry["gaussians"]  # Masks need not show any background.

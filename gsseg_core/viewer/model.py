@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsseg_core.data.class_names import BACKGROUND_NAME, class_name
+from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.errors import StateFileError, UnknownLabelError
 from gsseg_core.export.pictures import FILL, palette
 from gsseg_core.files.json_files import read_json
@@ -43,11 +44,14 @@ class Labelling(NamedTuple):
         By class; zeros where nothing is known. Rows sum to at most 1: a source may know the largest one only.
     class_names : dict of int to str
         Names by id, for all K.
+    nodes : tuple of int, optional
+        Ids of the classes where they are nodes of a tree, by which they have their colours.
     """
 
     labels: np.ndarray
     probabilities: np.ndarray
     class_names: dict[int, str]
+    nodes: tuple[int, ...] | None = None
 
     @classmethod
     def of(cls, segmentation: Segmentation) -> Labelling:
@@ -95,6 +99,8 @@ class ViewModel:
         Labels that are switched off; and those that are off the list, too.
     class_ids : tuple of int
         Ids by label, for as many labels as ids were given: labels are numbers without gaps, ids need not be.
+    tree : ObjectTree or None
+        Parts and wholes of the classes.
     """
 
     scene: GaussianScene
@@ -106,9 +112,12 @@ class ViewModel:
     hidden: set[int] = field(default_factory=set)
     removed: set[int] = field(default_factory=set)
     class_ids: tuple[int, ...] = ()
+    tree: ObjectTree | None = None
 
     def ids(self) -> list[int]:
         """Ids of all classes, by label; those that were added in the viewer have the smallest free ones."""
+        if self.labelling.nodes is not None:
+            return list(self.labelling.nodes)
         free = (i for i in range(len(self.class_ids) + len(self.labelling.class_names)) if i not in self.class_ids)
         return [*self.class_ids, *free][: len(self.labelling.class_names)]
 
@@ -201,7 +210,8 @@ class ViewModel:
     @property
     def _palette(self) -> np.ndarray:
         """Colours by label, (K + 2, 3) uint8: labels -1 and -2, which are no class, are its last two."""
-        colors = palette(max(self.labelling.class_names, default=0) + 1)
+        nodes = self.labelling.nodes or range(max(self.labelling.class_names, default=0) + 1)
+        colors = palette(max(nodes) + 1)[list(nodes)]
         return np.concatenate([colors, np.array([NOTHING_KNOWN] * len(NO_CLASS), np.uint8)])
 
     @cached_property

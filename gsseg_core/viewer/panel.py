@@ -6,6 +6,7 @@ through `_paragraph`, and into labels, which are text, only through `_shown`.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -73,6 +74,7 @@ class Panel:
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="medium")
         gui.set_panel_label("gsseg")
         self._answer = gui.add_html(_paragraph(_ASK))
+        self._build_offers()
         tabs = gui.add_tab_group()
         with tabs.add_tab("Classes"):
             self._build_classes()
@@ -93,8 +95,43 @@ class Panel:
 
     # Tabs.
 
+    def _build_offers(self) -> None:
+        """Offer the parts and the whole of what was clicked."""
+        self._node: int | None = None
+        self._parts, self._whole = (self._gui.add_button(f"its {what}", visible=False) for what in ("parts", "whole"))
+        for button, show in ((self._parts, self._state.show_parts), (self._whole, self._state.show_whole)):
+            self._on(button.on_click, functools.partial(self._show_offered, show))
+
+    def _show_offered(self, show: Callable[[int], None], _: Event) -> None:
+        if self._node is not None:
+            show(self._node)
+            self._offer(None)
+            _set(self._level, next(name for name, g in self._levels.items() if g == self._state.granularity))
+
+    def _offer(self, node: int | None) -> None:
+        tree, self._node = self._state.model.tree, node
+        of = ([], None) if tree is None or node is None else (tree.parts(node), tree.whole(node))
+        self._parts.visible, self._whole.visible = bool(of[0]), of[1] is not None
+
+    def _build_level(self) -> None:
+        """Choose a level of the tree of parts and wholes."""
+        tree = self._state.model.tree
+        self._levels = {} if tree is None else {tree.level_name(g): g for g in tree.granularities}
+        if tree is None or len(self._levels) < 2:
+            return
+        self._level = self._gui.add_dropdown("show", tuple(self._levels), initial_value=tree.level_name(tree.level))
+
+        def choose(event: Event) -> None:
+            if event.client is not None:  # Else it was set from here.
+                names = tuple(self._levels)
+                self._state.set_level(self._levels[names[_chosen(self._level, names)]])
+                self._offer(None)
+
+        self._on(self._level.on_update, choose)
+
     def _build_classes(self) -> None:
         gui = self._gui
+        self._build_level()
         mode = gui.add_dropdown("colour by", MODES, initial_value=self._state.model.mode)
         hint = "hide Gaussians that are less sure of their class than this"
         confidence = gui.add_slider("confidence", 0.0, 1.0, 1 / BANDS, 0.0, hint=hint)
@@ -218,10 +255,11 @@ class Panel:
 
     def show_picked(self, picked: Picked | None, votes: Sequence[ViewVote] | None) -> None:
         """Answer a click: the Gaussian that it hit, and the votes for that, if they are known."""
+        self._offer(None if picked is None else self._state.node_of(picked.gaussian))
         if picked is None:
             self._answer.content = _paragraph("Nothing is there.")
             return
-        model = self._state.model
+        model, classes = self._state.model, self._state.objects.class_names
         i = picked.gaussian
         label, probabilities = int(model.labelling.labels[i]), model.labelling.probabilities[i]
         best = [k for k in np.argsort(-probabilities, kind="stable")[:MOST_CLASSES].tolist() if probabilities[k] > 0]
@@ -233,7 +271,10 @@ class Panel:
         if votes is not None:
             views = counted(len({vote.view for vote in votes}), "view")
             lines.append(f"{views} voted for it" + (", the largest votes:" if votes else ""))
-            lines += [f"{_shown(v.view)}: {_shown(model.name(v.label))}, {v.weight:.1f} px" for v in votes[:MOST_VIEWS]]
+            lines += [
+                f"{_shown(v.view)}: {_shown(class_name(classes, v.label))}, {v.weight:.1f} px"
+                for v in votes[:MOST_VIEWS]
+            ]
         self._answer.content = _paragraph(*lines, title=_shown(model.name(label)))
 
     def show_progress(self, stage: str, done: int, total: int) -> None:
@@ -297,7 +338,7 @@ class Panel:
 
     def _target_names(self) -> tuple[str, ...]:
         """Names by class id, as they are shown."""
-        known = {**self._state.added_names, **self._state.model.labelling.class_names}
+        known = {**self._state.added_names, **self._state.objects.class_names}
         return _distinct([_shown(class_name(known, k)) for k in range(max(known) + 1)])
 
     def _view_text(self, view: View) -> str:

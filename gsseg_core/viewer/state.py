@@ -5,11 +5,13 @@ from __future__ import annotations
 import tempfile
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
 from gsseg_core.export.class_files import write_selection
@@ -20,6 +22,7 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.scene_writers import SCENE_WRITERS, check_format
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 from gsseg_core.viewer.corrections import Corrections
+from gsseg_core.viewer.levels import at_level
 from gsseg_core.viewer.model import BY_RELIABILITY, MODES, ClassRow, Labelling, ViewModel, completed
 from gsseg_core.viewer.picking import ViewVotes
 from gsseg_core.viewer.picture import Picture, cut
@@ -42,6 +45,10 @@ class ViewerState:
         What people drew.
     added_names : dict of int to str
         Classes that were added in the viewer.
+    objects : Labelling
+        The classes with their corrections, of which the model shows a level.
+    granularity : float
+        That level, where there is a tree.
     stale : threading.Event
         Set by every change: what browsers show is out of date.
     """
@@ -51,7 +58,8 @@ class ViewerState:
         self.corrections = Corrections(model.scene, device=device)
         self.added_names: dict[int, str] = {}
         self.stale = threading.Event()
-        self._learnt = model.labelling
+        self.objects = self._learnt = model.labelling
+        self.granularity = model.tree.level if model.tree else 0.0
         self._view_votes: ViewVotes | None = None
         self._view_votes_lock = threading.Lock()
         self._lock = threading.RLock()
@@ -87,6 +95,38 @@ class ViewerState:
                 )
             self.model.reliability = self.view_votes(progress).mean_reliability(self.reliability)
         self.change(lambda model: setattr(model, "mode", mode))
+
+    def set_level(self, granularity: float, inside: int | None = None) -> None:
+        """Show the level of the tree at a granularity: all of it, or only what lies inside one node."""
+        tree = self._tree()
+        with self._lock:
+            self.granularity = granularity
+            self._relabel()
+            model, shown = self.model, None if inside is None else {inside, *tree.inside(inside)}
+            ids, model.hidden, model.removed = model.ids(), set(), set()
+            if shown is not None:
+                model.hidden = {label for label in model.labels_in_use if label < 0 or ids[label] not in shown}
+
+    def node_of(self, gaussian: int) -> int | None:
+        """Node of the tree that a Gaussian is in as it is shown; None if none."""
+        with self._lock:
+            label, ids, tree = int(self.model.labelling.labels[gaussian]), self.model.ids(), self.model.tree
+        return None if tree is None or label < 0 or ids[label] >= len(tree) else ids[label]
+
+    def show_parts(self, node: int) -> None:
+        """Show the parts of a node, alone, where it has any."""
+        self.set_level(self._tree().opened(node), node)
+
+    def show_whole(self, node: int) -> None:
+        """Show what a node is a part of, alone, where that is anything."""
+        tree = self._tree()
+        if (whole := tree.whole(node)) is not None:
+            self.set_level(tree.closed(whole), whole)
+
+    def _tree(self) -> ObjectTree:
+        if self.model.tree is None:
+            raise SettingsError("parts and wholes are not known; expected a segmentation of ids of each view's own")
+        return self.model.tree
 
     def view_votes(self, progress: Progress = silent) -> ViewVotes:
         """Return the votes of each view for each Gaussian; collected when first asked for."""
@@ -153,7 +193,7 @@ class ViewerState:
         if collision and not SCENE_WRITERS[scene_format].together:
             raise SettingsError(f"format {scene_format}: holds no meshes to collide with; expected usd, or none")
         with self._lock:
-            shown, (labels, _, names) = self.model.shown(), self.model.labelling
+            shown, (labels, _, names, _) = self.model.shown(), self.model.labelling
             scene, ids = self.model.scene, self.model.ids()
         name = f"selection{SCENE_WRITERS[scene_format].suffixes[0]}"
         given = np.array([*ids, REMOVED, UNOBSERVED])[labels]  # labels -1 and -2 are its last two
@@ -169,13 +209,18 @@ class ViewerState:
 
     def segmentation_npz(self) -> tuple[str, bytes]:
         """Write labels and class probabilities, corrections included: the name `segmentation.npz`, and its bytes."""
-        labels, probabilities, names = self.model.labelling
+        (labels, probabilities, names, _), tree = self.objects, self.model.tree
         nothing, none = np.zeros(len(labels), bool), np.empty((0, probabilities.shape[1]), np.float32)
         result = Segmentation(labels, completed(probabilities), names, self.model.scene.digest, nothing, none)
-        return "segmentation.npz", _as_file(result.with_ids(self.model.ids()).save, "segmentation.npz")
+        if tree is None:
+            result = result.with_ids(self.model.ids())
+        elif tree.num_classes == len(names):  # Classes that were added are in no tree.
+            result = replace(result, tree=tree)
+        return "segmentation.npz", _as_file(result.save, "segmentation.npz")
 
     def _relabel(self) -> None:
-        self.model.relabel(self.corrections.apply(self._learnt, self.added_names))
+        self.objects, tree = self.corrections.apply(self._learnt, self.added_names), self.model.tree
+        self.model.relabel(at_level(self.objects, tree, self.granularity) if tree else self.objects)
         self._recut()
         self.stale.set()
 

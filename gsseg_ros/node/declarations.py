@@ -52,7 +52,7 @@ class Declaration:
     any_type: bool = False
 
 
-MAX_PIXELS = 1 << 24
+MAX_PIXELS, OBJECTS = 1 << 24, -1.0
 SCALES, _NO_TURN = (1e-9, 1e9), [0.0, 0.0, 0.0, 1.0]
 """Least and largest scene_to_map.scale."""
 
@@ -89,6 +89,13 @@ DECLARATIONS = (
         "what the labels of a mask are: given, those of classes; per-view, numbers that hold in their own mask only, "
         "as automatic mask generators give, so that objects are found and named by the node; auto: per-view for "
         "detections without class_names, else given",
+    ),
+    Declaration(
+        "granularity",
+        OBJECTS,
+        "ids per-view: what ~/segment, ~/render_view and ~/export give, from 0, objects put together to wholes, to 1, "
+        "all their parts; below 0: the objects [-1..1]",
+        *(-1.0, 1.0, True),
     ),
     Declaration(
         "label_map",

@@ -23,7 +23,7 @@ from gsseg_core.raster.depth_gating import DepthTolerance
 from gsseg_core.scene.scene_writers import check_format
 from gsseg_ros.camera_infos import AUTO, RECTIFIED
 from gsseg_ros.frames import Similarity, pose_from_parameters
-from gsseg_ros.node.declarations import AT_ONCE, DECLARATIONS, POSE_SOURCES
+from gsseg_ros.node.declarations import AT_ONCE, DECLARATIONS, OBJECTS, POSE_SOURCES
 from gsseg_ros.node.masks.compressed import TRANSPORTS
 from gsseg_ros.node.masks.palette import Palette
 
@@ -51,6 +51,7 @@ class Settings:
     max_pixels: int
     class_names: tuple[str, ...]
     ids: str
+    granularity: float
     label_map: str
     detections_topic: str
     palette: Palette | None
@@ -99,6 +100,9 @@ class Settings:
         if self.ids == PER_VIEW and self.label_map and not self.detections_topic:
             found = f"{self.label_map}, but with ids '{PER_VIEW}' masks have no classes"
             raise SettingsError(f"parameter label_map is {found}; expected it to be empty")
+        if self.ids != PER_VIEW and self.granularity >= 0:
+            found = f"{self.granularity:g}, but with ids '{self.ids}' objects have no parts"
+            raise SettingsError(f"parameter granularity is {found}; expected {OBJECTS:g}")
         if self.ids == PER_VIEW and self.class_names:
             raise SettingsError(
                 f"parameter class_names gives {len(self.class_names)} names, but with ids '{PER_VIEW}' the node finds "

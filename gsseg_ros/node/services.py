@@ -23,8 +23,10 @@ from gsseg_core.export.class_files import mesh_file_name, write_classes
 from gsseg_core.export.collision import check_collision, collision_meshes
 from gsseg_core.export.summary import RunReport
 from gsseg_core.files.json_files import write_json
+from gsseg_core.live.per_view_session import PerViewSession
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.scene_writers import check_format
+from gsseg_core.segmentation import Segmentation
 from gsseg_core.text import one_line
 from gsseg_ros.camera_infos import is_rectified
 from gsseg_ros.errors import InvalidRequestError, error_code
@@ -211,7 +213,7 @@ class Services:
         session, settings = self.workspace.session, self.workspace.settings
         with self.workspace.run("render_view") as run:
             self.workspace.number(run)
-            result = session.segmentation(refinement(request, self.workspace.settings), run.watch)
+            result = self._at_level(session.segmentation(refinement(request, settings), run.watch), run)
             camera = viewpoint(request, settings, self._lookup())
             header = Header(stamp=run.stamp, frame_id=request.viewpoint_camera.header.frame_id)
             selection = Selection(session, result, sorted(result.class_names), 0.0, settings.scene_to_map)
@@ -331,12 +333,20 @@ class Services:
     def _select(self, request: Any, run: Run) -> tuple[Selection, RefineSettings]:
         session, refine = self.workspace.session, refinement(request, self.workspace.settings)
         threshold = checked_confidence(request)
-        if session.has_codes:
+        if session.has_codes and self.workspace.settings.granularity < 0:
             # Before the work: a wrong name should not have to wait for it.
             chosen_classes(request, session.class_names)
-        result = session.segmentation(refine, run.watch)
+        result = self._at_level(session.segmentation(refine, run.watch), run)
         chosen = chosen_classes(request, result.class_names)
         return Selection(session, result, chosen, threshold, self.workspace.settings.scene_to_map), refine
+
+    def _at_level(self, result: Segmentation, run: Run) -> Segmentation:
+        """Cut a result at the level that the parameter granularity chooses."""
+        session, granularity = self.workspace.session, self.workspace.settings.granularity
+        if granularity < 0 or not isinstance(session, PerViewSession):
+            return result
+        with run.watch.stage("parts"):
+            return session.at_level(result, granularity)
 
     def clear(self, run: Run) -> None:
         """Replace all that is latched by empty messages."""

@@ -38,7 +38,9 @@ def test_a_node_has_parts_a_whole_a_kind_and_a_name() -> None:
     assert cups.whole(4) == 1 and cups.whole(1) == 6 and cups.whole(6) is None
     assert cups.class_of(5) == 1 and cups.class_of(6) == -1
     assert cups.names(NAMES) == {**NAMES, 4: "mug.1", 5: "mug.2", 6: "whole_001"}
-    assert [(one["name"], one["part_of"], one["gaussians"]) for one in cups.describe(NAMES)] == [
+    sizes = cups.sizes(np.array([0, 1, 1, 1, 2, 3, -1], np.int32))
+    assert cups.inside(6) == [1, 4, 5, 2] and sizes.tolist() == [1, 3, 1, 1, 2, 1, 4]
+    assert [(one["name"], one["part_of"], one["gaussians"]) for one in cups.describe(NAMES, sizes)] == [
         ("mug.1", 1, 2), ("mug.2", 1, 1), ("whole_001", None, 4)
     ]  # fmt: skip
 
@@ -91,15 +93,18 @@ def trees(draw: st.DrawFn) -> ObjectTree:
     k, level = draw(st.integers(2, 5)), 0.5
     parents, agreement = [-1] * k, [1.0] * k
     for parent in list(range(1, k)) + list(range(k, k + 3)):
-        if parent < len(parents) and draw(st.booleans()):
-            low = agreement[parents[parent]] if parents[parent] >= 0 else level
-            agreement[parent] = draw(st.sampled_from([step / 10 for step in range(5, 11) if step / 10 >= low]))
+        low = agreement[parents[parent]] if parent < len(parents) and parents[parent] >= 0 else level - 0.1
+        steps = [step / 10 for step in range(5, 10) if step / 10 > low]
+        if parent < len(parents) and steps and draw(st.booleans()):
+            agreement[parent] = draw(st.sampled_from(steps))
             parents += [parent] * 2
             agreement += [1.0] * 2
     roots = list(range(1, k))
     while len(roots) > 1 and draw(st.booleans()):
         parts = [roots.pop(0), roots.pop(0)]
-        steps = range(round(10 * min([0.4, *(agreement[part] for part in parts)])) + 1)
+        steps = range(round(10 * min(0.5, *(agreement[part] for part in parts))))
+        if not steps:
+            break
         for part in parts:
             parents[part] = len(parents)
         roots.append(len(parents))
@@ -136,3 +141,12 @@ def test_shares_keep_their_sum_and_labels_are_their_nodes(tree: ObjectTree, gran
     at, nodes = tree.shares_at(granularity, shares, tree.leaves)
     np.testing.assert_allclose(at.sum(axis=1), 1)
     np.testing.assert_array_equal(np.array(nodes)[at.argmax(axis=1)], tree.labels_at(granularity, classes))
+
+
+@given(trees())
+def test_every_node_is_there_where_it_is_closed_and_in_parts_where_it_is_opened(tree: ObjectTree) -> None:
+    for node in range(len(tree)):
+        assert tree.cut(tree.closed(node))[node] == node
+        if tree.parts(node) and tree.agreement[node] < 1:
+            there = tree.cut(tree.opened(node))
+            assert [there[part] for part in tree.parts(node)] == tree.parts(node)

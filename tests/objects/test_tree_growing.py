@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
-from per_view_ids import shuffled, with_labels
-from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, true_labels
+from parts_of_balls import SCENE, TOP, TRUTH, halved, seen_as, views_in_halves
+from per_view_ids import shuffled
+from small_scenes import NAMES, NUM_CLASSES, clean_views, ring, write_dataset
 
+from gsseg_core.cli.main import main
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.label_images import write_mask
 from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.data.view import View
 from gsseg_core.learn.vote_learner import VoteLearner
@@ -18,21 +24,10 @@ from gsseg_core.objects.object_table import ObjectTable, find_objects, object_na
 from gsseg_core.objects.tree_growing import grow_tree
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.settings import UNREFINED
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
-SCENE, TRUTH = balls_on_a_table()
 VIEWS = clean_views(12)
-TOP = 10 + NUM_CLASSES
-
-
-def halved(ball: int) -> np.ndarray:
-    """True labels with the upper half of a ball under a number of its own."""
-    high = SCENE.means[:, 2] > np.median(SCENE.means[ball == TRUTH, 2])
-    return np.where((ball == TRUTH) & high, TOP, TRUTH)
-
-
-def seen_as(view: View, truth: np.ndarray) -> View:
-    return shuffled(with_labels(view, true_labels(SCENE, truth, view.camera)))
 
 
 def grown(views: Sequence[View], level: float = 0.4) -> ObjectTree:
@@ -41,7 +36,7 @@ def grown(views: Sequence[View], level: float = 0.4) -> ObjectTree:
 
 
 def test_an_object_that_some_views_cut_up_has_parts() -> None:
-    views = [seen_as(view, halved(1) if i % 2 else TRUTH) for i, view in enumerate(VIEWS)]
+    views = views_in_halves()
     tree = grown(views)
     assert [len(tree.parts(k)) for k in range(NUM_CLASSES)] == [0, 2, 0, 0] and len(tree) == NUM_CLASSES + 2
     assert tree.agreement[1] == pytest.approx(0.5, abs=0.1)
@@ -96,7 +91,7 @@ def test_the_tree_has_the_same_bits_in_any_order_of_views_and_ids() -> None:
 
 def test_every_node_is_shown_by_several_views() -> None:
     """The slow reading of what a segment has to be: it fits the node better than either of what merged to it."""
-    views = [seen_as(view, halved(1) if i % 2 else TRUTH) for i, view in enumerate(VIEWS)]
+    views = views_in_halves()
     tree = grown(views)
     lifted = {v.name: Lifted.of(make_operator(SCENE, v.camera).observe(v.read_labels())) for v in views}
     for part in tree.parts(1):
@@ -111,7 +106,7 @@ def test_every_node_is_shown_by_several_views() -> None:
 
 
 def test_an_object_table_adds_the_tree_to_a_segmentation() -> None:
-    views = [seen_as(view, halved(1) if i % 2 else TRUTH) for i, view in enumerate(VIEWS)]
+    views = views_in_halves()
     table = find_objects(SCENE, views, AssociationSettings(agreement=0.4))
     learner = VoteLearner(SCENE, len(table.class_names))
     learner.observe_all([table.relabelled(view) for view in views])
@@ -129,7 +124,7 @@ def test_an_object_table_adds_the_tree_to_a_segmentation() -> None:
 
 
 def test_views_that_came_one_by_one_make_the_same_tree() -> None:
-    views = [seen_as(view, halved(1) if i % 2 else TRUTH) for i, view in enumerate(VIEWS)]
+    views = views_in_halves()
     codes = np.eye(NUM_CLASSES, dtype=np.float32)[TRUTH]
     found = []
     for order in (views, views[::-1]):
@@ -141,3 +136,40 @@ def test_views_that_came_one_by_one_make_the_same_tree() -> None:
     np.testing.assert_array_equal(found[0].leaves, found[1].leaves)
     np.testing.assert_array_equal(found[0].agreement, found[1].agreement)
     assert len(found[0]) == NUM_CLASSES + 2
+
+
+def test_the_command_writes_the_level_that_is_asked_for_and_keeps_the_objects(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data", SCENE, TRUTH, ring(18), NAMES)
+    for i, view in enumerate(Dataset(data).views("train")):
+        labels = seen_as(view, halved(1) if i % 2 else TRUTH).read_labels()
+        write_mask(data / "labels" / f"{view.name}.png", labels, 8)
+    inputs = [f"{data}/scene.ply", "--data", str(data), "--ids", "per-view", "--learner", "votes", "--quiet"]
+    assert main(["segment", *inputs, "--out", f"{tmp_path}/out", "--granularity", "0.9"]) == 0
+    report = json.loads((tmp_path / "out/report.json").read_text())
+    names = {entry["name"]: entry for entry in report["classes"]}
+    parts = sorted(name for name in names if "." in name)
+    assert len(parts) == 2 and len(report["ids"]["tree"]) == 2
+    assert [names[part]["gaussians"] for part in parts] == [one["gaussians"] for one in report["ids"]["tree"]]
+    whole = parts[0].removesuffix(".1")
+    assert whole not in names and (tmp_path / "out" / names[parts[1]]["ply"]).is_file()
+    scene = GaussianScene.load(data / "scene.ply")
+    result = Segmentation.load(tmp_path / "out/segmentation.npz", scene)
+    assert list(result.class_names.values()) == ["background", "object_001", "object_002", "object_003"]
+    assert (
+        result.tree is not None
+        and sum(names[part]["gaussians"] for part in parts)
+        == (result.counts()[result.tree.class_of(names[parts[0]]["id"])])
+    )
+    left = tmp_path / "left.ply"
+    assert main(["remove", f"{data}/scene.ply", "--segmentation", f"{tmp_path}/out/segmentation.npz",
+                 "--class", parts[0], "--out", str(left)]) == 0  # fmt: skip
+    assert len(GaussianScene.load(left)) == len(scene) - names[parts[0]]["gaussians"]
+
+
+def test_a_granularity_is_for_ids_of_each_views_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = write_dataset(tmp_path / "data", SCENE, TRUTH, ring(6), NAMES)
+    inputs = ["segment", f"{data}/scene.ply", "--data", str(data), "--out", f"{tmp_path}/out", "--quiet"]
+    assert main([*inputs, "--granularity", "0.5"]) == 2
+    assert "expected ids per-view" in capsys.readouterr().err
+    assert main([*inputs, "--ids", "per-view", "--granularity", "1.5"]) == 2
+    assert "granularity is 1.5; expected a share in [0, 1]" in capsys.readouterr().err

@@ -7,9 +7,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from parts_of_balls import SCENE, TRUTH, halved, seen_as
 from patience import PATIENCE
 from PIL import Image
 from report_cases import run_with_nasty_names
+from small_scenes import NAMES, ring, write_dataset
+
+from gsseg_core import pipeline
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.label_images import write_mask
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -143,3 +149,28 @@ def test_everything_but_the_preview_works_without_javascript(chromium: Browser, 
         assert page.locator(".triple img").count() == 9
     finally:
         context.close()
+
+
+def test_levels_recolour_the_preview_and_parts_stand_under_their_object(
+    page: Page, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("levels")
+    data = write_dataset(folder / "data", SCENE, TRUTH, ring(18), NAMES)
+    for i, view in enumerate(Dataset(data).views("train")):
+        labels = seen_as(view, halved(1) if i % 2 else TRUTH).read_labels()
+        write_mask(data / "labels" / f"{view.name}.png", labels, 8)
+    pipeline.segment(data / "scene.ply", data, folder / "out", ids="per-view", learner="votes")
+    page.goto((folder / "out/report.html").as_uri())
+    page.wait_for_selector(f"{CANVAS}[data-frames]")
+    rows = page.locator(".legend li:visible bdi")
+    objects, before = rows.all_text_contents(), shot(page.locator(CANVAS))
+    assert page.locator(".level-name").text_content() == "objects"
+    most = page.locator(".level").get_attribute("max")
+    fine = after(page, lambda: page.locator(".level").fill(str(most)))
+    assert page.locator(".level-name").text_content().startswith("parts at 0.")
+    parts = [name for name in rows.all_text_contents() if name not in objects]
+    assert len(parts) == 2 and {name[-2:] for name in parts} == {".1", ".2"}
+    assert changed(before, fine) > 0.002
+    assert changed(after(page, lambda: page.locator(".level").fill("0")), before) < 0.002
+    page.locator("#classes .parts summary").click()
+    assert page.locator("#classes .parts bdi").all_text_contents() == sorted(parts)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from parts_of_balls import views_in_halves
 from ros_fixtures import running_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros, ros_fixture  # noqa: F401
 from ros_robot import Robot
@@ -20,6 +21,7 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 from action_msgs.msg import GoalStatus
 from gsseg_msgs.action import Learn
 from gsseg_msgs.msg import SegmentationReport
+from gsseg_msgs.srv import Segment
 
 
 @pytest.fixture(scope="module")
@@ -95,6 +97,26 @@ def test_a_saved_state_comes_back_and_later_masks_are_matched_to_its_objects(rob
     robot.drive(views[5:])
     robot.ros.wait_until(lambda: robot.ask("segment").report.num_views == 6, "the last view")
     assert_objects_are_the_balls(robot.exported(Path(robot.get("data_root")) / "out" / "loaded"))
+
+
+def test_parts_are_given_where_the_parameter_granularity_asks_for_them(robot: Robot) -> None:
+    objects = fused(robot, views_in_halves()).classes
+    assert robot.set("granularity", 0.9) == (True, "")
+    try:
+        answer = robot.done("segment", classes=[])
+        names = [thing.name for thing in answer.objects]
+        parts = [name for name in names if "." in name]
+        assert len(parts) == 2 and len(names) == 4
+        whole = parts[0].removesuffix(".1")
+        assert parts == [f"{whole}.1", f"{whole}.2"] and whole not in names
+        sizes = {summary.name: summary.num_gaussians for summary in (*objects, *answer.report.classes)}
+        assert sizes[parts[0]] + sizes[parts[1]] == sizes[whole]
+        alone = robot.done("segment", classes=[parts[1]], publish_nothing=True)
+        assert alone.cloud.width == sizes[parts[1]]
+        assert robot.ask("segment", classes=[whole]).error_code == Segment.Response.UNKNOWN_CLASS
+    finally:
+        assert robot.set("granularity", -1.0) == (True, "")
+    assert [summary.name for summary in robot.done("segment").report.classes] == [one.name for one in objects]
 
 
 def test_a_dataset_folder_cannot_be_learnt_from(robot: Robot) -> None:

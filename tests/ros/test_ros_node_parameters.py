@@ -65,6 +65,8 @@ STEMS = ("0_background", "1_red_ball", "2_cup_mug", "3_box")
         ("rectified", "maybe", "parameter rectified is 'maybe'; expected auto, true, false"),
         ("ids", "mine", "parameter ids is 'mine'; expected auto, given, per-view"),
         ("ids", "per-view", "parameter class_names gives 4 names, but with ids 'per-view' the node finds the objects"),
+        ("granularity", 0.5, "parameter granularity is 0.5, but with ids 'given' objects have no parts; expected -1"),
+        ("granularity", 1.5, "out of range"),
         ("map_frame", "", "parameter map_frame is empty; expected the name of a frame"),
         ("data_root", "/", "read-only"),
         ("max_pixels", 2**31 - 1, "read-only"),

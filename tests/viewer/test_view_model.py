@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from small_scenes import NAMES, balls_on_a_table
+from parts_of_balls import tree_of_balls
+from small_scenes import NAMES, balls_on_a_table, ring
 
 from gsseg_core.errors import SettingsError, StateFileError, UnknownLabelError
 from gsseg_core.export.pictures import FILL
-from gsseg_core.segmentation import REMOVED, UNOBSERVED
+from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 from gsseg_core.viewer.model import (
     BY_CLASS,
     BY_CONFIDENCE,
@@ -32,6 +33,7 @@ from gsseg_core.viewer.picture import BANDS, Node, Picture, cut
 
 pytest.importorskip("viser")
 
+from gsseg_core.viewer.corrections import disc
 from gsseg_core.viewer.splats import SplatNodes, Splats
 from gsseg_core.viewer.state import ViewerState
 
@@ -252,3 +254,69 @@ def test_what_is_shown_is_saved_with_meshes_to_collide_with_in_usd_alone(tmp_pat
     assert sorted(meshes) == ["class_1_red_ball", "class_3_box"]
     with pytest.raises(SettingsError, match="format glb: holds no meshes to collide with"):
         state.selection("glb", "hull")
+
+
+def with_parts() -> ViewerState:
+    """The table, of whose red ball two halves are known, and of the others that they make a whole."""
+    objects = model().labelling
+    return ViewerState(ViewModel(SCENE, objects, class_ids=tuple(NAMES), tree=tree_of_balls()), [], {}, "cpu")
+
+
+def test_a_level_lists_its_nodes_in_colours_that_stay() -> None:
+    state = with_parts()
+    colors = {row.name: row.color for row in state.model.rows()}
+    state.set_level(0.85)
+    fine = {row.name: row for row in state.model.rows()}
+    assert set(fine) - set(colors) == {"red ball.1", "red ball.2"} and "red ball" not in fine
+    assert state.model.ids() == [0, 2, 3, 4, 5]
+    assert all(fine[name].color == color for name, color in colors.items() if name in fine)
+    assert fine["red ball.1"].color != fine["red ball.2"].color
+    np.testing.assert_allclose(state.model.labelling.probabilities.sum(axis=1), (state.objects.labels != -1), atol=1e-5)
+    state.set_level(0.2)
+    assert [row.name for row in state.model.rows() if row.label > 0] == ["red ball", "whole_001"]
+    state.set_level(0.5)
+    assert state.model.labelling is state.objects
+
+
+def test_what_is_clicked_offers_its_parts_and_its_whole() -> None:
+    state = with_parts()
+    inside = int(np.flatnonzero(TRUTH == 1)[-1])
+    assert state.node_of(inside) == 1
+    state.show_parts(1)
+    np.testing.assert_array_equal(state.model.shown(), state.objects.labels == 1)
+    part = state.node_of(inside)
+    assert part in (4, 5)
+    state.show_whole(part)
+    assert state.granularity == 0.5 and state.node_of(inside) == 1
+    state.show_whole(2)
+    np.testing.assert_array_equal(state.model.shown(), np.isin(state.objects.labels, [2, 3]))
+    assert state.node_of(int(np.flatnonzero(TRUTH == 0)[50])) == 0
+    name, content = state.selection("ply")
+    assert name == "selection.ply" and content
+
+
+def test_corrections_are_of_objects_on_every_level_and_the_tree_is_saved(tmp_path: Path) -> None:
+    state = with_parts()
+    state.set_level(0.85)
+    camera = ring(1)[0]
+    (uv,), _ = camera.project(SCENE.means[TRUTH == 1].mean(axis=0, keepdims=True))
+    assert state.correct(disc(camera, *uv, 3, 2)) > 0
+    gone = (state.objects.labels == 2) & (TRUTH == 1)
+    assert gone.any() and set(np.array(state.model.ids())[state.model.labelling.labels[gone]]) == {2}
+    (tmp_path / "s.npz").write_bytes(state.segmentation_npz()[1])
+    saved = Segmentation.load(tmp_path / "s.npz", SCENE)
+    np.testing.assert_array_equal(saved.labels, state.objects.labels)
+    assert saved.tree is not None and saved.tree.names(saved.class_names)[4] == "red ball.1"
+    assert state.undo()
+    state.added_names[K] = "spoon"
+    assert state.correct(disc(camera, *uv, 3, K)) > 0
+    spoon = state.objects.labels == K
+    assert state.model.name(int(state.model.labelling.labels[spoon][0])) == "spoon" and state.model.rows()
+    assert all(state.node_of(int(i)) is None for i in np.flatnonzero(spoon)[:3])
+    (tmp_path / "s.npz").write_bytes(state.segmentation_npz()[1])
+    assert Segmentation.load(tmp_path / "s.npz", SCENE).tree is None
+
+
+def test_levels_need_a_tree() -> None:
+    with pytest.raises(SettingsError, match="parts and wholes are not known"):
+        ViewerState(model(), [], {}, "cpu").set_level(0.5)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from browser import opened_page, screenshot
+from parts_of_balls import tree_of_balls
 from patience import PATIENCE
 from small_scenes import NAMES, balls_on_a_table, clean_views, write_dataset
 
@@ -191,6 +192,31 @@ def test_a_click_tells_the_class_its_probabilities_and_the_views_that_voted_for_
         shown.says(f"view0: {NAMES[k]}")
     shown.page.mouse.click(5, 200)
     shown.says("Nothing is there.")
+
+
+def test_a_click_on_an_object_offers_its_parts_and_a_level_can_be_chosen(chromium: Browser) -> None:
+    model = ViewModel(SCENE, LEARNT, class_ids=tuple(NAMES), tree=tree_of_balls())
+    viewer = Viewer(model, listener=listen(port=18080), draw=SERVER)
+    with closing(viewer), opened_page(chromium, 960, 640, tolerated="computeBoundingSphere") as page:
+        page.goto(viewer.url)
+        shown = Shown(viewer, page)
+        shown.wait(lambda: viewer.server.get_clients(), "the page")
+        shown.wait(lambda: shown.looks_like(1), "the first picture")
+        assert not page.get_by_role("button", name="its parts").is_visible()
+        page.mouse.click(*shown.pixel_of(1))
+        shown.press("its parts")
+        shown.says("red ball.2  ")
+        shown.wait(lambda: viewer.state.model.ids() == [0, 2, 3, 4, 5], "the parts")
+        upper, lower = (viewer.state.model.ids().index(node) for node in (5, 4))
+        shown.wait(
+            lambda: shown.looks_like(upper) and shown.looks_like(lower) and not shown.looks_like(1), "its halves"
+        )
+        page.mouse.click(*shown.pixel_of(1))
+        shown.press("its whole")
+        shown.wait(lambda: viewer.state.granularity == 0.5, "the ball")
+        shown.pressing("objects", "wholes at 0.30")
+        shown.says("whole_001")
+        assert viewer.state.model.shown().all()
 
 
 def test_the_camera_jumps_to_a_view_and_its_mask_lies_over_it(shown: Shown) -> None:
