@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matching import Contingency
+from parts_of_balls import views_in_halves
 from per_view_ids import in_halves, shuffled, with_labels
 from small_scenes import (
     NUM_CLASSES,
@@ -23,6 +24,7 @@ from gsseg_core.errors import SettingsError, UnknownLabelError
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner_state import Learnt
 from gsseg_core.live.per_view_session import PerViewSession
+from gsseg_core.refine.settings import UNREFINED
 
 SCENE, TRUTH = balls_on_a_table()
 VIEWS = clean_views(8)
@@ -146,3 +148,24 @@ def test_a_view_that_was_set_aside_is_saved_and_loaded_and_comes_back(tmp_path: 
         assert each.move_view(name, lambda camera: VIEWS[1].camera, each.era)
         assert each.view_names == [view.name for view in VIEWS[:4]] and each.num_fused == 4
         np.testing.assert_array_equal(each.codes(), before)
+
+
+def test_a_result_can_be_cut_at_a_level_and_the_tree_grows_with_the_views() -> None:
+    session = PerViewSession(SCENE)
+    views = views_in_halves()
+    for view in views[:2]:
+        assert session.fuse(view) is None
+    early = session.segmentation(UNREFINED)
+    np.testing.assert_array_equal(session.at_level(early, 1.0).labels, early.labels)  # A single view shows halves.
+    for view in views[2:]:
+        assert session.fuse(view) is None
+    session.repair()
+    objects = session.segmentation(UNREFINED)
+    fine = session.at_level(objects, 0.9)
+    assert session.scene_of(fine) is SCENE
+    parts = [k for k, name in fine.class_names.items() if "." in name]
+    assert len(parts) == 2
+    whole = int(objects.labels[fine.labels == parts[0]][0])
+    np.testing.assert_array_equal(np.isin(fine.labels, parts), objects.labels == whole)
+    with pytest.raises(SettingsError, match="granularity"):
+        session.at_level(objects, 2.0)
