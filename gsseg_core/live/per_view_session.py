@@ -111,10 +111,10 @@ class PerViewSession(LiveSession):
             self._version += 1
         return repair
 
-    def at_level(self, result: Segmentation, granularity: float) -> Segmentation:
+    def at_level(self, result: Segmentation, granularity: float | None) -> Segmentation:
         """Cut a result of `segmentation` at a level of the tree of parts and wholes, by the views that are kept now.
 
-        Where the scene has changed since, it stays as it is.
+        None gives the objects, with their tree. Where the scene has changed since, it stays as it is.
 
         Raises
         ------

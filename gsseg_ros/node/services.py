@@ -336,17 +336,18 @@ class Services:
         if session.has_codes and self.workspace.settings.granularity < 0:
             # Before the work: a wrong name should not have to wait for it.
             chosen_classes(request, session.class_names)
-        result = self._at_level(session.segmentation(refine, run.watch), run)
+        with_tree = isinstance(request, Export.Request)
+        result = self._at_level(session.segmentation(refine, run.watch), run, with_tree)
         chosen = chosen_classes(request, result.class_names)
         return Selection(session, result, chosen, threshold, self.workspace.settings.scene_to_map), refine
 
-    def _at_level(self, result: Segmentation, run: Run) -> Segmentation:
-        """Cut a result at the level that the parameter granularity chooses."""
+    def _at_level(self, result: Segmentation, run: Run, with_tree: bool = False) -> Segmentation:
+        """Cut a result at the level that the parameter granularity chooses; the objects have a tree only on request."""
         session, granularity = self.workspace.session, self.workspace.settings.granularity
-        if granularity < 0 or not isinstance(session, PerViewSession):
+        if not isinstance(session, PerViewSession) or (granularity < 0 and not with_tree):
             return result
         with run.watch.stage("parts"):
-            return session.at_level(result, granularity)
+            return session.at_level(result, granularity if granularity >= 0 else None)
 
     def clear(self, run: Run) -> None:
         """Replace all that is latched by empty messages."""

@@ -117,6 +117,8 @@ def test_parts_are_given_where_the_parameter_granularity_asks_for_them(robot: Ro
     finally:
         assert robot.set("granularity", -1.0) == (True, "")
     assert [summary.name for summary in robot.done("segment").report.classes] == [one.name for one in objects]
+    tree = robot.exported(Path(robot.get("data_root")) / "out" / "with_tree").tree
+    assert tree is not None and len(tree) == len(objects) + 2
 
 
 def test_a_dataset_folder_cannot_be_learnt_from(robot: Robot) -> None:
