@@ -20,6 +20,7 @@ from gsseg_core.segmentation import Segmentation
 
 TOGETHER = "objects"
 """Stem of the file in which a format keeps the objects of all classes."""
+_PART = 1 << 15  # vertices that are copied at a time
 
 
 def export_classes(
@@ -90,7 +91,7 @@ def write_classes(
     for k, path in paths.items():
         members = segmentation.labels == k
         if scene_format == DEFAULT:
-            write_vertices(path, _with_confidence(scene.vertices[members], k, confidence[members]), run)
+            write_vertices(path, _with_confidence(scene.vertices, np.flatnonzero(members), k, confidence), run)
         else:
             write_scene(scene.subset(members), path, scene_format, run)
     return paths
@@ -174,12 +175,17 @@ def _stem(label: int, name: str) -> str:
     return f"{label}_{re.sub(r'[^0-9A-Za-z._-]+', '_', name)[:100].strip('._') or 'class'}"
 
 
-def _with_confidence(vertices: np.ndarray, label: int, confidence: np.ndarray) -> np.ndarray:
-    """Add properties `label` (int32) and `confidence` (M,) (float32) to vertices (M,); earlier ones are replaced."""
+def _with_confidence(vertices: np.ndarray, ids: np.ndarray, label: int, confidence: np.ndarray) -> np.ndarray:
+    """Take some (M,) of the vertices (N,), with properties `label` (int32) and `confidence` (N,); earlier ones go."""
     names = [name for name in vertices.dtype.names or () if name not in ("label", "confidence")]
-    kept = np.ascontiguousarray(repack_fields(vertices[names]))
-    out = np.empty(len(kept), [*kept.dtype.descr, ("label", "<i4"), ("confidence", "<f4")])
-    # Row by row as bytes: property by property takes several times as long.
-    out.view(np.uint8).reshape(len(out), -1)[:, : kept.itemsize] = kept.view(np.uint8).reshape(len(kept), -1)
-    out["label"], out["confidence"] = label, confidence
+    kept = repack_fields(vertices[:0][names])
+    out = np.empty(len(ids), [*kept.dtype.descr, ("label", "<i4"), ("confidence", "<f4")])
+    # Row by row as bytes: property by property takes several times as long. In parts, so that there is one copy.
+    rows = out.view(np.uint8).reshape(len(out), -1)[:, : kept.itemsize]
+    out["label"], out["confidence"] = label, confidence[ids]
+    if kept.itemsize < vertices.itemsize:
+        vertices, ids = repack_fields(vertices[ids][names]), np.arange(len(ids))
+    source = np.ascontiguousarray(vertices).view(np.uint8).reshape(len(vertices), -1)
+    for first in range(0, len(ids), _PART):
+        rows[first : first + _PART] = source[ids[first : first + _PART]]
     return out
