@@ -36,6 +36,11 @@ A mask passes through the files of `gsseg_core` that one small run enters, from 
 `Segmentation`. A file is entered where a Python function of it is called, or a kernel of it from Python. One is climbed
 back to where a call enters it from a room that lies below its own. The time of `gsseg --help` is the best of five,
 without the start of Python itself; heavy are numba, scipy and torch.
+
+Not measured here: from nothing on two idle cores, `.ci/run` is to take 12 minutes at most, `make test` with its
+environment 8, and `make check`, once all is compiled, one; `time` tells. No stage of `make bench` is to be 5 % slower
+than in the last BENCHMARK.json. Labels of the demo cannot be those of before the rooms any more, since its scene, the
+learner and the refinement are others; docs/results.md has what they score.
 """
 
 

@@ -190,7 +190,7 @@ def test_poses_of_located_photos_make_a_similarity_whatever_axes_cameras_have_an
 def test_a_similarity_of_a_real_scene_is_found_to_a_fraction_of_a_pixel(real_data: Path) -> None:
     scene, true = GaussianScene.load(real_data / "kitchen_table/scene.ply"), Dataset(real_data / "kitchen_table")
     moved = true.moved(DISTURBED.camera)
-    settings = replace(SETTINGS, views=3, photos=8, survivors=0.01, picture_px=64)
+    settings = replace(SETTINGS, views=3, photos=5, survivors=0.01, picture_px=64)
     found = find_alignment(scene, moved.views("train"), settings)
     assert found.alignment.similarity.scale == pytest.approx(1 / DISTURBED.scale, rel=1e-2)
     assert pixels_apart(scene, moved.moved(found.alignment.camera), true) < 1
