@@ -41,7 +41,7 @@ class Place:
         write_dataset(folder / "data")
         self.ros = Ros(folder)
         self.node = start_node(self.ros, folder)
-        self.client = SegmentationClient(domain_id=self.ros.domain)
+        self.client = SegmentationClient(domain_id=self.ros.domain, find_timeout=PATIENCE)
 
     @property
     def views(self) -> list[View]:
@@ -59,7 +59,7 @@ def shared_fixture(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
         patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         patch.setenv("ROS_LOG_DIR", str(folder / "ros_log"))
         place = Place(folder)
-        place.client.wait_until_active()
+        place.client.wait_until_active(PATIENCE)
         yield place
         place.close()
 

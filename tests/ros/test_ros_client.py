@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 from ros_client_cases import (  # noqa: F401
     Background,
     Place,
@@ -279,8 +280,8 @@ def test_a_viewpoint_is_the_camera_that_it_was_made_of() -> None:
 
 
 def test_it_lives_in_a_context_of_the_program_and_leaves_that_as_it_is(place: Place) -> None:
-    with SegmentationClient(context=place.ros.context) as client:
-        client.wait_until_active()
+    with SegmentationClient(context=place.ros.context, find_timeout=PATIENCE) as client:
+        client.wait_until_active(PATIENCE)
         assert client.learn("data").report.num_views == 4
     assert place.ros.context.ok()
     with pytest.raises(ValueError, match="both context and domain_id"):
@@ -292,8 +293,8 @@ def test_it_lives_beside_the_default_context_of_the_program(place: Place) -> Non
     rclpy.init(args=[], domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
     try:
         node = rclpy.create_node("program")
-        with SegmentationClient(domain_id=domain) as client:
-            client.wait_until_active()
+        with SegmentationClient(domain_id=domain, find_timeout=PATIENCE) as client:
+            client.wait_until_active(PATIENCE)
         assert rclpy.ok()
         node.destroy_node()
     finally:

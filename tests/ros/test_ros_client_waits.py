@@ -48,7 +48,7 @@ def test_cancel_from_another_thread_ends_learning_and_changes_nothing(learnt: Pl
 
 def test_a_second_learn_is_refused_while_one_runs(place: Place) -> None:
     running = learning_forever(place.client)
-    with SegmentationClient(domain_id=place.ros.domain) as other:
+    with SegmentationClient(domain_id=place.ros.domain, find_timeout=PATIENCE) as other:
         assert failure(lambda: other.learn("data")).name == "BUSY"
         assert failure(other.reset).name == "BUSY"
         assert not other.cancel()  # It is not this client's.
@@ -84,7 +84,7 @@ def test_ctrl_c_in_a_plain_script_cancels_learning(place: Place) -> None:
         place.ros,
         f"""
         from gsseg_ros.client import SegmentationClient
-        with SegmentationClient() as client:
+        with SegmentationClient(find_timeout={PATIENCE}) as client:
             try:
                 client.learn("data", **{FOREVER}, on_feedback=lambda *told: print("told", flush=True))
             except KeyboardInterrupt:
@@ -103,8 +103,8 @@ def test_a_script_that_forgets_to_close_ends_cleanly(place: Place) -> None:
         place.ros,
         """
         from gsseg_ros.client import SegmentationClient
-        client = SegmentationClient()
-        client.wait_until_active()
+        client = SegmentationClient(find_timeout=300)
+        client.wait_until_active(300)
         print("active")
         """,
     )
@@ -133,7 +133,7 @@ def test_a_node_that_is_not_active_is_waited_for_and_its_state_named(ros: Ros, t
     write_dataset(tmp_path / "data")
     node = start_node(ros, tmp_path, autostart=False)
     node.wait_for("waiting to be configured")
-    with SegmentationClient(domain_id=ros.domain) as client:
+    with SegmentationClient(domain_id=ros.domain, find_timeout=PATIENCE) as client:
         says_in_the_end(lambda: client.wait_until_active(1.0), "/gsseg is unconfigured after 1 s; expected active")
         assert failure(client.segment).name == failure(client.learn).name == "NOT_ACTIVE"
 
@@ -142,16 +142,16 @@ def test_a_node_in_a_namespace_is_found_under_its_name(ros: Ros, tmp_path: Path)
     write_dataset(tmp_path / "data")
     parameters = {"scene_path": tmp_path / "data/scene.ply"}
     ros.start("segment_node", parameters, "-r", "__ns:=/robot1", "-r", "__node:=eyes")
-    with SegmentationClient("robot1/eyes", domain_id=ros.domain) as client:
-        client.wait_until_active()
+    with SegmentationClient("robot1/eyes", domain_id=ros.domain, find_timeout=PATIENCE) as client:
+        client.wait_until_active(PATIENCE)
         assert failure(client.segment).name == "NO_CODES"
 
 
 def test_a_node_that_hangs_is_not_waited_for_for_ever(ros: Ros, tmp_path: Path) -> None:
     write_dataset(tmp_path / "data")
     node = start_node(ros, tmp_path)
-    with SegmentationClient(domain_id=ros.domain) as client:
-        client.wait_until_active()
+    with SegmentationClient(domain_id=ros.domain, find_timeout=PATIENCE) as client:
+        client.wait_until_active(PATIENCE)
         assert failure(client.segment).name == "NO_CODES"
         node.send(signal.SIGSTOP)
         with pytest.raises(NodeUnavailableError, match="/gsseg did not answer in time during /gsseg/segment"):
@@ -163,8 +163,8 @@ def test_a_node_that_hangs_is_not_waited_for_for_ever(ros: Ros, tmp_path: Path) 
 def test_a_node_that_is_asked_to_end_cancels_learning_and_says_so(ros: Ros, tmp_path: Path) -> None:
     write_dataset(tmp_path / "data")
     node = start_node(ros, tmp_path)
-    with SegmentationClient(domain_id=ros.domain) as client:
-        client.wait_until_active()
+    with SegmentationClient(domain_id=ros.domain, find_timeout=PATIENCE) as client:
+        client.wait_until_active(PATIENCE)
         running = learning_forever(client)
         node.send(signal.SIGTERM)
         running.join()
@@ -175,7 +175,7 @@ def test_a_node_that_is_asked_to_end_cancels_learning_and_says_so(ros: Ros, tmp_
 def test_a_service_that_goes_away_unanswered_ends_the_wait(ros: Ros) -> None:
     silent = rclpy.create_node("gsseg", context=ros.context)  # Nobody spins it.
     service = silent.create_service(Reset, "/gsseg/reset", lambda request, response: response)
-    with SegmentationClient(domain_id=ros.domain) as client:
+    with SegmentationClient(domain_id=ros.domain, find_timeout=PATIENCE) as client:
         running = Background(client.reset)
         ros.wait_until(lambda: service.handle.service_take_request(Reset.Request)[0] is not None, "the request")
         silent.destroy_node()
@@ -190,7 +190,7 @@ def test_the_end_of_the_programs_context_ends_the_wait(place: Place) -> None:
     client = SegmentationClient(context=context)
     began = threading.Event()
     running = Background(lambda: client.wait_for_views(1_000_000, on_views=lambda _: began.set()))
-    assert began.wait(30), running.error
+    assert began.wait(PATIENCE), running.error
     context.try_shutdown()
     running.join()
     assert isinstance(running.error, RuntimeError) and "its ROS context was shut down" in str(running.error)

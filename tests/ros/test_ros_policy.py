@@ -7,6 +7,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from patience import PATIENCE
 from ros_helpers import REPOSITORY, Ros, ros_fixture  # noqa: F401
 from small_scenes import balls_on_a_table, write_dataset
 
@@ -97,11 +98,11 @@ def test_the_policy_lists_exactly_what_replay_client_and_viewer_have(ros: Ros, t
     ros.start("segment_node", {"scene_path": data / "scene.ply"}).wait_for("active: listening")
     ros.start("replay_node", {"data": data, "rate": 0.1})
     assert_listed(ros, "replay", {"/clock"})
-    with SegmentationClient(domain_id=ros.domain) as client:
+    with SegmentationClient(domain_id=ros.domain, find_timeout=PATIENCE) as client:
         with pytest.raises(Exception, match="of 1000 views"):
             client.wait_for_views(1000, timeout=3.0)
         assert_listed(ros, "gsseg_client", set())
-    viewer = RosSource(GaussianScene.load(data / "scene.ply"), domain_id=ros.domain)
+    viewer = RosSource(GaussianScene.load(data / "scene.ply"), domain_id=ros.domain, find_timeout=PATIENCE)
     try:
         assert_listed(ros, "gsseg_view", {"/gsseg/classes/*"})
     finally:

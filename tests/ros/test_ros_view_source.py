@@ -43,8 +43,8 @@ def test_live_codes_are_those_of_the_node_wherever_the_scene_lies_in_the_map(ros
     ros.start("segment_node", {**parameters, **MOVED})
     source = RosSource(scene, domain_id=ros.domain, find_timeout=PATIENCE)
     try:
-        with SegmentationClient(domain_id=ros.domain) as client:
-            client.wait_until_active()
+        with SegmentationClient(domain_id=ros.domain, find_timeout=PATIENCE) as client:
+            client.wait_until_active(PATIENCE)
             client.learn("data")
             update = next_update(source)
             client.export("out", filter=False)
