@@ -90,10 +90,11 @@ def run(options: argparse.Namespace) -> int:
     from gsseg_core.text import segment_summary
 
     agreement = report["frame"]["agreement"]
-    if agreement and agreement["agrees"] is False:
+    if agreement and not agreement["agrees"]:  # None, too, where nobody can tell.
+        looks = "does not look" if agreement["agrees"] is False else "hardly looks"
         note(
-            f"the scene does not look as the {agreement['compared']} do from these cameras: the two may be in "
-            f"different frames; try --align, or gsseg doctor {options.data} --scene {options.scene}"
+            f"the scene {looks} as the {agreement['compared']} do from these cameras: the two may be in different "
+            f"frames; try --align, or gsseg doctor {options.data} --scene {options.scene}"
         )
     tell(segment_summary(report, options.out))
     return 0

@@ -15,7 +15,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from gsseg_core.align import placing
-from gsseg_core.align.agreement import agreement, look_at, render
+from gsseg_core.align.agreement import Agreement, agreement, look_at, render
 from gsseg_core.align.conventions import AXIS_ROTATIONS, OPENGL, Convention
 from gsseg_core.align.features import Extractor, Features
 from gsseg_core.align.placing import find_alignment, place
@@ -237,6 +237,16 @@ def test_doctor_says_what_makes_cameras_fit_and_whether_they_did(
     assert "as in OpenGL" in capsys.readouterr().out
     assert main(["doctor", "--scene", str(demo / "scene.ply")]) == 2
     assert "expected a dataset, too" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("few_views")
+def test_segment_warns_too_where_nobody_can_tell_whether_cameras_fit(
+    demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(placing, "agreement", lambda *_: Agreement("masks", 6, 0.34, 0.28, None))
+    quick = ["--quiet", "--learner", "votes", "--views", "4", "--no-knn", "--no-filter", "--out", str(tmp_path / "out")]
+    assert main(["segment", str(demo / "scene.ply"), "--data", str(demo), *quick]) == 0
+    assert "hardly looks as the masks do from these cameras" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("few_views")

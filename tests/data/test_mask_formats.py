@@ -188,7 +188,24 @@ def test_of_video_masks_the_smaller_id_is_on_top_and_an_object_0_is_an_object(tm
     assert (labels == 1).sum() == 9 and (labels == 5).sum() == 27
 
 
+def test_an_image_in_which_automatic_masks_found_nothing_is_all_background(tmp_path: Path) -> None:
+    place = tmp_path / written(tmp_path, mask_writers.sam_json)
+    (place / "frame_001.json").write_text("[]")  # the first, by which a format is recognised
+    first, second, _ = Dataset(tmp_path, place).views()
+    assert not first.read_labels().any() and second.read_labels().any()
+
+
 # Ids and names
+
+
+def test_annotations_of_coco_none_of_which_is_of_an_image_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / written(tmp_path, mask_writers.coco)
+    whole = json.loads(path.read_text())
+    for annotation in whole["annotations"]:
+        annotation["image_id"] = str(annotation["image_id"])  # as some exports have it, the images' ids being numbers
+    path.write_text(json.dumps(whole))
+    with pytest.raises(MaskFormatError, match=r"annotation 0: is of the image '7'.* expected ids such as 7"):
+        Dataset(tmp_path, path)
 
 
 def test_a_category_0_of_coco_is_an_object_unless_it_is_called_background(tmp_path: Path) -> None:

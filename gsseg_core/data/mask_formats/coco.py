@@ -31,7 +31,9 @@ def read_coco(place: Place) -> MaskSet:
     labels = ids_from_zero(names)
     shapes: defaultdict[object, list[Shape]] = defaultdict(list)
     images = _images(whole, place, path)
-    for annotation in whole.records("annotations", "annotation"):
+    annotations = list(whole.records("annotations", "annotation"))
+    _check_meet(whole, annotations)
+    for annotation in annotations:
         image_id = annotation.value("image_id")
         if not isinstance(image_id, (int, str)) or image_id not in images:
             continue
@@ -64,6 +66,23 @@ def segmentation(annotation: Record, width: int, height: int) -> Region:
         raise MaskFormatError(f"{where}: has no segmentation, perhaps a box; expected polygons or RLE")
     rings = [ring for polygon in value for ring in Polygons.of(polygon, where).rings]
     return Polygons(rings, where)
+
+
+def _check_meet(whole: Record, annotations: list[Record]) -> None:
+    """Raise `MaskFormatError` if no annotation is of an image of the file: all views would be background."""
+    listed, named = (
+        [value for value in values if isinstance(value, (int, str))]
+        for values in (
+            (image.value("id") for image in whole.records("images", "image")),
+            (annotation.value("image_id") for annotation in annotations),
+        )
+    )
+    if annotations and listed and not set(listed) & set(named):
+        found = annotations[0]
+        raise MaskFormatError(
+            f"{found.where}: is of the image {quoted(found.value('image_id'))}, and so is none of the "
+            f"{len(annotations):,} of an image that 'images' has; expected ids such as {quoted(listed[0])}"
+        )
 
 
 def _images(whole: Record, place: Place, path: Path) -> dict[object, tuple[str, str, tuple[int, int]]]:

@@ -87,9 +87,17 @@ class Place:
 
     @cached_property
     def sample(self) -> tuple[Path, object] | None:
-        """The JSON file by which formats are told apart, with what it holds: the first of a view, or the only one."""
-        path = next(iter(self.by_view(".json").values()), None) or self.only(".json")
-        return None if path is None else (path, read_json(path, MaskFormatError, self.within))
+        """The JSON file by which formats are told apart, with what it holds: the first of a view, or the only one.
+
+        An empty list tells nothing: whoever writes one found nothing in that image.
+        """
+        paths = list(self.by_view(".json").values()) or [path for path in (self.only(".json"),) if path]
+        found = None
+        for path in paths:
+            found = path, read_json(path, MaskFormatError, self.within)
+            if found[1] != []:
+                break
+        return found
 
     def only(self, suffix: str) -> Path | None:
         """Find the only file with a suffix, which the place itself may be; none beside masks of single views."""

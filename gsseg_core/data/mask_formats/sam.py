@@ -59,7 +59,10 @@ def read_sam_folder(place: Place) -> MaskSet:
 
 
 def _read_json(place: Place, path: Path, camera: Camera) -> npt.NDArray[np.int32]:
-    return _drawing(path, read_json(path, MaskFormatError, place.within)).labels(camera, str(path))
+    content = read_json(path, MaskFormatError, place.within)
+    if content == []:  # Nothing was found in this image.
+        return np.zeros(camera.image_size[::-1], np.int32)
+    return _drawing(path, content).labels(camera, str(path))
 
 
 def _listed(content: object) -> list[object]:
