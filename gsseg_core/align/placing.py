@@ -156,7 +156,8 @@ def find_alignment(
 ) -> Found:
     """Find where cameras are in a scene, from what their photos show or, without photos, their masks.
 
-    First as they are, if photos tell, then by conventions, and at last, with photos, by a similarity.
+    First as they are, if photos tell, then by conventions, and at last, with photos, by a similarity. The first is taken
+    in which photos and renderings lie upon each other, and where none is, the one that agrees best.
 
     Raises
     ------
@@ -171,18 +172,33 @@ def find_alignment(
             "alignment: no view has a photo or a mask; expected some, to see where cameras are by them"
         )
     photos = before.compared == "photos"
+    agreeing: list[Found] = []
     # Masks say less than photos do: on a shelf, regions may lie well enough from a wrong side, too.
     if before.agrees and photos:
-        return _closer(scene, views, shown, Found(Alignment(), before, before), settings, device)
+        agreeing.append(_closer(scene, views, shown, Found(Alignment(), before, before), settings, device))
+        if _is_close(agreeing[-1], settings):
+            return agreeing[-1]
     alignment = Alignment(find_convention(scene, shown, settings, device, progress))
     if (reached := _through(scene, shown, alignment, settings, device)).agrees:
-        return _closer(scene, views, shown, Found(alignment, reached, before), settings, device)
+        agreeing.append(_closer(scene, views, shown, Found(alignment, reached, before), settings, device))
+        if _is_close(agreeing[-1], settings):
+            return agreeing[-1]
     if not photos:
         raise AlignmentError(
             f"alignment: no convention of axes has scene and masks agree ({reached} at best); expected photos of the "
             "views in images/, by which scale, rotation and translation can be found, too"
         )
-    return _registered(scene, views, shown, before, settings, device, progress)
+    try:
+        agreeing.append(_registered(scene, views, shown, before, settings, device, progress))
+    except AlignmentError:
+        if not agreeing:
+            raise
+    return max(agreeing, key=lambda found: found.agreement.score)
+
+
+def _is_close(found: Found, settings: AlignSettings) -> bool:
+    """Whether photos and renderings lie upon each other, as far as is known: round a table, other sides look alike."""
+    return found.offset_px is None or found.offset_px <= settings.reprojection_px
 
 
 def _registered(

@@ -18,7 +18,7 @@ from gsseg_core.align import placing
 from gsseg_core.align.agreement import Agreement, agreement, look_at, render
 from gsseg_core.align.conventions import AXIS_ROTATIONS, OPENGL, Convention
 from gsseg_core.align.features import Extractor, Features
-from gsseg_core.align.placing import find_alignment, place
+from gsseg_core.align.placing import Found, find_alignment, place
 from gsseg_core.align.registration import Located, Photo, fit_poses
 from gsseg_core.align.settings import AlignSettings
 from gsseg_core.align.thinning import thinned
@@ -168,6 +168,30 @@ def test_conventions_are_found_exactly(
     assert placed.agreement is not None and placed.agreement.agrees and not placed.fits
     assert poses_apart(placed.dataset, true) < 1e-9
     assert "not aligned as it is" in placed.describe() and "aligned: " in placed.describe()
+
+
+def test_a_table_seen_from_another_side_is_not_taken_for_right_because_it_looks_alike(real_data: Path) -> None:
+    scene, true = GaussianScene.load(real_data / "kitchen_table/scene.ply"), Dataset(real_data / "kitchen_table")
+    turned = true.moved(Convention(world_axes=AXIS_ROTATIONS[4]).camera)
+    found = find_alignment(scene, turned.views("train"))
+    assert found.before.agrees
+    assert poses_apart(turned.moved(found.alignment.camera), true) < 1e-9
+
+
+@pytest.mark.usefixtures("few_views")
+def test_where_photos_and_renderings_lie_upon_each_other_nowhere_what_agrees_best_is_taken(
+    with_photos: Path, scene: GaussianScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(placing, "_closer", lambda *given: replace(given[3], offset_px=29.0))
+    asked = []
+
+    def nowhere(*_: object) -> Found:
+        asked.append(True)
+        raise AlignmentError("no place looks as the photos do")
+
+    monkeypatch.setattr(placing, "_registered", nowhere)
+    found = find_alignment(scene, Dataset(with_photos).views(), replace(SETTINGS, survivors=0.01, picture_px=48))
+    assert asked and found.alignment.parts == [] and found.offset_px == 29.0
 
 
 @pytest.mark.parametrize(
