@@ -156,8 +156,8 @@ def find_alignment(
 ) -> Found:
     """Find where cameras are in a scene, from what their photos show or, without photos, their masks.
 
-    First as they are, if photos tell, then by conventions, and at last, with photos, by a similarity. The first is taken
-    in which photos and renderings lie upon each other, and where none is, the one that agrees best.
+    First as they are, if photos tell, then by conventions, and at last, with photos, by a similarity. The first one is
+    taken in which photos and renderings lie upon each other, and where none is, the one that agrees best.
 
     Raises
     ------

@@ -47,7 +47,7 @@ _EXTRA = re.compile(r"""extra\s*==\s*["'](?P<extra>[^"']+)["']""")
 _EXTRAS_FOR = {
     "view": "gsseg view, the scene in the browser",
     "formats": "--format compressed-ply, spz; reading SPZ of version 4, YAML of masks",
-    "usd": "--format usd, --collision surface",
+    "usd": "--format usd, --collision surface, poisson",
     "ros": "the ROS 2 nodes, on a machine without ROS from apt",
     "distributed": "gsseg segment --scheduler, several machines",
     "gsplat": "--device cuda, on a machine with an NVIDIA GPU",

@@ -5,8 +5,8 @@ an ellipsoid of one standard deviation.
 
 - The hull is the convex hull of the ends of their axes.
 - The surface is watertight, follows hollows, and has no cavity. The ellipsoids fill voxels; gaps between these are
-  closed and what they enclose is filled; marching cubes at half of the smoothed filling make the triangles. A Poisson
-  surface would need normals, which Gaussians do not have.
+  closed and what they enclose is filled; marching cubes at half of the smoothed filling make the triangles.
+- The Poisson surface is closed also where no camera looked: `gsseg_core.export.poisson_surface`.
 """
 
 from __future__ import annotations
@@ -15,14 +15,15 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.errors import SettingsError
+from gsseg_core.export.poisson_surface import Voxels, poisson_surface
 from gsseg_core.objects.oriented_boxes import without_floaters
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.quaternions import rotations
 from gsseg_core.scene.triangle_mesh import TriangleMesh
 from gsseg_core.segmentation import Segmentation
 
-HULL, SURFACE = "hull", "surface"
-KINDS = (HULL, SURFACE)
+HULL, SURFACE, POISSON = "hull", "surface", "poisson"
+KINDS = (HULL, SURFACE, POISSON)
 
 OPAQUE = 0.1
 """Opacity from which on a Gaussian is solid."""
@@ -31,18 +32,19 @@ VOXELS = 64
 """Of a surface, along the longest side of the object."""
 
 _MARGIN, _CLOSED, _SAMPLES, _AT_ONCE = 4, 2, 128, 1 << 14
+_ROOM = 16  # voxels around a Poisson surface, whose grid goes on with its other side
 
 
 def check_collision(kind: str | None) -> None:
     """Raise `SettingsError` if there is no such kind of mesh, or the library that makes it is not installed."""
     if kind is not None and kind not in KINDS:
         raise SettingsError(f"collision is {kind!r}; expected one of {', '.join(KINDS)}")
-    if kind == SURFACE:
+    if kind in (SURFACE, POISSON):
         try:
             import skimage.measure  # noqa: F401
         except ImportError as error:
             raise SettingsError(
-                "collision surface: needs scikit-image, which is not installed; expected: pip install 'gsseg[usd]'"
+                f"collision {kind}: needs scikit-image, which is not installed; expected: pip install 'gsseg[usd]'"
             ) from error
 
 
@@ -80,7 +82,7 @@ def collision_mesh(
     if not len(index):
         return None
     kept = without_floaters(scene.means[index].astype(np.float64), scene.opacities[index] * confidence[index])
-    make = _hull if kind == HULL else _surface
+    make = {HULL: _hull, SURFACE: _surface, POISSON: _poisson}[kind]
     return make(scene.means[index[kept]], _half_axes(scene, index[kept]))
 
 
@@ -115,25 +117,42 @@ def _surface(
 ) -> TriangleMesh | None:
     """Watertight surface around ellipsoids; None where they have no extent."""
     from scipy import ndimage
-    from skimage.measure import marching_cubes
 
+    voxels = _filled(means, half_axes)
+    if voxels is None:
+        return None
+    filled = ndimage.binary_fill_holes(ndimage.binary_closing(voxels.filled, iterations=_CLOSED))
+    smooth = ndimage.gaussian_filter(filled.astype(np.float32), 1.0)
+    return voxels.mesh(smooth, 0.5 * float(smooth.max()))
+
+
+def _poisson(
+    means: npt.NDArray[np.float32],  # (M, 3)
+    half_axes: npt.NDArray[np.float32],  # (M, 3, 3)
+) -> TriangleMesh | None:
+    """Poisson surface of ellipsoids, and where they have no inside, the surface around them."""
+    voxels = _filled(means, half_axes, _ROOM)
+    mesh = None if voxels is None else poisson_surface(means, half_axes, voxels)
+    return mesh or _surface(means, half_axes)
+
+
+def _filled(
+    means: npt.NDArray[np.float32],  # (M, 3)
+    half_axes: npt.NDArray[np.float32],  # (M, 3, 3)
+    margin: int = _MARGIN,
+) -> Voxels | None:
+    """Voxels that ellipsoids fill; None where they have no extent."""
     reach = np.linalg.norm(half_axes, axis=2)  # (M, 3): of an ellipsoid along x, y, z
     low, high = (means - reach).min(axis=0), (means + reach).max(axis=0)
     voxel = float((high - low).max()) / VOXELS
     if not voxel > 0:
         return None
-    shape = np.ceil((high - low) / voxel).astype(np.int64) + 1 + 2 * _MARGIN
-    filled = np.zeros(shape, bool)
+    shape = np.ceil((high - low) / voxel).astype(np.int64) + 1 + 2 * margin
+    voxels = Voxels(np.zeros(shape, bool), low, voxel, margin)
     for first in range(0, len(means), _AT_ONCE):
         own = slice(first, first + _AT_ONCE)
-        inside = means[own, None] + np.einsum("sk,mjk->msj", _BALL, half_axes[own])  # (m, samples, 3)
-        cells = ((inside - low) / voxel).astype(np.int64) + _MARGIN
-        filled[tuple(cells.reshape(-1, 3).T)] = True
-    filled = ndimage.binary_fill_holes(ndimage.binary_closing(filled, iterations=_CLOSED))
-    smooth = ndimage.gaussian_filter(filled.astype(np.float32), 1.0)
-    points, triangles, _, _ = marching_cubes(smooth, 0.5 * float(smooth.max()), gradient_direction="ascent")
-    points = (points - _MARGIN + 0.5) * voxel + low  # middles of voxels
-    return TriangleMesh(points.astype(np.float32), triangles.astype(np.int32))
+        voxels.filled[voxels.cells(means[own, None] + np.einsum("sk,mjk->msj", _BALL, half_axes[own]))] = True
+    return voxels
 
 
 def _ball(count: int) -> npt.NDArray[np.float32]:

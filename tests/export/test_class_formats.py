@@ -15,7 +15,7 @@ from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table
 
 from gsseg_core.errors import EmptySceneError, SettingsError
 from gsseg_core.export.class_files import class_file_name, export_classes, write_selection
-from gsseg_core.export.collision import HULL, KINDS, SURFACE, collision_meshes
+from gsseg_core.export.collision import HULL, KINDS, POISSON, SURFACE, collision_meshes
 from gsseg_core.files.run_folder import RUN_FILE
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -95,7 +95,7 @@ def test_every_object_but_the_background_has_a_closed_mesh(tmp_path: Path, kind:
     for k, path in enumerate(meshes, start=1):
         mesh = trimesh.load(path, force="mesh")
         assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
-        assert mesh.is_convex or kind == SURFACE
+        assert mesh.is_convex or kind != HULL
         own = SCENE.means[k == TRUTH]
         np.testing.assert_allclose(mesh.bounds, [own.min(axis=0) - 0.09, own.max(axis=0) + 0.09], atol=0.04)
         assert path.read_text().startswith("# gsseg_run ")
@@ -120,6 +120,45 @@ def test_a_surface_follows_a_hollow_that_a_hull_closes() -> None:
         volumes[kind] = closed.volume
     ring_volume = np.pi * (1.05**2 - 0.75**2) * 0.3
     assert abs(volumes[SURFACE] / ring_volume - 1) < 0.15 and volumes[HULL] > 1.8 * volumes[SURFACE]
+    assert abs(volumes[POISSON] / ring_volume - 1) < 0.1
+
+
+def shells(points: np.ndarray, scale: float | tuple[float, float, float]) -> tuple[GaussianScene, Segmentation]:
+    """A scene of nothing but one object, Gaussians of one size at these places (M, 3)."""
+    count = len(points)
+    scales = np.broadcast_to(scale, (count, 3))
+    scene = GaussianScene.from_arrays(
+        points, np.tile([1.0, 0, 0, 0], (count, 1)), scales, np.full(count, 0.9), np.zeros((count, 1, 3))
+    )
+    codes = np.tile(np.float32([0, 1]), (count, 1))
+    names = {0: "background", 1: "thing"}
+    return scene, Segmentation.from_codes(scene, codes, names, RefineSettings(cluster=False))
+
+
+def test_a_poisson_surface_closes_a_box_without_a_bottom_and_leaves_a_bowl_hollow() -> None:
+    rng = np.random.default_rng(0)
+    walls = []
+    for axis, side in ((0, -1), (0, 1), (1, -1), (1, 1), (2, 1)):
+        wall = rng.uniform(-1, 1, (800, 3))
+        wall[:, axis] = side
+        walls.append(wall)
+    half = rng.normal(size=(1500, 3))
+    half = np.abs(half / np.linalg.norm(half, axis=1, keepdims=True)) * [1, 1, -1]
+    half[:, :2] *= rng.choice([-1, 1], (1500, 2))
+    bowl = np.concatenate([half, 0.85 * half])
+    for points, scale, volume in (
+        (np.concatenate(walls), 0.04, 8 * 1.04**3), (bowl, 0.03, 2 / 3 * np.pi * (1.03**3 - 0.82**3))
+    ):  # fmt: skip
+        mesh = collision_meshes(*shells(points, scale), POISSON)[1]
+        closed = trimesh.Trimesh(mesh.points, mesh.triangles)
+        assert closed.is_watertight and closed.body_count == 1 and closed.volume == pytest.approx(volume, rel=0.1)
+
+
+def test_a_sheet_that_is_seen_from_both_sides_gets_the_surface_around_it() -> None:
+    x, y = (side.ravel() for side in np.meshgrid(np.linspace(-1, 1, 30), np.linspace(-1, 1, 30)))
+    sheet = shells(np.stack([x, y, 0 * x], axis=1), (0.05, 0.05, 0.002))
+    around, found = (collision_meshes(*sheet, kind)[1] for kind in (SURFACE, POISSON))
+    np.testing.assert_array_equal(around.points, found.points)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -184,7 +223,7 @@ def test_a_selection_in_usd_keeps_its_classes_apart(tmp_path: Path) -> None:
 def test_a_format_or_mesh_that_is_not_there_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="format is 'obj'"):
         export_classes(SCENE, segmented(), tmp_path / "out", "obj")
-    with pytest.raises(SettingsError, match="collision is 'box'; expected one of hull, surface"):
+    with pytest.raises(SettingsError, match="collision is 'box'; expected one of hull, surface, poisson"):
         export_classes(SCENE, segmented(), tmp_path / "out", "ply", "box")
     assert not (tmp_path / "out").exists()
 

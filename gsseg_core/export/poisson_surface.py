@@ -1,0 +1,139 @@
+"""The Poisson surface of an object: closed also where no camera looked, as on an underside.
+
+Gaussians have no normals, so these are made first. A Gaussian's *free direction* is the mean of the directions from
+which it is seen past the others, and its normal is that direction as the Gaussian's shape turns it, towards its thin
+axis: Sigma^-1 d. The rest is as in Kazhdan, Bolitho & Hoppe, *Poisson surface reconstruction* (2006), on a regular
+grid, where the equation is a division in the frequency domain: the function whose gradient is nearest to the normals is
+high inside and low outside, and the surface is where it has the mean of its values at the Gaussians.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gsseg_core.scene.triangle_mesh import TriangleMesh
+
+_DIRECTIONS, _DISC = 96, 32
+_THINNEST = 1e-2  # of the longest half axis
+_SMOOTH, _DENSITY = 1.0, 2.0  # voxels
+_APART = 1e-2  # of the range of values
+_HELD = 0.5  # share of the Gaussians that a surface holds, or it is none of theirs
+
+
+class Voxels(NamedTuple):
+    """What ellipsoids fill: middle of voxel i is low + (i - margin + 0.5) * size."""
+
+    filled: npt.NDArray[np.bool_]  # (X, Y, Z)
+    low: npt.NDArray[np.float32]  # (3,)
+    size: float
+    margin: int
+
+    def cells(self, points: npt.NDArray[np.floating]) -> tuple[npt.NDArray[np.int64], ...]:
+        """Find the voxels that points (..., 3) are in: their indices."""
+        found = ((points - self.low) / self.size).astype(np.int64) + self.margin
+        return tuple(np.moveaxis(np.clip(found, 0, np.array(self.filled.shape) - 1), -1, 0))
+
+    def mesh(self, values: npt.NDArray[np.floating], level: float) -> TriangleMesh:
+        """Make a mesh of the places where values (X, Y, Z), high inside, cross a level."""
+        from skimage.measure import marching_cubes
+
+        points, triangles, _, _ = marching_cubes(values, level, gradient_direction="ascent")
+        points = (points - self.margin + 0.5) * self.size + self.low
+        return TriangleMesh(points.astype(np.float32), triangles.astype(np.int32))
+
+
+def poisson_surface(
+    means: npt.NDArray[np.float32],  # (M, 3)
+    half_axes: npt.NDArray[np.float32],  # (M, 3, 3)
+    voxels: Voxels,
+) -> TriangleMesh | None:
+    """Close a surface around ellipsoids; None where they have no inside, as a sheet that is seen from both sides.
+
+    It goes through those ends of ellipsoids that point outwards.
+    """
+    from scipy import ndimage
+
+    normals = _normals(means, half_axes, voxels)
+    seen = np.flatnonzero(np.abs(normals).max(axis=1) > 0)
+    if not len(seen):
+        return None
+    axes = np.take_along_axis(half_axes, np.argsort(np.linalg.norm(half_axes, axis=1))[:, None], axis=2)[seen]
+    # Where each is farthest out, about there.
+    reach = np.linalg.norm(np.einsum("mjk,mj->mk", half_axes[seen], normals[seen]), axis=1)
+    tips = means[seen] + reach[:, None] * normals[seen]
+    discs = tips[:, None] + np.einsum("sk,mjk->msj", _disc(), axes[:, :, 1:])  # (m, samples, 3)
+    area = np.prod(np.linalg.norm(axes[:, :, 1:], axis=1), axis=1).repeat(_DISC)
+    cells = tuple(axis.ravel() for axis in voxels.cells(discs))
+    density = np.zeros(voxels.filled.shape)
+    np.add.at(density, cells, area)
+    weight = area / np.maximum(ndimage.gaussian_filter(density, _DENSITY)[cells], 1e-30)
+    field = np.zeros((3, *voxels.filled.shape))
+    for i in range(3):
+        np.add.at(field[i], cells, weight * normals[seen, i].repeat(_DISC))
+    inside = _potential(field)
+    level = float(np.average(inside[cells], weights=weight))
+    pieces, _ = ndimage.label(inside > level)
+    held = np.unique(pieces[voxels.cells(means)])
+    solid = ndimage.binary_fill_holes(np.isin(pieces, held[held > 0]))
+    beyond = np.ones(solid.shape, bool)
+    beyond[(slice(voxels.margin // 2, -voxels.margin // 2),) * 3] = False
+    if solid[beyond].any() or ndimage.binary_dilation(solid)[voxels.cells(means)].mean() < _HELD:
+        return None
+    # Other pieces end below the level, and hollows above; nothing is so near to it that triangles lose their area.
+    away = np.maximum(np.abs(inside - level), _APART * float(np.ptp(inside)))
+    return voxels.mesh(np.where(solid, away, -away), 0.0)
+
+
+def _normals(
+    means: npt.NDArray[np.float32],  # (M, 3)
+    half_axes: npt.NDArray[np.float32],  # (M, 3, 3)
+    voxels: Voxels,
+) -> npt.NDArray[np.float64]:
+    """Find unit normals (M, 3), outwards; 0 of a Gaussian that is seen from nowhere."""
+    solid = (np.argwhere(voxels.filled) - voxels.margin + 0.5) * voxels.size + voxels.low
+    cell, free = 1.5 * voxels.size, np.zeros(means.shape)
+    for direction in _sphere():
+        across = np.linalg.svd(direction[None])[2][1:]  # (2, 3)
+        pixel, own = (np.floor(points @ across.T / cell).astype(np.int64) for points in (solid, means))
+        pixel, own = pixel - pixel.min(axis=0), np.clip(own - pixel.min(axis=0), 0, np.ptp(pixel, axis=0))
+        front = np.full(pixel.max(axis=0) + 1, -np.inf)
+        np.maximum.at(front, tuple(pixel.T), solid @ direction)
+        reach = np.linalg.norm(np.einsum("mjk,j->mk", half_axes, direction), axis=1)
+        free += (means @ direction + reach >= front[tuple(own.T)] - 2 * voxels.size)[:, None] * direction
+    lengths = np.linalg.norm(half_axes, axis=1)  # (M, 3)
+    turned = np.einsum("mjk,mj->mk", half_axes / np.maximum(lengths, 1e-30)[:, None], free)
+    turned /= np.maximum(lengths, _THINNEST * lengths.max(axis=1, keepdims=True) + 1e-30) ** 2
+    normals = np.einsum("mjk,mk->mj", half_axes / np.maximum(lengths, 1e-30)[:, None], turned)
+    norms = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.where(norms > 0, normals / np.maximum(norms, 1e-300), 0)
+
+
+def _potential(field: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:  # (3, X, Y, Z)
+    """Find the function (X, Y, Z) whose gradient is nearest to the field turned round, both smoothed."""
+    from scipy import fft
+
+    shape = field.shape[1:]
+    waves = [2 * np.pi * fft.fftfreq(n) for n in shape[:2]] + [2 * np.pi * fft.rfftfreq(shape[2])]
+    k = np.stack(np.meshgrid(*waves, indexing="ij"))
+    squared = (k**2).sum(axis=0)
+    divergence = sum(1j * k[i] * fft.rfftn(field[i]) for i in range(3))
+    solved = np.where(squared > 0, divergence / np.maximum(squared, 1e-12), 0) * np.exp(-(_SMOOTH**2) * squared / 2)
+    potential: npt.NDArray[np.float64] = fft.irfftn(solved, shape)
+    return potential
+
+
+def _sphere() -> npt.NDArray[np.float64]:
+    """Directions (D, 3) spread evenly, on a Fibonacci spiral."""
+    i = np.arange(_DIRECTIONS) + 0.5
+    z, turn = 1 - 2 * i / _DIRECTIONS, np.pi * (1 + 5**0.5) * i
+    return np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
+
+
+def _disc() -> npt.NDArray[np.float64]:
+    """Points (S, 2) spread evenly over a disc of radius 0.7, half as large as the unit disc."""
+    i = np.arange(_DISC) + 0.5
+    turn = np.pi * (1 + 5**0.5) * i
+    return 0.7 * np.sqrt(i / _DISC)[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
