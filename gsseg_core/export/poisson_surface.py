@@ -136,4 +136,5 @@ def _disc() -> npt.NDArray[np.float64]:
     """Points (S, 2) spread evenly over a disc of radius 0.7, half as large as the unit disc."""
     i = np.arange(_DISC) + 0.5
     turn = np.pi * (1 + 5**0.5) * i
-    return 0.7 * np.sqrt(i / _DISC)[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    points: npt.NDArray[np.float64] = 0.7 * np.sqrt(i / _DISC)[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    return points
