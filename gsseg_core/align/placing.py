@@ -175,14 +175,17 @@ def find_alignment(
     agreeing: list[Found] = []
     # Masks say less than photos do: on a shelf, regions may lie well enough from a wrong side, too.
     if before.agrees and photos:
-        agreeing.append(_closer(scene, views, shown, Found(Alignment(), before, before), settings, device))
-        if _is_close(agreeing[-1], settings):
-            return agreeing[-1]
+        as_they_are = _closer(scene, views, shown, Found(Alignment(), before, before), settings, device)
+        # Nothing was compared with it yet, and round a table other sides look alike.
+        if as_they_are.offset_px is not None and as_they_are.offset_px <= _CLOSE_PX:
+            return as_they_are
+        agreeing.append(as_they_are)
     alignment = Alignment(find_convention(scene, shown, settings, device, progress))
     if (reached := _through(scene, shown, alignment, settings, device)).agrees:
-        agreeing.append(_closer(scene, views, shown, Found(alignment, reached, before), settings, device))
-        if _is_close(agreeing[-1], settings):
-            return agreeing[-1]
+        by_convention = _closer(scene, views, shown, Found(alignment, reached, before), settings, device)
+        if by_convention.offset_px is None or by_convention.offset_px <= settings.reprojection_px:
+            return by_convention
+        agreeing.append(by_convention)
     if not photos:
         raise AlignmentError(
             f"alignment: no convention of axes has scene and masks agree ({reached} at best); expected photos of the "
@@ -194,11 +197,6 @@ def find_alignment(
         if not agreeing:
             raise
     return max(agreeing, key=lambda found: found.agreement.score)
-
-
-def _is_close(found: Found, settings: AlignSettings) -> bool:
-    """Whether photos and renderings lie upon each other, as far as is known: round a table, other sides look alike."""
-    return found.offset_px is None or found.offset_px <= settings.reprojection_px
 
 
 def _registered(
