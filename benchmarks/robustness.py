@@ -40,6 +40,7 @@ from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.mask_reliability import check_views
 from gsseg_core.learn.registry import make_learner
+from gsseg_core.report.pictures import ViewImages
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.warm_up import warm_up
@@ -323,7 +324,8 @@ def measure_reliability(benches: Sequence[Bench], pictures: Path, aside: Path) -
         plots[bench.name] = {"views": list(zip(true.tolist(), told.tolist(), strict=True))}
         # The real scene may be looked at, but not handed on.
         folder = pictures if bench.name.startswith("demo") else aside
-        save_small(folder / "worst_views.png", draw_worst_views(learner.scene, learner.views, checks, 2))
+        images = ViewImages(learner.scene)
+        save_small(folder / "worst_views.png", draw_worst_views(images.rendered, learner.views, checks, 2))
     share = Axis("true share of right pixels", 0, 1, 0.25)
     draw_panels(pictures / "reliability.svg", plots, share, replace(share, name="reliability"), lines=False)
     header = ["scene", "views", "rank correlation", "worst found", "bias", "mean error", "largest error", "seconds"]

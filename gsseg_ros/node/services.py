@@ -23,7 +23,6 @@ from gsseg_core.export.class_files import mesh_file_name, write_classes
 from gsseg_core.export.collision import check_collision, collision_meshes
 from gsseg_core.export.summary import RunReport
 from gsseg_core.files.json_files import write_json
-from gsseg_core.live.per_view_session import PerViewSession
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.scene_writers import check_format
 from gsseg_core.segmentation import Segmentation
@@ -344,7 +343,11 @@ class Services:
     def _at_level(self, result: Segmentation, run: Run, with_tree: bool = False) -> Segmentation:
         """Cut a result at the level that the parameter granularity chooses; the objects have a tree only on request."""
         session, granularity = self.workspace.session, self.workspace.settings.granularity
-        if not isinstance(session, PerViewSession) or (granularity < 0 and not with_tree):
+        if granularity < 0 and not with_tree:
+            return result
+        from gsseg_core.live.per_view_session import PerViewSession  # Others start without SciPy.
+
+        if not isinstance(session, PerViewSession):
             return result
         with run.watch.stage("parts"):
             return session.at_level(result, granularity if granularity >= 0 else None)

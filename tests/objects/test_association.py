@@ -34,6 +34,7 @@ from gsseg_core.objects.lifted_segments import Lifted
 from gsseg_core.objects.object_table import ObjectTable, find_objects
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.segmentation import Segmentation
 
 SCENE, TRUTH = balls_on_a_table()
 VIEWS = clean_views(8)
@@ -69,7 +70,9 @@ def test_an_object_that_some_views_split_is_one() -> None:
     table = find_objects(SCENE, views)
     assert table.num_objects == 3 and agreement(table, VIEWS) == 1.0
     assert [table.alignment(view.name).split for view in VIEWS] == [1, 0, 0, 1, 0, 0, 1, 0]
-    assert table.summary()["split"] == 3 and table.summary()["merged"] == 0
+    nothing = Segmentation.from_codes(SCENE, np.zeros((len(SCENE), 4), np.float32), table.class_names)
+    summary = table.summary(nothing)
+    assert summary["split"] == 3 and summary["merged"] == 0 and summary["objects"] == 3
 
 
 def test_objects_that_some_views_merge_stay_two() -> None:

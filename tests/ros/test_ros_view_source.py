@@ -49,7 +49,7 @@ def test_live_codes_are_those_of_the_node_wherever_the_scene_lies_in_the_map(ros
             update = next_update(source)
             client.export("out", filter=False)
         truth = Segmentation.load(tmp_path / "out/segmentation.npz", scene)
-        labels, probabilities, names = update.labelling
+        labels, probabilities, names, _ = update.labelling
         assert names == NAMES and update.num_views == 4
         truth = truth.filtered(scene, PAPER)
         assert np.array_equal(labels, np.where(truth.labels == REMOVED, UNOBSERVED, truth.labels))
