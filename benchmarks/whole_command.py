@@ -33,7 +33,7 @@ LEARNING = ("observe", "learn")
 def main() -> int:
     """Write the workload, run the trees in turn, and print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--workload", choices=("a", "c", "d", "e"), default="a", help="as benchmarks/workloads.py has them")
+    parser.add_argument("--workload", choices=("a", "c", "d", "e"), default="a", help="of benchmarks/workloads.py")
     parser.add_argument("--share", type=float, default=1.0, help="of its Gaussians, views and pixels")
     parser.add_argument("--data", type=Path, help="a dataset folder with its scene.ply, in place of a workload")
     parser.add_argument("--labels", default="labels_noisy", help="folder of the masks")

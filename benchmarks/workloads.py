@@ -148,7 +148,7 @@ WHOLE = {
     "d": RoomSize(6_000_000, 300, 20, 1600, 1064, sh_degree=3, outdoors=True),
     "e": RoomSize(3_000_000, 60, 20, 1600, 1064, sh_degree=1),
 }
-"""Workloads of the whole command: (e) is (a) at the size of real captures, (c) is what people capture outdoors, (d) the largest of it."""
+"""Workloads of the whole command: (c) is what people capture outdoors, (d) the largest of it, (e) a large room."""
 
 
 def write_room(folder: Path, size: RoomSize, *, wrong: bool = False, seed: int = 0) -> Path:
