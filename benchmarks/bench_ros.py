@@ -20,6 +20,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from gsseg_msgs.action import Learn
 from gsseg_msgs.srv import Export, Reset, Segment
+from lifecycle_msgs.srv import GetState
 from rcl_interfaces.srv import SetParameters
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
@@ -118,6 +120,11 @@ class Robot:
         """Change a setting of the refinement, so that nothing kept from before can be the answer."""
         request = SetParameters.Request(parameters=[Parameter("beta", value=beta).to_parameter_msg()])
         self.call(SetParameters, "set_parameters", request)
+
+    def wait_until_active(self) -> None:
+        """Wait until the node has loaded its scene; its services are there before that."""
+        state = partial(self.call, GetState, "get_state", GetState.Request())
+        self.wait(lambda: state().current_state.label == "active", "the node to be active")
 
     def settled(self) -> None:
         """Wait until all that was received has been fused or rejected."""
@@ -214,6 +221,7 @@ def real_scene(robot: Robot, wanted: list[str], folder: Path) -> None:
 
 def fuse(robot: Robot, data: str, rate: float) -> None:
     """Replay once and count what was fused."""
+    robot.wait_until_active()
     robot.call(Reset, "reset", Reset.Request())
     before = int(robot.status.get("views accepted", 0)), int(robot.status.get("queue drops", 0))
     robot.replay({"data": data, "rate": rate})
