@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,11 +17,10 @@ import pytest
 from browser import opened_page, screenshot
 from parts_of_balls import tree_of_balls
 from patience import PATIENCE
-from small_scenes import NAMES, balls_on_a_table, clean_views, write_dataset
+from small_scenes import NAMES, clean_views, write_dataset
 
 from gsseg_core.cli.main import main
 from gsseg_core.errors import SettingsError
-from gsseg_core.export.pictures import FILL
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.viewer.access import listen
@@ -30,76 +29,25 @@ from gsseg_core.viewer.model import BY_RELIABILITY, TRUE_COLOURS, Labelling, Vie
 
 pytest.importorskip("viser")
 
+from shown_viewer import SCENE, TRUTH, Shown, on_a_page
+
 from gsseg_core.viewer import clients, splats
 from gsseg_core.viewer.clients import AUTO, BROWSER, SERVER
 from gsseg_core.viewer.viewer import Viewer
 from gsseg_core.viewer.viewpoint import camera_of
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Browser
 
-SCENE, TRUTH = balls_on_a_table()
 LEARNT = Labelling(TRUTH.astype(np.int32), np.eye(4, dtype=np.float32)[TRUTH] * np.float32(0.9), dict(NAMES))
-
-
-class Shown:
-    """A viewer, and a page of it."""
-
-    def __init__(self, viewer: Viewer, page: Page) -> None:
-        self.viewer, self.page = viewer, page
-
-    @property
-    def client(self) -> Any:
-        return next(iter(self.viewer.server.get_clients().values()))
-
-    def picture(self) -> np.ndarray:
-        """The part of the page that the panel leaves free, (H, W, 3)."""
-        return screenshot(self.page)[200:, :600].astype(int)
-
-    def wait(self, condition: Callable[[], Any], what: str) -> None:
-        deadline = time.monotonic() + PATIENCE
-        while not condition():
-            assert time.monotonic() < deadline, f"waited {PATIENCE:g} s in vain for {what}"
-            self.page.wait_for_timeout(50)
-
-    def looks_like(self, label: int) -> bool:
-        """Whether the colour of a class is anywhere in the picture."""
-        hue = self.picture() - self.picture().mean(axis=2, keepdims=True)
-        color = np.array(self.viewer.state.model.color(label))
-        return int((np.abs(hue - FILL * (color - color.mean())).max(axis=2) < 12).sum()) > 40
-
-    def pixel_of(self, label: int) -> tuple[float, float]:
-        """Where the middle of a class is on the page."""
-        camera = camera_of(self.client)
-        (uv,), _ = camera.project(SCENE.means[label == TRUTH].mean(axis=0, keepdims=True))
-        return float(uv[0]), float(uv[1])
-
-    def press(self, name: str, nth: int = 0) -> None:
-        self.page.get_by_role("button", name=name).nth(nth).click()
-
-    def pressing(self, did: str, does: str) -> None:
-        """Choose what a press on a class does."""
-        self.page.locator(f"input[role=combobox][value='{did}']").click()
-        self.page.get_by_role("option", name=does).click()
-
-    def tab(self, name: str) -> None:
-        self.page.get_by_role("tab", name=name).click()
-
-    def says(self, text: str) -> None:
-        self.page.get_by_text(text).first.wait_for(timeout=PATIENCE * 1000)
 
 
 @pytest.fixture(scope="module", params=[BROWSER, SERVER])
 def opened(chromium: Browser, request: pytest.FixtureRequest) -> Iterator[Shown]:
     views = clean_views(3)
     reliability = {view.name: 0.2 + 0.3 * i for i, view in enumerate(views)}
-    # three.js complains of the splats' own geometry, which is flat, wherever one points at it.
     viewer = Viewer(ViewModel(SCENE, LEARNT), views, reliability, listener=listen(port=18080), draw=request.param)
-    with closing(viewer), opened_page(chromium, 960, 640, tolerated="computeBoundingSphere") as page:
-        page.goto(viewer.url)
-        shown = Shown(viewer, page)
-        shown.wait(lambda: viewer.server.get_clients(), "the page")
-        shown.wait(lambda: shown.looks_like(1), "the first picture")
+    with on_a_page(viewer, chromium) as shown:
         yield shown
 
 
@@ -197,11 +145,8 @@ def test_a_click_tells_the_class_its_probabilities_and_the_views_that_voted_for_
 def test_a_click_on_an_object_offers_its_parts_and_a_level_can_be_chosen(chromium: Browser) -> None:
     model = ViewModel(SCENE, LEARNT, class_ids=tuple(NAMES), tree=tree_of_balls())
     viewer = Viewer(model, listener=listen(port=18080), draw=SERVER)
-    with closing(viewer), opened_page(chromium, 960, 640, tolerated="computeBoundingSphere") as page:
-        page.goto(viewer.url)
-        shown = Shown(viewer, page)
-        shown.wait(lambda: viewer.server.get_clients(), "the page")
-        shown.wait(lambda: shown.looks_like(1), "the first picture")
+    with on_a_page(viewer, chromium) as shown:
+        page = shown.page
         assert not page.get_by_role("button", name="its parts").is_visible()
         page.mouse.click(*shown.pixel_of(1))
         shown.press("its parts")
@@ -339,10 +284,7 @@ def test_a_browser_gets_images_until_it_has_shown_that_it_draws_fast(
 ) -> None:
     monkeypatch.setattr(clients, "SLOW", limit)
     viewer = Viewer(ViewModel(SCENE, LEARNT), clean_views(1), listener=listen(port=18080), draw=AUTO)
-    with closing(viewer), opened_page(chromium, 960, 640, tolerated="computeBoundingSphere") as page:
-        page.goto(viewer.url)
-        shown = Shown(viewer, page)
-        shown.wait(lambda: shown.looks_like(1), "the first picture")
+    with on_a_page(viewer, chromium) as shown:
         (renderer,) = viewer.renderers.by_client.values()
         if draws:
             shown.wait(lambda: renderer.frames is None, "the browser to draw")
