@@ -23,7 +23,8 @@ from gsseg_core.progress import Progress as Progress
 from gsseg_core.progress import silent as silent
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.observation import Observation
-from gsseg_core.raster.view_operator import PixelGrid, Strongest, ViewOperator
+from gsseg_core.raster.view_operator import ViewOperator
+from gsseg_core.raster.view_renderer import PixelGrid, Strongest
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 VOTE_UNIT = 2.0**-24  # votes are counted in whole multiples of this many px, so that adding and taking back are exact

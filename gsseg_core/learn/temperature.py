@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsseg_core.raster.view_operator import PixelGrid
+from gsseg_core.raster.view_renderer import PixelGrid
 
 LOWEST, HIGHEST = 0.2, 5.0  # temperatures that are tried
 VIEWS = 16  # views whose masks the temperature is fitted to, at most

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from gsseg_core.raster.view_operator import Blended, ViewOperator
+from gsseg_core.raster.view_operator import ViewOperator
+from gsseg_core.raster.view_renderer import Blended
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 

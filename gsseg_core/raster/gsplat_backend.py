@@ -24,7 +24,8 @@ from gsseg_core.csr_rows import starts
 from gsseg_core.errors import SettingsError
 from gsseg_core.raster.constants import ALPHA_MAX, ALPHA_MIN, CHANNELS, DILATION, NEAR, T_MIN, TINY
 from gsseg_core.raster.observation import Observation, VoteShares
-from gsseg_core.raster.view_operator import Blended, ViewOperator
+from gsseg_core.raster.view_operator import ViewOperator
+from gsseg_core.raster.view_renderer import Blended
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
@@ -13,11 +13,9 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence, vote_units
 from gsseg_core.errors import SceneValueError
 from gsseg_core.raster.constants import AHEAD
+from gsseg_core.raster.view_renderer import ViewRenderer
 from gsseg_core.scene.camera import Camera
 from gsseg_core.simd import prefetch
-
-if TYPE_CHECKING:
-    from gsseg_core.raster.view_operator import ViewOperator
 
 
 class VoteShares(NamedTuple):
@@ -89,7 +87,7 @@ class Observation(ABC):
         return out
 
     @abstractmethod
-    def operator(self, camera: Camera, num_gaussians: int) -> ViewOperator:
+    def operator(self, camera: Camera, num_gaussians: int) -> ViewRenderer:
         """Make the operator of the view again, to blend codes: what pixels without a label show has no meaning.
 
         Nothing is projected. Camera and number of Gaussians are those of the operator that it was observed with.

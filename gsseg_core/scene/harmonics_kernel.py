@@ -8,16 +8,14 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.kernel_cache import called_by_kernels
-from gsseg_core.scene.spherical_harmonics import C0, MAX_DEGREE
 from gsseg_core.simd import prefetch
 
-_C0, _C1, _C2 = np.float32(C0), np.float32(sqrt(3 / (4 * pi))), np.float32(sqrt(15 / (4 * pi)))
+_C0, _C1, _C2 = np.float32(sqrt(1 / (4 * pi))), np.float32(sqrt(3 / (4 * pi))), np.float32(sqrt(15 / (4 * pi)))
 _C2_MIDDLE, _C2_HALF = np.float32(sqrt(5 / (16 * pi))), np.float32(sqrt(15 / (16 * pi)))
 _C3_SIDE, _C3_INNER = np.float32(sqrt(35 / (32 * pi))), np.float32(sqrt(21 / (32 * pi)))
 _C3_MIDDLE = np.float32(sqrt(7 / (16 * pi)))
 _C3_ALL, _C3_HALF = np.float32(sqrt(105 / (4 * pi))), np.float32(sqrt(105 / (16 * pi)))
 _TWO, _THREE, _FOUR = np.float32(2), np.float32(3), np.float32(4)
-_BANDS = (MAX_DEGREE + 1) ** 2
 _LEAST = np.finfo(np.float32).tiny  # of a length
 _CHUNKS = 64
 _AHEAD = 12  # Gaussians between the one that is worked on and the one that is fetched from memory
@@ -59,7 +57,7 @@ def seen_colors(
     out = np.empty((count, 3), np.float32)
     second, third = coefficients[:, 16:], coefficients[:, 32:]
     for chunk in nb.prange(_CHUNKS):
-        harmonics = np.empty(_BANDS, np.float32)
+        harmonics = np.empty(bands, np.float32)
         for m in range(chunk * count // _CHUNKS, (chunk + 1) * count // _CHUNKS):
             # A row of coefficients is up to four cache lines, anywhere in memory: it is asked for before it is needed.
             i, later = ids[m], ids[min(m + _AHEAD, count - 1)]

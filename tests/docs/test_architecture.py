@@ -1,4 +1,4 @@
-"""The page of the architecture shows the rooms of the import contract, and pages name modules that are there."""
+"""The page of the architecture shows the rooms of the contract, imports go in no circle, what pages name is there."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import sys
 
 import pytest
 from doc_blocks import PAGES, REPOSITORY
+from house import import_circles
 
 sys.path.insert(0, str(REPOSITORY / "docs/gen"))
 rooms = pytest.importorskip("rooms", reason="import-linter is not installed", exc_type=ImportError)
@@ -28,6 +29,10 @@ def test_the_table_of_the_rooms_is_that_of_the_contract_and_the_docstrings() -> 
     assert rooms.PAGE.read_text(encoding="utf-8") == rooms.page(), f"docs/architecture.md: {AGAIN}"
     for folder in (REPOSITORY / "gsseg_core").iterdir():
         assert not (folder / "__init__.py").is_file() or f"| `{folder.name}/` |" in rooms.table(), folder.name
+
+
+def test_no_imports_go_in_a_circle_not_even_for_types_or_within_a_function_or_a_room() -> None:
+    assert import_circles() == []  # The contract orders rooms, and sees nothing of what goes on within one.
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
 import small_scenes
@@ -36,6 +38,7 @@ def slow_tree(features: np.ndarray) -> list[tuple[frozenset[int], float]]:
                 if j < height * width and (j == i + width or j % width)]  # fmt: skip
     out, highest = [], 0.0
 
+    @functools.cache  # All pairs are looked at before every merge, and most of them have been before.
     def price(a: frozenset[int], b: frozenset[int]) -> float:
         border = sum((i in a and j in b) or (i in b and j in a) for i, j in touching)
         apart = ((flat[list(a)].mean(axis=0) - flat[list(b)].mean(axis=0)) ** 2).sum()

@@ -15,7 +15,7 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.errors import MaskSizeError, SceneValueError, SettingsError
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu import blending as blend
-from gsseg_core.raster.view_operator import PixelGrid
+from gsseg_core.raster.view_renderer import PixelGrid
 from gsseg_core.scene.camera import Camera
 
 SIZES = [(37, 21), (16, 16), (33, 50), (70, 5), (1, 1), (1, 40)]

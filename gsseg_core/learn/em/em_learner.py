@@ -41,7 +41,8 @@ from gsseg_core.learn.em.scene_edges import scene_edges
 from gsseg_core.learn.learner import VOTE_UNIT, Learner, Progress, silent
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.observation import Observation
-from gsseg_core.raster.view_operator import PixelGrid, Strongest, ViewOperator
+from gsseg_core.raster.view_operator import ViewOperator
+from gsseg_core.raster.view_renderer import PixelGrid, Strongest, ViewRenderer
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import neighbours_of
 
@@ -227,7 +228,7 @@ class EMLearner(Learner):
         codes, background, operator = self._without(view, only_labelled)
         return operator.strongest(codes, self.num_classes, background, grid)
 
-    def _without(self, view: View, only_labelled: bool) -> tuple[CSRRows, bool, ViewOperator]:
+    def _without(self, view: View, only_labelled: bool) -> tuple[CSRRows, bool, ViewRenderer]:
         """Take the last step of `fit` once more, without a view's mask: codes, N rows, and what to blend them with.
 
         If only its labelled pixels count, what they see is at hand, and all other rows are empty. Between the two is

@@ -18,7 +18,8 @@ from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_OPACITY, WIDTH
 from gsseg_core.raster.cpu.tiling import TILE, Tiles, assign
 from gsseg_core.raster.observation import Observation, VoteShares
-from gsseg_core.raster.view_operator import Blended, PixelGrid, Strongest, ViewOperator
+from gsseg_core.raster.view_operator import ViewOperator
+from gsseg_core.raster.view_renderer import Blended, PixelGrid, Strongest
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 

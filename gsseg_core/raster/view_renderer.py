@@ -1,0 +1,111 @@
+"""A posed view that blends what Gaussians carry, be it by the whole operator or by what an observation kept of it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+import numpy as np
+
+from gsseg_core.csr_rows import CSRRows
+from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.errors import SceneValueError
+from gsseg_core.scene.camera import Camera
+
+
+class Blended(NamedTuple):
+    """A view of the scene."""
+
+    image: np.ndarray  # (H, W, K) float32: codes, blended, W q
+    transmittance: np.ndarray  # (H, W) float32: what is left of each ray after the last Gaussian, in [0, 1]
+
+
+class PixelGrid(NamedTuple):
+    """Some pixels of a view: each `step`-th one of each row and column, from the `first`, below the step, on."""
+
+    first: int
+    step: int
+
+    def of(self, image: np.ndarray) -> np.ndarray:  # (H, W, ...)
+        """Take these pixels of an image."""
+        return image[self.first :: self.step, self.first :: self.step]
+
+
+class Strongest(NamedTuple):
+    """The class that a view shows most of in each pixel."""
+
+    classes: np.ndarray  # (H, W) int32: the column of the largest blended probability
+    known: np.ndarray  # (H, W) float32: what is known of the pixel, the sum of its probabilities
+    some: np.ndarray  # (R, C, K) float32: all probabilities of the pixels of a grid; R and C are 0 without one
+
+    @classmethod
+    def of(cls, image: np.ndarray, grid: PixelGrid | None = None) -> Strongest:  # (H, W, K)
+        """Find it in an image of probabilities."""
+        some = image[:0, :0] if grid is None else grid.of(image)
+        return cls(image.argmax(axis=2).astype(np.int32), image.sum(axis=2), some)
+
+    def labels(self) -> np.ndarray:
+        """Class of each pixel of which more than half is known, (H, W) int32; `UNKNOWN` elsewhere."""
+        return np.where(self.known > 0.5, self.classes, np.int32(UNKNOWN))
+
+
+class ViewRenderer(ABC):
+    """A view of one scene that blends what its Gaussians carry.
+
+    Attributes
+    ----------
+    camera : Camera
+        Where from.
+    num_gaussians : int
+        N, the size of the scene.
+    ids : (M,) int32
+        Gaussians that can reach the image, nearest first.
+    """
+
+    camera: Camera
+    num_gaussians: int
+    ids: np.ndarray
+
+    def render(self, codes: np.ndarray) -> np.ndarray:
+        """Blend into the view anything that a Gaussian carries, as class probabilities, colours or depths: W q.
+
+        Parameters
+        ----------
+        codes : (N, K)
+            One row per Gaussian.
+
+        Returns
+        -------
+        (H, W, K) float32
+
+        Raises
+        ------
+        SceneValueError
+            There is not one row of codes per Gaussian.
+        """
+        return self.blend(codes).image
+
+    def blend(self, codes: np.ndarray) -> Blended:
+        """Render codes (N, K), and return what is left of each ray, in one pass; raises as `render` does."""
+        codes = np.asarray(codes)
+        if codes.ndim != 2 or len(codes) != self.num_gaussians:
+            raise SceneValueError(f"codes have shape {codes.shape}; expected ({self.num_gaussians}, K)")
+        return self.blend_seen(codes.take(self.ids, axis=0))
+
+    @abstractmethod
+    def blend_seen(self, codes: np.ndarray) -> Blended:
+        """Do the same for codes (M, K) of `ids` alone."""
+
+    def blend_rows(self, codes: CSRRows, num_classes: int) -> Blended:
+        """Do the same for codes (N, K) of which only the entries that are not zero are at hand."""
+        return self.blend_seen(codes.take(self.ids).dense(num_classes))
+
+    def strongest(self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid | None = None) -> Strongest:
+        """Find the class of each pixel, from codes (N, K) of which only the entries that are not zero are at hand.
+
+        What a ray has left over is `background`, class 0, or else nothing.
+        """
+        image, left_over = self.blend_rows(codes, num_classes)
+        if background:
+            image[..., 0] += left_over
+        return Strongest.of(image, grid)
