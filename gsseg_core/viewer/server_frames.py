@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from contextlib import suppress
 
 import numpy as np
@@ -35,17 +34,16 @@ class Frames:
     def __init__(self, client: viser.ClientHandle, device: str = "cpu") -> None:
         self._client, self._device = client, device
         self._picture: Picture | None = None
-        self._changed = -RESTS
         self._operators: dict[int, ViewOperator] = {}
         self._stale, self._closing = threading.Event(), threading.Event()
-        client.camera.on_update(lambda camera: self._change())
+        client.camera.on_update(lambda camera: self._stale.set())
         self._thread = threading.Thread(target=self._keep_drawing, name="frames", daemon=True)
         self._thread.start()
 
     def show(self, picture: Picture) -> None:
         """Show a picture from now on."""
         self._picture = picture
-        self._change()
+        self._stale.set()
 
     def close(self) -> None:
         """Draw no more; the last image stays."""
@@ -53,23 +51,21 @@ class Frames:
         self._stale.set()
         self._thread.join()
 
-    def _change(self) -> None:
-        self._changed = time.monotonic()
-        self._stale.set()
-
     def _keep_drawing(self) -> None:
         while self._stale.wait() and not self._closing.is_set():
             self._stale.clear()
             if self._picture is None:
                 continue
-            changing = time.monotonic() - self._changed < RESTS
-            # A window may be so small that nothing can be seen in it; and viser warns of a browser that has just left.
-            with suppress(GssegError, UserWarning):
-                self._send(self._picture, QUICK_ROWS if changing else FINE_ROWS)
-            if changing and not self._stale.wait(RESTS):
-                self._stale.set()
+            self._send(self._picture, QUICK_ROWS)
+            if not self._stale.wait(RESTS):
+                self._send(self._picture, FINE_ROWS)
 
     def _send(self, picture: Picture, rows: int) -> None:
+        # A window may be so small that nothing can be seen in it; and viser warns of a browser that has just left.
+        with suppress(GssegError, UserWarning):
+            self._draw(picture, rows)
+
+    def _draw(self, picture: Picture, rows: int) -> None:
         camera, operator = camera_of(self._client, rows), self._operators.get(rows)
         if operator is None or not _alike(operator.camera, camera):  # While the camera rests, the last one will do.
             operator = self._operators[rows] = make_operator(picture.scene, camera, self._device)

@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from patience import PATIENCE
+from patience import PATIENCE, wait_until
 
 from gsseg_ros.child_nodes import NODES, claimed_domain
 
@@ -80,15 +80,6 @@ def private_context(*args: str) -> Iterator[Context]:
 def own_domain() -> int:
     """A ROS domain for a program that runs for long: 215 to 232, where no tests are."""
     return os.getpid() % 18 + 215
-
-
-def wait_until(condition: Callable[[], Any], what: str, timeout: float = PATIENCE) -> None:
-    """Wait until the condition holds; fails the test, saying what was waited for."""
-    deadline = time.monotonic() + timeout
-    while not condition():
-        if time.monotonic() > deadline:
-            pytest.fail(f"waited {timeout:g} s in vain for {what}")
-        time.sleep(0.01)
 
 
 class Process:

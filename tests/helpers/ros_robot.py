@@ -200,7 +200,7 @@ class Robot:
                 asked_at = time.monotonic()
             return any(question.done() for question in asked)
 
-        self.ros.wait_until(answered, "a first answer of the node", timeout=2 * PATIENCE)
+        self.ros.wait_until(answered, "a first answer of the node", timeout=PATIENCE)
         self._greeted = True
 
     def done(self, service: str, **fields: Any) -> Any:
@@ -229,8 +229,8 @@ class Robot:
         return self.goals[-1]
 
     def outcome(self, goal: Goal) -> tuple[int, Any]:
-        """Wait for the end of a goal; returns status and result. To learn may take a busy machine long."""
-        answer = self.ros.result(goal.future, "the result", 5 * PATIENCE)
+        """Wait for the end of a goal; returns status and result."""
+        answer = self.ros.result(goal.future, "the result", PATIENCE)
         return answer.status, answer.result
 
     def learn(self, **fields: Any) -> tuple[int, Any]:

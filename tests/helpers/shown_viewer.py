@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from browser import opened_page, screenshot
-from patience import PATIENCE
+from patience import PATIENCE, wait_until
 from small_scenes import balls_on_a_table
 
 from gsseg_core.export.pictures import FILL
@@ -37,10 +36,7 @@ class Shown:
         return screenshot(self.page)[200:, :600].astype(int)
 
     def wait(self, condition: Callable[[], Any], what: str) -> None:
-        deadline = time.monotonic() + PATIENCE
-        while not condition():
-            assert time.monotonic() < deadline, f"waited {PATIENCE:g} s in vain for {what}"
-            self.page.wait_for_timeout(50)
+        wait_until(condition, what, pause=lambda: self.page.wait_for_timeout(50))
 
     def looks_like(self, label: int) -> bool:
         """Whether the colour of a class is anywhere in the picture."""

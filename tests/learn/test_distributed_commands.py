@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 from dask_workers import SCENE, SETTINGS, VIEWS, address_fixture, assert_same, changed, client_fixture, distributed  # noqa: F401
-from patience import PATIENCE
+from patience import PATIENCE, wait_until
 from small_scenes import NUM_CLASSES, balls_on_a_table, taught, write_dataset
 
 from gsseg_core.cli.main import main
@@ -228,12 +228,8 @@ def test_the_documented_commands_make_a_cluster_and_its_loss_is_one_clear_error(
 
 def written(path: Path) -> str:
     """The address in a scheduler's file, as soon as it is there."""
-    end = time.monotonic() + PATIENCE
-    while time.monotonic() < end:
-        if path.is_file() and path.stat().st_size:
-            return str(json.loads(path.read_text())["address"])
-        time.sleep(0.1)
-    raise AssertionError(f"{path}: no scheduler in {PATIENCE:g} s")
+    wait_until(lambda: path.is_file() and path.stat().st_size, f"a scheduler that writes {path}")
+    return str(json.loads(path.read_text())["address"])
 
 
 def test_dask_is_not_imported_where_nothing_is_distributed() -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 from ros_fixtures import node_fixture, parameters_fixture, root_fixture, spun  # noqa: F401
 from ros_helpers import Ros, ros_fixture  # noqa: F401
 from ros_robot import Robot, viewpoint
@@ -32,7 +33,7 @@ def test_few_requests_work_some_wait_the_rest_are_busy_and_everything_else_goes_
 
     def wait_and_draw(*arguments: Any, **settings: Any) -> Any:
         at_work.append(1)
-        go_on.wait(60)
+        go_on.wait(PATIENCE)
         return draw(*arguments, **settings)
 
     monkeypatch.setattr(services, "draw", wait_and_draw)
@@ -63,7 +64,7 @@ def test_those_that_wait_are_not_active_any_more_once_the_node_is_not(
     ros: Ros, node: SegmentNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot, go_on, draw = Robot(ros), threading.Event(), services.draw
-    monkeypatch.setattr(services, "draw", lambda *a, **k: go_on.wait(60) and draw(*a, **k))
+    monkeypatch.setattr(services, "draw", lambda *a, **k: go_on.wait(PATIENCE) and draw(*a, **k))
     with spun(node, ros):
         robot.brought_to("inactive")
         assert robot.change("activate")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any
 
 import numpy as np
@@ -106,7 +105,9 @@ def test_the_objects_of_a_run_stay_until_another_view_comes(robot: Robot) -> Non
     _, result = robot.learn()
     heard = robot.ros.collect(ObjectArray, f"{robot.name}/objects", LATCHED)
     robot.ros.wait_until(lambda: heard, "the latched message")
-    time.sleep(OBJECTS_PERIOD + 0.5)
+    told = len(robot.received_status)
+    enough = told + 2 + OBJECTS_PERIOD  # Diagnostics come once a second, by the clock of the node.
+    robot.ros.wait_until(lambda: len(robot.received_status) > enough, "the node to go on for a while")
     assert {array.revision for array in heard} == {result.report.revision}
     robot.drive(clean_views(1))
     robot.ros.wait_until(lambda: heard[-1].revision == 0, "objects of the view")

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 from ros_fixtures import parameters_fixture, root_fixture, running_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_helpers import wait_until
 from ros_robot import CLASSES, LATCHED, Robot, core_session, messages
@@ -109,12 +110,18 @@ def test_the_prediction_is_drawn_over_the_camera_image(
     assert close_to(viewer.picture_of(image.header.stamp), expected)
 
 
-def test_without_camera_images_the_classes_alone_are_drawn(robot: Robot, viewer: Viewer, scene: GaussianScene) -> None:
-    time.sleep(2.5)  # Since the images of other tests, if there were any.
+def test_without_camera_images_the_classes_alone_are_drawn(robot: Robot, scene: GaussianScene) -> None:
+    # A node that has been inactive has seen no image yet, whatever other tests have sent it.
+    assert robot.change("deactivate")
+    robot.ros.wait_until(lambda: not robot.publishers["mask"].get_subscription_count(), "the node to stop listening")
+    assert robot.change("activate")
+    robot.wait_active()
+    viewer = Viewer(robot)
     view = clean_views(6)[0]  # Again, so that nothing depends on whether its own votes are in the codes yet.
     sent = messages(view, robot.next_stamp())
     robot.publish(sent)
     found = viewer.picture_of(sent["mask"].header.stamp)
+    viewer.close()
     assert close_to(found, palette(4)[labels_of(scene, clean_views(6), view.camera)])
 
 
@@ -180,21 +187,26 @@ class Shown:
     def publish_overlay(self, image: Image, wanted: Callable[[], bool], camera: str) -> None:
         self.wanted.append(wanted)
         self.stamps.append(image.header.stamp.sec)
-        self.go_on.wait(60)
+        self.go_on.wait(PATIENCE)
 
 
 @pytest.fixture
-def live() -> Iterator[tuple[LiveOutputs, Shown, dict[str, bool]]]:
+def live() -> Iterator[tuple[LiveOutputs, Shown, dict[str, int]]]:
     scene, _ = balls_on_a_table()
     session = LiveSession(scene, dict(enumerate(CLASSES)))
     for view in clean_views(2):
         session.fuse(view)
     similarity = Similarity(np.eye(3), np.zeros(3), 1.0)
     settings = SimpleNamespace(rectified="auto", scene_to_map=similarity, max_pixels=1 << 24)
-    shown, state = Shown(), {"busy": False}
+    shown, state = Shown(), {"busy": False, "asked": 0}
     workspace: Any = SimpleNamespace(session=session, settings=settings, era=session.era)
     outputs: Any = shown
-    live = LiveOutputs(workspace, outputs, lambda: state["busy"], Time, lambda key, text: pytest.fail(text))
+
+    def busy() -> bool:
+        state["asked"] += 1
+        return bool(state["busy"])
+
+    live = LiveOutputs(workspace, outputs, busy, Time, lambda key, text: pytest.fail(text))
     yield live, shown, state
     shown.go_on.set()
     live.close()
@@ -211,7 +223,7 @@ def paired(second: int) -> Paired:
 
 
 def test_whoever_fuses_never_waits_for_a_picture_and_only_the_newest_is_drawn(
-    live: tuple[LiveOutputs, Shown, dict[str, bool]],
+    live: tuple[LiveOutputs, Shown, dict[str, int]],
 ) -> None:
     outputs, shown, _ = live
     outputs.fused(paired(1), CAMERA)
@@ -225,7 +237,7 @@ def test_whoever_fuses_never_waits_for_a_picture_and_only_the_newest_is_drawn(
 
 
 def test_nothing_is_drawn_while_masks_wait(
-    live: tuple[LiveOutputs, Shown, dict[str, bool]], monkeypatch: pytest.MonkeyPatch
+    live: tuple[LiveOutputs, Shown, dict[str, int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(live_outputs, "POSTPONED_SECONDS", 60.0)
     outputs, shown, state = live
@@ -233,7 +245,7 @@ def test_nothing_is_drawn_while_masks_wait(
     state["busy"] = True
     outputs.fused(paired(1), CAMERA)
     outputs.fused(paired(2), CAMERA)
-    time.sleep(0.5)
+    wait_until(lambda: state["asked"] > 3, "it to look several times whether masks still wait")
     assert shown.stamps == []
     state["busy"] = False
     wait_until(lambda: shown.stamps, "the picture")
@@ -241,7 +253,7 @@ def test_nothing_is_drawn_while_masks_wait(
 
 
 def test_a_picture_is_drawn_within_a_second_though_masks_never_cease_to_wait(
-    live: tuple[LiveOutputs, Shown, dict[str, bool]],
+    live: tuple[LiveOutputs, Shown, dict[str, int]],
 ) -> None:
     outputs, shown, state = live
     shown.go_on.set()
@@ -255,7 +267,7 @@ def test_a_picture_is_drawn_within_a_second_though_masks_never_cease_to_wait(
 
 
 def test_a_picture_that_was_begun_before_a_reset_is_not_published_after_it(
-    live: tuple[LiveOutputs, Shown, dict[str, bool]],
+    live: tuple[LiveOutputs, Shown, dict[str, int]],
 ) -> None:
     outputs, shown, _ = live
     shown.go_on.set()

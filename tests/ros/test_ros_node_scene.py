@@ -147,12 +147,12 @@ def test_a_request_that_began_before_a_reset_is_answered_and_publishes_nothing(h
     def slowly(*arguments: Any) -> Any:
         selection = select(*arguments)
         selected.set()
-        assert go_on.wait(30)
+        assert go_on.wait(PATIENCE)
         return selection
 
     services._select = slowly  # type: ignore[method-assign]
     thread, answers = in_thread(lambda: here.ask("segment"))
-    assert selected.wait(30)
+    assert selected.wait(PATIENCE)
     here.done("reset")
     go_on.set()
     joined(thread)

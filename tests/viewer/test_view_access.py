@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 
 import pytest
+from patience import PATIENCE
 
 from gsseg_core.cli.main import main
 from gsseg_core.errors import SettingsError
@@ -135,7 +136,7 @@ def test_an_address_that_is_not_this_machines_gives_one_clear_error_before_anyth
 def test_a_name_server_that_never_answers_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     gone = threading.Event()
     monkeypatch.setattr(view_access, "PATIENCE", 0.1)
-    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: gone.wait(30))
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: gone.wait(PATIENCE))
     try:
         with pytest.raises(SettingsError, match=r"host 'slow\.example' has no answer after 0\.1 s; expected a name"):
             listen("slow.example")

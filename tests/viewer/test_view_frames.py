@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from contextlib import closing
 
 import numpy as np
 import pytest
-from patience import PATIENCE
+from patience import wait_until
 from small_scenes import NAMES, balls_on_a_table, clean_views
 
 pytest.importorskip("viser")
@@ -16,9 +15,11 @@ pytest.importorskip("viser")
 import viser.transforms as vtf
 
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.scene.camera import Camera
+from gsseg_core.viewer import server_frames
 from gsseg_core.viewer.model import Labelling, ViewModel
 from gsseg_core.viewer.picture import Picture, cut
-from gsseg_core.viewer.server_frames import FINE_ROWS, QUICK_ROWS, RESTS, Frames
+from gsseg_core.viewer.server_frames import FINE_ROWS, QUICK_ROWS, Frames
 from gsseg_core.viewer.viewpoint import camera_of
 
 SCENE, TRUTH = balls_on_a_table()
@@ -53,10 +54,7 @@ class Client:
         pass
 
     def wait_for(self, count: int) -> None:
-        deadline = time.monotonic() + PATIENCE
-        while len(self.images) < count:
-            assert time.monotonic() < deadline, f"{len(self.images)} images came; expected {count}"
-            time.sleep(0.01)
+        wait_until(lambda: len(self.images) >= count, f"{count} images")
 
 
 def test_an_image_has_the_colours_of_what_is_shown_and_nothing_else() -> None:
@@ -76,21 +74,28 @@ def test_a_change_is_answered_by_a_quick_image_and_then_by_a_fine_one() -> None:
         client.wait_for(2)
         client.move(None)
         client.wait_for(4)
-        time.sleep(2 * RESTS)
-    assert [len(image) for image in client.images] == [QUICK_ROWS, FINE_ROWS] * 2
+        client.move(None)
+        client.wait_for(6)
+    assert [len(image) for image in client.images] == [QUICK_ROWS, FINE_ROWS] * 3  # And none came between.
     assert np.array_equal(client.images[1], client.images[3])
 
 
-def test_a_window_that_is_too_small_for_a_picture_gets_one_once_it_is_larger() -> None:
-    client = Client()
+def test_a_window_that_is_too_small_for_a_picture_gets_one_once_it_is_larger(monkeypatch: pytest.MonkeyPatch) -> None:
+    client, asked = Client(), []
     client.image_height = 0
+
+    def ask(client: Client, rows: int) -> Camera:
+        asked.append(rows)
+        return camera_of(client, rows)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(server_frames, "camera_of", ask)
     with closing(Frames(client)) as frames:  # type: ignore[arg-type]
         frames.show(picture(TRUTH >= 0))
-        time.sleep(2 * RESTS)
-        assert not client.images
+        wait_until(lambda: len(asked) == 2, "both images to be tried")
         client.image_height = 1080
         client.move(None)
-        client.wait_for(1)
+        client.wait_for(2)
+    assert len(client.images) == len(asked) - 2
 
 
 def test_a_camera_of_a_viewer_sees_what_the_viewer_sees() -> None:
@@ -110,5 +115,4 @@ def test_after_the_end_no_image_comes() -> None:
     count = len(client.images)
     client.move(None)
     frames.show(picture(TRUTH == 1))
-    time.sleep(2 * RESTS)
-    assert len(client.images) == count
+    assert not frames._thread.is_alive() and len(client.images) == count

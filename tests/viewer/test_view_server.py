@@ -7,7 +7,7 @@ import math
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from browser import opened_page
-from patience import PATIENCE
+from patience import PATIENCE, wait_until
 from small_scenes import balls_on_a_table, clean_views
 
 pytest.importorskip("viser")
@@ -126,13 +126,6 @@ def heard(page: ClientConnection, kind: str, label: str | None = None) -> dict[s
             if message["type"] == kind and label in (None, message.get("props", {}).get("label")):
                 found: dict[str, Any] = message
                 return found
-
-
-def wait(condition: Callable[[], Any], what: str) -> None:
-    deadline = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < deadline, f"waited {PATIENCE:g} s in vain for {what}"
-        time.sleep(0.01)
 
 
 def test_the_own_page_is_answered_and_may_load_and_connect_to_its_own_server_alone(viewer: Viewer) -> None:
@@ -335,7 +328,7 @@ def test_markup_in_names_and_errors_runs_nothing_and_fetches_nothing(chromium: B
         viewer = stack.enter_context(served(names=names, views=[view]))
         page = stack.enter_context(opened_page(chromium, 960, 640, tolerated="computeBoundingSphere"))
         page.goto(viewer.url)
-        wait(lambda: page.wait_for_timeout(50) or viewer.server.get_clients(), "the page")
+        wait_until(lambda: page.wait_for_timeout(50) or viewer.server.get_clients(), "the page")
         client = next(iter(viewer.server.get_clients().values()))
         for label in (1, 3):
             answer = page.locator("strong").get_by_text(names[label], exact=True)
@@ -347,7 +340,7 @@ def test_markup_in_names_and_errors_runs_nothing_and_fetches_nothing(chromium: B
                 page.wait_for_timeout(100)
                 return answer.is_visible()
 
-            wait(answered, "the answer to a click")
+            wait_until(answered, "the answer to a click")
             page.get_by_text(f"{names[3]}: {names[label]}, ").wait_for(timeout=1000 * PATIENCE)
         assert page.get_by_text(rf"<img src={fetched}>\x1b[31m\u202e").count()
         for name in (names[3], script):
@@ -362,7 +355,7 @@ def test_a_browser_with_the_printed_address_gets_the_page_and_one_without_the_to
         refused = page.goto(viewer.url.partition("?")[0])
         assert refused is not None and refused.status == 403 and "address that `gsseg view` printed" in page.content()
         page.goto(viewer.url)
-        wait(lambda: page.wait_for_timeout(50) or viewer.server.get_clients(), "the page")
+        wait_until(lambda: page.wait_for_timeout(50) or viewer.server.get_clients(), "the page")
 
 
 def test_an_address_that_makes_the_page_connect_elsewhere_does_not(chromium: Browser, viewer: Viewer) -> None:
@@ -375,5 +368,5 @@ def test_an_address_that_makes_the_page_connect_elsewhere_does_not(chromium: Bro
             (f"playbackPath=http://127.0.0.1:{port}/a.viser", "violates"),
         ):
             page.goto(f"{viewer.url}/?{query}")
-            wait(lambda sign=sign: page.wait_for_timeout(50) or any(sign in text for text in said), sign)  # type: ignore[misc]
+            wait_until(lambda sign=sign: page.wait_for_timeout(50) or any(sign in text for text in said), sign)  # type: ignore[misc]
         assert not other.asked
