@@ -28,6 +28,7 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from gsseg_msgs.action import Learn
+from gsseg_msgs.msg import SegmentationReport
 from gsseg_msgs.srv import Export, Reset, Segment
 from lifecycle_msgs.srv import GetState
 from rcl_interfaces.srv import SetParameters
@@ -146,7 +147,7 @@ class Robot:
         answer = self.call(Segment, "segment", Segment.Request())
         answered = time.perf_counter()
         stamp = _nanoseconds(answer.report.header.stamp)
-        topics = ["/gsseg/cloud", *(entry.topic for entry in answer.report.classes)]
+        topics = ["/gsseg/cloud", *topics_of(answer.report)]
         self.wait(lambda: all(self.clouds.get(topic, (0, 0.0))[0] == stamp for topic in topics), "clouds")
         last = max(self.clouds[topic][1] for topic in topics)
         return answered - started, last - started, {stage.name: stage.seconds for stage in answer.report.stages}
@@ -223,18 +224,19 @@ def fuse(robot: Robot, data: str, rate: float) -> None:
     """Replay once and count what was fused."""
     robot.wait_until_active()
     robot.call(Reset, "reset", Reset.Request())
-    before = int(robot.status.get("views accepted", 0)), int(robot.status.get("queue drops", 0))
+    before = [int(robot.status.get(key, 0)) for key in ("views accepted", "queue drops", "/mask received")]
     robot.replay({"data": data, "rate": rate})
     robot.settled()
     accepted, drops = int(robot.status["views accepted"]) - before[0], int(robot.status["queue drops"]) - before[1]
-    print(f"replay at {rate:g} masks/s: {accepted} fused, {drops} dropped")
+    sent, arrived = len(list((Path(data) / "labels").iterdir())), int(robot.status["/mask received"]) - before[2]
+    print(f"replay at {rate:g} masks/s: of {sent} masks {arrived} arrived, {accepted} were fused, {drops} dropped")
 
 
 def segment(robot: Robot, what: str, runs: int) -> None:
     """Segment from new codes or settings each time, then once more with nothing changed."""
     robot.listen(["/gsseg/cloud"])
     first = robot.call(Segment, "segment", Segment.Request())
-    robot.listen([entry.topic for entry in first.report.classes])
+    robot.listen(topics_of(first.report))
     time.sleep(1.0)  # Subscriptions are found by then; a robot has them from the start.
     rows = []
     for run in range(runs):
@@ -318,6 +320,11 @@ def real_size(robot: Robot, data: Path) -> None:
         segment(robot, "3,000,000 Gaussians, 20 classes", 5)
         status = Path(f"/proc/{process.pid}/status").read_text()
         print(f"peak resident memory of the node: {int(status.split('VmHWM:')[1].split()[0]) / 2**20:.2f} GiB")
+
+
+def topics_of(report: SegmentationReport) -> list[str]:
+    """Topics of the classes that have Gaussians; the others have none."""
+    return [entry.topic for entry in report.classes if entry.topic]
 
 
 def _nanoseconds(stamp: Any) -> int:

@@ -10,7 +10,7 @@ import array
 import math
 import re
 import unicodedata
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -55,7 +55,8 @@ _CLOUD_FIELDS = (
     ("label", PointField.UINT32, "u4"),
     ("confidence", PointField.FLOAT32, "f4"),
 )
-_CLOUD_POINT = np.dtype([(name, "<" + kind) for name, _, kind in _CLOUD_FIELDS])
+CLOUD_POINT = np.dtype([(name, "<" + kind) for name, _, kind in _CLOUD_FIELDS])
+"""A point of a cloud, as its bytes hold it."""
 
 
 class CloudArrays(NamedTuple):
@@ -274,13 +275,32 @@ def cloud(
         )
     if count and labels.min() < 0:
         raise SceneValueError(f"cloud: the least label is {labels.min()}; expected class ids, which are 0 or more")
-    records = np.empty(count, _CLOUD_POINT)
+    records = np.empty(count, CLOUD_POINT)
+    fill_records(records, points, rgb, labels, confidence)
+    return cloud_of_records(header, records)
+
+
+def fill_records(
+    records: npt.NDArray[Any],  # (M,) CLOUD_POINT
+    points: npt.NDArray[np.float32],  # (M, 3)
+    rgb: npt.NDArray[np.uint8],  # (M, 3), or (3,) for all
+    labels: npt.NDArray[np.integer[Any]] | int,  # (M,)
+    confidence: npt.NDArray[np.float32],  # (M,)
+) -> None:
+    """Fill in points of a cloud."""
     for axis, name in enumerate("xyz"):
         records[name] = points[:, axis]
     records["rgb"] = rgb @ np.array([1 << 16, 1 << 8, 1], np.uint32)
     records["label"] = labels
     records["confidence"] = confidence
-    return _cloud_of(header, records, [datatype for _, datatype, _ in _CLOUD_FIELDS])
+
+
+def cloud_of_records(
+    header: Header,
+    *parts: npt.NDArray[Any],  # (M,) CLOUD_POINT each
+) -> PointCloud2:
+    """Write points one part after the other, all as they are in memory."""
+    return _cloud_of(header, parts, CLOUD_POINT, [datatype for _, datatype, _ in _CLOUD_FIELDS])
 
 
 def points_cloud(
@@ -289,25 +309,28 @@ def points_cloud(
 ) -> PointCloud2:
     """Write points (M, 3) in metres, and nothing besides."""
     records = np.ascontiguousarray(points, "<f4").view([(axis, "<f4") for axis in "xyz"])[:, 0]
-    return _cloud_of(header, records, [PointField.FLOAT32] * 3)
+    return _cloud_of(header, [records], records.dtype, [PointField.FLOAT32] * 3)
 
 
-def _cloud_of(header: Header, records: npt.NDArray[Any], datatypes: list[int]) -> PointCloud2:
-    """Write records (M,) whose fields have these types, four bytes each."""
+def _cloud_of(
+    header: Header, parts: Sequence[npt.NDArray[Any]], kind: np.dtype[Any], datatypes: list[int]
+) -> PointCloud2:
+    """Write records, (M,) in each part, whose fields have these types, four bytes each."""
+    width = sum(map(len, parts))
     message = PointCloud2(
         header=header,
         height=1,
-        width=len(records),
+        width=width,
         fields=[
             PointField(name=name, offset=4 * i, datatype=datatype, count=1)
-            for i, (name, datatype) in enumerate(zip(records.dtype.names or (), datatypes, strict=True))
+            for i, (name, datatype) in enumerate(zip(kind.names or (), datatypes, strict=True))
         ],
         is_bigendian=False,
-        point_step=records.dtype.itemsize,
-        row_step=records.dtype.itemsize * len(records),
+        point_step=kind.itemsize,
+        row_step=kind.itemsize * width,
         is_dense=True,
     )
-    message.data = byte_array(records)
+    message.data = byte_array(*parts)
     return message
 
 
@@ -344,10 +367,11 @@ def arrays_from_cloud(message: PointCloud2, topic: str = "cloud") -> CloudArrays
     )
 
 
-def byte_array(values: npt.NDArray[Any], kind: str = "B") -> array.array[int]:
+def byte_array(*parts: npt.NDArray[Any], kind: str = "B") -> array.array[int]:
     """Copy the bytes of numbers into an `array.array` of a kind, which rclpy takes over as a whole."""
     data = array.array(kind)
-    data.frombytes(np.ascontiguousarray(values).view(np.uint8).data if values.size else b"")
+    for values in parts:
+        data.frombytes(np.ascontiguousarray(values).view(np.uint8).data if values.size else b"")
     return data
 
 

@@ -34,3 +34,36 @@ def test_what_was_freed_is_used_again_without_asking_the_system() -> None:
     done = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True)
     without, kept = map(int, done.stdout.split())
     assert kept < without / 4
+
+
+IN_THREADS = """
+import threading
+import numpy as np
+from gsseg_core.freed_memory import keep_freed_memory
+
+keep_freed_memory()
+ended, done = threading.Event(), threading.Semaphore(0)
+
+def work():
+    [np.ones(2_500_000, np.float32) for _ in range(4)]
+    done.release()
+    ended.wait()
+
+def mib():
+    return int(open("/proc/self/status").read().split("VmRSS:")[1].split()[0]) / 1024
+
+before = mib()
+threads = [threading.Thread(target=work) for _ in range(10)]
+for thread in threads:
+    thread.start()
+    done.acquire()
+print(mib() - before)
+ended.set()
+"""
+
+
+def test_what_one_thread_has_freed_another_uses_again() -> None:
+    if not keep_freed_memory():
+        pytest.skip("the C library is not glibc")
+    done = subprocess.run([sys.executable, "-c", IN_THREADS], capture_output=True, text=True, check=True)
+    assert float(done.stdout) < 160  # MiB; what each of ten threads takes is 38

@@ -76,7 +76,7 @@ def fill_answer(
     index = picked.ids
     confidence, color = picked.membership[index], palette(OBJECT + 1)[OBJECT]
     points, rgb = place.points_to_map(scene.means[index]), np.tile(color, (len(index), 1))
-    response.indices = byte_array(index.astype(np.uint32), "I")
+    response.indices = byte_array(index.astype(np.uint32), kind="I")
     response.cloud = cloud(header, points, rgb, np.full(len(index), OBJECT), confidence)
     response.object = Object(name=name or "object")
     if len(index):

@@ -19,10 +19,12 @@ from gsseg_core.objects.oriented_boxes import class_box
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_ros.conversions import cloud
+from gsseg_ros.conversions import CLOUD_POINT, cloud_of_records, fill_records
 from gsseg_ros.frames import Similarity
 from gsseg_ros.node.workspace import Run
 from gsseg_ros.object_messages import object_message, point_message
+
+_AT_ONCE = 1 << 15  # points of a cloud that are put together at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +66,8 @@ class Selection:
     def indices(self) -> dict[int, np.ndarray]:
         """Gaussians (M,) of each class that was asked for."""
         labels = self.result.labels
-        order = np.argsort(labels, kind="stable")
+        # Short numbers are sorted by their digits, in a quarter of the time.
+        order = np.argsort(labels.astype(np.int16) if self.result.num_classes < 2**15 else labels, kind="stable")
         kept = order[self._confidence[order] >= self.min_confidence]
         bounds = np.searchsorted(labels[kept], [(k, k + 1) for k in self.chosen])
         return {k: kept[first:last] for k, (first, last) in zip(self.chosen, bounds.tolist(), strict=True)}
@@ -79,25 +82,32 @@ class Selection:
         return self.result.confidence
 
     @cached_property
-    def _points(self) -> np.ndarray:
-        return self.similarity.points_to_map(self.scene.means)
-
-    @cached_property
     def _colors(self) -> np.ndarray:
         return palette(self.result.num_classes)
 
+    @cached_property
+    def _records(self) -> dict[int, np.ndarray]:
+        """Points of each class, as clouds hold them: parts of one array, those of the objects side by side."""
+        records = np.empty(sum(map(len, self.indices.values())), CLOUD_POINT)
+        found, end = {}, 0
+        for k, index in self.indices.items():
+            found[k] = records[end : end + len(index)]
+            end += len(index)
+            # What is put together at a time stays in the processor's cache.
+            for first in range(0, len(index), _AT_ONCE):
+                part = index[first : first + _AT_ONCE]
+                points = self.similarity.points_to_map(self.scene.means[part])
+                fill_records(found[k][first : first + _AT_ONCE], points, self._colors[k], k, self._confidence[part])
+        return found
+
     def class_cloud(self, k: int, header: Header) -> PointCloud2:
         """Cloud of one class."""
-        return self._cloud(self.indices[k], header)
+        return cloud_of_records(header, self._records[k])
 
     def objects_cloud(self, header: Header) -> PointCloud2:
         """Cloud of all objects that were asked for: every class but the background."""
-        parts = [index for k, index in self.indices.items() if k > 0]
-        return self._cloud(np.concatenate(parts) if parts else np.empty(0, np.int64), header)
-
-    def _cloud(self, index: np.ndarray, header: Header) -> PointCloud2:
-        labels = self.result.labels[index]
-        return cloud(header, self._points[index], self._colors[labels], labels, self._confidence[index])
+        parts = [records for k, records in self._records.items() if k > 0]
+        return cloud_of_records(header, *parts)
 
     def objects(self, header: Header, revision: int) -> ObjectArray:
         """Put boxes around all objects that were asked for."""
@@ -127,7 +137,9 @@ class Selection:
             num_gaussians=len(index),
         )
         if len(index):
-            points, confidence = self._points[index], self._confidence[index]
+            records = self._records[k]
+            points = np.stack([records[axis] for axis in "xyz"], axis=1)
+            confidence = np.ascontiguousarray(records["confidence"])
             summary.mean_confidence = float(confidence.mean(dtype=np.float64))
             summary.min_confidence = float(confidence.min())
             summary.centroid = point_message(points.mean(axis=0, dtype=np.float64))

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -25,8 +26,10 @@ from rclpy.lifecycle import LifecycleNode
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
+from gsseg_core.export.pictures import palette
 from gsseg_core.live.session import LiveSession
 from gsseg_core.refine.settings import PAPER
+from gsseg_ros.conversions import arrays_from_cloud
 from gsseg_ros.frames import Similarity
 from gsseg_ros.node import outputs as outputs_module
 from gsseg_ros.node.outputs import Outputs
@@ -49,6 +52,24 @@ def selection(*chosen: int) -> Selection:
     for view in clean_views(2):
         session.fuse(view)
     return Selection(session, session.segmentation(PAPER), chosen, 0.0, Similarity(np.eye(3), np.zeros(3), 1.0))
+
+
+def test_clouds_hold_their_classes_as_they_lie_in_the_map() -> None:
+    similarity = Similarity.from_parameters(1.5, [0.1, -2.0, 3.0], [0.1, 0.2, 0.3, 0.9])
+    some = replace(selection(0, 2, 3), similarity=similarity, min_confidence=0.6)
+    result = some.result
+    everywhere = similarity.points_to_map(some.scene.means)
+    found = {k: arrays_from_cloud(some.class_cloud(k, Header())) for k in some.chosen}
+    for k, cloud in found.items():
+        members = (result.labels == k) & (result.confidence >= 0.6)
+        assert members.any()
+        np.testing.assert_array_equal(cloud.points, everywhere[members])
+        np.testing.assert_array_equal(cloud.confidence, result.confidence[members])
+        np.testing.assert_array_equal(cloud.rgb, np.tile(palette(result.num_classes)[k], (members.sum(), 1)))
+        assert (cloud.labels == k).all()
+    together = arrays_from_cloud(some.objects_cloud(Header()))
+    for name, values in together._asdict().items():
+        np.testing.assert_array_equal(values, np.concatenate([getattr(found[k], name) for k in (2, 3)]))
 
 
 class Publisher:
