@@ -76,6 +76,8 @@ def why_dropped(inputs: Inputs, reason: str) -> str:
         "segmenter, or a bag, running twice?",
         "several_cameras": "masks of several cameras (frame_id) carry one stamp, and their poses do not say whose they "
         "are; expected the parameter pose_source to be tf, or cameras to name them, each with topics of its own",
+        "negative_stamp": f"their stamp is below 0{_negative_stamps(inputs)}; expected the time at which the image "
+        "was taken, by the clock of the poses",
         "time_jump": "they are from before time was set back; expected so only for a moment, then check the clocks",
         "queue_full": "they come faster than they are fused; expected a lower rate or smaller masks (the parameter "
         "queue_size says how many may wait)",
@@ -121,6 +123,12 @@ def _pose_problem(inputs: Inputs) -> str:
     if time.monotonic() - refused_at < WINDOW_SECONDS:
         return f" ({refusal})"
     return f" ({inputs.tf.problem})" if inputs.tf is not None and inputs.tf.problem else ""
+
+
+def _negative_stamps(inputs: Inputs) -> str:
+    stamps = {camera.topic("mask"): camera.pairing.negative_stamp for camera in inputs.cameras.values()}
+    found = ", ".join(f"{stamp / 1e9:.3f} s on {topic}" for topic, stamp in stamps.items() if stamp)
+    return f" ({found})" * bool(found)
 
 
 def _frame_problem(inputs: Inputs) -> str:

@@ -86,8 +86,8 @@ class Pairing:
     ----------
     dropped : Counter
         Masks not paired, by reason: "no_pose", "no_camera_info", "no_depth", "repeated_stamp" (and the same frame_id),
-        "several_cameras" (whose poses cannot be told apart), and "time_jump" for one from before time was set back that
-        came after it.
+        "several_cameras" (whose poses cannot be told apart), "negative_stamp", and "time_jump" for one from before time
+        was set back that came after it.
     out_of_order : int
         Masks that were older than one before them; they are paired all the same.
     time_jumps : int
@@ -95,6 +95,8 @@ class Pairing:
         dropped then, and the same stamps are new ones.
     unmatched_frame : str
         The frame_id of the last mask that was dropped for want of a camera_info.
+    negative_stamp : int
+        That of the last mask that was dropped for it, ns.
     """
 
     def __init__(
@@ -103,6 +105,7 @@ class Pairing:
         self.dropped: Counter[str] = Counter()
         self.out_of_order = 0
         self.unmatched_frame = ""
+        self.negative_stamp = 0
         self._poses = poses
         self._prefix, self._stream = prefix, stream
         self._settings = settings or PairingSettings()
@@ -202,6 +205,11 @@ class Pairing:
 
     def _take_in(self, message: Message) -> None:
         with self._lock:
+            if message.stamp < 0:  # No clock is ever there: it must not be taken for time that was set back.
+                if message.stream == MASK:
+                    self.dropped["negative_stamp"] += 1
+                    self.negative_stamp = message.stamp
+                return
             epoch = self._timeline.epoch
             self._deliver(epoch, self._timeline.take_in(message))
 

@@ -150,8 +150,9 @@ class Hears:
     def __init__(self, steady: Steady) -> None:
         self.pairing = SimpleNamespace(time_jumps=0, last_jump=(0, 0), out_of_order=0, waiting=0)
         self.pairing.unmatched_frame, self.pairing.camera_frames = "left", ["right"]
+        self.pairing.negative_stamp = -1_500_000_000
         self.inputs: Any = SimpleNamespace(
-            cameras={"": SimpleNamespace(name="", pairing=self.pairing)}, dropped=Counter(), gated=Counter(),
+            cameras={"": SimpleNamespace(name="", pairing=self.pairing, topic=lambda role: role)}, dropped=Counter(), gated=Counter(),
             rejected=Counter(), accepted=0, explained={}, worker=SimpleNamespace(dropped=0, waiting=0),
             arrivals={}, roles={}, tf=None, last_refusal=(-100.0, ""), refused_poses=0, logged=Counter(),
             counted=deque([(steady.seconds, Counter())]),
@@ -216,6 +217,7 @@ def test_the_level_says_whether_few_many_or_all_masks_are_refused(
         ("no_camera_info", r"(masks have the frame_id 'left', camera_infos have 'right': expected the same)"),
         ("repeated_stamp", "a mask with their stamp and frame_id came before; expected every image once"),
         ("several_cameras", "masks of several cameras (frame_id) carry one stamp, and their poses do not say whose"),
+        ("negative_stamp", "their stamp is below 0 (-1.500 s on mask); expected the time at which the image was taken"),
         ("time_jump", "they are from before time was set back"),
         ("queue_full", "they come faster than they are fused"),
     ],

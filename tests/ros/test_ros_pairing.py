@@ -192,6 +192,17 @@ def test_masks_of_one_stamp_and_several_cameras_are_refused_where_poses_do_not_s
     assert [p.stamp for p in pairing.take()] == [11 * S]
 
 
+def test_what_has_a_stamp_below_zero_is_refused_by_itself_and_sets_no_time_back() -> None:
+    pairing = Pairing(MessagePoses())
+    for stamp in (5 * S, 6 * S, *range(-12 * S, 0, S), 7 * S):
+        pairing.add_mask(stamp, "mask", "left")
+        pairing.add_camera_info(stamp, "info", "left")
+        send(pairing, [("pose", stamp)])
+    assert [p.stamp for p in pairing.take()] == [5 * S, 6 * S, 7 * S]
+    assert pairing.dropped == {"negative_stamp": 12}
+    assert (pairing.time_jumps, pairing.negative_stamp) == (0, -1 * S)
+
+
 @pytest.mark.parametrize(("mask", "info", "paired"), [("", "left", 1), ("left", "", 1), ("left", "right", 0)])
 def test_a_camera_info_of_another_camera_is_not_used_but_a_frame_may_be_left_out(
     mask: str, info: str, paired: int
