@@ -24,7 +24,7 @@ from gsseg_core.scene.lens import MODELS_BY_NAME, Lens, Projection
 from gsseg_core.segmentation import Segmentation
 
 WIDTH, HEIGHT, FOCAL = 200, 150, 175.0
-TRAIN, TEST = slice(0, 36, 4), slice(1, 36, 6)
+TRAIN, TEST = slice(0, 36, 6), slice(1, 36, 9)
 
 
 def cast(parts: list[Part], lens: Lens, camera: Camera) -> np.ndarray:

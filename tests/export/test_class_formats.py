@@ -167,13 +167,13 @@ def test_meshes_are_in_the_usd_with_the_collision_schemas(tmp_path: Path, kind: 
     stage = Usd.Stage.Open(str(tmp_path / "objects.usdc"))
     parents = stage.GetDefaultPrim().GetChildren()
     assert [prim.GetChild("collision").IsValid() for prim in parents] == [False, True, True, True]
+    meshes = collision_meshes(SCENE, segmented(), kind)
     for k, parent in enumerate(parents[1:], start=1):
         prim = parent.GetChild("collision")
         assert prim.HasAPI(UsdPhysics.CollisionAPI) and UsdGeom.Imageable(prim).GetPurposeAttr().Get() == "guide"
         approximation = UsdPhysics.MeshCollisionAPI(prim).GetApproximationAttr().Get()
         assert approximation == ("convexHull" if kind == HULL else "none")
-        written = collision_meshes(SCENE, segmented(), kind)[k]
-        np.testing.assert_array_equal(np.array(UsdGeom.Mesh(prim).GetPointsAttr().Get()), written.points)
+        np.testing.assert_array_equal(np.array(UsdGeom.Mesh(prim).GetPointsAttr().Get()), meshes[k].points)
 
 
 def test_floaters_and_haze_do_not_blow_a_mesh_up() -> None:
