@@ -152,9 +152,10 @@ class Hears:
         self.pairing.unmatched_frame, self.pairing.camera_frames = "left", ["right"]
         self.pairing.negative_stamp = -1_500_000_000
         self.inputs: Any = SimpleNamespace(
-            cameras={"": SimpleNamespace(name="", pairing=self.pairing, topic=lambda role: role)}, dropped=Counter(), gated=Counter(),
-            rejected=Counter(), accepted=0, explained={}, worker=SimpleNamespace(dropped=0, waiting=0),
-            arrivals={}, roles={}, tf=None, last_refusal=(-100.0, ""), refused_poses=0, logged=Counter(),
+            cameras={"": SimpleNamespace(name="", pairing=self.pairing, topic=lambda role: role)},
+            dropped=Counter(), gated=Counter(), rejected=Counter(), accepted=0, explained={},
+            worker=SimpleNamespace(dropped=0, waiting=0), arrivals={}, roles={}, tf=None,
+            last_refusal=(-100.0, ""), refused_poses=0, logged=Counter(),
             counted=deque([(steady.seconds, Counter())]),
         )  # fmt: skip
         self.lines: list[str] = []
