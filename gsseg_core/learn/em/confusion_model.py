@@ -9,7 +9,10 @@ import numpy as np
 from gsseg_core.data.label_evidence import LabelEvidence
 
 PART_PRIOR = 300.0
-"""Pixels of each class under a word that part into those that lost the name and the rest as all pixels of it do."""
+"""Weight of the prior on how a class's pixels under one word divide between rejected regions and the rest, in px.
+
+A class with few pixels there is taken to divide as all classes together do.
+"""
 
 
 @dataclass
@@ -60,7 +63,7 @@ class ErrorModel:
     def by_label(self) -> tuple[np.ndarray, np.ndarray]:
         """Return C_v by label, (L, K) float32, and the same with zeros for labels that are not informative.
 
-        All classes are as likely under such a label: its pixels would not change where EM ends, only how soon.
+        Under such a label all classes are equally likely, so its pixels would change how soon EM ends, but not where.
         """
         likelihood = np.ascontiguousarray(self.likelihood.T)
         return likelihood, np.where(self.evidence.informative[:, None], likelihood, np.float32(0))
@@ -78,8 +81,9 @@ class ErrorModel:
     def m_step(self, counts: np.ndarray) -> None:
         """Set the confusion matrix to its maximiser for expected counts, (K, W) px; rows without any count stay.
 
-        A nameless label is a part of what its former word was, so that an object that goes by another's name is known
-        by all of its parts: C[k, part] = C[k, word] P(part | k, word), the latter with a prior of `PART_PRIOR` px.
+        A rejected region is a word of its own, and a part of the word that its pixels had before. C[k, word] is
+        estimated of both together, then divided: C[k, part] = C[k, word] P(part | k, word), the latter with a prior of
+        `PART_PRIOR` px. So where a view calls an object by another's name, all of the object's regions count as one.
         """
         former = self.evidence.former_words
         counts = counts.astype(np.float64)
