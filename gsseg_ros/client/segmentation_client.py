@@ -129,6 +129,7 @@ class SegmentationClient(SceneRequests):
         viewpoint: Viewpoint | None = None,
         publish: bool = True,
         *,
+        granularity: float | None = None,
         timeout: float = 60.0,
     ) -> SegmentResult:
         """Get every object of the scene; the node publishes them, too.
@@ -148,13 +149,16 @@ class SegmentationClient(SceneRequests):
             Where to draw a label image from, too.
         publish : bool
             False: the answer is for this caller alone, and no topic of the node changes.
+        granularity : float, optional
+            Of a node with ids per-view: level of parts and wholes, from 0, wholes, to 1, all parts, or below 0 the
+            objects; by default what the node's parameter says.
         timeout : float
             Seconds.
         """
         deadline = time.monotonic() + timeout
         request = Segment.Request(
             classes=class_names(classes), min_confidence=float(min_confidence), publish_nothing=not publish,
-            **refinement(refine, filter),
+            granularity=[] if granularity is None else [float(granularity)], **refinement(refine, filter),
         )  # fmt: skip
         if viewpoint is not None:
             request.viewpoint_pose, request.viewpoint_camera = viewpoint_messages(viewpoint.camera)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from gsseg_msgs.srv import Export
+from gsseg_msgs.srv import Export, Segment
 
 from gsseg_core.data.class_names import class_ids
+from gsseg_core.data.label_images import PER_VIEW
 from gsseg_core.errors import SettingsError
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_ros.errors import InvalidRequestError, UnknownClassError
@@ -42,6 +43,27 @@ def checked_confidence(request: Any) -> float:
     if not 0 <= request.min_confidence <= 1:
         raise InvalidRequestError(f"min_confidence is {request.min_confidence}; expected 0 to 1")
     return float(request.min_confidence)
+
+
+def level_of(request: Any, settings: Settings) -> float:
+    """Level of parts and wholes that a request asks for, as the parameter granularity has it.
+
+    Raises
+    ------
+    InvalidRequestError
+        It is above 1 or no number, or there are no parts.
+    """
+    if not isinstance(request, Segment.Request) or not len(request.granularity):
+        return settings.granularity
+    wanted = float(request.granularity[0])
+    if not wanted <= 1:
+        raise InvalidRequestError(f"granularity is {wanted:g}; expected 0 to 1, or below 0 for the objects")
+    if wanted >= 0 and settings.ids != PER_VIEW:
+        raise InvalidRequestError(
+            f"granularity is {wanted:g}, but with the parameter ids '{settings.ids}' objects have no parts; expected "
+            "none, or a node with ids per-view"
+        )
+    return wanted
 
 
 def refinement(request: Any, settings: Settings) -> RefineSettings:

@@ -34,7 +34,7 @@ from gsseg_ros.node.output_folders import pinned_folder, require_own_folder, sta
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.picking import fill_answer, pick_object
 from gsseg_ros.node.reports import Selection, empty_report, finish, report_message, stage_timings
-from gsseg_ros.node.request_fields import checked_confidence, chosen_classes, refinement
+from gsseg_ros.node.request_fields import checked_confidence, chosen_classes, level_of, refinement
 from gsseg_ros.node.scene_frame import placed, placed_by
 from gsseg_ros.node.viewpoints import Lookup, draw, viewpoint
 from gsseg_ros.node.workspace import Run, Workspace
@@ -43,7 +43,7 @@ from gsseg_ros.qos import requests
 
 STATE_FILE, EXPORT_FOLDER = "gsseg_state.npz", "gsseg_export"
 
-_PUBLISHED = ("min_confidence", "skip_refinement", "skip_filter", "refine")
+_PUBLISHED = ("min_confidence", "skip_refinement", "skip_filter", "refine", "granularity")
 """Fields of a request of ~/segment that decide what is published."""
 
 AT_WORK, WAITING = 2, 4
@@ -212,7 +212,8 @@ class Services:
         session, settings = self.workspace.session, self.workspace.settings
         with self.workspace.run("render_view") as run:
             self.workspace.number(run)
-            result = self._at_level(session.segmentation(refinement(request, settings), run.watch), run)
+            result = session.segmentation(refinement(request, settings), run.watch)
+            result = self._at_level(result, run, settings.granularity)
             camera = viewpoint(request, settings, self._lookup())
             header = Header(stamp=run.stamp, frame_id=request.viewpoint_camera.header.frame_id)
             selection = Selection(session, result, sorted(result.class_names), 0.0, settings.scene_to_map)
@@ -331,26 +332,26 @@ class Services:
 
     def _select(self, request: Any, run: Run) -> tuple[Selection, RefineSettings]:
         session, refine = self.workspace.session, refinement(request, self.workspace.settings)
-        threshold = checked_confidence(request)
-        if session.has_codes and self.workspace.settings.granularity < 0:
+        threshold, level = checked_confidence(request), level_of(request, self.workspace.settings)
+        if session.has_codes and level < 0:
             # Before the work: a wrong name should not have to wait for it.
             chosen_classes(request, session.class_names)
         with_tree = isinstance(request, Export.Request)
-        result = self._at_level(session.segmentation(refine, run.watch), run, with_tree)
+        result = self._at_level(session.segmentation(refine, run.watch), run, level, with_tree)
         chosen = chosen_classes(request, result.class_names)
         return Selection(session, result, chosen, threshold, self.workspace.settings.scene_to_map), refine
 
-    def _at_level(self, result: Segmentation, run: Run, with_tree: bool = False) -> Segmentation:
-        """Cut a result at the level that the parameter granularity chooses; the objects have a tree only on request."""
-        session, granularity = self.workspace.session, self.workspace.settings.granularity
-        if granularity < 0 and not with_tree:
+    def _at_level(self, result: Segmentation, run: Run, level: float, with_tree: bool = False) -> Segmentation:
+        """Cut a result at a level, as the parameter granularity has it; the objects have a tree only on request."""
+        session = self.workspace.session
+        if level < 0 and not with_tree:
             return result
         from gsseg_core.live.per_view_session import PerViewSession  # Others start without SciPy.
 
         if not isinstance(session, PerViewSession):
             return result
         with run.watch.stage("parts"):
-            return session.at_level(result, granularity if granularity >= 0 else None)
+            return session.at_level(result, level if level >= 0 else None)
 
     def clear(self, run: Run) -> None:
         """Replace all that is latched by empty messages."""

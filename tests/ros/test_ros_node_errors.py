@@ -108,6 +108,7 @@ CASES = [
     Case("render_view", "NOT_ACTIVE", "idle", "the node is not active"),
     Case("render_view", "BUSY", "crowded", "too many requests"),
     Case("render_view", "INVALID_REQUEST", "main", "refine is 'sand'", nowhere() | {"refine": "sand"}),
+    Case("segment", "INVALID_REQUEST", "main", "ids 'given' objects have no parts", {"granularity": [0.5]}),
     Case("render_view", "NO_SCENE", "bare", "no scene is loaded"),
     Case("render_view", "NO_CODES", "fresh", "expected at least one posed mask"),
     Case("render_view", "INVALID_VIEWPOINT", "main", "viewpoint_", {}),

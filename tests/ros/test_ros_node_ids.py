@@ -121,6 +121,24 @@ def test_parts_are_given_where_the_parameter_granularity_asks_for_them(robot: Ro
     assert tree is not None and len(tree) == len(objects) + 2
 
 
+def test_one_request_may_ask_for_parts_while_others_get_the_objects(robot: Robot) -> None:
+    objects = fused(robot, views_in_halves()).classes
+    parts = [thing.name for thing in robot.done("segment", granularity=[0.9], publish_nothing=True).objects]
+    assert len(parts) == 4 and sum("." in name for name in parts) == 2
+    assert [summary.name for summary in robot.done("segment").report.classes] == [one.name for one in objects]
+    assert robot.set("granularity", 0.9) == (True, "")
+    try:
+        assert [thing.name for thing in robot.done("segment").objects] == parts
+        given = robot.done("segment", granularity=[-1.0]).report.classes
+        assert [summary.name for summary in given] == [one.name for one in objects]
+    finally:
+        assert robot.set("granularity", -1.0) == (True, "")
+    for level in (1.5, float("nan")):
+        refused = robot.ask("segment", granularity=[level])
+        assert refused.error_code == Segment.Response.INVALID_REQUEST
+        assert refused.error_msg == f"granularity is {level:g}; expected 0 to 1, or below 0 for the objects"
+
+
 def test_a_dataset_folder_cannot_be_learnt_from(robot: Robot) -> None:
     fused(robot, shuffled_views(2))
     status, result = robot.learn(dataset_path="data")
