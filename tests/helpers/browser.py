@@ -13,6 +13,7 @@ from io import BytesIO
 from typing import TYPE_CHECKING
 
 import numpy as np
+from patience import PATIENCE
 from PIL import Image
 
 if TYPE_CHECKING:
@@ -60,7 +61,9 @@ def started_chromium() -> Iterator[Browser]:
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=find_chromium(), headless=True, args=list(_FLAGS))
+        browser = playwright.chromium.launch(
+            executable_path=find_chromium(), headless=True, args=list(_FLAGS), timeout=1000 * PATIENCE
+        )
         try:
             yield browser
         finally:
@@ -75,6 +78,7 @@ def opened_page(browser: Browser, width: int = 960, height: int = 720, tolerated
     """
     complaints: list[str] = []
     context = browser.new_context(viewport={"width": width, "height": height}, accept_downloads=True)
+    context.set_default_timeout(1000 * PATIENCE)  # Of pictures, too, which a busy machine takes half a minute to take.
     page = context.new_page()
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)
