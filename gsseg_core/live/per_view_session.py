@@ -38,8 +38,7 @@ class PerViewSession(LiveSession):
     @property
     def class_names(self) -> dict[int, str]:
         """Names by number, "object_001" and so on."""
-        with self._lock:
-            return {k: object_name(k) for k in range(self._live.num_classes)}
+        return {k: object_name(k) for k in range(self._live.num_classes)}
 
     def _fuse(self, view: View) -> Rejection | None:
         undo = self._table.checkpoint()

@@ -96,8 +96,8 @@ class LiveSession:
     @property
     def class_names(self) -> dict[int, str]:
         """Names by id, of every class; one without a name is called like "class_07"."""
-        with self._lock:
-            return {k: class_name(self._names, k) for k in range(self._live.num_classes)}
+        names = self._names.copy()  # At once: nobody who asks for names waits for a view that is being fused.
+        return {k: class_name(names, k) for k in range(self._live.num_classes)}
 
     @property
     def version(self) -> int:

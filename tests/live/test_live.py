@@ -299,3 +299,22 @@ def test_threads_that_fuse_learn_and_segment_at_once_lose_nothing() -> None:
     assert session.num_fused == len(VIEWS)
     session._learnt = None
     np.testing.assert_array_equal(session.codes(), fed(LiveSession(SCENE, NAMES)).codes())
+
+
+def test_names_of_classes_are_told_while_a_view_is_being_fused(monkeypatch: pytest.MonkeyPatch) -> None:
+    session = LiveSession(balls_on_a_table()[0], NAMES)
+    begun, told, in_time = threading.Event(), threading.Event(), []
+
+    def observe(learner: object, view: object) -> bool:
+        begun.set()
+        in_time.append(told.wait(30))
+        return True
+
+    monkeypatch.setattr(VoteLearner, "observe", observe)
+    fusing = threading.Thread(target=session.fuse, args=(clean_views(1)[0],))
+    fusing.start()
+    assert begun.wait(30)
+    assert session.class_names == NAMES
+    told.set()
+    fusing.join()
+    assert in_time == [True]
