@@ -21,6 +21,7 @@ from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.refine.silhouette_carving import Silhouette
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
+from gsseg_core.two_at_once import two_at_once
 
 _DIFFERENT = np.array([[0, 0, 0], [230, 40, 40]], np.uint8)
 SavePicture = Callable[[Path, np.ndarray, "str | None"], object]
@@ -79,10 +80,13 @@ def draw_views(
     scene: GaussianScene, segmentation: Segmentation, views: Iterable[View], *, device: str = "cpu"
 ) -> Iterator[Drawn]:
     """Draw the labels of some views, and the scene under them."""
-    for view in views:
+
+    def draw(view: View) -> Drawn:
         operator = make_operator(scene, view.camera, device)
         labels = segmentation.label_map(operator)
-        yield Drawn.of(view, labels, background_image(scene, operator), segmentation.num_classes)
+        return Drawn.of(view, labels, background_image(scene, operator), segmentation.num_classes)
+
+    yield from two_at_once(draw, views) if device == "cpu" else map(draw, views)
 
 
 def look_at(
@@ -96,14 +100,17 @@ def look_at(
 ) -> Iterator[Silhouette]:
     """Tell what views show, to carve objects by, and draw those in `pictured` on the way, into `drawn`."""
     names = {view.name for view in pictured}
-    for view in views:
+
+    def look(view: View) -> Silhouette:
         operator, depth = make_operator(scene, view.camera, device), None
         labels = segmentation.label_map(operator)
         if view.name in names:
             image, left_over = colours_and_depth(scene, operator)
             depth = surface_of(image[..., 3], left_over).depth
             drawn[view.name] = Drawn.of(view, labels, as_pixels(image[..., :3]), segmentation.num_classes)
-        yield Silhouette.of(scene, operator, labels, depth)
+        return Silhouette.of(scene, operator, labels, depth)
+
+    yield from two_at_once(look, views) if device == "cpu" else map(look, views)
 
 
 def write_pictures(

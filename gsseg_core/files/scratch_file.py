@@ -51,6 +51,10 @@ class ScratchFile:
         """Bytes of the objects in the file."""
         return sum(place.size for place in self._places.values())
 
+    def holds(self, name: str) -> bool:
+        """Tell whether there is an object of that name."""
+        return name in self._places
+
     def put(self, name: str, value: Any) -> bool:
         """Write an object; whether that was possible: there may be no space, and what was there of the name is gone."""
         self.drop(name)

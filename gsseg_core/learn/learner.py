@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+import threading
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import closing, suppress
 from typing import Any, TypeVar
 
 import numpy as np
@@ -26,6 +27,7 @@ from gsseg_core.raster.observation import Observation
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import PixelGrid, Strongest
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.two_at_once import two_at_once
 
 VOTE_UNIT = 2.0**-24  # votes are counted in whole multiples of this many px, so that adding and taking back are exact
 UNITS = 1 / VOTE_UNIT  # units per px
@@ -35,6 +37,10 @@ MEMORY_BUDGET = 2 << 30  # bytes of them where the system does not say how much 
 NO_MASK, SEES_NOTHING, ALL_UNKNOWN = "no mask", "sees no Gaussian", "all pixels unknown"
 
 Self = TypeVar("Self", bound="Learner")
+T = TypeVar("T")
+R = TypeVar("R")
+
+_ALONE = threading.Lock()  # of two threads at work on a view each, one at a time keeps its view or lends out the votes
 
 
 def default_budget() -> int:
@@ -106,7 +112,8 @@ class Learner(ABC):
         self.history_: list[float] = []
         self._votes = np.zeros((len(scene), num_classes), np.int64)
         self._prepared: dict[str, Observation] = {}
-        self._in_file = ScratchFile()
+        self._turned = False
+        self._in_file, self._answers = ScratchFile(), ScratchFile()  # views, and what each was asked and answered last
 
     @classmethod
     def default_settings(cls, max_steps: int | None, seed: int) -> tuple[Any, ...]:
@@ -129,27 +136,23 @@ class Learner(ABC):
         MaskFormatError, MaskSizeError, UnknownLabelError
             The mask is broken, of another size than the camera, or has labels beyond the classes.
         """
-        try:
-            if self.memory_budget == 0 and view.name not in self.views:
+        if self.memory_budget == 0 and view.name not in self.views:
+            try:
                 self._vote(view, 1)
-            else:
-                observation = self._open(view)
-                if view.name in self.views:
-                    self.retract(view.name)
-                observation.vote(self._votes, UNITS)
-                self._keep(view.name, observation)
-        except UnusableViewError as why:
-            self.rejected[view.name] = str(why)
-            return False
-        self.rejected.pop(view.name, None)
-        self.views[view.name] = view
-        return True
+            except UnusableViewError as why:
+                return self._add(view, why)
+            return self._add(view, None)
+        return self._add(view, self._opened(view))
 
     def observe_all(self, views: Sequence[View], progress: Progress = silent) -> None:
         """Add views, as `observe` does; the error that one of them raises ends it."""
-        for done, view in enumerate(views):
-            progress("observe", done, len(views))
-            self.observe(view)
+        with closing(self.in_turn(self._opened, views)) as opened:
+            for done, view in enumerate(views):
+                progress("observe", done, len(views))
+                if self.memory_budget == 0:
+                    self.observe(view)
+                else:
+                    self._add(view, next(opened))
         progress("observe", len(views), len(views))
 
     def retract(self, name: str) -> None:
@@ -173,8 +176,7 @@ class Learner(ABC):
     def forget(self, name: str) -> None:
         """Drop a view and its mask; its votes stay. `fit` learns from the views that are left."""
         del self.views[name]
-        self._prepared.pop(name, None)
-        self._in_file.drop(name)
+        self._unprepare(name)
 
     def grow(self, num_classes: int) -> None:
         """Have at least this many classes."""
@@ -216,6 +218,10 @@ class Learner(ABC):
         """Tell the same, and the probabilities of the pixels of a grid."""
         return Strongest.of(self.predict_without(view, only_labelled), grid)
 
+    def in_turn(self, work: Callable[[T], R], items: Iterable[T]) -> Generator[R, None, None]:
+        """Give what is made of each view, or of its name, in their order; on the CPU two are worked on at once."""
+        yield from two_at_once(work, items) if self.device == "cpu" else map(work, items)
+
     def rejected_share(self, view: View) -> float:
         """Share of a view's labelled pixels whose label `fit` has not used, in [0, 1]."""
         return 0.0
@@ -256,6 +262,7 @@ class Learner(ABC):
         self.rejected.clear()
         self._prepared.clear()
         self._in_file.clear()
+        self._answers.clear()
 
     def vote_codes(self) -> np.ndarray:
         """Votes as probabilities, (N, K) float32; a row of zeros where no labelled pixel saw the Gaussian."""
@@ -267,11 +274,12 @@ class Learner(ABC):
     def vote_codes_without(self, name: str) -> np.ndarray:
         """Votes of all other views as probabilities, (N, K) float32; a row of zeros where none saw the Gaussian."""
         observation = self.observation(name)
-        observation.vote(self._votes, UNITS, -1)
-        try:
-            return self.vote_codes()
-        finally:
-            observation.vote(self._votes, UNITS)
+        with _ALONE:
+            observation.vote(self._votes, UNITS, -1)
+            try:
+                return self.vote_codes()
+            finally:
+                observation.vote(self._votes, UNITS)
 
     def evidence(self) -> np.ndarray:
         """Weight of the labelled pixels that saw each Gaussian, over all views, in px, (N,) float32."""
@@ -293,7 +301,8 @@ class Learner(ABC):
 
     def prepared_bytes(self) -> tuple[int, int]:
         """Tell how many bytes of prepared views are kept, in memory and in the temporary file."""
-        return sum(kept.nbytes for kept in self._prepared.values()), self._in_file.nbytes
+        in_file = self._in_file.nbytes + self._answers.nbytes
+        return sum(kept.nbytes for kept in self._prepared.values()), in_file
 
     def _vote(self, view: View, sign: int) -> None:
         """Add a view's votes, or take them away, and keep nothing of it."""
@@ -301,6 +310,51 @@ class Learner(ABC):
         operator = self._operator_of(view)
         if not operator.vote(*self._used_labels(seen, operator), self._votes, UNITS, sign):
             raise UnusableViewError(SEES_NOTHING)
+
+    def _opened(self, view: View) -> Observation | UnusableViewError:
+        """Prepare a view that is new; what is wrong with it is returned."""
+        try:
+            return self._open(view)
+        except UnusableViewError as why:
+            return why
+
+    def _add(self, view: View, opened: Observation | UnusableViewError | None) -> bool:
+        """Count a view, and add its votes if it is prepared, or say why it cannot be used."""
+        if isinstance(opened, UnusableViewError):
+            self.rejected[view.name] = str(opened)
+            return False
+        if opened is not None:
+            if view.name in self.views:
+                self.retract(view.name)
+            opened.vote(self._votes, UNITS)
+            self._keep(view.name, opened)
+        self.rejected.pop(view.name, None)
+        self.views[view.name] = view
+        return True
+
+    def _of_each(
+        self, work: Callable[[str, Observation], R], names: Iterable[str] | None, tick: Callable[[], None]
+    ) -> Iterator[tuple[str, R]]:
+        """Give what is made of each prepared view, or of some of them, two at once; ticks before each.
+
+        Every second time the last view comes first: of a file that is larger than the memory that caches it, what was
+        read last is still there.
+        """
+        names, self._turned = list(self.views if names is None else names), not self._turned
+        names = names if self._turned else names[::-1]
+        with closing(self.in_turn(lambda name: self._asked(name, work), names)) as made:
+            for name in names:
+                tick()
+                yield name, next(made)
+
+    def _asked(self, name: str, work: Callable[[str, Observation], R]) -> R:
+        """Work with a prepared view; what it is asked last is remembered of those that are in the file, too."""
+        observation = self.observation(name)
+        before, made = observation.answered, work(name, observation)
+        if self._in_file.holds(name) and observation.answered is not before:
+            with _ALONE:
+                self._answers.put(name, observation.answered)
+        return made
 
     def _open(self, view: View) -> Observation:
         observation = self._prepare(view, self._read(view))
@@ -334,14 +388,25 @@ class Learner(ABC):
         return seen
 
     def _keep(self, name: str, observation: Observation) -> None:
-        if self.prepared_bytes()[0] + observation.nbytes <= self.memory_budget:
-            self._prepared[name] = observation
-        elif self.memory_budget > 0 and self.device == "cpu":  # what lies on a GPU is not for a file
-            self._in_file.put(name, observation)
+        with _ALONE:
+            if self.prepared_bytes()[0] + observation.nbytes <= self.memory_budget:
+                self._prepared[name] = observation
+            elif self.memory_budget > 0 and self.device == "cpu":  # what lies on a GPU is not for a file
+                self._in_file.put(name, observation)
 
     def _kept(self, name: str) -> Observation | None:
         kept: Observation | None = self._prepared.get(name)
-        return self._in_file.get(name) if kept is None else kept
+        if kept is None:
+            kept = self._in_file.get(name)
+            if kept is not None:
+                kept.answered = self._answers.get(name)
+        return kept
+
+    def _unprepare(self, name: str) -> None:
+        """Keep nothing of a view that is prepared."""
+        self._prepared.pop(name, None)
+        self._in_file.drop(name)
+        self._answers.drop(name)
 
     def _observations(self, names: Iterable[str] | None = None) -> Iterator[tuple[str, Observation]]:
         for name in self.views if names is None else names:

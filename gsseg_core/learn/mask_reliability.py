@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -101,9 +102,10 @@ class MaskChecker:
         """
         views = self.learner.views
         checks = {}
-        for done, view in enumerate(views.values()):
-            progress("check views", done, len(views))
-            checks[view.name] = self._check(view)
+        with closing(self.learner.in_turn(self._check, views.values())) as checked:
+            for done, name in enumerate(views):
+                progress("check views", done, len(views))
+                checks[name] = next(checked)
         for check in shown_views(list(checks.values())):
             if check.num_pixels < views[check.name].camera.width * views[check.name].camera.height:
                 everywhere = PackedLabels(self.learner.classes_without(views[check.name]))

@@ -51,6 +51,8 @@ class Observation(ABC):
         Pixels of each label.
     evidence : LabelEvidence
         What the labels say of the classes; of a plain mask, that they are classes.
+    answered : tuple or None
+        What `shares` was asked last, and what it answered; it is not asked twice.
     """
 
     name: str
@@ -59,6 +61,7 @@ class Observation(ABC):
     labels: np.ndarray
     classes: np.ndarray
     areas: np.ndarray
+    answered: tuple[np.ndarray, np.ndarray, VoteShares] | None = None
 
     @property
     @abstractmethod
@@ -125,7 +128,9 @@ class Observation(ABC):
                 f"view '{self.name}': likelihood and rest have shapes {likelihood.shape} and {rest.shape}; "
                 f"expected {self.labels.shape} and {self.classes.shape}"
             )
-        return self._shares(likelihood, rest)
+        if self.answered is None or not all(map(np.array_equal, self.answered[:2], (likelihood, rest))):
+            self.answered = likelihood.copy(), rest.copy(), self._shares(likelihood, rest)
+        return self.answered[2]
 
     @abstractmethod
     def _shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares: ...

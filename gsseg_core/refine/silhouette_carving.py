@@ -20,7 +20,8 @@ Gaussian is all there is, it stays although it sticks out. One that never sticks
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +33,7 @@ from gsseg_core.raster.depth import BEHIND, depths, surface
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.two_at_once import two_at_once
 
 STEPS = 2  # of the shares: all move at once and so overshoot; on held-out views five were no better
 KEPT = 0.5  # least share with which a Gaussian stays with its object, of the largest share in that object
@@ -99,11 +101,8 @@ def kept_shares(
     asked = go > 0
     for step in range(steps):
         stay[asked] = 0
-        shares = kept.astype(np.float32)
-        for shown, alone in views:
-            wanted = asked[alone.ids]
-            reasons = alone.reasons_to_stay(shares[alone.ids], wanted, shown.labels)
-            stay[alone.ids[wanted]] += reasons[wanted]
+        for ids, reasons in two_at_once(partial(_reasons_to_stay, views, kept.astype(np.float32), asked), views.shown):
+            stay[ids] += reasons
         kept[asked] = np.clip(kept[asked] * stay[asked] / go[asked], _LEAST, 1.0)
         if step == 0:
             # The less is kept, the more reason there is to stay: who stays beside all others stays beside fewer.
@@ -111,27 +110,37 @@ def kept_shares(
     return KeptShares(kept, stay, go)
 
 
+def _reasons_to_stay(
+    views: _ObjectViews, shares: np.ndarray, asked: np.ndarray, shown: Silhouette
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weigh what speaks in one view for those that are asked for, (N,) bool: which they are, and how much."""
+    alone = views.project(shown)
+    wanted = asked[alone.ids]
+    reasons = alone.reasons_to_stay(shares[alone.ids], wanted, shown.labels)
+    return alone.ids[wanted], reasons[wanted]
+
+
 class _ObjectViews:
     """Views with the objects in them, of which those that do not fit into memory are projected again each time."""
 
     def __init__(self, scene: GaussianScene, labels: np.ndarray) -> None:  # (N,) int32
         self._scene, self._labels = scene, labels
-        self._shown: list[Silhouette] = []
+        self.shown: list[Silhouette] = []
         self._kept: dict[int, ObjectsAlone] = {}
 
     def add(self, shown: Silhouette) -> ObjectsAlone:
         """Project a view, unless it comes with its operator."""
-        alone = self._project(shown)
+        alone = self.project(shown)
+        self.shown.append(shown._replace(operator=None))
         if alone.nbytes + sum(kept.nbytes for kept in self._kept.values()) <= _MEMORY:
-            self._kept[len(self._shown)] = alone
-        self._shown.append(shown._replace(operator=None))
+            self._kept[id(self.shown[-1])] = alone
         return alone
 
-    def __iter__(self) -> Iterator[tuple[Silhouette, ObjectsAlone]]:
-        for number, shown in enumerate(self._shown):
-            yield shown, self._kept.get(number) or self._project(shown)
-
-    def _project(self, shown: Silhouette) -> ObjectsAlone:
+    def project(self, shown: Silhouette) -> ObjectsAlone:
+        """Give the objects of a view, projected anew if they are not kept."""
+        kept = self._kept.get(id(shown))
+        if kept is not None:
+            return kept
         operator = shown.operator or TileOperator.of(self._scene, shown.camera)  # on the CPU, which alone tells reasons
         return operator.objects_alone(self._labels)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_scenes import NAMES, NUM_CLASSES, OUT_OF_SIGHT, balls_on_a_table, clean_views, look_at, mean_iou, taught
 
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import MaskSizeError, NoUsableViewsError, SettingsError, UnknownLabelError
@@ -18,8 +20,10 @@ from gsseg_core.learn import learner as learner_module
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.gradient_learner import GradientLearner
 from gsseg_core.learn.learner import VOTE_UNIT, Learner
+from gsseg_core.learn.mask_reliability import check_views
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.cpu import label_pairs
 from gsseg_core.raster.observation import Observation
 from gsseg_core.refine.settings import UNREFINED, RefineSettings
 from gsseg_core.segmentation import UNOBSERVED, Segmentation
@@ -90,6 +94,47 @@ def test_views_beyond_the_memory_budget_are_prepared_once_and_memory_does_not_gr
         assert prepared == len(views) and learner.prepared_bytes()[0] == 0 < learner.prepared_bytes()[1]
     # What stays of a view is its error model, and the numbers of its labels: little, even of views as small as these.
     assert peaks[2] - peaks[1] < 0.2 * (len(many) - len(VIEWS)) * largest
+
+
+def test_nothing_is_asked_twice_of_a_view_that_is_in_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    share, asked = label_pairs.share, []
+
+    def counted(*given: Any) -> Any:
+        asked.append(1)
+        return share(*given)
+
+    monkeypatch.setattr(label_pairs, "share", counted)
+    counts = []
+    for budget in (1 << 30, 1):
+        asked.clear()
+        learner = taught(EMLearner(SCENE, NUM_CLASSES, memory_budget=budget), VIEWS).fit()
+        after_fit = len(asked)
+        check_views(learner)
+        counts.append((after_fit, len(asked)))
+    assert counts[0] == counts[1] and counts[0][0] == counts[0][1]
+    learner.retract(VIEWS[0].name)
+    assert not learner._answers.holds(VIEWS[0].name) and learner._answers.holds(VIEWS[1].name)
+
+
+@pytest.mark.parametrize("budget", [0, 1, 1 << 30])
+def test_views_that_are_worked_on_two_at_once_give_the_same_results(
+    budget: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = replace(VIEWS[0].camera, name="blank")
+    blank = View.from_seen(camera, SeenLabels(np.full((camera.height, camera.width), UNKNOWN, np.int32)))
+    views = [*VIEWS[:2], blank, *VIEWS[2:]]
+    alone = EMLearner(SCENE, NUM_CLASSES)
+    for view in views:
+        alone.observe(view)
+    monkeypatch.setattr("gsseg_core.two_at_once.numba.get_num_threads", lambda: 2)
+    together = EMLearner(SCENE, NUM_CLASSES, memory_budget=budget)
+    together.observe_all(views)
+    assert list(together.views) == list(alone.views) and together.rejected == alone.rejected != {}
+    np.testing.assert_array_equal(together.fit().codes_, alone.fit().codes_)
+    assert list(together.error_models_) == list(alone.error_models_) and together.history_ == alone.history_
+    for one, other in zip(check_views(together), check_views(alone), strict=True):
+        assert one.name == other.name
+        np.testing.assert_array_equal(one.counts, other.counts)
 
 
 def test_by_default_an_eighth_of_the_free_memory_is_for_prepared_views(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -40,7 +40,7 @@ from gsseg_core.learn.em.rejected_regions import find_rejected, split_regions
 from gsseg_core.learn.em.scene_edges import scene_edges
 from gsseg_core.learn.learner import VOTE_UNIT, Learner, Progress, silent
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.raster.observation import Observation
+from gsseg_core.raster.observation import Observation, VoteShares
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import PixelGrid, Strongest, ViewRenderer
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -270,10 +270,13 @@ class EMLearner(Learner):
         rejected : dict of str to (L,) bool
             Which they are; views without any are left out.
         """
+        possible = self._possible()
+
+        def find(_: str, observation: Observation) -> tuple[np.ndarray, Observation]:
+            return find_rejected(votes, observation, possible, self.settings.least_agreement), observation
+
         remaining, rejected = np.zeros_like(votes.data), {}
-        for name, observation in self._observations(names):
-            tick()
-            labels = find_rejected(votes, observation, self._possible(), self.settings.least_agreement)
+        for name, (labels, observation) in self._of_each(find, names, tick):
             if labels.any():
                 rejected[name] = labels
                 rejected_votes = observation.evidence.without_names(~labels).votes
@@ -292,19 +295,20 @@ class EMLearner(Learner):
 
         The votes, int64, are without those of labels that are `rejected`: (L,) bool, of views that have any.
         """
-        models, settings = {}, self.settings
-        for name, observation in self._observations(names):
-            tick()
+        settings, possible = self.settings, self._possible()
+
+        def estimate(name: str, observation: Observation) -> ErrorModel:
             evidence, outliers = observation.evidence, settings.outliers
             if not settings.errors:
-                models[name] = ErrorModel.without_errors(evidence, self.num_classes, outliers, observation.num_pixels)
-                continue
+                return ErrorModel.without_errors(evidence, self.num_classes, outliers, observation.num_pixels)
             if name in rejected:
                 evidence = evidence.without_names(rejected[name])
             pixels = int(observation.areas[evidence.informative].sum())
-            counts = leave_one_out_counts(votes, observation, self._possible(), evidence, settings.majority)
-            models[name] = ErrorModel.from_counts(evidence, counts, settings.error_prior, outliers, pixels)
-        return models
+            counts = leave_one_out_counts(votes, observation, possible, evidence, settings.majority)
+            return ErrorModel.from_counts(evidence, counts, settings.error_prior, outliers, pixels)
+
+        models = dict(self._of_each(estimate, names, tick))
+        return {name: models[name] for name in (self.views if names is None else names) if name in models}
 
     def _e_step(self, codes: CSRRows, models: dict[str, ErrorModel], tick: Tick) -> tuple[np.ndarray, dict[str, float]]:
         """Sum over the views of these models the gradient of the log-likelihood.
@@ -316,11 +320,14 @@ class EMLearner(Learner):
         log_likelihoods : dict of str to float
             Of each view's labels, in nats.
         """
-        gradient, log_likelihoods = np.zeros(len(codes.data), np.int64), {}
-        for name, observation in self._observations(models):
-            tick()
+
+        def share(name: str, observation: Observation) -> tuple[ViewPairs, np.ndarray, VoteShares]:
             (likelihood, used), pairs = models[name].by_label, ViewPairs.of(observation)
-            shares = observation.shares(kernels.pair_likelihood(codes, pairs, likelihood), likelihood[:, 0])
+            said = kernels.pair_likelihood(codes, pairs, likelihood)
+            return pairs, used, observation.shares(said, likelihood[:, 0])
+
+        gradient, log_likelihoods = np.zeros(len(codes.data), np.int64), {}
+        for name, (pairs, used, shares) in self._of_each(share, models, tick):
             log_likelihoods[name] = shares.log_likelihood
             kernels.accumulate(codes.with_data(gradient), pairs, used, shares.pairs)
         return gradient, log_likelihoods
@@ -329,8 +336,8 @@ class EMLearner(Learner):
         self, codes: CSRRows, gradient: np.ndarray, prior: np.ndarray, models: dict[str, ErrorModel], tick: Tick
     ) -> dict[str, ErrorModel]:
         """Re-estimate each view's error model, in place, from the step without this view; see `codes_without`."""
-        for name, observation in self._observations(models):
-            tick()
+
+        def refit(name: str, observation: Observation) -> None:
             model, pairs = models[name], ViewPairs.of(observation)
             without = codes_without(observation, model, codes, gradient, prior)
             rows = np.arange(len(pairs.ids), dtype=np.int32)
@@ -340,6 +347,9 @@ class EMLearner(Learner):
             counts = kernels.confusion_counts(without, pairs, shares.pairs, self.num_classes, len(likelihood))
             counts[0] += shares.rest
             model.m_step(model.expected_counts(counts))
+
+        for _ in self._of_each(refit, models, tick):
+            pass
         return models
 
     def _spatial_prior(self, votes: CSRRows) -> CSRRows:

@@ -154,11 +154,10 @@ class TileObservation(Observation):
         self._tiles = tiles._replace(
             table=table, start=start, entries=entries, gaussian_start=none, gaussian_entries=none.astype(np.int32)
         )
-        self._answered: tuple[np.ndarray, np.ndarray, VoteShares] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what `shares` was asked last."""
-        return {**self.__dict__, "_answered": None}
+        return {**self.__dict__, "answered": None}
 
     @property
     def nbytes(self) -> int:
@@ -177,8 +176,6 @@ class TileObservation(Observation):
         return self._votes
 
     def _shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares:
-        if self._answered is not None and all(map(np.array_equal, self._answered[:2], (likelihood, rest))):
-            return self._answered[2]  # a refit begins with what the last step asked
         slots, numbered = (self._slot_start, self._pair), np.empty_like(likelihood)
         numbered[self._number] = likelihood
         logs, left_over, sums = label_pairs.share(
@@ -186,9 +183,7 @@ class TileObservation(Observation):
         )
         pairs = label_pairs.add_up(*slots, sums, len(likelihood)).sum(axis=0)[self._number]
         total = np.bincount(self._mask.present, weights=left_over, minlength=len(rest))
-        shares = VoteShares(pairs, total, float(logs.sum()))
-        self._answered = likelihood.copy(), rest.copy(), shares
-        return shares
+        return VoteShares(pairs, total, float(logs.sum()))
 
 
 def _ascending(ids: np.ndarray) -> np.ndarray:  # (M,) int32, distinct

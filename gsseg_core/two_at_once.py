@@ -1,0 +1,51 @@
+"""Work on two views at once, each with half of the threads: what one thread alone can do of a view leaves no core idle.
+
+A mask is decoded, cut into regions and counted by one thread, and a view of another step comes out of a file, while the
+other cores would wait. More than two at once would gain little, and each takes the memory of a view.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+import numba
+
+from gsseg_core import kernel_cache as _kernel_cache  # noqa: F401 - before any kernel is defined
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+def two_at_once(work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+    """Give what `work` makes of each item, in their order; the next two are worked on meanwhile.
+
+    The error that one of them raises comes in its turn, and the work ends. `work` may be called in two threads at once;
+    with one core, or where kernels of two threads cannot run beside each other, in none but the caller's.
+    """
+    threads = numba.get_num_threads()
+    if threads == 1 or not _kernels_run_beside_each_other():
+        yield from map(work, items)
+        return
+    begun: deque[Future[R]] = deque()
+    with ThreadPoolExecutor(2, "gsseg-view", numba.set_num_threads, (threads // 2,)) as pool:
+        try:
+            for item in items:
+                begun.append(pool.submit(work, item))
+                if len(begun) == 2:
+                    yield begun.popleft().result()
+            while begun:
+                yield begun.popleft().result()
+        finally:
+            for future in begun:
+                future.cancel()
+
+
+def _kernels_run_beside_each_other() -> bool:
+    """Tell whether numba's threads are of a kind that serves several callers; it is known after the first kernel."""
+    try:
+        return bool(numba.threading_layer() != "workqueue")  # type: ignore[attr-defined]
+    except ValueError:
+        return False
