@@ -93,7 +93,8 @@ class Observation(ABC):
     def operator(self, camera: Camera, num_gaussians: int) -> ViewRenderer:
         """Make the operator of the view again, to blend codes: what pixels without a label show has no meaning.
 
-        Nothing is projected. Camera and number of Gaussians are those of the operator that it was observed with.
+        Nothing is projected. Camera and number of Gaussians are those of the operator that it was observed with; the
+        `ids` may come in another order.
         """
 
     @abstractmethod

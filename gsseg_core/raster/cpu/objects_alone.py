@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsseg_core.raster.cpu import silhouette_kernels
+from gsseg_core.raster.cpu.label_pairs import take
 from gsseg_core.raster.cpu.tiling import Tiles
 
 
@@ -17,7 +18,8 @@ class ObjectsAlone:
     Attributes
     ----------
     ids : (M,) int32
-        Those that can reach the image, nearest first, as indices in the scene.
+        Those that reach a tile, as indices in the scene, in the order in which tiles meet them: what one tile needs
+        lies close together.
     labels : (M,) int32
         Object of each, above 0.
     tiles : Tiles
@@ -31,13 +33,10 @@ class ObjectsAlone:
     @classmethod
     def of(cls, ids: np.ndarray, tiles: Tiles, labels: np.ndarray) -> ObjectsAlone:
         """Choose them among the Gaussians of a view, `ids` (M',), by the labels (N,) int32 of the whole scene."""
-        labels = labels[ids]
-        own = labels > 0
-        place = (np.cumsum(own) - 1).astype(np.int32)
-        kept, none = own[tiles.entries], np.empty(0, np.int32)
-        start = np.concatenate([[0], np.cumsum(kept)])[tiles.start]
-        return cls(ids[own], labels[own], tiles._replace(
-            table=tiles.table[own], start=start, entries=place[tiles.entries[kept]],
+        start, entries, rows = silhouette_kernels.choose(tiles.start, tiles.entries, labels[ids])
+        ids, none = ids[rows], np.empty(0, np.int32)
+        return cls(ids, labels[ids], tiles._replace(
+            table=take(tiles.table, rows), start=start, entries=entries,
             gaussian_start=none.astype(np.int64), gaussian_entries=none,
         ))  # fmt: skip
 

@@ -6,16 +6,44 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.kernel_cache import called_by_kernels
-from gsseg_core.raster.constants import T_MIN
+from gsseg_core.raster.constants import AHEAD, T_MIN
 from gsseg_core.raster.cpu.blending import corner_of, in_block, open_rays, stride_of, tile_of_turn
 from gsseg_core.raster.cpu.splat import WIDTH, aim, alpha_of
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
-from gsseg_core.simd import add_product, add_scaled, first_bit, load_row, nothing, store_row, sum_row
+from gsseg_core.simd import add_product, add_scaled, first_bit, load_row, nothing, prefetch, store_row, sum_row
 
 _ROUNDING = np.float32(1e-3)  # of 1 - T, below which a pixel is as good as empty
 _UNKNOWN, _MIXED = np.int32(-1), np.int32(-2)  # in place of the one label that a block or a tile shows
 
 _FAST = {"contract", "reassoc", "nnan", "nsz"}
+
+
+@nb.njit(nogil=True, cache=True)
+def choose(start: np.ndarray, entries: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Keep the entries of Gaussians with a label, (M',) int32, above 0, and number these as they occur.
+
+    Returns where the entries of each tile begin, (T + 1,) int64; the new number of each entry's Gaussian, (E,) int32;
+    and the former one of each, (M,) int32.
+    """
+    new, former = np.full(labels.shape[0], -1, np.int32), np.empty(labels.shape[0] + 1, np.int32)
+    kept_start, kept, e, n = np.zeros_like(start), np.empty_like(entries), 0, np.int32(0)
+    last = entries.shape[0] - 1
+    for tile in range(start.shape[0] - 1):
+        for i in range(start[tile], start[tile + 1]):
+            later = entries[min(i + 2 * AHEAD, last)]
+            prefetch(new, later)
+            prefetch(labels, later)
+            g = entries[i]
+            own, known = labels[g] > 0, new[g]
+            # Without a branch, which nobody could predict: what does not count is overwritten.
+            former[n] = g
+            number = n if known < 0 else known
+            kept[e] = number
+            new[g] = number if own else np.int32(-1)
+            n += np.int32(own & (known < 0))
+            e += own
+        kept_start[tile + 1] = e
+    return kept_start, kept[:e].copy(), former[:n].copy()
 
 
 @nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath=_FAST)

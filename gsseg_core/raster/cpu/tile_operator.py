@@ -140,17 +140,21 @@ class TileObservation(Observation):
             tiles, kept, facts, lifted.sums, self._mask.present, len(self.classes), capacity, entries, self._pair
         )
         before = np.cumsum(found, axis=0) - found
-        label_pairs.renumber(entries, before[:, 0])
-        label_pairs.renumber(self._pair, before[:, 1])
         seen, counts = _joined(gaussians, chunks, found[:, 0]), _joined(label_counts, chunks, found[:, 0])
-        # Blending goes through them nearest first, learning in the order of the scene, in which all views meet.
-        self._nearest_first: np.ndarray = ids[seen]
-        order, first = _ascending(self._nearest_first), starts(counts)
-        self.ids, self.start = self._nearest_first[order], starts(counts[order])
         labels, votes = _joined(labels, capacity, found[:, 1]), _joined(votes, capacity, found[:, 1])
+        # Blending goes through them tile by tile, learning in the order of the scene, in which all views meet.
+        rows = label_pairs.renumber(entries, before[:, 0], len(seen))
+        pair_numbers = label_pairs.renumber(self._pair, before[:, 1], len(labels))
+        nearest_first, by_row = ids[seen], np.empty_like(seen)
+        by_row[rows] = seen
+        self._ids_by_row: np.ndarray = ids[by_row]
+        order, first = _ascending(nearest_first), starts(counts)
+        self.ids, self.start = nearest_first[order], starts(counts[order])
         # Of each pair its number in `_pair`.
-        self._number, self.labels, self._votes = label_pairs.put_in_order(order, first, self.start, labels, votes)
-        table, none = label_pairs.take(tiles.table, seen), np.empty(0, np.int64)
+        self._number, self.labels, self._votes = label_pairs.put_in_order(
+            order, first, self.start, pair_numbers, labels, votes
+        )
+        table, none = label_pairs.take(tiles.table, by_row), np.empty(0, np.int64)
         self._tiles = tiles._replace(
             table=table, start=start, entries=entries, gaussian_start=none, gaussian_entries=none.astype(np.int32)
         )
@@ -162,14 +166,14 @@ class TileObservation(Observation):
     @property
     def nbytes(self) -> int:
         """Memory that it holds, in bytes."""
-        held = (self.ids, self._nearest_first, self._number, self.start, self.labels, self._votes, *self._tiles[4:],
+        held = (self.ids, self._ids_by_row, self._number, self.start, self.labels, self._votes, *self._tiles[4:],
                 self._blocks, self._records, self._slot_start, self._pair, *self._mask)  # fmt: skip
         # And what `shares` was asked last, and answered.
         return sum(array.nbytes for array in held) + 2 * self._votes.nbytes
 
     def operator(self, camera: Camera, num_gaussians: int) -> TileOperator:
         """Make an operator of the Gaussians that labelled pixels see."""
-        return TileOperator(camera, num_gaussians, self._nearest_first, self._tiles)
+        return TileOperator(camera, num_gaussians, self._ids_by_row, self._tiles)
 
     def votes(self) -> np.ndarray:
         """Weights summed by pair, (P,) float32."""
