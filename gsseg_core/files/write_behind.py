@@ -15,20 +15,20 @@ WriteBehind = Callable[Concatenate[Callable[Arguments, object], Arguments], None
 
 @contextmanager
 def writing_behind() -> Iterator[WriteBehind[...]]:
-    """Give a function that has files written by another thread, one after the other; all are when the body has ended.
+    """Give a function that has files written by two other threads; all are when the body has ended.
 
     To compress and to wait for the disk takes little of the cores that the body works on. Only what writes, or gets
     something ready for that, belongs there: nothing else may change what it is given. The first error of a writer is
     raised with the next call, or at the end.
     """
-    with ThreadPoolExecutor(1, "gsseg-write") as thread:
+    with ThreadPoolExecutor(2, "gsseg-write") as threads:
         waiting: list[Future[object]] = []
 
         def write(job: Callable[..., object], *arguments: object, **named: object) -> None:
             for done in [future for future in waiting if future.done()]:
                 waiting.remove(done)
                 done.result()
-            waiting.append(thread.submit(job, *arguments, **named))
+            waiting.append(threads.submit(job, *arguments, **named))
 
         yield write
         for future in waiting:
