@@ -42,7 +42,7 @@ from gsseg_core.segmentation import Segmentation
 SCENES = {"shelf": 0, "kitchen_table": 0, "workbench": 2}
 """The last class that is not an object: what is behind them, and what they stand on."""
 
-LEVELS = (0.15, 0.2, 0.25, 0.3, 0.4, 0.5)
+LEVELS = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5)
 LEAST_PX = 120
 """Pixels of a part."""
 

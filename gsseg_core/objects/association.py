@@ -10,15 +10,20 @@ and O_ab / V_av is the share of what v sees of a that it calls b. Hidden parts d
 behind a chair still matches the whole. All three are products of sparse matrices, and sums over the segments of a
 cluster are those of the cluster.
 
-1. **Views vote on pairs.** View v says that clusters C and D are one object with the probability that a point of each
-   gets the same id there, A_v = sum_b O_Cb O_Db / (V_Cv V_Dv). What counts is the mean over the views that see both,
-   so an object that some views split, or two that some views merge, are outvoted by the other views.
+1. **Views that show things whole vote.** A view shows cluster C whole by f_C, which grows from 0 to 1 while the largest
+   share O_Cb / V_Cv of an id grows from one half to nine tenths. Of the views that see both C and D, two averages are
+   taken: the share in which one id shows both whole, and the share of that among those in which each is shown whole.
+   Their geometric mean is the agreement of C and D. Parts of one object are shown whole together as often as the object
+   is; two objects only where both happen to be whole and have been merged as well. And that half of C went with D, as
+   where many neighbours are merged, says nothing.
 2. **Clusters merge**, the most agreed pairs first; what has merged is compared anew, with the evidence of all its
    segments together.
-3. **The views tell where to stop.** Segmenters split objects far more often than they merge two, but how often they
-   merge differs. It shows in the clusters that most views hold together: of those that touch, the least agreed pairs
-   are different objects, so their agreement is how often neighbours are merged. Merging goes on to a level above it; to
-   one half where hardly a pair is in doubt, since there objects are whole, and small ones must not go to large ones.
+3. **The views tell where to stop.** Let views show an object whole with the probability w, and merge neighbours with
+   the probability m. Two objects are under one id, both whole, in w w m of the views, which is an agreement of w m, and
+   parts of one in w of them. Both are read off the clusters so far: w is how often they are shown whole, m how often
+   those that touch are under one id where both are whole. As pairs differ, the level is a multiple of sqrt(w m), and at
+   least 0.4 w. Where hardly any clusters that touch agree by 0.3 to 0.6, no object comes in parts, and merging stops at
+   one half: small ones must not go to large ones.
 4. **Segments move** to the object that explains them best by what the other views say, until none does. That gives
    leftovers, one half of something, say, to the whole, and clutter to the background; objects left without a segment
    are gone.
@@ -29,7 +34,6 @@ Nothing depends on the order of views or ids, nor on how many there are.
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -44,12 +48,10 @@ _PAIRS = 1 << 15  # so many pairs at a time, to keep memory small
 _BEST = 0.75  # pairs that agree nearly as well as the best one merge at once, before anything is compared anew
 _MOST = 0.6  # agreement above which clusters are one object whatever the segmenter does
 _WHOLE = 0.5  # the level where segmenters hardly ever split an object, or too little is known
-# Where they do, it is _LEAST + _SLOPE sqrt(how often views merge neighbours), at most _MOST; fitted to made-up masks.
-_LEAST, _SLOPE = 0.2, 1.75
-_SPLIT, _OFTEN = 0.3, 0.15  # agreement of two parts of one object, at least; share of such pairs that means often
-_DIFFERENT = 0.1  # share of the pairs of clusters that touch of which it is sure that they are different objects
-_TOUCHING = 5  # views in which clusters touch, for that
-_FEWEST = 10  # such pairs, of which fewer tell nothing
+_LEVEL, _LEAST = 3.0, 0.4  # the level by sqrt(w m), fitted to made-up masks, and by w at least
+_DOUBTED, _SPLIT = 0.3, 0.1  # agreement of parts of one object, at least; share of such pairs that means often split
+_DIFFERENT = 0.4  # clusters that touch and agree by less where both are whole are taken for different objects
+_OFTEN = 5  # views in which clusters touch, or that see one, from which on they tell how the segmenter works
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,8 @@ class AssociationSettings:
     full_sight: float = 0.5  # share of a cluster, as far as any view sees it, that a view must see to count in full
     plenty: float = 2000.0  # px of a cluster that a view must see to count in full, however large the cluster is
     full_sight_px: float = 10.0  # what a view sees of a cluster counts by x / (x + this), x in px
-    least_share: float = 0.05  # smaller shares O_ab / V_av are soft edges, not overlap
+    least_share: float = 0.5  # of what a view sees of a cluster: an id that has no more does not show it
+    whole_share: float = 0.9  # an id that has as much shows it whole
     unseen: float = 0.3  # a segment of which the other views have seen less than this share stays what it is
     rounds: int = 10  # of moves, at most
 
@@ -73,7 +76,12 @@ class AssociationSettings:
             raise SettingsError(f"association: kept is {self.kept}; expected a share in (0, 1]")
         if self.agreement is not None and not 0 < self.agreement < 1:
             raise SettingsError(f"association: agreement is {self.agreement}; expected a share in (0, 1), or None")
-        for name in ("doubt", "evidence", "full_sight_px", "least_share", "unseen", "rounds"):
+        if not 0 <= self.least_share < self.whole_share <= 1:
+            raise SettingsError(
+                f"association: least_share is {self.least_share}, whole_share {self.whole_share}; expected shares "
+                "in [0, 1], the second the larger one"
+            )
+        for name in ("doubt", "evidence", "full_sight_px", "unseen", "rounds"):
             if getattr(self, name) < 0:
                 raise SettingsError(f"association: {name} is {getattr(self, name)}; expected 0 or more")
         if min(self.full_sight, self.plenty) <= 0:
@@ -156,23 +164,24 @@ def _merge(stack: _Stack, settings: AssociationSettings) -> tuple[np.ndarray, fl
     overlap.data[stack.background[overlap.indices]] = 0
     overlap.eliminate_zeros()
     overlap, seen, hidden = overlap[nodes], seen[nodes], hidden[nodes]
-    agreement = settings.agreement
+    agreement, split = settings.agreement or _MOST, np.nan
     while len(seen) > 1:
-        votes, counts = _votes(overlap, seen, hidden, stack.view, settings)
-        target = _match(_agreements(votes, counts, settings), len(seen), _MOST if agreement is None else agreement)
-        if target is None and agreement is not None:
-            break
+        votes = _Votes.of(overlap, seen, hidden, stack.view, settings)
+        pairs = votes.pairs()
+        if settings.agreement is None and not (pairs.score > agreement).any():
+            beside = _grouping(cluster) @ touching @ _grouping(cluster).T
+            split = votes.split(beside) if np.isnan(split) else split
+            agreement = min(agreement, votes.told_level(beside, split))
+        target = _match(pairs, len(seen), agreement)
         if target is None:
-            groups = _grouping(cluster)
-            agreement = _told_level(votes, counts, groups @ touching @ groups.T, settings)
-            continue
+            break
         merged = np.unique(target, return_inverse=True)[1]
         groups = _grouping(merged)
         overlap, seen, hidden = (groups @ overlap).tocsr(), groups @ seen, groups @ hidden
         cluster = merged[cluster]
     clusters = np.zeros(len(stack.view), np.int64)
     clusters[nodes] = cluster + 1
-    return clusters, _WHOLE if agreement is None else agreement
+    return clusters, agreement
 
 
 def _grouping(cluster: np.ndarray) -> sparse.csr_matrix:  # (n,)
@@ -180,42 +189,102 @@ def _grouping(cluster: np.ndarray) -> sparse.csr_matrix:  # (n,)
     return sparse.csr_matrix((np.ones(len(cluster), np.float32), (cluster, np.arange(len(cluster)))))
 
 
-def _votes(
-    overlap: sparse.csr_matrix, seen: np.ndarray, hidden: np.ndarray, view: np.ndarray, settings: AssociationSettings
-) -> tuple[sparse.csr_matrix, np.ndarray]:
-    """Share of each cluster that each segment has, (C, n), and what each view counts for it, (C, views), in the former.
-
-    From what they have in common, (C, n), what each view sees of a cluster, and how much of that is background there,
-    (C, views) both. Who calls a cluster background says nothing of which object it is.
-    """
-    foreground = np.maximum(seen - hidden, 0)
-    full = np.minimum(settings.full_sight * seen.max(axis=1, keepdims=True), settings.plenty)
-    counts: np.ndarray = np.minimum(foreground / np.maximum(full, 1e-9), 1)
-    counts *= foreground / (foreground + settings.full_sight_px)
-    entries = overlap.tocoo()
-    share = entries.data / np.maximum(foreground[entries.row, view[entries.col]], 1e-9)
-    strong = share > settings.least_share
-    row, col, share = entries.row[strong], entries.col[strong], share[strong]
-    return sparse.csr_matrix((share * counts[row, view[col]], (row, col)), shape=overlap.shape), counts
-
-
 class _Pairs(NamedTuple):
-    """Pairs of clusters that some view calls the same, (P,) each."""
+    """Pairs of clusters that some view shows whole under one id, (P,) each."""
 
     first: np.ndarray
     second: np.ndarray  # larger than the first
-    score: np.ndarray  # mean agreement of the views; 0 where too few see both
+    score: np.ndarray  # agreement; 0 where too few views see both
 
 
-def _agreements(votes: sparse.csr_matrix, counts: np.ndarray, settings: AssociationSettings) -> _Pairs:
-    """Compare clusters; takes what `_votes` returns."""
-    both = sparse.triu(votes @ votes.T, 1).tocoo()
-    evidence = np.empty(both.nnz)
-    for k in range(0, both.nnz, _PAIRS):
-        part = slice(k, k + _PAIRS)
-        evidence[part] = np.einsum("pv,pv->p", counts[both.row[part]], counts[both.col[part]])
-    score = np.where(evidence >= settings.evidence, both.data / (evidence + settings.doubt), 0)
-    return _Pairs(both.row, both.col, score)
+class _Votes(NamedTuple):
+    """How the views show C clusters."""
+
+    whole: sparse.csr_matrix  # (C, n): how whole each segment shows each cluster, times what its view counts for that
+    counts: np.ndarray  # (C, views): 0 to 1, by how much of a cluster the view sees
+    shown: np.ndarray  # (C, views): how whole the view shows it under any id, times counts
+    settings: AssociationSettings
+
+    @classmethod
+    def of(
+        cls,
+        overlap: sparse.csr_matrix,  # (C, n): what clusters and segments have in common
+        seen: np.ndarray,  # (C, views): what views see of clusters
+        hidden: np.ndarray,  # (C, views): how much of that is background there
+        view: np.ndarray,  # (n,): of the segments
+        settings: AssociationSettings,
+    ) -> _Votes:
+        """Let the views vote. Who calls a cluster background says nothing of which object it is."""
+        foreground = np.maximum(seen - hidden, 0)
+        full = np.minimum(settings.full_sight * seen.max(axis=1, keepdims=True), settings.plenty)
+        counts: np.ndarray = np.minimum(foreground / np.maximum(full, 1e-9), 1)
+        counts *= foreground / (foreground + settings.full_sight_px)
+        entries = overlap.tocoo()
+        share = entries.data / np.maximum(foreground[entries.row, view[entries.col]], 1e-9)
+        strong = share > settings.least_share
+        row, col = entries.row[strong], entries.col[strong]
+        grown = (share[strong] - settings.least_share) / (settings.whole_share - settings.least_share)
+        whole = np.minimum(grown, 1) * counts[row, view[col]]
+        shown = np.zeros_like(counts)
+        np.maximum.at(shown, (row, view[col]), whole)
+        return cls(sparse.csr_matrix((whole, (row, col)), shape=overlap.shape), counts, shown, settings)
+
+    def pairs(self) -> _Pairs:
+        """Compare all clusters that any id shows whole together."""
+        together = sparse.triu(self.whole @ self.whole.T, 1).tocoo()
+        see, show = self._views_of_both(together.row, together.col)
+        doubt = self.settings.doubt
+        score = together.data / np.sqrt((see + doubt) * (show + doubt))
+        return _Pairs(together.row, together.col, np.where(see >= self.settings.evidence, score, 0))
+
+    def split(self, touching: sparse.csr_matrix) -> float:
+        """Tell whether objects come in parts, 0 to 1, by how many of the clusters that touch may be one."""
+        first, second = _often(touching)
+        together, see, show = self._compared(first, second)
+        score = together / np.sqrt((see + self.settings.doubt) * (show + self.settings.doubt))
+        known = see > _OFTEN
+        return min(float(np.mean(score[known] > _DOUBTED)) / _SPLIT, 1) if known.any() else 0.0
+
+    def told_level(self, touching: sparse.csr_matrix, split: float) -> float:
+        """Agreement above which clusters are one object, by how often views show them whole and merge neighbours.
+
+        Takes in how many views clusters touch, (C, C), and what `split` told.
+        """
+        seen = self.counts.sum(axis=1)
+        known = seen >= _OFTEN
+        if not known.any():
+            return _WHOLE
+        whole = float(np.mean(self.shown[known].sum(axis=1) / seen[known]))
+        level = max(_LEVEL * np.sqrt(whole * self._merged(touching)), _LEAST * whole)
+        return float(_WHOLE + split * (min(level, _MOST) - _WHOLE))
+
+    def _merged(self, touching: sparse.csr_matrix) -> float:
+        """How often clusters that touch, but differ, are under one id where each of them is shown whole."""
+        together, see, show = self._compared(*_often(touching))
+        rate = together / (show + self.settings.doubt)
+        differ = (show > 1) & (rate < _DIFFERENT)
+        return float(np.average(rate[differ], weights=see[differ])) if differ.any() else 0.0
+
+    def _compared(self, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Count, for pairs of clusters, views that show both whole under one id, see both, and show each whole."""
+        together = np.asarray(self.whole[first].multiply(self.whole[second]).sum(axis=1)).ravel()
+        return together, *self._views_of_both(first, second)
+
+    def _views_of_both(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        """Count, for pairs of clusters, the views that see both, and those that show each of them whole, (2, P)."""
+        count = np.empty((2, len(first)))
+        for k in range(0, len(first), _PAIRS):
+            part = slice(k, k + _PAIRS)
+            for row, votes in zip(count, (self.counts, self.shown), strict=True):
+                row[part] = np.einsum("pv,pv->p", votes[first[part]], votes[second[part]])
+        return count
+
+
+def _often(touching: sparse.csr_matrix) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of clusters that touch in several views, the first before the second."""
+    pairs = sparse.triu(touching, 1).tocoo()
+    several = pairs.data >= _OFTEN
+    return pairs.row[several], pairs.col[several]
 
 
 def _same_view(overlap: sparse.csr_matrix, view: np.ndarray) -> sparse.csr_matrix:
@@ -224,25 +293,6 @@ def _same_view(overlap: sparse.csr_matrix, view: np.ndarray) -> sparse.csr_matri
     same = view[entries.row] == view[entries.col]
     ones = np.ones(int(same.sum()), np.float32)
     return sparse.csr_matrix((ones, (entries.row[same], entries.col[same])), shape=overlap.shape)
-
-
-def _told_level(
-    votes: sparse.csr_matrix, counts: np.ndarray, touching: sparse.csr_matrix, settings: AssociationSettings
-) -> float:
-    """Agreement above which clusters are one object, by how often the views merge two that are not.
-
-    Takes what `_votes` returns, and in how many views clusters touch, (C, C).
-    """
-    pairs = sparse.triu(touching, 1).tocoo()
-    often = pairs.data >= _TOUCHING
-    first, second = pairs.row[often], pairs.col[often]
-    evidence = np.einsum("pv,pv->p", counts[first], counts[second])
-    agreed = np.asarray(votes[first].multiply(votes[second]).sum(axis=1)).ravel()
-    score = (agreed / (evidence + settings.doubt))[evidence > _TOUCHING]
-    if len(score) < _FEWEST:
-        return _WHOLE
-    told = min(_LEAST + _SLOPE * math.sqrt(np.quantile(score, _DIFFERENT)), _MOST)
-    return _WHOLE + (told - _WHOLE) * min(float(np.mean(score > _SPLIT)) / _OFTEN, 1)
 
 
 def _match(pairs: _Pairs, num: int, least: float) -> np.ndarray | None:

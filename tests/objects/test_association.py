@@ -127,7 +127,7 @@ def test_there_can_be_more_than_255_objects() -> None:
 
 
 def row_of_objects(rng: np.random.Generator, split: float, merged: float) -> Lifted:
-    """A view of 16 objects, 20 Gaussians each, of which each reaches over to the next; as a generator masks them.
+    """A view of 16 objects, 20 Gaussians each, as a generator masks them, with Gaussians that reach over edges.
 
     It cuts an object in two somewhere, and gives two neighbours one id, each with a probability.
     """
@@ -140,7 +140,7 @@ def row_of_objects(rng: np.random.Generator, split: float, merged: float) -> Lif
     segment = np.unique(2 * ids[owner] + (np.arange(320) % 20 >= cut[owner]), return_inverse=True)[1]
     weights = np.zeros((segment.max() + 1, 320), np.float32)
     weights[segment, np.arange(320)] = 10 + rng.random(320)
-    last = np.arange(19, 319, 20)
+    last = np.flatnonzero(np.diff(segment))
     weights[segment[last + 1], last] += 4
     return Lifted(np.arange(1, len(weights) + 1), np.arange(320), sparse.csr_matrix(weights))
 
@@ -290,7 +290,8 @@ def test_views_of_a_corner_of_something_large_say_that_what_is_beside_it_is_anot
 
 
 def test_settings_that_make_no_sense_are_refused() -> None:
-    for wrong in ({"kept": 0.0}, {"agreement": 1.0}, {"doubt": -1.0}, {"full_sight": 0.0}, {"plenty": 0.0}):
+    senseless = {"kept": 0.0}, {"agreement": 1.0}, {"doubt": -1.0}, {"full_sight": 0.0}, {"least_share": 0.9}
+    for wrong in (*senseless, {"plenty": 0.0}):
         with pytest.raises(SettingsError, match="association"):
             AssociationSettings(**wrong)
 
