@@ -14,7 +14,7 @@ from workloads import RoomSize, make_room
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.view import View
 from gsseg_core.learn.em.em_learner import EMLearner
-from gsseg_core.learn.learner import MEMORY_BUDGET
+from gsseg_core.learn.prepared_views import MEMORY_BUDGET
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.segmentation import Segmentation
 

@@ -33,8 +33,9 @@ from gsseg_core.files.json_files import write_json
 from gsseg_core.files.run_folder import StagedRun, staged_run
 from gsseg_core.files.write_behind import WriteBehind, writing_behind
 from gsseg_core.learn.calibrate import Calibration, calibrate
-from gsseg_core.learn.learner import NO_MASK, Learner, default_budget
+from gsseg_core.learn.learner import NO_MASK, Learner
 from gsseg_core.learn.mask_reliability import MaskChecker, ViewCheck, compare_mask, reliability_report
+from gsseg_core.learn.prepared_views import default_budget
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.objects.object_table import ObjectTable, find_objects
 from gsseg_core.progress import Progress, Stopwatch, silent

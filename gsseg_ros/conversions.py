@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import array
 import math
-import re
-import unicodedata
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +26,6 @@ from gsseg_ros.frames import quaternion_from_rotation, rigid, rotation_from_quat
 
 _NS = 1_000_000_000
 _UNIT_TOLERANCE = 1e-3
-_LONGEST_TOKEN = 64  # The full name of a topic must stay below 256 characters.
 
 # Type of a pixel, and its value for "unknown".
 MASK_ENCODINGS: dict[str, tuple[npt.DTypeLike, int]] = {
@@ -373,28 +370,6 @@ def byte_array(*parts: npt.NDArray[Any], kind: str = "B") -> array.array[int]:
     for values in parts:
         data.frombytes(np.ascontiguousarray(values).view(np.uint8).data if values.size else b"")
     return data
-
-
-def topic_tokens(class_names: Mapping[int, str]) -> dict[int, str]:
-    """Turn class names into unique parts of topic names: ASCII letters, digits and single underscores.
-
-    Where classes would get the same token, that of the lowest id keeps it and the others get `_<id>` appended.
-    """
-    owners: dict[str, int] = {}
-    for number, name in sorted(class_names.items()):
-        token = _token(name, number)
-        while token in owners:
-            token = f"{token}_{number}"
-        owners[token] = number
-    return {number: token for token, number in owners.items()}
-
-
-def _token(name: str, number: int) -> str:
-    ascii_name = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
-    token = re.sub(r"[^A-Za-z0-9]+", "_", ascii_name)[:_LONGEST_TOKEN].strip("_")
-    if not token:
-        return f"class_{number}"
-    return f"class_{token}" if token[0].isdigit() else token
 
 
 def _matrix(position: Any, orientation: Any, topic: str) -> npt.NDArray[np.float64]:

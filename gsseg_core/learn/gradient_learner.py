@@ -100,8 +100,9 @@ class GradientLearner(Learner):
         for epoch in range(settings.epochs):
             losses = []
             order = [names[i] for i in rng.permutation(len(names))]
-            for done, (_, observation) in enumerate(self._observations(order)):
+            for done, name in enumerate(order):
                 progress("gradient", epoch * len(names) + done, steps)
+                observation = self.observation(name)
                 optimiser.zero_grad()
                 loss = cross_entropy(torch.softmax(codes, dim=1), observation)
                 loss.backward()  # type: ignore[no-untyped-call]

@@ -16,10 +16,9 @@ from gsseg_core.data.label_evidence import impute_probabilities, is_resolved
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
-from gsseg_core.files.scratch_file import ScratchFile
 from gsseg_core.learn.em.em_kernels import normalise_votes
-from gsseg_core.learn.free_memory import free_memory
 from gsseg_core.learn.learner_state import State
+from gsseg_core.learn.prepared_views import PreparedViews, default_budget
 from gsseg_core.progress import Progress as Progress
 from gsseg_core.progress import silent as silent
 from gsseg_core.raster.backends import make_operator
@@ -31,8 +30,6 @@ from gsseg_core.two_at_once import two_at_once
 
 VOTE_UNIT = 2.0**-24  # votes are counted in whole multiples of this many px, so that adding and taking back are exact
 UNITS = 1 / VOTE_UNIT  # units per px
-MEMORY_SHARE = 8  # prepared views take this part of the free memory, unless asked otherwise; more goes to a file
-MEMORY_BUDGET = 2 << 30  # bytes of them where the system does not say how much is free
 
 NO_MASK, SEES_NOTHING, ALL_UNKNOWN = "no mask", "sees no Gaussian", "all pixels unknown"
 
@@ -40,13 +37,7 @@ Self = TypeVar("Self", bound="Learner")
 T = TypeVar("T")
 R = TypeVar("R")
 
-_ALONE = threading.Lock()  # of two threads at work on a view each, one at a time keeps its view or lends out the votes
-
-
-def default_budget() -> int:
-    """Bytes of prepared views that are kept in memory where nobody says how many."""
-    free = free_memory()
-    return MEMORY_BUDGET if free is None else free // MEMORY_SHARE
+_ALONE = threading.Lock()  # of two threads at work on a view each, one at a time lends out the votes
 
 
 class UnusableViewError(Exception):
@@ -101,8 +92,7 @@ class Learner(ABC):
     ) -> None:
         if num_classes < 1:
             raise SettingsError(f"num_classes is {num_classes}; expected at least 1")
-        if memory_budget is None:
-            memory_budget = default_budget()
+        memory_budget = default_budget() if memory_budget is None else memory_budget
         if memory_budget < 0:
             raise SettingsError(f"memory_budget is {memory_budget} bytes; expected at least 0")
         self.scene, self.num_classes, self.device = scene, num_classes, device
@@ -111,9 +101,8 @@ class Learner(ABC):
         self.rejected: dict[str, str] = {}
         self.history_: list[float] = []
         self._votes = np.zeros((len(scene), num_classes), np.int64)
-        self._prepared: dict[str, Observation] = {}
+        self._prepared = PreparedViews(memory_budget, with_file=device == "cpu")  # what lies on a GPU is not for a file
         self._turned = False
-        self._in_file, self._answers = ScratchFile(), ScratchFile()  # views, and what each was asked and answered last
 
     @classmethod
     def default_settings(cls, max_steps: int | None, seed: int) -> tuple[Any, ...]:
@@ -165,7 +154,7 @@ class Learner(ABC):
         """
         if name not in self.views:
             raise SettingsError(f"view {name!r} was not observed; there are {len(self.views)} others")
-        observation = self._kept(name)
+        observation = self._prepared.get(name)
         if observation is not None:
             observation.vote(self._votes, UNITS, -1)
         else:
@@ -176,7 +165,7 @@ class Learner(ABC):
     def forget(self, name: str) -> None:
         """Drop a view and its mask; its votes stay. `fit` learns from the views that are left."""
         del self.views[name]
-        self._unprepare(name)
+        self._prepared.drop(name)
 
     def grow(self, num_classes: int) -> None:
         """Have at least this many classes."""
@@ -261,8 +250,6 @@ class Learner(ABC):
         self.num_classes = state.votes.shape[1]
         self.rejected.clear()
         self._prepared.clear()
-        self._in_file.clear()
-        self._answers.clear()
 
     def vote_codes(self) -> np.ndarray:
         """Votes as probabilities, (N, K) float32; a row of zeros where no labelled pixel saw the Gaussian."""
@@ -293,16 +280,15 @@ class Learner(ABC):
 
     def observation(self, name: str) -> Observation:
         """Return a view with its mask, prepared; it is kept, in memory as far as the budget goes."""
-        observation = self._kept(name)
+        observation = self._prepared.get(name)
         if observation is None:
             observation = self._prepare(self.views[name], self.views[name].read_seen())
-            self._keep(name, observation)
+            self._prepared.keep(name, observation)
         return observation
 
     def prepared_bytes(self) -> tuple[int, int]:
         """Tell how many bytes of prepared views are kept, in memory and in the temporary file."""
-        in_file = self._in_file.nbytes + self._answers.nbytes
-        return sum(kept.nbytes for kept in self._prepared.values()), in_file
+        return self._prepared.nbytes
 
     def _vote(self, view: View, sign: int) -> None:
         """Add a view's votes, or take them away, and keep nothing of it."""
@@ -327,7 +313,7 @@ class Learner(ABC):
             if view.name in self.views:
                 self.retract(view.name)
             opened.vote(self._votes, UNITS)
-            self._keep(view.name, opened)
+            self._prepared.keep(view.name, opened)
         self.rejected.pop(view.name, None)
         self.views[view.name] = view
         return True
@@ -342,19 +328,14 @@ class Learner(ABC):
         """
         names, self._turned = list(self.views if names is None else names), not self._turned
         names = names if self._turned else names[::-1]
-        with closing(self.in_turn(lambda name: self._asked(name, work), names)) as made:
+
+        def ask(name: str) -> R:
+            return self._prepared.ask(name, self.observation(name), work)
+
+        with closing(self.in_turn(ask, names)) as made:
             for name in names:
                 tick()
                 yield name, next(made)
-
-    def _asked(self, name: str, work: Callable[[str, Observation], R]) -> R:
-        """Work with a prepared view; what it is asked last is remembered of those that are in the file, too."""
-        observation = self.observation(name)
-        before, made = observation.answered, work(name, observation)
-        if self._in_file.holds(name) and observation.answered is not before:
-            with _ALONE:
-                self._answers.put(name, observation.answered)
-        return made
 
     def _open(self, view: View) -> Observation:
         observation = self._prepare(view, self._read(view))
@@ -386,31 +367,6 @@ class Learner(ABC):
     def _used_labels(self, seen: SeenLabels, operator: ViewOperator) -> SeenLabels:
         """Turn a mask into the labels that are learnt from; here, as they are."""
         return seen
-
-    def _keep(self, name: str, observation: Observation) -> None:
-        with _ALONE:
-            if self.prepared_bytes()[0] + observation.nbytes <= self.memory_budget:
-                self._prepared[name] = observation
-            elif self.memory_budget > 0 and self.device == "cpu":  # what lies on a GPU is not for a file
-                self._in_file.put(name, observation)
-
-    def _kept(self, name: str) -> Observation | None:
-        kept: Observation | None = self._prepared.get(name)
-        if kept is None:
-            kept = self._in_file.get(name)
-            if kept is not None:
-                kept.answered = self._answers.get(name)
-        return kept
-
-    def _unprepare(self, name: str) -> None:
-        """Keep nothing of a view that is prepared."""
-        self._prepared.pop(name, None)
-        self._in_file.drop(name)
-        self._answers.drop(name)
-
-    def _observations(self, names: Iterable[str] | None = None) -> Iterator[tuple[str, Observation]]:
-        for name in self.views if names is None else names:
-            yield name, self.observation(name)
 
     def _begin(self) -> None:
         """Set `observed_`; without a view there is nothing to learn from."""

@@ -38,7 +38,7 @@ class VoteLearner(Learner):
             with suppress(UnusableViewError):
                 self._vote(view, sign)
         self.views[name] = after
-        self._unprepare(name)
+        self._prepared.drop(name)
 
     def predict_without(self, view: View, only_labelled: bool = False) -> np.ndarray:
         """Blend into a view the votes of all others as probabilities, (H, W, K) float32; exact, by subtraction."""

@@ -19,11 +19,12 @@ from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
-from gsseg_ros.conversions import cloud, topic_tokens
+from gsseg_ros.conversions import cloud
 from gsseg_ros.node.masks.label_info import label_info, label_info_class
 from gsseg_ros.node.reports import Selection
 from gsseg_ros.object_messages import object_markers
 from gsseg_ros.qos import clear_overrides, latched
+from gsseg_ros.topic_tokens import topic_tokens
 
 InvalidHandle = rclpy_implementation.InvalidHandle
 

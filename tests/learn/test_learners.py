@@ -16,7 +16,7 @@ from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import MaskSizeError, NoUsableViewsError, SettingsError, UnknownLabelError
-from gsseg_core.learn import learner as learner_module
+from gsseg_core.learn import prepared_views
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.gradient_learner import GradientLearner
 from gsseg_core.learn.learner import VOTE_UNIT, Learner
@@ -62,11 +62,11 @@ def test_what_no_view_sees_is_unobserved_until_its_neighbours_fill_it_in(kind: t
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.7, 1.0])
 def test_prepared_views_stay_within_the_memory_budget_and_results_are_the_same(share: float) -> None:
     whole = taught(EMLearner(SCENE, NUM_CLASSES), VIEWS).fit()
-    needed = sum(observation.nbytes for observation in whole._prepared.values())
-    assert len(whole._prepared) == len(VIEWS)
+    needed = sum(observation.nbytes for observation in whole._prepared.in_memory.values())
+    assert len(whole._prepared.in_memory) == len(VIEWS)
     bounded = taught(EMLearner(SCENE, NUM_CLASSES, memory_budget=int(share * needed)), VIEWS).fit()
-    held = sum(observation.nbytes for observation in bounded._prepared.values())
-    assert share * needed - max(o.nbytes for o in whole._prepared.values()) < held <= share * needed
+    held = sum(observation.nbytes for observation in bounded._prepared.in_memory.values())
+    assert share * needed - max(o.nbytes for o in whole._prepared.in_memory.values()) < held <= share * needed
     np.testing.assert_array_equal(bounded.codes_, whole.codes_)
 
 
@@ -113,7 +113,7 @@ def test_nothing_is_asked_twice_of_a_view_that_is_in_the_file(monkeypatch: pytes
         counts.append((after_fit, len(asked)))
     assert counts[0] == counts[1] and counts[0][0] == counts[0][1]
     learner.retract(VIEWS[0].name)
-    assert not learner._answers.holds(VIEWS[0].name) and learner._answers.holds(VIEWS[1].name)
+    assert not learner._prepared.remembers(VIEWS[0].name) and learner._prepared.remembers(VIEWS[1].name)
 
 
 @pytest.mark.parametrize("budget", [0, 1, 1 << 30])
@@ -138,9 +138,9 @@ def test_views_that_are_worked_on_two_at_once_give_the_same_results(
 
 
 def test_by_default_an_eighth_of_the_free_memory_is_for_prepared_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(learner_module, "free_memory", lambda: 8 << 30)
+    monkeypatch.setattr(prepared_views, "free_memory", lambda: 8 << 30)
     assert VoteLearner(SCENE, NUM_CLASSES).memory_budget == 1 << 30
-    monkeypatch.setattr(learner_module, "free_memory", lambda: None)
+    monkeypatch.setattr(prepared_views, "free_memory", lambda: None)
     assert VoteLearner(SCENE, NUM_CLASSES).memory_budget == 2 << 30
 
 

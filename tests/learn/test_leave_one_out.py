@@ -24,7 +24,7 @@ def observed(views: list[View], name: str) -> tuple[EMLearner, Observation]:
     learner = EMLearner(SCENE, NUM_CLASSES)
     for view in views:
         learner.observe(view)
-    return learner, learner._prepared[name]
+    return learner, learner._prepared.in_memory[name]
 
 
 def slow_count(

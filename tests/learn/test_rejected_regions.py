@@ -106,7 +106,7 @@ def test_a_region_is_rejected_only_where_the_others_saw_enough_of_it(seen: float
     learner.observe(view)
     votes = learner._votes.copy()
     votes[:, NUM_CLASSES] = seen * votes.sum(axis=1)  # all is one more class to the others
-    observation, possible = learner._prepared[view.name], np.ones(NUM_CLASSES + 1, bool)
+    observation, possible = learner._prepared.in_memory[view.name], np.ones(NUM_CLASSES + 1, bool)
     rejected = find_rejected(CSRRows.from_dense(votes), observation, possible, EMSettings().least_agreement)
     assert len(rejected) >= NUM_CLASSES
     np.testing.assert_array_equal(rejected, expected)

@@ -26,8 +26,8 @@ from gsseg_ros.conversions import (
     rgb_image,
     stamp_message,
     stamp_ns,
-    topic_tokens,
 )
+from gsseg_ros.topic_tokens import topic_tokens
 
 sizes = hnp.array_shapes(min_dims=2, max_dims=2, max_side=9)
 

@@ -25,6 +25,7 @@ from gsseg_core.files.input_files import open_input
 from gsseg_core.learn.em.confusion_model import ErrorModel
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import UNITS, UnusableViewError
+from gsseg_core.learn.prepared_views import PreparedViews
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.vertices import DC
 
@@ -45,11 +46,11 @@ class Shard(EMLearner):
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the prepared views behind."""
-        return {**self.__dict__, "_prepared": {}}
+        return {**self.__dict__, "_prepared": PreparedViews(self.memory_budget, with_file=self.device == "cpu")}
 
     def __sizeof__(self) -> int:
         """Tell Dask how much memory is in use."""
-        return sum(observation.nbytes for observation in self._prepared.values())
+        return self._prepared.nbytes[0]
 
 
 def load(path: str, digest: str) -> GaussianScene:
@@ -92,7 +93,7 @@ def prepare(
             if digest is not None and view.mask_path is not None and digest_of(view.mask_path) != digest:
                 raise NotHereError(str(view.mask_path))
             try:
-                shard._keep(view.name, shard._open(view))
+                shard._prepared.keep(view.name, shard._open(view))
                 shard.views[view.name] = view
             except UnusableViewError as why:
                 shard.rejected[view.name] = str(why)
@@ -103,8 +104,9 @@ def sum_votes(shard: Shard, wanted: dict[str, Any]) -> Part:
     """Count votes; beside them, why a view was rejected, or ""."""
     votes = np.zeros((len(shard.scene), shard.num_classes), np.int64)
     with _all_threads():
-        for _, observation in shard._observations(name for name in wanted if name in shard.views):
-            observation.vote(votes, UNITS)
+        for name in wanted:
+            if name in shard.views:
+                shard.observation(name).vote(votes, UNITS)
     return votes, {name: shard.rejected.get(name, "") for name in wanted}
 
 

@@ -1,0 +1,88 @@
+"""Views that are prepared for learning: kept in memory as far as a budget goes, and the rest in a temporary file."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import TypeVar
+
+from gsseg_core.files.scratch_file import ScratchFile
+from gsseg_core.learn.free_memory import free_memory
+from gsseg_core.raster.observation import Observation
+
+MEMORY_SHARE = 8  # they take this part of the free memory, unless asked otherwise; more goes to the file
+MEMORY_BUDGET = 2 << 30  # bytes of them where the system does not say how much is free
+
+R = TypeVar("R")
+
+_ALONE = threading.Lock()  # of two threads at work on a view each, one at a time keeps something
+
+
+def default_budget() -> int:
+    """Bytes of prepared views that are kept in memory where nobody says how many."""
+    free = free_memory()
+    return MEMORY_BUDGET if free is None else free // MEMORY_SHARE
+
+
+class PreparedViews:
+    """Prepared views by name; a copy sent elsewhere has those in memory alone.
+
+    Parameters
+    ----------
+    budget : int
+        Bytes of memory that they may take; 0 keeps nothing.
+    with_file : bool
+        Whether what is beyond the budget may go to a temporary file.
+    """
+
+    def __init__(self, budget: int, with_file: bool) -> None:
+        self.in_memory: dict[str, Observation] = {}
+        self._budget, self._with_file = budget, with_file
+        self._file, self._answers = ScratchFile(), ScratchFile()  # views, and what each was asked and answered last
+
+    @property
+    def nbytes(self) -> tuple[int, int]:
+        """Bytes that are kept, in memory and in the temporary file."""
+        in_file = self._file.nbytes + self._answers.nbytes
+        return sum(kept.nbytes for kept in self.in_memory.values()), in_file
+
+    def keep(self, name: str, observation: Observation) -> None:
+        """Keep a view, where there is room."""
+        with _ALONE:
+            if self.nbytes[0] + observation.nbytes <= self._budget:
+                self.in_memory[name] = observation
+            elif self._budget > 0 and self._with_file:
+                self._file.put(name, observation)
+
+    def get(self, name: str) -> Observation | None:
+        """Return a view, if it is kept."""
+        kept: Observation | None = self.in_memory.get(name)
+        if kept is None:
+            kept = self._file.get(name)
+            if kept is not None:
+                kept.answered = self._answers.get(name)
+        return kept
+
+    def ask(self, name: str, observation: Observation, work: Callable[[str, Observation], R]) -> R:
+        """Work with a view; what it is asked last is remembered of those that are in the file, too."""
+        before, made = observation.answered, work(name, observation)
+        if self._file.holds(name) and observation.answered is not before:
+            with _ALONE:
+                self._answers.put(name, observation.answered)
+        return made
+
+    def remembers(self, name: str) -> bool:
+        """Tell whether the file has what a view was asked last."""
+        return self._answers.holds(name)
+
+    def drop(self, name: str) -> None:
+        """Keep nothing of a view."""
+        self.in_memory.pop(name, None)
+        self._file.drop(name)
+        self._answers.drop(name)
+
+    def clear(self) -> None:
+        """Keep nothing."""
+        self.in_memory.clear()
+        self._file.clear()
+        self._answers.clear()
