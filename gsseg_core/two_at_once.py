@@ -7,7 +7,7 @@ other cores would wait. More than two at once would gain little, and each takes 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
@@ -19,14 +19,15 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
-def two_at_once(work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
+def two_at_once(work: Callable[[T], R], items: Iterable[T], device: str = "cpu") -> Generator[R, None, None]:
     """Give what `work` makes of each item, in their order; the next two are worked on meanwhile.
 
     The error that one of them raises comes in its turn, and the work ends. `work` may be called in two threads at once;
-    with one core, or where kernels of two threads cannot run beside each other, in none but the caller's.
+    on another device, with one core, or where kernels of two threads cannot run beside each other, in none but the
+    caller's.
     """
     threads = numba.get_num_threads()
-    if threads == 1 or not _kernels_run_beside_each_other():
+    if device != "cpu" or threads == 1 or not _kernels_run_beside_each_other():
         yield from map(work, items)
         return
     begun: deque[Future[R]] = deque()

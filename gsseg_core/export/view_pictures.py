@@ -86,7 +86,7 @@ def draw_views(
         labels = segmentation.label_map(operator)
         return Drawn.of(view, labels, background_image(scene, operator), segmentation.num_classes)
 
-    yield from two_at_once(draw, views) if device == "cpu" else map(draw, views)
+    yield from two_at_once(draw, views, device)
 
 
 def look_at(
@@ -110,7 +110,7 @@ def look_at(
             drawn[view.name] = Drawn.of(view, labels, as_pixels(image[..., :3]), segmentation.num_classes)
         return Silhouette.of(scene, operator, labels, depth)
 
-    yield from two_at_once(look, views) if device == "cpu" else map(look, views)
+    yield from two_at_once(look, views, device)
 
 
 def write_pictures(

@@ -6,7 +6,7 @@ import os
 import threading
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, suppress
 from typing import Any, TypeVar
 
@@ -34,7 +34,6 @@ UNITS = 1 / VOTE_UNIT  # units per px
 NO_MASK, SEES_NOTHING, ALL_UNKNOWN = "no mask", "sees no Gaussian", "all pixels unknown"
 
 Self = TypeVar("Self", bound="Learner")
-T = TypeVar("T")
 R = TypeVar("R")
 
 _ALONE = threading.Lock()  # of two threads at work on a view each, one at a time lends out the votes
@@ -135,7 +134,7 @@ class Learner(ABC):
 
     def observe_all(self, views: Sequence[View], progress: Progress = silent) -> None:
         """Add views, as `observe` does; the error that one of them raises ends it."""
-        with closing(self.in_turn(self._opened, views)) as opened:
+        with closing(two_at_once(self._opened, views, self.device)) as opened:
             for done, view in enumerate(views):
                 progress("observe", done, len(views))
                 if self.memory_budget == 0:
@@ -206,10 +205,6 @@ class Learner(ABC):
     def strongest_without(self, view: View, only_labelled: bool = False, grid: PixelGrid | None = None) -> Strongest:
         """Tell the same, and the probabilities of the pixels of a grid."""
         return Strongest.of(self.predict_without(view, only_labelled), grid)
-
-    def in_turn(self, work: Callable[[T], R], items: Iterable[T]) -> Generator[R, None, None]:
-        """Give what is made of each view, or of its name, in their order; on the CPU two are worked on at once."""
-        yield from two_at_once(work, items) if self.device == "cpu" else map(work, items)
 
     def rejected_share(self, view: View) -> float:
         """Share of a view's labelled pixels whose label `fit` has not used, in [0, 1]."""
@@ -332,7 +327,7 @@ class Learner(ABC):
         def ask(name: str) -> R:
             return self._prepared.ask(name, self.observation(name), work)
 
-        with closing(self.in_turn(ask, names)) as made:
+        with closing(two_at_once(ask, names, self.device)) as made:
             for name in names:
                 tick()
                 yield name, next(made)

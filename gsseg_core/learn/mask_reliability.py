@@ -23,6 +23,7 @@ from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View, spread
 from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.learn.temperature import VIEWS, Sample, grid_of, sample_grid
+from gsseg_core.two_at_once import two_at_once
 
 WORST = 4  # views that are trusted least, as pictures show them
 
@@ -102,7 +103,7 @@ class MaskChecker:
         """
         views = self.learner.views
         checks = {}
-        with closing(self.learner.in_turn(self._check, views.values())) as checked:
+        with closing(two_at_once(self._check, views.values(), self.learner.device)) as checked:
             for done, name in enumerate(views):
                 progress("check views", done, len(views))
                 checks[name] = next(checked)

@@ -89,6 +89,12 @@ class AssociationSettings:
                 f"association: full_sight is {self.full_sight}, plenty {self.plenty}; expected more than 0"
             )
 
+    def sight(self, seen: np.ndarray, most: np.ndarray) -> np.ndarray:
+        """Say how much views count for what they see of clusters, (C, views) px; the most that any sees is (C, 1)."""
+        full = np.minimum(self.full_sight * most, self.plenty)
+        counts: np.ndarray = np.minimum(seen / np.maximum(full, 1e-9), 1) * seen / (seen + self.full_sight_px)
+        return counts
+
 
 class Association(NamedTuple):
     """Objects that the segments of some views show."""
@@ -169,7 +175,8 @@ def _merge(stack: _Stack, settings: AssociationSettings) -> tuple[np.ndarray, fl
         votes = _Votes.of(overlap, seen, hidden, stack.view, settings)
         pairs = votes.pairs()
         if settings.agreement is None and not (pairs.score > agreement).any():
-            beside = _grouping(cluster) @ touching @ _grouping(cluster).T
+            groups = _grouping(cluster)
+            beside = groups @ touching @ groups.T
             split = votes.split(beside) if np.isnan(split) else split
             agreement = min(agreement, votes.told_level(beside, split))
         target = _match(pairs, len(seen), agreement)
@@ -216,9 +223,7 @@ class _Votes(NamedTuple):
     ) -> _Votes:
         """Let the views vote. Who calls a cluster background says nothing of which object it is."""
         foreground = np.maximum(seen - hidden, 0)
-        full = np.minimum(settings.full_sight * seen.max(axis=1, keepdims=True), settings.plenty)
-        counts: np.ndarray = np.minimum(foreground / np.maximum(full, 1e-9), 1)
-        counts *= foreground / (foreground + settings.full_sight_px)
+        counts = settings.sight(foreground, seen.max(axis=1, keepdims=True))
         entries = overlap.tocoo()
         share = entries.data / np.maximum(foreground[entries.row, view[entries.col]], 1e-9)
         strong = share > settings.least_share
@@ -233,17 +238,19 @@ class _Votes(NamedTuple):
         """Compare all clusters that any id shows whole together."""
         together = sparse.triu(self.whole @ self.whole.T, 1).tocoo()
         see, show = self._views_of_both(together.row, together.col)
-        doubt = self.settings.doubt
-        score = together.data / np.sqrt((see + doubt) * (show + doubt))
+        score = self._agreement(together.data, see, show)
         return _Pairs(together.row, together.col, np.where(see >= self.settings.evidence, score, 0))
+
+    def _agreement(self, together: np.ndarray, see: np.ndarray, show: np.ndarray) -> np.ndarray:
+        doubt = self.settings.doubt
+        agreement: np.ndarray = together / np.sqrt((see + doubt) * (show + doubt))
+        return agreement
 
     def split(self, touching: sparse.csr_matrix) -> float:
         """Tell whether objects come in parts, 0 to 1, by how many of the clusters that touch may be one."""
-        first, second = _often(touching)
-        together, see, show = self._compared(first, second)
-        score = together / np.sqrt((see + self.settings.doubt) * (show + self.settings.doubt))
-        known = see > _OFTEN
-        return min(float(np.mean(score[known] > _DOUBTED)) / _SPLIT, 1) if known.any() else 0.0
+        together, see, show = self._compared(*_often(touching))
+        doubted = self._agreement(together, see, show)[see > _OFTEN] > _DOUBTED
+        return min(float(np.mean(doubted)) / _SPLIT, 1) if len(doubted) else 0.0
 
     def told_level(self, touching: sparse.csr_matrix, split: float) -> float:
         """Agreement above which clusters are one object, by how often views show them whole and merge neighbours.

@@ -136,9 +136,8 @@ class _Segments:
 
     def votes(self, regions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Shares of regions (R, S) that each view's ids have, as far as the view counts, and how far, (R, views)."""
-        settings, seen = self.settings, self.seen(regions)
-        full = np.minimum(settings.full_sight * seen.max(axis=1, keepdims=True, initial=0), settings.plenty)
-        counts = np.minimum(seen / np.maximum(full, 1e-9), 1) * seen / (seen + settings.full_sight_px)
+        seen = self.seen(regions)
+        counts = self.settings.sight(seen, seen.max(axis=1, keepdims=True, initial=0))
         return regions * (counts / np.maximum(seen, 1e-9))[:, self.view], counts
 
     def showing(self, regions: Sequence[_Region], shares: np.ndarray) -> np.ndarray:

@@ -27,14 +27,7 @@ class ViewOperator(ViewRenderer):
     w[p, i] = alpha_i(p) * prod over nearer j of (1 - alpha_j(p)), as 3DGS blends colours (Kerbl et al. 2023, eq. 3).
     A row of W sums to 1 minus the ray's final transmittance.
 
-    Attributes
-    ----------
-    camera : Camera
-        Where from.
-    num_gaussians : int
-        N, the size of the scene.
-    ids : (M,) int32
-        Gaussians that can reach the image, nearest first. All others have a column of zeros.
+    Its `ids` are nearest first; all other Gaussians have a column of zeros.
     """
 
     def adjoint(self, residual: np.ndarray) -> np.ndarray:

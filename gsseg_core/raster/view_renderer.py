@@ -59,7 +59,7 @@ class ViewRenderer(ABC):
     num_gaussians : int
         N, the size of the scene.
     ids : (M,) int32
-        Gaussians that can reach the image, nearest first.
+        Gaussians that can reach the image, in the order in which `blend_seen` takes their codes.
     """
 
     camera: Camera

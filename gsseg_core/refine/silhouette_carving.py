@@ -101,7 +101,8 @@ def kept_shares(
     asked = go > 0
     for step in range(steps):
         stay[asked] = 0
-        for ids, reasons in two_at_once(partial(_reasons_to_stay, views, kept.astype(np.float32), asked), views.shown):
+        speak = partial(_reasons_to_stay, views, kept.astype(np.float32), asked)
+        for ids, reasons in two_at_once(speak, range(len(views))):
             stay[ids] += reasons
         kept[asked] = np.clip(kept[asked] * stay[asked] / go[asked], _LEAST, 1.0)
         if step == 0:
@@ -111,10 +112,10 @@ def kept_shares(
 
 
 def _reasons_to_stay(
-    views: _ObjectViews, shares: np.ndarray, asked: np.ndarray, shown: Silhouette
+    views: _ObjectViews, shares: np.ndarray, asked: np.ndarray, number: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Weigh what speaks in one view for those that are asked for, (N,) bool: which they are, and how much."""
-    alone = views.project(shown)
+    shown, alone = views[number]
     wanted = asked[alone.ids]
     reasons = alone.reasons_to_stay(shares[alone.ids], wanted, shown.labels)
     return alone.ids[wanted], reasons[wanted]
@@ -125,22 +126,24 @@ class _ObjectViews:
 
     def __init__(self, scene: GaussianScene, labels: np.ndarray) -> None:  # (N,) int32
         self._scene, self._labels = scene, labels
-        self.shown: list[Silhouette] = []
+        self._shown: list[Silhouette] = []
         self._kept: dict[int, ObjectsAlone] = {}
 
     def add(self, shown: Silhouette) -> ObjectsAlone:
         """Project a view, unless it comes with its operator."""
-        alone = self.project(shown)
-        self.shown.append(shown._replace(operator=None))
+        alone = self._project(shown)
         if alone.nbytes + sum(kept.nbytes for kept in self._kept.values()) <= _MEMORY:
-            self._kept[id(self.shown[-1])] = alone
+            self._kept[len(self._shown)] = alone
+        self._shown.append(shown._replace(operator=None))
         return alone
 
-    def project(self, shown: Silhouette) -> ObjectsAlone:
-        """Give the objects of a view, projected anew if they are not kept."""
-        kept = self._kept.get(id(shown))
-        if kept is not None:
-            return kept
+    def __len__(self) -> int:
+        return len(self._shown)
+
+    def __getitem__(self, number: int) -> tuple[Silhouette, ObjectsAlone]:
+        return self._shown[number], self._kept.get(number) or self._project(self._shown[number])
+
+    def _project(self, shown: Silhouette) -> ObjectsAlone:
         operator = shown.operator or TileOperator.of(self._scene, shown.camera)  # on the CPU, which alone tells reasons
         return operator.objects_alone(self._labels)
 
