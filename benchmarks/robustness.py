@@ -27,7 +27,6 @@ from PIL import Image
 from plots import Axis, draw_panels
 from results import machine, markdown, points, score
 from robustness_text import BAR, CURVES, HEADER, OCCLUDER, RELIABILITY
-from scipy.stats import spearmanr
 from view_errors import STRONGEST, PoseErrors, corrupt_views, errors_at, typical_depth
 from wrong_masks import WrongMasks
 
@@ -301,6 +300,8 @@ def curve_row(kind: str, strength: float, right: float, runs: Mapping[str, Run])
 
 def measure_reliability(benches: Sequence[Bench], pictures: Path, aside: Path) -> str:
     """Compare the reliability of views with their true share of right pixels, where some frames are bad."""
+    from scipy.stats import spearmanr  # It takes half a second, which who looks at curves does not wait for.
+
     rows = []
     plots: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for bench in benches:

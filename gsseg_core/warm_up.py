@@ -33,6 +33,8 @@ EVERY_RUN = f"compiling kernels, a minute or two, as in every run: they cannot b
 SIDE = 72
 """Gaussians on a side of the square that is segmented; trees of fewer than 4,096 in all are built by other kernels."""
 
+_warm: set[str] = set()  # the devices for which all kernels are there
+
 
 class _FirstCompilation(event.Listener):
     def __init__(self, say: Callable[[str], object]) -> None:
@@ -51,8 +53,10 @@ def warm_up(device: str = "cpu", say: Callable[[str], object] = lambda text: Non
     """Take some thousand Gaussians through everything that segmenting does, so that all its kernels are there.
 
     That takes a second when they are in the cache, and a minute or two at the first time after an installation; then
-    `say` is told, and a second process compiles beside this one.
+    `say` is told, and a second process compiles beside this one. In a process that is warm, nothing is done.
     """
+    if device in _warm:
+        return
     beside: list[subprocess.Popen[bytes]] = []
 
     def begin(text: str) -> None:
@@ -69,6 +73,7 @@ def warm_up(device: str = "cpu", say: Callable[[str], object] = lambda text: Non
         for process in beside:
             with process:
                 process.kill()
+    _warm.add(device)
 
 
 def telling(say: Callable[[str], object]) -> AbstractContextManager[object]:

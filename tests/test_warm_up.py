@@ -57,10 +57,14 @@ def test_the_first_compilation_is_shared_with_a_second_process_and_no_third(monk
                 pass
 
     monkeypatch.setattr(warming.subprocess, "Popen", Helper)
+    monkeypatch.setattr(warming, "_warm", set())
     monkeypatch.setattr(warming, "_learn_something", learn)
     warm_up()
     assert len(started) == 1 and "refine_beside" in started[0][-1]
+    warm_up()
+    assert len(started) == 1  # Whoever is warm need not begin.
     started.clear()
+    monkeypatch.setattr(warming, "_warm", set())
     monkeypatch.setattr(warming.kernel_cache, "FOLDER", None)  # Nothing that it compiles would be found.
     warm_up()
     assert not started

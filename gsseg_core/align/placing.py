@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gsseg_core.align.agreement import Agreement, Shown, agreement, look_at
 from gsseg_core.align.alignment import Alignment
@@ -20,6 +21,10 @@ from gsseg_core.errors import AlignmentError, CameraFileError
 from gsseg_core.files.input_files import is_there
 from gsseg_core.progress import Progress, silent
 from gsseg_core.scene.gaussian_scene import GaussianScene
+
+if TYPE_CHECKING:
+    from gsseg_core.align.features import Extractor
+    from gsseg_core.align.registration import Photo
 
 _CLOSE_PX = 1.0  # photos and renderings that are nearer than this are as they should be
 
@@ -172,17 +177,18 @@ def find_alignment(
             "alignment: no view has a photo or a mask; expected some, to see where cameras are by them"
         )
     photos = before.compared == "photos"
+    matched = cache(partial(_photos, views, settings))
     agreeing: list[Found] = []
     # Masks say less than photos do: on a shelf, regions may lie well enough from a wrong side, too.
     if before.agrees and photos:
-        as_they_are = _closer(scene, views, shown, Found(Alignment(), before, before), settings, device)
+        as_they_are = _closer(scene, matched, shown, Found(Alignment(), before, before), settings, device)
         # Nothing was compared with it yet, and round a table other sides look alike.
         if as_they_are.offset_px is not None and as_they_are.offset_px <= _CLOSE_PX:
             return as_they_are
         agreeing.append(as_they_are)
     alignment = Alignment(find_convention(scene, shown, settings, device, progress))
     if (reached := _through(scene, shown, alignment, settings, device)).agrees:
-        by_convention = _closer(scene, views, shown, Found(alignment, reached, before), settings, device)
+        by_convention = _closer(scene, matched, shown, Found(alignment, reached, before), settings, device)
         if by_convention.offset_px is None or by_convention.offset_px <= settings.reprojection_px:
             return by_convention
         agreeing.append(by_convention)
@@ -192,16 +198,25 @@ def find_alignment(
             "views in images/, by which scale, rotation and translation can be found, too"
         )
     try:
-        agreeing.append(_registered(scene, views, shown, before, settings, device, progress))
+        agreeing.append(_registered(scene, matched, shown, before, settings, device, progress))
     except AlignmentError:
         if not agreeing:
             raise
     return max(agreeing, key=lambda found: found.agreement.score)
 
 
+def _photos(views: Sequence[View], settings: AlignSettings) -> tuple[Extractor, list[Photo]]:
+    """Read the photos that renderings are matched with, and what finds features in both."""
+    from gsseg_core.align.features import Extractor
+    from gsseg_core.align.registration import read_photos
+
+    extractor = Extractor(settings)
+    return extractor, read_photos(views, extractor, settings)
+
+
 def _registered(
     scene: GaussianScene,
-    views: Sequence[View],
+    matched: Callable[[], tuple[Extractor, list[Photo]]],
     shown: Sequence[Shown],
     before: Agreement,
     settings: AlignSettings,
@@ -209,12 +224,10 @@ def _registered(
     progress: Progress,
 ) -> Found:
     """Find a similarity by the photos."""
-    from gsseg_core.align.features import Extractor
     from gsseg_core.align.refinement import offset_px, refined
-    from gsseg_core.align.registration import candidates, read_photos
+    from gsseg_core.align.registration import candidates
 
-    extractor = Extractor(settings)
-    photos = read_photos(views, extractor, settings)
+    extractor, photos = matched()
     for guess in candidates(scene, photos, extractor, settings, device, progress):
         alignment = refined(scene, photos, guess, extractor, settings, device)
         reached = _through(scene, shown, alignment, settings, device)
@@ -230,7 +243,7 @@ def _registered(
 
 def _closer(
     scene: GaussianScene,
-    views: Sequence[View],
+    matched: Callable[[], tuple[Extractor, list[Photo]]],
     shown: Sequence[Shown],
     found: Found,
     settings: AlignSettings,
@@ -239,12 +252,9 @@ def _closer(
     """Fit what is about right to the photos, if there are any and they are not yet close to the renderings."""
     if found.agreement.compared != "photos":
         return found
-    from gsseg_core.align.features import Extractor
     from gsseg_core.align.refinement import offset_px, refined
-    from gsseg_core.align.registration import read_photos
 
-    extractor = Extractor(settings)
-    photos = read_photos(views, extractor, settings)
+    extractor, photos = matched()
     few = spread(photos, settings.views)
     offset = offset_px(scene, few, found.alignment, extractor, settings, device)
     if offset is None or offset <= _CLOSE_PX:
