@@ -33,7 +33,7 @@ export CMAKE_BUILD_PARALLEL_LEVEL ?= $(shell nproc 2>/dev/null || echo 1)
 # NumPy's matrix products cannot be told to, so there is one.
 run-tests run-fast-tests: export OMP_WAIT_POLICY = passive
 run-tests run-fast-tests: export OPENBLAS_NUM_THREADS = 1
-# One thread for each worker's kernels takes an eighth less of the processor; all tests run with all threads, too.
+# One thread for each worker's kernels takes a tenth less of the processor; `make test` runs with all threads.
 run-fast-tests: export NUMBA_NUM_THREADS = 1
 
 # Targets that `make test` makes beside the tests.

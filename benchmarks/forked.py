@@ -93,14 +93,6 @@ def run_command(arguments: list[str]) -> int:
         return end.code if isinstance(end.code, int) else 1
 
 
-def skip_warm_up() -> None:
-    """Have commands in children load no kernels: the parent has them."""
-    from gsseg_core import warm_up
-
-    warm_up.warm_up()
-    warm_up.warm_up = lambda *arguments, **named: None  # type: ignore[assignment]
-
-
 def _do(job: Callable[[], int | None], paths: tuple[Path, Path]) -> int:
     for number, path in zip((1, 2), paths, strict=True):
         os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)

@@ -26,7 +26,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from forked import MOST_MEMORY, Ended, in_child, run_command, skip_warm_up  # first: it says how numba runs
+from forked import MOST_MEMORY, Ended, in_child, run_command  # first: it says how numba runs
 from report import table
 
 from gsseg_core.text import printable
@@ -85,7 +85,6 @@ class Files:
 
         self._folder, self._base = folder, folder / "plain"
         plain(self._base)
-        skip_warm_up()
         with contextlib.redirect_stdout(io.StringIO()):  # In this process: children then have all that it loads.
             command = [
                 "segment",

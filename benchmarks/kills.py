@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from forked import in_child, run_command, skip_warm_up  # first: it says how numba runs
+from forked import in_child, run_command  # first: it says how numba runs
 from report import table
 from whole_outputs import Fault, faults_of, leftovers, listing, read_folder
 
@@ -95,11 +95,13 @@ class Segmenting:
     def __init__(self, folder: Path) -> None:
         from small_scenes import write_dataset
 
+        from gsseg_core.warm_up import warm_up
+
         self._folder = folder
         self._data = write_dataset(folder / "data")
         _turn_labels(self._data)
         self._out = folder / "killed" / "out"
-        skip_warm_up()
+        warm_up()  # Children have what their parent has.
         (folder / "clean").mkdir()
         for name in ("first", "second", "first"):
             self._run(name, folder / "clean" / "out")

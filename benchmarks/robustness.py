@@ -300,7 +300,7 @@ def curve_row(kind: str, strength: float, right: float, runs: Mapping[str, Run])
 
 def measure_reliability(benches: Sequence[Bench], pictures: Path, aside: Path) -> str:
     """Compare the reliability of views with their true share of right pixels, where some frames are bad."""
-    from scipy.stats import spearmanr  # It takes half a second, which who looks at curves does not wait for.
+    from scipy.stats import spearmanr  # Half a second, for this table alone.
 
     rows = []
     plots: dict[str, dict[str, list[tuple[float, float]]]] = {}

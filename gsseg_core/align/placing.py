@@ -177,18 +177,18 @@ def find_alignment(
             "alignment: no view has a photo or a mask; expected some, to see where cameras are by them"
         )
     photos = before.compared == "photos"
-    matched = cache(partial(_photos, views, settings))
+    read = cache(partial(_read, views, settings))
     agreeing: list[Found] = []
     # Masks say less than photos do: on a shelf, regions may lie well enough from a wrong side, too.
     if before.agrees and photos:
-        as_they_are = _closer(scene, matched, shown, Found(Alignment(), before, before), settings, device)
+        as_they_are = _closer(scene, read, shown, Found(Alignment(), before, before), settings, device)
         # Nothing was compared with it yet, and round a table other sides look alike.
         if as_they_are.offset_px is not None and as_they_are.offset_px <= _CLOSE_PX:
             return as_they_are
         agreeing.append(as_they_are)
     alignment = Alignment(find_convention(scene, shown, settings, device, progress))
     if (reached := _through(scene, shown, alignment, settings, device)).agrees:
-        by_convention = _closer(scene, matched, shown, Found(alignment, reached, before), settings, device)
+        by_convention = _closer(scene, read, shown, Found(alignment, reached, before), settings, device)
         if by_convention.offset_px is None or by_convention.offset_px <= settings.reprojection_px:
             return by_convention
         agreeing.append(by_convention)
@@ -198,14 +198,14 @@ def find_alignment(
             "views in images/, by which scale, rotation and translation can be found, too"
         )
     try:
-        agreeing.append(_registered(scene, matched, shown, before, settings, device, progress))
+        agreeing.append(_registered(scene, read, shown, before, settings, device, progress))
     except AlignmentError:
         if not agreeing:
             raise
     return max(agreeing, key=lambda found: found.agreement.score)
 
 
-def _photos(views: Sequence[View], settings: AlignSettings) -> tuple[Extractor, list[Photo]]:
+def _read(views: Sequence[View], settings: AlignSettings) -> tuple[Extractor, list[Photo]]:
     """Read the photos that renderings are matched with, and what finds features in both."""
     from gsseg_core.align.features import Extractor
     from gsseg_core.align.registration import read_photos
@@ -216,7 +216,7 @@ def _photos(views: Sequence[View], settings: AlignSettings) -> tuple[Extractor, 
 
 def _registered(
     scene: GaussianScene,
-    matched: Callable[[], tuple[Extractor, list[Photo]]],
+    read: Callable[[], tuple[Extractor, list[Photo]]],
     shown: Sequence[Shown],
     before: Agreement,
     settings: AlignSettings,
@@ -227,7 +227,7 @@ def _registered(
     from gsseg_core.align.refinement import offset_px, refined
     from gsseg_core.align.registration import candidates
 
-    extractor, photos = matched()
+    extractor, photos = read()
     for guess in candidates(scene, photos, extractor, settings, device, progress):
         alignment = refined(scene, photos, guess, extractor, settings, device)
         reached = _through(scene, shown, alignment, settings, device)
@@ -243,7 +243,7 @@ def _registered(
 
 def _closer(
     scene: GaussianScene,
-    matched: Callable[[], tuple[Extractor, list[Photo]]],
+    read: Callable[[], tuple[Extractor, list[Photo]]],
     shown: Sequence[Shown],
     found: Found,
     settings: AlignSettings,
@@ -254,7 +254,7 @@ def _closer(
         return found
     from gsseg_core.align.refinement import offset_px, refined
 
-    extractor, photos = matched()
+    extractor, photos = read()
     few = spread(photos, settings.views)
     offset = offset_px(scene, few, found.alignment, extractor, settings, device)
     if offset is None or offset <= _CLOSE_PX:

@@ -40,6 +40,10 @@ class PreparedViews:
         self._budget, self._with_file = budget, with_file
         self._file, self._answers = ScratchFile(), ScratchFile()  # views, and what each was asked and answered last
 
+    def emptied(self) -> PreparedViews:
+        """Return one like this that keeps nothing yet."""
+        return PreparedViews(self._budget, self._with_file)
+
     @property
     def nbytes(self) -> tuple[int, int]:
         """Bytes that are kept, in memory and in the temporary file."""

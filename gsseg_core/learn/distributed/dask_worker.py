@@ -25,7 +25,6 @@ from gsseg_core.files.input_files import open_input
 from gsseg_core.learn.em.confusion_model import ErrorModel
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import UNITS, UnusableViewError
-from gsseg_core.learn.prepared_views import PreparedViews
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.vertices import DC
 
@@ -46,7 +45,7 @@ class Shard(EMLearner):
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the prepared views behind."""
-        return {**self.__dict__, "_prepared": PreparedViews(self.memory_budget, with_file=self.device == "cpu")}
+        return {**self.__dict__, "_prepared": self._prepared.emptied()}
 
     def __sizeof__(self) -> int:
         """Tell Dask how much memory is in use."""
