@@ -52,8 +52,9 @@ _PARAMETERS: tuple[tuple[str, str | int | float, float | None, float | None, str
 
 # Endpoints are discovered one by one: who listens to the masks may not be known to listen to the poses yet.
 _SETTLE_S = 0.5
-# For messages on their way when all is done; a receiver that hangs may not hold up the end for longer.
-_LINGER_S = 1.0
+# For messages on their way when all is done: what a busy receiver has lost, it asks for again seconds later. One that
+# hangs may not hold up the end for longer.
+_LINGER_S = 10.0
 
 
 # A signal is noticed when a wait ends, so no wait is longer.
@@ -128,11 +129,11 @@ class ReplayNode(Node):
         self._spin_until(time.monotonic() + _SETTLE_S)
 
     def linger(self) -> None:
-        """Stay until what was published has arrived, or a moment has passed."""
+        """Stay until what was published has arrived, or too long; raises `Stopped` as soon as that is asked for."""
         deadline = time.monotonic() + _LINGER_S
         for publisher in self._topics.values():
-            left = max(0.0, deadline - time.monotonic())
-            publisher.wait_for_all_acked(Duration(seconds=left))
+            while not publisher.wait_for_all_acked(Duration()) and (now := time.monotonic()) < deadline:
+                self._spin_until(min(deadline, now + _SLICE_S))
 
     def stop(self) -> None:
         """Have the replay end soon with `Stopped`; may be called from a signal handler."""

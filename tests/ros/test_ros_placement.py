@@ -78,7 +78,7 @@ def test_after_any_moves_votes_are_those_of_views_that_came_at_the_last_place(pl
     for after in places:
         placement.change(before, after, lambda after=after: told.append(after))  # type: ignore[misc]
         before = after
-    wait_until(lambda: not placement._running and settled, "the views to follow")
+    wait_until(lambda: not placement._moved_from and settled, "the views to follow")
     assert told == places
     assert session.num_views == session.num_fused == 3
     expected = LivingSession(SCENE, session.class_names)

@@ -6,8 +6,10 @@ import json
 import shutil
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -39,7 +41,8 @@ from gsseg_ros.conversions import (
     stamp_message,
     stamp_ns,
 )
-from gsseg_ros.replay.replay_node import _PARAMETERS, _with_parameters, make_source
+from gsseg_ros.replay import replay_node
+from gsseg_ros.replay.replay_node import _PARAMETERS, ReplayNode, Stopped, _with_parameters, make_source
 from gsseg_ros.replay.sources import BagSource, FolderSource, PhotoFileError
 
 KINDS = {"mask": Image, "camera_info": CameraInfo, "pose": PoseStamped, "image": Image}
@@ -359,6 +362,39 @@ def test_a_signal_stops_it_while_it_waits_for_a_subscriber(ros: Ros, folder: Pat
     ros.wait_until(lambda: ros.node.count_publishers("/other") == 1, "the node")
     assert process.stop() == 0, process.output
     assert "stopped: published 0 mask" in process.output
+
+
+class Slow:
+    """A publisher whose subscriber has everything when it is asked for the last time."""
+
+    def __init__(self, asks: float) -> None:
+        self.asks = asks
+
+    def wait_for_all_acked(self, _: object) -> bool:
+        self.asks -= 1
+        return self.asks <= 0
+
+
+def lingering(topic: Slow, wait: Callable[[float], None] = lambda deadline: None) -> None:
+    ReplayNode.linger(cast(ReplayNode, SimpleNamespace(_topics={"mask": topic}, _spin_until=wait)))
+
+
+def test_it_stays_until_a_busy_subscriber_has_everything() -> None:
+    topic = Slow(50)
+    lingering(topic)
+    assert topic.asks == 0
+
+
+def test_a_subscriber_that_hangs_does_not_keep_it_for_ever_nor_from_being_stopped(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def stopped(_: float) -> None:
+        raise Stopped
+
+    with pytest.raises(Stopped):
+        lingering(Slow(np.inf), stopped)
+    monkeypatch.setattr(replay_node, "_LINGER_S", 0.0)
+    lingering(Slow(np.inf))
 
 
 def test_a_folder_of_bent_images_is_replayed_as_what_a_pinhole_sees(tmp_path: Path) -> None:
