@@ -41,9 +41,6 @@ START_SECONDS = 240.0
 SLICE_SECONDS = 2.0
 COMPARED_VIEWS = 3
 
-# A robot's masks may get lost on the way; here each one counts, so the node is told to have lost ones sent again.
-RELIABLE = {f"qos_overrides./{topic}.subscription.reliability": "reliable" for topic in ("mask", "camera_info", "pose")}
-
 
 def run_demo(out: Path, nodes: ChildNodes, *, seed: int = 0, rate: float = 10.0, progress: Progress = silent) -> str:
     """Build the scene, replay its masks to a node, learn, segment, look, export; and say how well that went.
@@ -110,7 +107,6 @@ def _start(client: SegmentationClient, nodes: ChildNodes, demo: DemoScene, progr
             "scene_path": str(demo.root.resolve() / "scene.ply"),
             "data_root": str(demo.root.resolve().parent),
             "class_names": list(demo.class_names.values()),
-            **RELIABLE,
         },
     )
     _in_slices(nodes, client.wait_until_active, START_SECONDS)

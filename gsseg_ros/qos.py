@@ -11,8 +11,21 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from gsseg_core.errors import SettingsError
 
 
+def input_data(depth: int) -> QoSProfile:
+    """Make a profile for an input, so many messages deep, for a burst while the interpreter is busy.
+
+    How reliable it is, `gsseg_ros.node.matched_subscription` finds out.
+    """
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=ReliabilityPolicy.BEST_AVAILABLE,
+        durability=DurabilityPolicy.VOLATILE,
+    )
+
+
 def sensor_data() -> QoSProfile:
-    """Make a profile as for sensor data, deep enough for a burst while the interpreter is busy."""
+    """Make a profile as for sensor data, which goes with every subscription but a reliable one."""
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
         depth=30,

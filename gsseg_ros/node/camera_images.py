@@ -8,16 +8,15 @@ from typing import Any
 
 from rclpy.callback_groups import CallbackGroup
 from rclpy.lifecycle import LifecycleNode
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CompressedImage, Image
 
 from gsseg_ros.conversions import stamp_ns
 from gsseg_ros.node.camera_streams import CameraStreams
 from gsseg_ros.node.live_outputs import LiveOutputs
 from gsseg_ros.node.masks.compressed import compressed_topic
+from gsseg_ros.node.matched_subscription import MatchedSubscription
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.pairing import Pairing
-from gsseg_ros.qos import clear_overrides, sensor_data
 
 
 class CameraImages:
@@ -66,7 +65,7 @@ class CameraImages:
             self._kind, self._topic = CompressedImage, compressed_topic(node, camera.topic("image"))
         self.pairing = Pairing(camera.poses(), stream=camera.name)
         camera.share(self.pairing)
-        self._subscription: Any = None
+        self._subscription: MatchedSubscription | None = None
         self._lock, self._closed = threading.Lock(), False
         self._listen(True)  # Only to have an override that cannot be used refused now, and not when somebody looks.
         self._listen(False)
@@ -77,6 +76,8 @@ class CameraImages:
             if self._closed:
                 return
             self._listen(self._outputs.wants_overlay(self._camera))
+            if self._subscription is not None:
+                self._subscription.look()
         self.pairing.expire(time.monotonic())
         self._hand_over()
 
@@ -88,21 +89,14 @@ class CameraImages:
 
     def _listen(self, wanted: bool) -> None:
         if wanted and self._subscription is None:
-            with clear_overrides(self._topic):
-                self._subscription = self._node.create_subscription(
-                    self._kind,
-                    self._topic,
-                    self._arrived,
-                    sensor_data(),
-                    callback_group=self._group,
-                    qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-                )
+            self._subscription = MatchedSubscription(self._node, self._kind, self._topic, self._arrived, self._group)
         elif not wanted and self._subscription is not None:
-            self._node.destroy_subscription(self._subscription)
+            self._subscription.close()
             self._subscription = None
 
     def _arrived(self, message: Any) -> None:
-        self.pairing.add_mask(stamp_ns(message.header.stamp), (self._topic, message), message.header.frame_id)
+        stamp, frame_id, size = stamp_ns(message.header.stamp), message.header.frame_id, len(message.data)
+        self.pairing.add_mask(stamp, (self._topic, message), frame_id, size=size)
         self._hand_over()
 
     def _hand_over(self) -> None:

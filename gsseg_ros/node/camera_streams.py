@@ -26,7 +26,7 @@ class Listen(Protocol):
 
     def __call__(
         self, kind: Any, role: str, topic: str, callback: Callable[[str, Any], None], required: bool = True
-    ) -> None:
+    ) -> object:
         """Subscribe with the type, role and name of a topic, what takes in its messages, and whether it has to come."""
 
 
@@ -117,8 +117,9 @@ class CameraStreams:
 
     def on_mask(self, topic: str, message: Image | CompressedImage | Detected) -> None:
         """Take in a mask, or what was detected in its place."""
-        stamp = stamp_ns(message.header.stamp)
-        self.pairing.add_mask(stamp, (topic, message), message.header.frame_id, self._era())
+        _, image = (message.mask or ("", None)) if isinstance(message, Detected) else ("", message)
+        stamp, size = stamp_ns(message.header.stamp), 0 if image is None else len(image.data)
+        self.pairing.add_mask(stamp, (topic, message), message.header.frame_id, self._era(), size)
 
     def on_camera_info(self, topic: str, message: CameraInfo) -> None:
         """Take in a camera_info."""

@@ -18,7 +18,7 @@ REFUSED_LABELS, DETECTIONS_TYPE = "refused label_info", "type of detections"
 
 REASONS = (
     "no_pose", "no_camera_info", "no_depth", "no_detections", "repeated_stamp", "several_cameras", "time_jump",
-    "negative_stamp", "queue_full", "no_scene", "mask_format", "size_mismatch", "unknown_label", "bad_pose",
+    "negative_stamp", "queue_full", "lost", "no_scene", "mask_format", "size_mismatch", "unknown_label", "bad_pose",
     "bad_camera_info", "bad_depth", "all_pixels_unknown", "sees_no_Gaussian", "no_mask", "too_large",
     "scene_changed", "unusable", "unexpected",
 )  # fmt: skip

@@ -193,7 +193,7 @@ DECLARATIONS = (
     ),
     Declaration("device", "cpu", f"where views are rendered: {devices()}"),
     Declaration("autostart", True, "configure and activate at start; false: wait for a lifecycle manager"),
-    Declaration("queue_size", 30, "masks waiting to be fused; of more, the oldest are dropped [count]", 1, 1000),
+    Declaration("queue_size", 100, "masks waiting to be fused, 256 MiB at most; else the oldest go [count]", 1, 1000),
     Declaration(
         "scene_frame",
         "scene",

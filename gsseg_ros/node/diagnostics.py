@@ -50,9 +50,10 @@ def missing_inputs(inputs: Inputs) -> dict[str, str]:
         publishers = inputs.publishers_of(topic)
         found = counted(publishers, "publisher")
         if publishers and not count:
+            this_side = inputs.policies.get(topic, "not subscribed")
             hint = (
-                f"it has {found}: do their QoS and type match (this side is {inputs.policies[topic]}; "
-                f"ros2 topic info -v {topic}), and do they publish?"
+                f"it has {found}: do their QoS and type match (this side is {this_side}; ros2 topic info -v {topic}), "
+                "and do they publish?"
             )
         elif publishers:
             hint = f"{count} came before, and it still has {found}"
@@ -65,19 +66,22 @@ def missing_inputs(inputs: Inputs) -> dict[str, str]:
 
 def why_dropped(inputs: Inputs, reason: str) -> str:
     """Explain why masks are dropped before they are fused, and what to check; empty for other reasons."""
+    came = "with their stamp came, neither in time nor late"
     return {
-        "no_pose": f"no pose with their stamp came within a second{_pose_problem(inputs)}; expected mask and pose to "
-        "carry the stamp of the same image, from the same clock (use_sim_time?), or the parameter pose_tolerance",
-        "no_camera_info": f"no camera_info with their stamp came within a second{_frame_problem(inputs)}; expected "
-        "mask and camera_info to carry the stamp of the same image, from the same clock (use_sim_time?)",
-        "no_depth": "no depth image with their stamp came within a second; expected depth with the stamp of the mask's "
-        "image, or the parameter depth_gating to be false",
+        "no_pose": f"no pose {came}{_pose_problem(inputs)}; expected mask and pose to carry the stamp of the same "
+        "image, from the same clock (use_sim_time?), or the parameter pose_tolerance",
+        "no_camera_info": f"no camera_info {came}{_frame_problem(inputs)}; expected mask and camera_info to carry the "
+        "stamp of the same image, from the same clock (use_sim_time?)",
+        "no_depth": f"no depth image {came}; expected depth with the stamp of the mask's image, or the parameter "
+        "depth_gating to be false",
         "repeated_stamp": "a mask with their stamp and frame_id came before; expected every image once: is the "
         "segmenter, or a bag, running twice?",
         "several_cameras": "masks of several cameras (frame_id) carry one stamp, and their poses do not say whose they "
         "are; expected the parameter pose_source to be tf, or cameras to name them, each with topics of its own",
         "negative_stamp": f"their stamp is below 0{_negative_stamps(inputs)}; expected the time at which the image "
         "was taken, by the clock of the poses",
+        "lost": f"they were lost on the way to this node{_unreliable(inputs)}; expected a publisher that is reliable "
+        "and keeps as many as come while this node is busy, or smaller masks",
         "time_jump": "they are from before time was set back; expected so only for a moment, then check the clocks",
         "queue_full": "they come faster than they are fused; expected a lower rate or smaller masks (the parameter "
         "queue_size says how many may wait)",
@@ -123,6 +127,11 @@ def _pose_problem(inputs: Inputs) -> str:
     if time.monotonic() - refused_at < WINDOW_SECONDS:
         return f" ({refusal})"
     return f" ({inputs.tf.problem})" if inputs.tf is not None and inputs.tf.problem else ""
+
+
+def _unreliable(inputs: Inputs) -> str:
+    found = ", ".join(f"{topic}: {inputs.policies[topic]}" for topic, count in inputs.lost.items() if count)
+    return f" ({found})" * bool(found)
 
 
 def _negative_stamps(inputs: Inputs) -> str:
@@ -230,6 +239,7 @@ def _input_values(inputs: Inputs) -> dict[str, object]:
     for topic, (count, last) in inputs.arrivals.items():
         values[f"{topic} received"] = count
         values[f"{topic} age [s]"] = f"{now - last:.1f}" if count else "never"
+    values.update({f"{topic} lost on the way": count for topic, count in inputs.lost.items()})
     values["views accepted"] = inputs.accepted
     values.update(
         {f"views accepted of {camera.name}": camera.accepted for camera in inputs.cameras.values() if camera.name}
@@ -242,6 +252,7 @@ def _input_values(inputs: Inputs) -> dict[str, object]:
         values[f"rejected {reason}"] = count
     pairings = [camera.pairing for camera in inputs.cameras.values()]
     values["masks waiting for pose or camera_info"] = sum(pairing.waiting for pairing in pairings)
+    values["bytes of these masks"] = sum(pairing.waiting_bytes for pairing in pairings)
     values["masks waiting to be fused"] = inputs.worker.waiting
     values["queue drops"] = inputs.worker.dropped
     values["poses refused"] = inputs.refused_poses

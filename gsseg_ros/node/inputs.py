@@ -14,8 +14,6 @@ from typing import Any
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode
-from rclpy.qos import QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CompressedImage
 
 from gsseg_core.data.soft_masks import SeenLabels
@@ -34,15 +32,16 @@ from gsseg_ros.node.masks.compressed import compressed_topic
 from gsseg_ros.node.masks.detections_input import DetectionsInput
 from gsseg_ros.node.masks.label_info_input import LabelInfoInput
 from gsseg_ros.node.masks.reader import MaskReader
+from gsseg_ros.node.matched_subscription import MatchedSubscription
 from gsseg_ros.node.outputs import Outputs
-from gsseg_ros.node.pairing import Paired
+from gsseg_ros.node.pairing import MOST_BYTES, Paired
 from gsseg_ros.node.parameters import Settings
 from gsseg_ros.node.sim_time import on_set_back
 from gsseg_ros.node.tf_poses import TfPoses
 from gsseg_ros.node.workspace import Workspace
-from gsseg_ros.qos import clear_overrides, sensor_data
 
 EXPIRE_PERIOD = 0.1  # s
+_MASKS = ("mask", "detections")  # Roles of what becomes views.
 
 AWAITED_SECONDS, _PAUSE = 5.0, 0.02
 """How long, at most, masks are waited for that have come and are not yet fused."""
@@ -76,8 +75,6 @@ class Inputs:
         Poses that could not be used.
     last_refusal : (float, str)
         When the last of these came (s, `time.monotonic`), and what was wrong with it.
-    policies : dict of str to str
-        By full name of the topic: quality of service of the subscription, overrides included.
     """
 
     def __init__(self, node: LifecycleNode, workspace: Workspace, outputs: Outputs, complaints: Complaints) -> None:
@@ -91,7 +88,7 @@ class Inputs:
         self.last_refusal = (-PERIOD, "")
         self.arrivals: dict[str, tuple[int, float]] = {}
         self.roles: dict[str, str] = {}
-        self.policies: dict[str, str] = {}
+        self._subscriptions: list[MatchedSubscription] = []
         self.started = time.monotonic()
         self.counted: deque[tuple[float, Counter[str]]] = deque([(self.started, Counter())])
         self.logged: Counter[str] = Counter()
@@ -116,7 +113,7 @@ class Inputs:
             self.tf.listen()
         elif settings.pose_source == "auto":
             node.get_logger().info("pose_source is auto, and tf2_ros cannot be imported: poses come from topics alone")
-        self.worker: Worker[Paired] = Worker(self._fuse, settings.queue_size)
+        self.worker: Worker[Paired] = Worker(self._fuse, settings.queue_size, lambda paired: paired.size, MOST_BYTES)
         built.callback(self.worker.stop)
         self.live = LiveOutputs(
             workspace,
@@ -171,6 +168,16 @@ class Inputs:
             stamps = {paired.stamp for paired in self.worker.unfinished}
             return set(map(str, stamps.union(*(camera.pairing.stamps for camera in self.cameras.values()))))
 
+    @property
+    def policies(self) -> dict[str, str]:
+        """By full name of the topic: quality of service of its subscription, overrides included."""
+        return {subscription.topic_name: subscription.policies for subscription in self._subscriptions}
+
+    @property
+    def lost(self) -> dict[str, int]:
+        """By full name of the topic: messages that did not arrive, as far as the middleware knows."""
+        return {subscription.topic_name: subscription.lost for subscription in self._subscriptions}
+
     def publishers_of(self, topic: str) -> int:
         """Count the publishers of an input."""
         return int(self._node.count_publishers(topic))
@@ -179,7 +186,6 @@ class Inputs:
         """Make the input of detections; their type, and so whether a mask belongs to them, turns out later."""
         topic = self._node.resolve_topic_name(camera.topic(settings.detections_topic))
         self.arrivals[topic], self.roles[topic] = (0, self.started), "detections"
-        self.policies[topic] = _policies(sensor_data())
         return DetectionsInput(
             self._node,
             topic,
@@ -203,33 +209,23 @@ class Inputs:
         topic: str,
         callback: Callable[[str, Any], None],
         required: bool = True,
-    ) -> Any:
-        """Subscribe until the stack is closed; without one, the caller takes the subscription away."""
+    ) -> MatchedSubscription:
+        """Subscribe until the stack is closed; without one, the caller closes the subscription."""
         topic = compressed_topic(self._node, topic) if kind is CompressedImage else topic
-        subscription: Any = None
+        name = self._node.resolve_topic_name(topic)
 
         def arrived(message: Any) -> None:
-            name = subscription.topic_name
             self.arrivals[name] = (self.arrivals[name][0] + 1, time.monotonic())
             callback(name, message)
             self._hand_over()
 
-        quality = sensor_data()
-        with clear_overrides(topic):
-            subscription = self._node.create_subscription(
-                kind,
-                topic,
-                arrived,
-                quality,
-                callback_group=self._group,
-                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-            )
-        self.arrivals[subscription.topic_name] = (0, self.started)
+        subscription = MatchedSubscription(self._node, kind, topic, arrived, self._group)
+        self.arrivals[name] = (0, self.started)
         if required:
-            self.roles[subscription.topic_name] = role
-        self.policies[subscription.topic_name] = _policies(quality)
+            self.roles[name] = role
+        self._subscriptions.append(subscription)
         if built is not None:
-            built.callback(self._node.destroy_subscription, subscription)
+            built.callback(subscription.close)
         return subscription
 
     def _refuse_pose(self, why: str) -> None:
@@ -247,6 +243,8 @@ class Inputs:
         self._hand_over()
 
     def _expire(self) -> None:
+        for subscription in self._subscriptions:
+            subscription.look()
         for camera in self.cameras.values():
             camera.expire()
         self._hand_over()
@@ -269,10 +267,12 @@ class Inputs:
 
     @property
     def dropped(self) -> Counter[str]:
-        """Masks that were dropped before they came to be fused, by reason."""
+        """Masks that were dropped before they came to be fused, or did not arrive, by reason."""
         dropped = sum((camera.pairing.dropped for camera in self.cameras.values()), Counter[str]())
         if self.worker.dropped:
             dropped["queue_full"] = self.worker.dropped
+        if lost := sum(count for topic, count in self.lost.items() if self.roles.get(topic) in _MASKS):
+            dropped["lost"] = lost
         return dropped
 
     def _forget_waiting(self) -> None:
@@ -354,8 +354,3 @@ class Inputs:
         if message not in self._said:
             self._said.add(message)
             self._node.get_logger().info(message)
-
-
-def _policies(quality: QoSProfile) -> str:
-    """Name what has to match between publisher and subscription."""
-    return f"{quality.reliability.short_key}, {quality.durability.short_key}".replace("_", " ")

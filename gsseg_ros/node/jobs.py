@@ -143,6 +143,10 @@ class Worker(Generic[T]):
         Takes one item; must not raise.
     capacity : int
         Items that may wait.
+    size : callable
+        Bytes of an item.
+    most_bytes : int
+        What those that wait may have together; one may wait whatever its size.
 
     Attributes
     ----------
@@ -150,9 +154,11 @@ class Worker(Generic[T]):
         Items that were dropped.
     """
 
-    def __init__(self, handle: Callable[[T], None], capacity: int) -> None:
+    def __init__(
+        self, handle: Callable[[T], None], capacity: int, size: Callable[[T], int] = lambda item: 0, most_bytes: int = 0
+    ) -> None:
         self.dropped = 0
-        self._handle, self._capacity = handle, capacity
+        self._handle, self._capacity, self._size, self._most_bytes = handle, capacity, size, most_bytes
         self._items: deque[T] = deque()
         self._in_hand: list[T] = []
         self._changed = threading.Condition()
@@ -164,7 +170,7 @@ class Worker(Generic[T]):
         """Add an item; returns at once."""
         with self._changed:
             self._items.append(item)
-            if len(self._items) > self._capacity:
+            while len(self._items) > self._capacity or (len(self._items) > 1 and self._too_large()):
                 self._items.popleft()
                 self.dropped += 1
             self._changed.notify()
@@ -194,6 +200,9 @@ class Worker(Generic[T]):
             self._items.clear()
             self._changed.notify()
         self._thread.join(timeout_s)
+
+    def _too_large(self) -> bool:
+        return sum(map(self._size, self._items)) > self._most_bytes
 
     def _run(self) -> None:
         while True:

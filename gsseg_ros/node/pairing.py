@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import threading
 from bisect import bisect_left
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
 from gsseg_ros.node.history import History
 from gsseg_ros.node.pose_sources import GivenPose, MessagePoses, Pose, PoseSource
-from gsseg_ros.node.timeline import MASK, SECOND, Message, Timeline
+from gsseg_ros.node.timeline import BEHIND_NS, MASK, SECOND, Message, Timeline
 
 _Key: TypeAlias = tuple[int, str]  # stamp and frame_id
 
@@ -23,6 +23,12 @@ _STAMPS_KEPT = 1000
 CAMERAS_KEPT = 16
 _UNCLEAR_NS = 10 * SECOND
 _DEPTH_BYTES = 64 << 20  # At 30 Hz, VGA and 16 bit, those of three seconds.
+_HELD_BACK = 30  # Messages, by `Timeline`.
+_RARE_S = 1.0
+_LONGEST_STEP_S = 0.5
+
+WAIT_S, MOST_WAITING, MOST_BYTES = 10.0, 300, 256 << 20
+"""Limits on the masks of a camera that wait; see `PairingSettings`."""
 
 
 class Paired(NamedTuple):
@@ -36,6 +42,7 @@ class Paired(NamedTuple):
     era: object = None  # As it was given with the mask.
     depth: Any = None  # If the pairing was to wait for it.
     stream: str = ""  # As it was given to the pairing.
+    size: int = 0  # Bytes of the mask.
 
 
 @dataclass(frozen=True)
@@ -45,15 +52,17 @@ class PairingSettings:
     Attributes
     ----------
     wait_s : float
-        Seconds of wall clock that a mask waits for its pose and camera_info.
-    max_waiting : int
-        Masks that wait at the same time; one more, and the oldest has to go.
+        Seconds that a mask waits for what belongs to it while that stream is silent. What was lost on the way, a
+        reliable publisher sends again only when the middleware next asks for it, three seconds later or more.
+    max_waiting, max_bytes : int
+        Masks that wait at the same time, and bytes of theirs; one more, and the oldest has to go.
     with_depth : bool
         Whether a mask waits for the depth image of exactly its stamp, too.
     """
 
-    wait_s: float = 1.0
-    max_waiting: int = 30
+    wait_s: float = WAIT_S
+    max_waiting: int = MOST_WAITING
+    max_bytes: int = MOST_BYTES
     with_depth: bool = False
 
 
@@ -61,9 +70,14 @@ class Pairing:
     """Pairs masks with camera_info and pose by stamp and camera. Its methods may be called from any thread.
 
     A camera_info belongs to a mask if it has its stamp and its frame_id, which names the camera; otherwise, once a
-    later one of this camera has come or the waiting time is over, the newest earlier one does. A mask without a
+    later one of this camera has come or the waiting time is over, the newest earlier one does. That time is a second
+    where camera_infos do not come with each mask: where the one before went with an earlier one, too. A mask without a
     frame_id goes with the only camera there is, a camera_info without one with every camera that has none of its own.
     Every mask comes out of `take`, or is counted in `dropped`, or still waits.
+
+    A mask is given up when what belongs to it can be told not to come: its stream has gone on from the mask's stamp by
+    a second, more than messages come out of order. While a stream is silent, masks wait within the limits of
+    `PairingSettings`. Time in which `expire` is not called does not count: then nothing that came was taken in.
 
     Poses that come from messages do not say of which camera they are. So when masks of two cameras carry one stamp, and
     the poses are not from a source that knows frames, none is paired until ten seconds (of stamps) later. A source that
@@ -110,18 +124,19 @@ class Pairing:
         self._prefix, self._stream = prefix, stream
         self._settings = settings or PairingSettings()
         self._lock = threading.Lock()
-        self._timeline = Timeline(self._settings.max_waiting, self._settings.wait_s)
-        self._camera_infos: dict[str, History[int, Any]] = {}  # By frame_id, that last heard at the end.
+        self._timeline = Timeline(min(_HELD_BACK, self._settings.max_waiting))
+        self._camera_infos: dict[str, _CameraInfos] = {}  # By frame_id, that last heard at the end.
         self._seen: History[int, list[str]] = History(_STAMPS_KEPT)  # Frames of the masks of a stamp.
         self._unclear_until = 0  # Up to this stamp poses may be of another camera.
         # By stamp and frame_id.
         self._depths: History[_Key, Any] = History(_DEPTH_BYTES, lambda image: len(image[1].data))
         self._waiting: dict[_Key, _Waiting] = {}
         self._finished: list[Paired] = []
+        self._awake_s, self._called_s = 0.0, float("inf")
 
-    def add_mask(self, stamp: int, message: Any, frame_id: str = "", era: object = None) -> None:
-        """Take in a mask whose header has this stamp and frame; `era` comes out with it."""
-        self._take_in(Message(MASK, stamp, (message, era), frame_id))
+    def add_mask(self, stamp: int, message: Any, frame_id: str = "", era: object = None, size: int = 0) -> None:
+        """Take in a mask, of so many bytes, whose header has this stamp and frame; `era` comes out with it."""
+        self._take_in(Message(MASK, stamp, (message, era, size), frame_id))
 
     def add_camera_info(self, stamp: int, message: Any, frame_id: str = "") -> None:
         """Take in a camera_info whose header has this stamp and frame."""
@@ -154,11 +169,14 @@ class Pairing:
             Seconds of a clock that never goes back, such as `time.monotonic`.
         """
         with self._lock:
+            self._awake_s += min(max(now_s - self._called_s, 0.0), _LONGEST_STEP_S)
+            self._called_s = now_s
             epoch = self._timeline.epoch
-            self._deliver(epoch, self._timeline.expire(now_s))
+            self._deliver(epoch, self._timeline.expire(self._awake_s))
             for key, waiting in sorted(self._waiting.items()):
-                waiting.since = now_s if waiting.since is None else waiting.since
-                self._pair(key, last_chance=now_s - waiting.since >= self._settings.wait_s)
+                waiting.since = self._awake_s if waiting.since is None else waiting.since
+                waited_s = self._awake_s - waiting.since
+                self._pair(key, last_chance=waited_s >= self._settings.wait_s, rare=waited_s >= _RARE_S)
 
     def take(self) -> list[Paired]:
         """Hand over what was paired since the last call; call it after each of the others."""
@@ -179,6 +197,12 @@ class Pairing:
         """Number of masks that wait for a pose or camera_info, or that `Timeline` holds back."""
         with self._lock:
             return len(self._waiting) + self._timeline.held_masks
+
+    @property
+    def waiting_bytes(self) -> int:
+        """Bytes of the masks that wait for a pose or camera_info."""
+        with self._lock:
+            return sum(waiting.size for waiting in self._waiting.values())
 
     @property
     def stamps(self) -> set[int]:
@@ -232,15 +256,19 @@ class Pairing:
                 self._depths.add((stamp, frame_id), content)
         for stream, stamp, content, frame_id in messages:
             if stream == MASK:
-                mask, era = content
-                self._await(stamp, mask, era, frame_id)
+                self._await(stamp, content, frame_id)
         if messages:
             for key in sorted(self._waiting):
                 self._pair(key)
-            while len(self._waiting) > self._settings.max_waiting:
+            while self._too_many():
                 self._pair(min(self._waiting), last_chance=True)
 
-    def _await(self, stamp: int, mask: Any, era: object, frame_id: str) -> None:
+    def _too_many(self) -> bool:
+        """Whether one of those that wait has to go; the only one need not."""
+        count, size = len(self._waiting), sum(waiting.size for waiting in self._waiting.values())
+        return count > self._settings.max_waiting or (size > self._settings.max_bytes and count > 1)
+
+    def _await(self, stamp: int, content: tuple[Any, object, int], frame_id: str) -> None:
         frames = self._seen.values.get(stamp, [])
         if frame_id in frames or len(frames) >= CAMERAS_KEPT:
             self.dropped["repeated_stamp"] += 1
@@ -250,48 +278,67 @@ class Pairing:
         frames.append(frame_id)
         if len(frames) > 1:
             self._unclear_until = max(self._unclear_until, stamp + _UNCLEAR_NS)
-        self._waiting[stamp, frame_id] = _Waiting(mask, era, len(frames))
+        self._waiting[stamp, frame_id] = _Waiting(*content, len(frames))
 
     def _add_camera_info(self, stamp: int, message: Any, frame_id: str) -> None:
-        infos = self._camera_infos.pop(frame_id, None) or History(_CAMERA_INFOS_KEPT)
+        infos = self._camera_infos.pop(frame_id, None) or _CameraInfos(_CAMERA_INFOS_KEPT)
         self._camera_infos[frame_id] = infos
         if len(self._camera_infos) > CAMERAS_KEPT:
             del self._camera_infos[next(iter(self._camera_infos))]
         infos.add(stamp, message)
 
-    def _pair(self, key: _Key, last_chance: bool = False, epoch: int | None = None) -> None:
+    def _pair(self, key: _Key, last_chance: bool = False, epoch: int | None = None, rare: bool = False) -> None:
+        """Pair or drop a mask, or let it wait on; `rare`: it has waited long enough where camera_infos are rare."""
         waiting, (stamp, frame_id) = self._waiting[key], key
         several = stamp < self._unclear_until
         if waiting.pose is None or several:
             waiting.pose = self._poses.at(stamp, frame_id, last_chance, several)
-        info, depth = self._camera_info(stamp, frame_id, last_chance), self._depth(stamp, frame_id, last_chance)
+        info = self._camera_info(stamp, frame_id, last_chance, rare)
+        depth = self._depth(stamp, frame_id, last_chance)
         if several and not self._poses.knows_frames:
             self.dropped["several_cameras"] += 1
         elif waiting.pose is not None and info is not None and (depth or not self._settings.with_depth):
             name = f"{self._prefix}{self._timeline.epoch if epoch is None else epoch}_{stamp}"
             name += f"_{waiting.camera}" * (waiting.camera > 1)
-            paired = Paired(name, stamp, waiting.mask, info, waiting.pose, waiting.era, depth, self._stream)
-            self._finished.append(paired)
-        elif waiting.pose is None and (last_chance or self._poses.too_late(stamp)):
+            mask, era, size = waiting.mask, waiting.era, waiting.size
+            self._finished.append(Paired(name, stamp, mask, info, waiting.pose, era, depth, self._stream, size))
+            if (infos := self._infos_of(frame_id)) is not None:
+                infos.found.append(stamp in infos.values)
+        elif waiting.pose is None:
+            if not (last_chance or self._poses.too_late(stamp)):
+                return
             self.dropped["no_pose"] += 1
-        elif last_chance:
-            if info is None:
-                self.unmatched_frame = frame_id
-            self.dropped["no_camera_info" if info is None else "no_depth"] += 1
+        elif info is None:
+            if not (last_chance or self._info_too_late(stamp, frame_id)):
+                return
+            self.dropped["no_camera_info"] += 1
+            self.unmatched_frame = frame_id
         else:
-            return
+            if not (last_chance or self._depth_too_late(stamp, frame_id)):
+                return
+            self.dropped["no_depth"] += 1
         del self._waiting[key]
 
-    def _camera_info(self, stamp: int, frame_id: str, last_chance: bool) -> Any:
+    def _camera_info(self, stamp: int, frame_id: str, last_chance: bool, rare: bool) -> Any:
         infos = self._infos_of(frame_id)
         if infos is None:
             return None
         if stamp in infos.values:
             return infos.values[stamp]
-        after = bisect_left(infos.stamps, stamp)
-        if after > 0 and (last_chance or after < len(infos.stamps)):
+        after, rare = bisect_left(infos.stamps, stamp), rare and not all(infos.found)
+        if after > 0 and (last_chance or rare or after < len(infos.stamps)):
             return infos.values[infos.stamps[after - 1]]
         return None
+
+    def _info_too_late(self, stamp: int, frame_id: str) -> bool:
+        """Whether the camera_infos of a camera have gone on from `stamp` by more than they come out of order."""
+        infos = self._infos_of(frame_id)
+        return infos is not None and infos.stamps[-1] >= stamp + BEHIND_NS
+
+    def _depth_too_late(self, stamp: int, frame_id: str) -> bool:
+        """Whether the depth images of a camera have gone on from `stamp` by more than they come out of order."""
+        newest = (s for s, frame in reversed(self._depths.stamps) if frame in (frame_id, ""))
+        return next(newest, stamp) >= stamp + BEHIND_NS
 
     def _depth(self, stamp: int, frame_id: str, last_chance: bool) -> Any:
         """Find the depth image of a mask; at last one of another frame, whose reader says what is wrong with it."""
@@ -305,16 +352,25 @@ class Pairing:
                 return depths[stamps[first]]
         return None
 
-    def _infos_of(self, frame_id: str) -> History[int, Any] | None:
+    def _infos_of(self, frame_id: str) -> _CameraInfos | None:
         if not frame_id and len(self._camera_infos) == 1:
             return next(iter(self._camera_infos.values()))
         return self._camera_infos.get(frame_id) or self._camera_infos.get("")
+
+
+class _CameraInfos(History[int, Any]):
+    """Those of one camera; `found` says of the last two masks that were paired whether there was one of their stamp."""
+
+    def __init__(self, capacity: int) -> None:
+        super().__init__(capacity)
+        self.found = deque([True, True], 2)
 
 
 @dataclass
 class _Waiting:
     mask: Any
     era: object
+    size: int  # bytes
     camera: int  # Among those with masks of this stamp, from 1.
     pose: Pose | None = None
     since: float | None = None

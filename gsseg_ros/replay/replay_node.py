@@ -6,7 +6,7 @@ import math
 import signal
 import sys
 import time
-from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -52,10 +52,9 @@ _PARAMETERS: tuple[tuple[str, str | int | float, float | None, float | None, str
 
 # Endpoints are discovered one by one: who listens to the masks may not be known to listen to the poses yet.
 _SETTLE_S = 0.5
-# For messages on their way when all is done: what a busy receiver has lost, it asks for again seconds later. One that
-# hangs may not hold up the end for longer.
-_LINGER_S = 10.0
-
+# For messages on their way: what a busy receiver has lost, it asks for again seconds later. One that hangs may not hold
+# up the others for longer.
+_PATIENCE_S = 10.0
 
 # A signal is noticed when a wait ends, so no wait is longer.
 _SLICE_S = 0.05
@@ -63,6 +62,50 @@ _SLICE_S = 0.05
 
 class Stopped(Exception):
     """The node was asked to stop before it was done."""
+
+
+class Topic:
+    """A topic that does not run away from who listens: messages that have not arrived are kept, and no others follow.
+
+    Parameters
+    ----------
+    publisher : Publisher
+        Reliable; keeps `_QOS.depth` messages.
+    wait : callable
+        Waits until a time (s, `time.monotonic`); what it raises ends the wait for receivers.
+
+    Attributes
+    ----------
+    published : int
+        Messages so far.
+    """
+
+    def __init__(self, publisher: Any, wait: Callable[[float], None]) -> None:
+        self.publisher, self.published = publisher, 0
+        self._wait, self._unheard, self._patience_s = wait, 0, _PATIENCE_S
+
+    def publish(self, message: Any) -> None:
+        """Publish a message, once receivers have asked for all that could be pushed out by it."""
+        if self._unheard >= _QOS.depth:
+            self.settle()
+        self.publisher.publish(message)
+        self.published += 1
+        # Seldom enough to cost nothing, and long before it has to be waited for.
+        self._unheard = 0 if self._unheard >= _QOS.depth // 2 and self._arrived() else self._unheard + 1
+
+    def settle(self) -> None:
+        """Wait until all has arrived; for one that hangs, only until the patience is at an end."""
+        while not self._arrived() and self._patience_s > 0:
+            started = time.monotonic()
+            self._wait(started + min(_SLICE_S, self._patience_s))
+            self._patience_s -= time.monotonic() - started
+        self._unheard = 0
+
+    def _arrived(self) -> bool:
+        arrived = bool(self.publisher.wait_for_all_acked(Duration()))
+        if arrived:
+            self._patience_s = _PATIENCE_S
+        return arrived
 
 
 class ReplayNode(Node):
@@ -73,12 +116,13 @@ class ReplayNode(Node):
 
     def __init__(self) -> None:
         super().__init__("replay")
-        self.published: Counter[str] = Counter()
         self._newest = 0  # stamp, ns
         self._stop_asked = False
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
-        self._topics = {name: self.create_publisher(kind, name, _QOS) for name, kind in _CLASSES.items()}
+        self._topics = {
+            name: Topic(self.create_publisher(kind, name, _QOS), self._spin_until) for name, kind in _CLASSES.items()
+        }
 
     def declare(self) -> dict[str, Any]:
         """Declare all parameters and return their values; raises `SettingsError` for a wrong type or range."""
@@ -120,9 +164,10 @@ class ReplayNode(Node):
     def wait_for_subscribers(self, seconds: float) -> None:
         """Wait until somebody listens to `mask`, or warn that nobody does."""
         deadline = time.monotonic() + seconds
-        while self._topics["mask"].get_subscription_count() == 0:
+        masks = self._topics["mask"].publisher
+        while masks.get_subscription_count() == 0:
             if time.monotonic() >= deadline:
-                topic = self._topics["mask"].topic_name
+                topic = masks.topic_name
                 self.get_logger().warning(f"nobody listens to '{topic}' after {seconds:g} s: publishing all the same")
                 return
             self._spin_until(min(deadline, time.monotonic() + _SLICE_S))
@@ -130,10 +175,13 @@ class ReplayNode(Node):
 
     def linger(self) -> None:
         """Stay until what was published has arrived, or too long; raises `Stopped` as soon as that is asked for."""
-        deadline = time.monotonic() + _LINGER_S
-        for publisher in self._topics.values():
-            while not publisher.wait_for_all_acked(Duration()) and (now := time.monotonic()) < deadline:
-                self._spin_until(min(deadline, now + _SLICE_S))
+        for topic in self._topics.values():
+            topic.settle()
+
+    @property
+    def published(self) -> dict[str, int]:
+        """Messages so far, by topic."""
+        return {name: topic.published for name, topic in self._topics.items()}
 
     def stop(self) -> None:
         """Have the replay end soon with `Stopped`; may be called from a signal handler."""
@@ -150,7 +198,6 @@ class ReplayNode(Node):
             if not isinstance(message, bytes):
                 message.header.stamp = stamp
             self._topics[topic].publish(message)
-            self.published[topic] += 1
 
     def _next_stamp(self) -> Any:
         # Strictly increasing even where the clock stands still (simulated time) or is set back.

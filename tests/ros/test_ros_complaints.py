@@ -148,13 +148,14 @@ class Hears:
     """Inputs with the counts that a test gives them, and their verdict."""
 
     def __init__(self, steady: Steady) -> None:
-        self.pairing = SimpleNamespace(time_jumps=0, last_jump=(0, 0), out_of_order=0, waiting=0)
+        self.pairing = SimpleNamespace(time_jumps=0, last_jump=(0, 0), out_of_order=0, waiting=0, waiting_bytes=0)
         self.pairing.unmatched_frame, self.pairing.camera_frames = "left", ["right"]
         self.pairing.negative_stamp = -1_500_000_000
         self.inputs: Any = SimpleNamespace(
             cameras={"": SimpleNamespace(name="", pairing=self.pairing, topic=lambda role: role)},
             dropped=Counter(), gated=Counter(), rejected=Counter(), accepted=0, explained={},
             worker=SimpleNamespace(dropped=0, waiting=0), arrivals={}, roles={}, tf=None,
+            lost={"/mask": 7, "/pose": 0}, policies={"/mask": "best effort, volatile"},
             last_refusal=(-100.0, ""), refused_poses=0, logged=Counter(),
             counted=deque([(steady.seconds, Counter())]),
         )  # fmt: skip
@@ -214,7 +215,8 @@ def test_the_level_says_whether_few_many_or_all_masks_are_refused(
 @pytest.mark.parametrize(
     ("reason", "said"),
     [
-        ("no_pose", "no pose with their stamp came within a second; expected mask and pose to carry the stamp"),
+        ("no_pose", "no pose with their stamp came, neither in time nor late; expected mask and pose to carry the"),
+        ("lost", "lost on the way to this node (/mask: best effort, volatile); expected a publisher that is reliable"),
         ("no_camera_info", r"(masks have the frame_id 'left', camera_infos have 'right': expected the same)"),
         ("repeated_stamp", "a mask with their stamp and frame_id came before; expected every image once"),
         ("several_cameras", "masks of several cameras (frame_id) carry one stamp, and their poses do not say whose"),
@@ -247,7 +249,7 @@ def test_refused_poses_explain_masks_without_a_pose(steady: Steady, hears: Hears
     hears.inputs.last_refusal = (steady.seconds, "/pose: position is (nan, 0, 0)")
     assert hears.verdict() == (DiagnosticStatus.WARN, "/pose: position is (nan, 0, 0)")
     hears.inputs.dropped["no_pose"] = 1
-    assert "came within a second (/pose: position is (nan, 0, 0)); expected" in hears.verdict()[1]
+    assert "neither in time nor late (/pose: position is (nan, 0, 0)); expected" in hears.verdict()[1]
 
 
 def test_time_that_was_set_back_is_logged_once(steady: Steady, hears: Hears) -> None:

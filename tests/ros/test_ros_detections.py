@@ -134,8 +134,8 @@ class Graph:
     def get_publishers_info_by_topic(self, topic: str) -> list[Any]:
         return [Fields(topic_type=name) for name in self.types]
 
-    def destroy_subscription(self, subscription: Any) -> None:
-        self.gone.append(subscription)
+    def subscribed(self, what: str) -> Any:
+        return Fields(close=lambda: self.gone.append(f"{what} subscription"))
 
 
 class Joined:
@@ -148,7 +148,7 @@ class Joined:
             for adapter in ADAPTERS.values():
                 monkeypatch.setattr(type(adapter), "message_class", property(lambda self: self.name))
         self.input = DetectionsInput(
-            graph, TOPIC, lambda kind, take: f"{kind} subscription", lambda take: "mask subscription",
+            graph, TOPIC, lambda kind, take: graph.subscribed(kind), lambda take: graph.subscribed("mask"),
             lambda topic, found: self.forwarded.append((topic, found)),
             lambda reason, message: self.lost.append((reason, message)),
         )  # fmt: skip

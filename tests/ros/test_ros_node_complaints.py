@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from array import array
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,11 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import State
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from sensor_msgs.msg import Image
 
 from gsseg_ros.conversions import stamp_ns
+
+MASK_RELIABILITY = "qos_overrides./mask.subscription.reliability"
 
 
 @pytest.fixture(scope="module")
@@ -34,27 +38,45 @@ def silent(tmp_path_factory: pytest.TempPathFactory, parameters: dict[str, Any])
         yield robot
 
 
-@pytest.mark.parametrize("reliability", [None, "reliable"])
+@pytest.mark.parametrize("reliability", [None, "best_effort"])
 def test_the_quality_of_service_of_an_input_can_be_overridden(
     ros: Ros, parameters: dict[str, Any], reliability: str | None
 ) -> None:
     robot = Robot(ros)
-    override = {} if reliability is None else {"qos_overrides./mask.subscription.reliability": reliability}
+    override = {} if reliability is None else {MASK_RELIABILITY: reliability}
     robot.started({**parameters, **override}, lossless=False)
     for topic in ("/mask", "/pose"):  # That the node is active says nothing of what has been discovered here.
         ros.wait_until(lambda topic=topic: ros.node.get_subscriptions_info_by_topic(topic), topic)
     (found,) = ros.node.get_subscriptions_info_by_topic("/mask")
-    wanted = ReliabilityPolicy.BEST_EFFORT if reliability is None else ReliabilityPolicy.RELIABLE
+    wanted = ReliabilityPolicy.RELIABLE if reliability is None else ReliabilityPolicy.BEST_EFFORT
     assert found.qos_profile.reliability == wanted
     assert found.qos_profile.durability == DurabilityPolicy.VOLATILE
     (other,) = ros.node.get_subscriptions_info_by_topic("/pose")
-    assert other.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+    assert other.qos_profile.reliability == ReliabilityPolicy.RELIABLE
 
     def fused() -> bool:
         robot.drive(clean_views(1))  # One that is sent before the two have found each other may be lost.
         return robot.ask("segment").error_code == 0
 
     ros.wait_until(fused, "a view")
+
+
+def test_masks_that_are_lost_on_the_way_are_counted_and_said(ros: Ros, parameters: dict[str, Any]) -> None:
+    robot = Robot(ros).started({**parameters, MASK_RELIABILITY: "best_effort"}, lossless=False)
+    # Larger than the middleware's buffers; what comes after it shows that it is missing.
+    large = Image(height=4096, width=4096, encoding="mono8", step=4096, data=array("B", bytes(1 << 24)))
+
+    def lost() -> int:
+        robot.drive(clean_views(1))
+        robot.publishers["mask"].publish(large)
+        return int(robot.status().get("rejected lost", 0))
+
+    ros.wait_until(lost, "a mask to be lost")
+    assert robot.process is not None
+    robot.process.wait_for("dropped because they were lost on the way to this node (/mask: best effort, volatile)")
+    status = robot.status()
+    assert int(status["/mask lost on the way"]) == int(status["rejected lost"]) > 0
+    assert "lost" in robot.ask("segment").report.rejection_reasons
 
 
 def test_without_tf2_ros_the_pose_source_tf_is_one_clear_error(ros: Ros, parameters: dict[str, Any]) -> None:
@@ -117,7 +139,7 @@ def test_the_log_says_which_input_is_missing_and_what_to_check_once_in_five_seco
         topics,
         (
             "nobody publishes it: is the segmenter running, and is its topic remapped to this one (--ros-args -r mask",
-            "it has 1 publisher: do their QoS and type match (this side is best effort, volatile; ros2 topic info -v",
+            "it has 1 publisher: do their QoS and type match (this side is reliable, volatile; ros2 topic info -v",
             "nobody publishes it: expected geometry_msgs/PoseStamped of the camera's optical frame",
         ),
         strict=True,

@@ -95,10 +95,10 @@ def test_views_of_another_process_are_fused_with_the_default_quality_of_service(
     robot = Robot(ros).started({**parameters, "queue_size": 1000}, lossless=False)
     views = Dataset(root / "data").views("train")
     replay = ros.start("replay_node", {"data": root / "data", "rate": 30.0, "loop": 5})
-    # Best effort: what is sent before the two have found each other may be lost.
-    status = robot.wait_for_status(lambda status: int(status.get("views accepted", 0)) >= 4 * len(views), "most views")
+    status = robot.wait_for_status(lambda status: status.get("views accepted") == str(5 * len(views)), "all views")
     assert replay.wait() == 0, replay.output
     assert (status["message"], status["queue drops"], status["time jumps"]) == ("fusing", "0", "0")
+    assert {key for key in status if key.startswith("rejected")} == set()
     found, wanted = learnt(robot, "replayed"), expected(scene, views)
     assert (found.labels == wanted.labels).mean() > 0.99
     assert np.abs(found.probabilities - wanted.probabilities).max() < 0.2

@@ -96,16 +96,6 @@ def test_without_its_own_camera_info_a_mask_takes_the_newest_earlier_one_once_a_
     assert [p.camera_info for p in pairing.take()] == [f"info {2 * S}"]
 
 
-def test_without_a_later_camera_info_the_earlier_one_serves_when_the_time_is_over() -> None:
-    pairing = Pairing(MessagePoses())
-    send(pairing, [("info", 1 * S), ("pose", 3 * S), ("mask", 3 * S)])
-    pairing.expire(10.0)
-    pairing.expire(10.9)
-    assert pairing.take() == []
-    pairing.expire(11.0)
-    assert [p.camera_info for p in pairing.take()] == [f"info {1 * S}"]
-
-
 def test_a_lost_camera_info_is_counted_as_such() -> None:
     pairing = Pairing(MessagePoses())
     send(pairing, [("info", 4 * S), ("pose", 3 * S), ("mask", 3 * S)])

@@ -71,7 +71,7 @@ class DetectionsInput:
         with self._lock:
             self._closed = True
             while self._subscriptions:
-                self._node.destroy_subscription(self._subscriptions.pop())
+                self._subscriptions.pop().close()
 
     def _look(self) -> str:
         types = sorted({info.topic_type for info in self._node.get_publishers_info_by_topic(self._topic)})

@@ -1,0 +1,131 @@
+"""A subscription that asks for as much as the publishers of its topic offer, and counts what is lost on the way."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.callback_groups import CallbackGroup
+from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import CameraInfo
+
+from gsseg_ros.qos import clear_overrides, input_data
+
+_SMALL, _SMALL_DEPTH, _DEPTH = (CameraInfo, PoseStamped, Odometry), 600, 100
+"""Messages that come while the node is busy wait in the middleware: for seconds, of an odometry at 200 Hz too."""
+
+_INT32, _UINT32 = 2**31 - 1, 2**32 - 1
+
+
+class MatchedSubscription:
+    """A subscription that is reliable while every publisher of its topic is, and best effort while one is not.
+
+    What a best-effort stream loses is lost for good, and of large images that may be half; but a reliable subscription
+    hears no best-effort publisher. So it is made anew when the publishers have changed. Where the parameter
+    qos_overrides says how reliable it is to be, it stays so.
+
+    Parameters
+    ----------
+    node : Node
+        Listens.
+    kind : type
+        Of the messages.
+    topic : str
+        Its name, not yet resolved.
+    callback : callable
+        Gets the messages.
+    group : CallbackGroup
+        Of the other inputs.
+
+    Raises
+    ------
+    SettingsError
+        Its quality of service is overridden by something impossible.
+
+    Attributes
+    ----------
+    topic_name : str
+        Full name of the topic.
+    lost : int
+        Messages that did not arrive, as far as the middleware knows.
+    """
+
+    def __init__(
+        self, node: Node, kind: Any, topic: str, callback: Callable[[Any], None], group: CallbackGroup
+    ) -> None:
+        self.topic_name, self.lost = node.resolve_topic_name(topic), 0
+        self._node, self._kind, self._topic, self._callback, self._group = node, kind, topic, callback, group
+        self._matches = False  # Whether nobody has said how reliable it is to be.
+        self._lock, self._closed = threading.Lock(), False
+        self._quality, self._subscription = self._subscribe()
+
+    @property
+    def policies(self) -> str:
+        """What has to match between publisher and subscription."""
+        return f"{self._quality.reliability.short_key}, {self._quality.durability.short_key}".replace("_", " ")
+
+    def look(self) -> None:
+        """Subscribe anew if the publishers have changed; call it some ten times a second."""
+        with self._lock:
+            if self._closed or not self._matches or self._offered() == self._quality.reliability:
+                return
+            self._node.destroy_subscription(self._subscription)
+            self._quality, self._subscription = self._subscribe()
+        self._node.get_logger().info(f"{self.topic_name}: its publishers have changed; now {self.policies}")
+
+    def close(self) -> None:
+        """Stop to listen, for good."""
+        with self._lock:
+            self._closed = True
+            self._node.destroy_subscription(self._subscription)
+
+    def _subscribe(self) -> tuple[QoSProfile, Any]:
+        quality = input_data(_SMALL_DEPTH if self._kind in _SMALL else _DEPTH)
+        # No validation, but rclpy's only word between reading the overrides and subscribing.
+        overridable = QoSOverridingOptions.with_default_policies(callback=self._match)
+        create = partial(
+            self._node.create_subscription,
+            self._kind,
+            self._topic,
+            self._callback,
+            quality,
+            callback_group=self._group,
+            qos_overriding_options=overridable,
+        )
+        events = partial(SubscriptionEventCallbacks, incompatible_qos=self._complain)
+        with clear_overrides(self._topic):
+            try:
+                return quality, create(event_callbacks=events(message_lost=self._count_lost))
+            except UnsupportedEventTypeError:  # Not every middleware counts.
+                return quality, create(event_callbacks=events())
+
+    def _match(self, quality: QoSProfile) -> SetParametersResult:
+        self._matches = quality.reliability == ReliabilityPolicy.BEST_AVAILABLE
+        if self._matches:
+            quality.reliability = self._offered()
+        return SetParametersResult(successful=True)
+
+    def _offered(self) -> ReliabilityPolicy:
+        """Find out what all publishers offer; reliable while there is none, so that of the first nothing is lost."""
+        publishers = self._node.get_publishers_info_by_topic(self.topic_name)
+        reliable = all(info.qos_profile.reliability == ReliabilityPolicy.RELIABLE for info in publishers)
+        return ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+
+    def _count_lost(self, event: Any) -> None:
+        # Of a large message that a later one has overtaken Fast DDS says besides that 2^31 - 1 are lost.
+        self.lost += (event.total_count_change & _UINT32) % _INT32
+
+    def _complain(self, event: Any) -> None:
+        if not self._matches:  # Else `look` sees to it.
+            self._node.get_logger().warning(
+                f"{self.topic_name}: the qos_overrides of this side ({self.policies}) ask for more than a publisher "
+                "offers: nothing will come from it"
+            )
