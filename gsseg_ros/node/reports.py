@@ -56,7 +56,7 @@ class Selection:
         """The scene that the result is of; the session's may have changed since."""
         return self.session.scene_of(self.result)
 
-    @cached_property
+    @property  # Kept, it would hold itself, and all arrays that belong to it, until the collector comes by.
     def of_all_classes(self) -> Selection:
         """The same without a choice of classes."""
         everything = sorted(self.result.class_names)

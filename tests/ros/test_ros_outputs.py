@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import subprocess
 import sys
 import threading
 import time
+import weakref
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +19,7 @@ import pytest
 from patience import PATIENCE
 from ros_fixtures import shared_fixture  # noqa: F401
 from ros_helpers import Ros
-from small_scenes import NAMES, balls_on_a_table, clean_views
+from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
@@ -52,6 +54,22 @@ def selection(*chosen: int) -> Selection:
     for view in clean_views(2):
         session.fuse(view)
     return Selection(session, session.segmentation(PAPER), chosen, 0.0, Similarity(np.eye(3), np.zeros(3), 1.0))
+
+
+def test_what_a_run_held_is_free_as_soon_as_it_ends() -> None:
+    asked = selection(*range(NUM_CLASSES))
+    everything = asked.of_all_classes
+    header = Header()
+    for k in everything.chosen:
+        everything.class_cloud(k, header)
+    everything.objects(header, 1)
+    held = [weakref.ref(asked), weakref.ref(everything)]
+    gc.disable()  # Arrays that a circle holds on to may be millions of points.
+    try:
+        del asked, everything
+        assert [reference() for reference in held] == [None, None]
+    finally:
+        gc.enable()
 
 
 def test_clouds_hold_their_classes_as_they_lie_in_the_map() -> None:
