@@ -27,6 +27,7 @@ setup(
     packages=find_packages(include=["gsseg_core*", "gsseg_ros*"]),
     package_data={
         "gsseg_core": ["__init__.pyi"],
+        "gsseg_ros": ["fastdds.xml"],
         "gsseg_core.report": ["charts.html.j2", "page.css", "page.html.j2", "page.js", "sections.html.j2"],
     },
     # What ROS looks for, at the places where it looks: the same after pip, colcon and colcon --symlink-install.

@@ -38,6 +38,7 @@ from gsseg_ros.node.services import AT_WORK, WAITING, Services, describe
 from gsseg_ros.node.sim_time import SimTime
 from gsseg_ros.node.viewpoints import Lookup
 from gsseg_ros.node.workspace import Workspace
+from gsseg_ros.shared_memory import make_room
 
 THREADS = AT_WORK + WAITING + 7
 """Of the executor: those that requests hold that take long, one for a learn job, one for a transition, one for
@@ -304,6 +305,7 @@ def _spin_once(executor: MultiThreadedExecutor, node: SegmentNode) -> None:
 def main(args: list[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM; returns the exit code: 0, or 2 for arguments that cannot be used."""
     keep_freed_memory()
+    make_room()
     # rclpy's own handlers would take the context away under a running job, and its spin() does not always notice.
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):

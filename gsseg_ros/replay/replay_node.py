@@ -26,6 +26,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_ros.conversions import stamp_message
 from gsseg_ros.replay.sources import TYPES, BagSource, FolderSource, Group, Source
+from gsseg_ros.shared_memory import make_room
 
 _CLASSES = {
     "mask": Image, "camera_info": CameraInfo, "pose": PoseStamped, "image": Image, "scene_delta": SceneDelta,
@@ -269,6 +270,7 @@ def _with_parameters(args: list[str] | None) -> list[str]:
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; exit code 0 when done or stopped by a signal, 2 for bad input."""
+    make_room()
     try:
         # rclpy's own handlers would take the context away in the middle of a publication.
         rclpy.init(args=_with_parameters(args), signal_handler_options=SignalHandlerOptions.NO)
