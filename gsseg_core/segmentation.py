@@ -29,7 +29,7 @@ from gsseg_core.files.run_folder import settle
 from gsseg_core.learn.temperature import tempered
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.view_operator import ViewOperator
-from gsseg_core.refine.knn_filter import cluster, statistical_filter
+from gsseg_core.refine.knn_filter import cluster_in_place, statistical_filter
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.refine.silhouette_carving import Silhouette, carve
 from gsseg_core.scene.camera import Camera
@@ -115,22 +115,24 @@ class Segmentation:
             Without the filter by default. What needs views is left to `carved`.
         """
         settings = settings or RefineSettings()
-        result = cls.unfiltered(scene, codes, class_names, settings)
+        result = cls.unfiltered(scene, np.array(codes, np.float32, order="C"), class_names, settings)
         return result.filtered(scene, settings) if settings.filter else result
 
     @classmethod
     def unfiltered(
         cls, scene: GaussianScene, codes: np.ndarray, class_names: Mapping[int, str], settings: RefineSettings
     ) -> Segmentation:
-        """Label learnt codes (N, K), after KNN clustering unless that is off, and leave the filter to the caller."""
+        """Label learnt codes (N, K), after KNN clustering unless that is off, and leave the filter to the caller.
+
+        The codes, contiguous float32, become the probabilities: they are taken over, and changed.
+        """
         names = {k: class_name(class_names, k) for k in range(codes.shape[1])}
-        probabilities, clustered = codes, np.zeros(len(codes), bool)
+        clustered, learnt = np.zeros(len(codes), bool), codes[:0].copy()
         if settings.cluster:
             observed, neighbours = largest(codes)[0] > 0, neighbours_of(scene, settings.k)
-            refined = cluster(scene.means, codes, observed, settings.k, settings.beta, neighbours)
-            probabilities, clustered = refined.probabilities, refined.changed
-        _, labels = largest(probabilities)  # -1, which is UNOBSERVED, where nothing is known
-        return cls(labels, probabilities, names, scene.digest, clustered, codes[clustered], ids=scene.ids)
+            clustered, learnt = cluster_in_place(scene.means, codes, observed, settings.k, settings.beta, neighbours)
+        _, labels = largest(codes)  # -1, which is UNOBSERVED, where nothing is known
+        return cls(labels, codes, names, scene.digest, clustered, learnt, ids=scene.ids)
 
     def filtered(self, scene: GaussianScene, settings: RefineSettings) -> Segmentation:
         """Take the outliers out of each object: the paper's statistical filter."""

@@ -60,16 +60,31 @@ def cluster(
     >>> cluster(means, codes, np.array([True, True, True]), k=1).probabilities.tolist()
     [[0.0, 1.0], [0.0, 1.0], [0.25, 0.75]]
     """
-    codes = np.ascontiguousarray(probabilities, np.float32)
+    refined = np.array(probabilities, np.float32, order="C")
+    return Clustered(refined, cluster_in_place(means, refined, observed, k, beta, neighbours)[0])
+
+
+def cluster_in_place(
+    means: np.ndarray,  # (N, 3) float32
+    codes: np.ndarray,  # (N, K) float32, contiguous
+    observed: np.ndarray,  # (N,) bool
+    k: int,
+    beta: float,
+    neighbours: Neighbours | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Do what `cluster` does in an array of millions of rows, without another one.
+
+    Returns
+    -------
+    (N,) bool, (M, K) float32
+        Which rows changed, and what these were before.
+    """
     wanted = ~observed | (largest(codes)[0] < beta)
-    refined, changed = codes.copy(), np.zeros(len(codes), bool)
-    if len(means) > 1 and wanted.any() and observed.any():
-        known = neighbours or Neighbours.among(means, k)
-        found = known.mean_codes(CSRRows.from_dense(codes), observed, codes.shape[1], wanted)
-        changed = np.diff(found.indptr) > 0
-        refined[changed] = 0.0
-        found.write(refined)
-    return Clustered(refined, changed)
+    if len(means) < 2 or not wanted.any() or not observed.any():
+        return np.zeros(len(codes), bool), np.empty((0, codes.shape[1]), np.float32)
+    known, before = neighbours or Neighbours.among(means, k), CSRRows.from_dense(codes)
+    changed = known.average_into(codes, before, observed, wanted)
+    return changed, before.take(np.flatnonzero(changed)).dense(codes.shape[1])
 
 
 def statistical_filter(

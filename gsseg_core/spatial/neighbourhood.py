@@ -11,7 +11,9 @@ among the k nearest share it equally, and sums are taken over whole numbers, whe
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 
 import numba as nb
@@ -73,20 +75,50 @@ class Neighbours:
         CSRRows
             N rows; one without entries where there is no such neighbour, or the point is not wanted.
         """
-        order = self.tree.order
-        selected = np.ones(len(order), bool) if wanted is None else wanted[order]
-        asked = np.flatnonzero(selected).astype(np.int32)
-        read = np.repeat(counted, np.diff(codes.indptr))
-        units = np.rint(codes.data * np.float32(1 / CODE_UNIT), where=read, out=np.zeros_like(codes.data))
-        rows = codes.with_data(units.astype(np.int32))
-        self.look_for(selected)
+        asked, means_of = self._asked(codes, counted, wanted)
         # A block at a time is written out in full, so that of all the codes only what is not zero is ever in memory.
         parts = []
         for first in range(0, max(len(asked), 1), ROWS_AT_ONCE):
             places = asked[first : first + ROWS_AT_ONCE]
-            out = average(self.tree, rows, counted, places, self.radii, self.k, num_classes)
+            out, rows = np.zeros((len(places), num_classes), np.float32), np.arange(len(places), dtype=np.int32)
+            means_of(places, rows, out, np.zeros(len(places), bool))
             parts.append(CSRRows.from_dense(out))
+        order = self.tree.order
         return CSRRows.vstack(parts).scattered(order[asked], len(order))
+
+    def average_into(
+        self,
+        out: np.ndarray,  # (N, K) float32
+        codes: CSRRows,  # N rows of K classes, float32 in [0, 1]
+        counted: np.ndarray,  # (N,) bool
+        wanted: np.ndarray,  # (N,) bool
+    ) -> np.ndarray:
+        """Replace those rows that are wanted by mean codes, as `mean_codes` finds them, where there are any.
+
+        Returns
+        -------
+        ndarray (N,) bool
+            Which rows were replaced.
+        """
+        asked, means_of = self._asked(codes, counted, wanted)
+        changed = np.zeros(len(out), bool)
+        means_of(asked, self.tree.order[asked], out, changed)
+        return changed
+
+    def _asked(
+        self, codes: CSRRows, counted: np.ndarray, wanted: np.ndarray | None
+    ) -> tuple[np.ndarray, Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], None]]:
+        """Find the places in the tree that are wanted, and prepare `average` for all but its last four arguments."""
+        order = self.tree.order
+        selected = np.ones(len(order), bool) if wanted is None else wanted[order]
+        read = np.repeat(counted, np.diff(codes.indptr))
+        units = np.rint(codes.data * np.float32(1 / CODE_UNIT), where=read, out=np.zeros_like(codes.data))
+        rows = codes.with_data(units.astype(np.int32))
+        self.look_for(selected)
+        empty = _nodes_without(counted, order, len(self.tree.blocks))
+        below = (self.radii.view(np.int32) - np.int32(1)).view(np.float32)
+        means_of = partial(average, self.tree, rows, counted, empty, self.radii, below, self.k)
+        return np.flatnonzero(selected).astype(np.int32), means_of
 
     def class_distances(
         self,
@@ -139,15 +171,18 @@ def find_neighbours(scene: GaussianScene, k: int) -> None:
 @nb.njit(parallel=True, nogil=True, cache=True)
 def average(
     tree: Tree, codes: CSRRows, counted: np.ndarray,  # n rows, int32 in steps of CODE_UNIT; (n,) bool, by row
-    places: np.ndarray, radii: np.ndarray,  # (M,) int32 ascending; (n,), squared distance to the k-th nearest other
-    k: int, num_classes: int,
-) -> np.ndarray:  # fmt: skip
-    """Mean code of the k nearest others that count, (M, K) float32; a row of zeros where none does.
+    empty: np.ndarray,  # (2 L,) int32: 1 for nodes of which no point counts
+    radii: np.ndarray, below: np.ndarray,  # (n,): squared distance to the k-th nearest other; the next smaller float32
+    k: int,
+    places: np.ndarray, rows: np.ndarray,  # (M,) int32, ascending; (M,) int32 of `out`
+    out: np.ndarray, changed: np.ndarray,  # (R, K) float32, (R,) bool
+) -> None:  # fmt: skip
+    """Write mean codes of the k nearest others that count; rows of those of which none does stay as they are.
 
     Those exactly at the radius share the places that are left.
     """
-    m, leaves, n = len(places), len(tree.blocks), len(tree.order)
-    out, skip = np.zeros((m, num_classes), np.float32), np.empty(0, np.int32)
+    m, leaves, n, num_classes = len(places), len(tree.blocks), len(tree.order), out.shape[1]
+    skip = np.empty(0, np.int32)
     for chunk in nb.prange((m + knn.CHUNK - 1) // knn.CHUNK):
         sums = np.empty((2, num_classes), np.int64)  # inside the radius, and on it
         counts = np.empty((2, 2), np.int64)  # the same, and of these the ones that count
@@ -159,30 +194,58 @@ def average(
             reach = np.float32(0)
             for q in range(begin, end):
                 reach = max(reach, radii[places[q]])
-            candidates, found = knn.find_leaves(tree.boxes, box, reach, skip, np.int32(0), candidates)
-            for q in range(begin, end):
+            # Most of those that no view saw are among their like, and none of these has to be looked at.
+            candidates, found = knn.find_leaves(tree.boxes, box, reach, empty, np.int32(1), candidates)
+            if found > 0:
+                candidates, found = knn.find_leaves(tree.boxes, box, reach, skip, np.int32(0), candidates)
+            for q in range(begin, end if found > 0 else begin):
                 own = places[q]
                 sums[:], counts[:] = 0, 0
                 for h in range(knn.measure(tree, own, radii[own], found, candidates)):
                     start = leaf_range(candidates.leaves[candidates.reached[h]], leaves, n)[0]
-                    within = at_most(load_row(candidates.near, h), radii[own])
-                    while within:
-                        lane = first_bit(within)
-                        within &= within - 1
-                        if start + lane != own:
-                            row, tied = tree.order[start + lane], np.int64(candidates.near[h, lane] == radii[own])
-                            counts[tied, 0] += 1
-                            if counted[row]:
-                                counts[tied, 1] += 1
-                                for e in range(codes.indptr[row], codes.indptr[row + 1]):
-                                    sums[tied, codes.indices[e]] += codes.data[e]
+                    others = ~(1 << (own - start)) if start <= own < start + LEAF else -1
+                    near = load_row(candidates.near, h)
+                    inside = at_most(near, below[own]) & others
+                    tied = at_most(near, radii[own]) & others & ~inside
+                    _add(codes, counted, tree.order, start, inside, sums[0], counts[0])
+                    if tied:
+                        _add(codes, counted, tree.order, start, tied, sums[1], counts[1])
                 if counts[0, 1] + counts[1, 1] > 0:
                     share = (k - counts[0, 0]) / counts[1, 0]
                     total = (counts[0, 1] + share * counts[1, 1]) / CODE_UNIT
+                    changed[rows[q]] = True
                     for c in range(num_classes):
-                        out[q, c] = (sums[0, c] + share * sums[1, c]) / total
+                        out[rows[q], c] = (sums[0, c] + share * sums[1, c]) / total
             begin = end
-    return out
+
+
+@nb.njit(inline="always")
+def _add(
+    codes: CSRRows, counted: np.ndarray, order: np.ndarray, start: int, lanes: int, sums: np.ndarray, counts: np.ndarray
+) -> None:
+    """Add up the codes of some points of a leaf, by the bits of their lanes: of those that count."""
+    while lanes:
+        row = order[start + first_bit(lanes)]
+        lanes &= lanes - 1
+        counts[0] += 1
+        if counted[row]:
+            counts[1] += 1
+            for e in range(codes.indptr[row], codes.indptr[row + 1]):
+                sums[codes.indices[e]] += codes.data[e]
+
+
+@nb.njit(parallel=True, nogil=True, cache=True)
+def _nodes_without(counted: np.ndarray, order: np.ndarray, leaves: int) -> np.ndarray:
+    """Tell of which nodes no point counts, (2 L,) int32: 1 for these, 0 for others."""
+    without = np.ones(2 * leaves, np.int32)
+    for leaf in nb.prange(leaves):
+        first, last = leaf_range(leaf, leaves, len(order))
+        for i in range(first, last):
+            if counted[order[i]]:
+                without[leaves + leaf] = 0
+    for node in range(leaves - 1, 0, -1):
+        without[node] = without[2 * node] & without[2 * node + 1]
+    return without
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)

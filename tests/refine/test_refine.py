@@ -110,6 +110,15 @@ def test_sure_gaussians_keep_their_codes_and_rows_sum_to_one():
     np.testing.assert_allclose(result.probabilities.sum(axis=1), 1, atol=1e-6)
 
 
+def test_in_place_the_rows_that_changed_come_back_as_they_were():
+    means, probabilities, observed, _ = scene(3, 700)
+    wanted, codes = cluster(means, probabilities, observed, 20, 0.65), probabilities.copy()
+    changed, before = refine.cluster_in_place(means, codes, observed, 20, 0.65)
+    np.testing.assert_array_equal(codes, wanted.probabilities)
+    np.testing.assert_array_equal(changed, wanted.changed)
+    np.testing.assert_array_equal(before, probabilities[changed])
+
+
 def test_unobserved_codes_are_never_read():
     means, probabilities, observed, _ = scene(1, 500)
     probabilities[~observed] = np.nan
