@@ -12,6 +12,7 @@ import numpy as np
 
 from gsseg_core.csr_rows import CSRRows, largest
 from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.spatial.class_distances import class_distances
 from gsseg_core.spatial.neighbourhood import Neighbours
 
 
@@ -133,7 +134,7 @@ def statistical_filter(
     limit = int(labels.max(initial=0)) + 1 if num_classes is None else num_classes
     if len(means) < 3:
         return removed
-    known = (neighbours or Neighbours.among(means, k)).class_distances(labels, limit)
+    known = class_distances(neighbours or Neighbours.among(means, k), labels, limit)
     # Short numbers are sorted by their digits, in a quarter of the time.
     short = np.clip(labels, -1, limit).astype(np.int16) if limit < 2**15 else labels
     by_class = np.argsort(short, kind="stable")

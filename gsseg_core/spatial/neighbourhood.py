@@ -14,13 +14,12 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import pairwise
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.kernel_cache import called_by_kernels
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 from gsseg_core.simd import at_most, first_bit, load_row
@@ -29,8 +28,19 @@ from gsseg_core.spatial.kd_tree import LEAF, Tree, leaf_range, scaled, tree_of
 
 CODE_UNIT = 2.0**-24  # codes are summed in steps of this, which is the precision of a float32 near 1
 ROWS_AT_ONCE = 1 << 16  # points whose mean codes are written out at once
-MIXED = np.int32(-(2**31))  # stands for the label of a node whose points have several
-NOBODY = MIXED + 1  # the label of no point
+
+
+class Found(NamedTuple):
+    """Mean distances of points to others of their class, and what they go by; all arrays are (N,), in tree order."""
+
+    labels: np.ndarray  # int32, 0 of points that are in no class
+    radii: np.ndarray  # float32: squared distance to the last of the k nearest of the class
+    distances: np.ndarray  # float64: mean distance to these; both are NaN where there is none
+
+    @classmethod
+    def nothing(cls, count: int) -> Found:
+        """Begin with points of which none is in a class."""
+        return cls(np.zeros(count, np.int32), np.full(count, np.nan, np.float32), np.full(count, np.nan))
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +51,7 @@ class Neighbours:
     tree: Tree  # the points, all arrays here being in its order
     radii: np.ndarray  # (N,) float32: squared distance to the k-th nearest other, NaN where nobody has asked for it
     distances: np.ndarray  # (N,) float64: mean distance to the k nearest others, both in units of the scaled points
+    by_class: list[Found] = field(default_factory=list, repr=False)  # What `class_distances` found last, if anything.
     _looking: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     @classmethod
@@ -115,40 +126,10 @@ class Neighbours:
         units = np.rint(codes.data * np.float32(1 / CODE_UNIT), where=read, out=np.zeros_like(codes.data))
         rows = codes.with_data(units.astype(np.int32))
         self.look_for(selected)
-        empty = _nodes_without(counted, order, len(self.tree.blocks))
+        empty = nodes_without(counted, order, len(self.tree.blocks))
         below = (self.radii.view(np.int32) - np.int32(1)).view(np.float32)
         means_of = partial(average, self.tree, rows, counted, empty, self.radii, below, self.k)
         return np.flatnonzero(selected).astype(np.int32), means_of
-
-    def class_distances(
-        self,
-        labels: np.ndarray,  # (N,) int
-        num_classes: int,
-    ) -> np.ndarray:
-        """Mean distance to the k nearest others of the same class, or to all of them if there are not as many: (N,).
-
-        Returns
-        -------
-        ndarray (N,) float64
-            In units of the scaled points. NaN where the label is not in 1 to `num_classes` - 1, and where a class has
-            a single member.
-        """
-        tree = self.tree
-        of_point = labels[tree.order].astype(np.int32)
-        of_point[of_point >= num_classes] = 0
-        self.look_for(of_point > 0)
-        found = pure_distances(tree, of_point, self.radii, self.distances)
-        by_class = np.argsort(of_point.astype(np.int16) if num_classes < 2**15 else of_point, kind="stable")
-        bounds = np.searchsorted(of_point, np.arange(1, num_classes + 1), sorter=by_class).tolist()
-        for first, last in pairwise(bounds):
-            members = by_class[first:last]
-            mixed = np.flatnonzero(np.isnan(found[members])).astype(np.int32)
-            # Where other classes are among the neighbours, more of its own are looked for, farther away.
-            if len(members) > 1 and len(mixed):
-                found[members[mixed]] = knn.nearest(tree.part(members), mixed, min(self.k, len(members) - 1))[1]
-        out = np.empty(len(labels))
-        out[tree.order] = found
-        return out
 
 
 _KNOWN: PerScene[Neighbours] = PerScene()
@@ -235,7 +216,7 @@ def _add(
 
 
 @nb.njit(parallel=True, nogil=True, cache=True)
-def _nodes_without(counted: np.ndarray, order: np.ndarray, leaves: int) -> np.ndarray:
+def nodes_without(counted: np.ndarray, order: np.ndarray, leaves: int) -> np.ndarray:
     """Tell of which nodes no point counts, (2 L,) int32: 1 for these, 0 for others."""
     without = np.ones(2 * leaves, np.int32)
     for leaf in nb.prange(leaves):
@@ -246,57 +227,3 @@ def _nodes_without(counted: np.ndarray, order: np.ndarray, leaves: int) -> np.nd
     for node in range(leaves - 1, 0, -1):
         without[node] = without[2 * node] & without[2 * node + 1]
     return without
-
-
-@nb.njit(parallel=True, nogil=True, cache=True)
-def pure_distances(tree: Tree, labels: np.ndarray, radii: np.ndarray, distances: np.ndarray) -> np.ndarray:
-    """Distances of the points whose neighbours within the radius all have their own, positive, label; else NaN.
-
-    All arrays are (n,) in tree order, the labels of int32.
-    """
-    leaves, n = len(tree.blocks), len(labels)
-    out, of_node = np.full(n, np.nan), _labels_of_nodes(labels, leaves)
-    for chunk in nb.prange((leaves + LEAF - 1) // LEAF):
-        candidates = knn.scratch_for(128)
-        for leaf in range(chunk * LEAF, min((chunk + 1) * LEAF, leaves)):
-            first, last = leaf_range(leaf, leaves, n)
-            widest, label = np.float32(-1), of_node[leaves + leaf]
-            for q in range(first, last):
-                widest = max(widest, radii[q]) if labels[q] > 0 else widest
-            if widest < 0:
-                continue
-            # A node of the leaf's own label has nothing to say; a leaf of several labels has none.
-            skipped = label if label != MIXED else NOBODY
-            box = tree.boxes[leaves + leaf]
-            candidates, found = knn.find_leaves(tree.boxes, box, widest, of_node, skipped, candidates)
-            for q in range(first, last):
-                if labels[q] > 0:
-                    reached = knn.measure(tree, q, radii[q], found, candidates)
-                    if _is_pure(labels, labels[q], radii[q], reached, leaves, candidates):
-                        out[q] = distances[q]
-    return out
-
-
-@called_by_kernels
-def _is_pure(
-    labels: np.ndarray, label: int, radius: float, reached: int, leaves: int, candidates: knn.LeafCandidates
-) -> bool:
-    """Whether all points measured and within the radius have a label."""
-    for h in range(reached):
-        first, last = leaf_range(candidates.leaves[candidates.reached[h]], leaves, labels.shape[0])
-        within = at_most(load_row(candidates.near, h), radius)
-        for i in range(last - first):
-            if (within >> i) & 1 and labels[first + i] != label:
-                return False
-    return True
-
-
-@called_by_kernels
-def _labels_of_nodes(labels: np.ndarray, leaves: int) -> np.ndarray:
-    of_node = np.empty(2 * leaves, np.int32)
-    for leaf in range(leaves):
-        first, last = leaf_range(leaf, leaves, labels.shape[0])
-        of_node[leaves + leaf] = labels[first] if (labels[first:last] == labels[first]).all() else MIXED
-    for node in range(leaves - 1, 0, -1):
-        of_node[node] = of_node[2 * node] if of_node[2 * node] == of_node[2 * node + 1] else MIXED
-    return of_node

@@ -14,6 +14,8 @@ from gsseg_core.refine import knn_filter as refine
 from gsseg_core.refine.knn_filter import cluster, statistical_filter
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.spatial import class_distances as class_distances_module
+from gsseg_core.spatial.class_distances import class_distances
 from gsseg_core.spatial.neighbourhood import Neighbours, neighbours_of
 
 
@@ -108,6 +110,32 @@ def test_sure_gaussians_keep_their_codes_and_rows_sum_to_one():
     np.testing.assert_array_equal(result.changed, ~observed | (probabilities.max(axis=1) < 0.65))
     np.testing.assert_array_equal(result.probabilities[~result.changed], probabilities[~result.changed])
     np.testing.assert_allclose(result.probabilities.sum(axis=1), 1, atol=1e-6)
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 10**6), n=st.integers(2, 400), k=st.integers(1, 60), on_grid=st.booleans())
+def test_distances_after_some_labels_have_changed_are_those_found_from_nothing(seed, n, k, on_grid):
+    means, _, _, labels = scene(seed, n, on_grid=on_grid)
+    rng, kept = np.random.default_rng(seed), Neighbours.among(means, k)
+    if not on_grid:
+        labels = np.digitize(means[:, 0], [-1, 0, 1]).astype(np.int32)  # Most are among their like.
+    for share in (0.0, 0.0, 0.01, 0.1, 1.0, 0.02):
+        moved = rng.random(n) < share
+        labels = np.where(moved, rng.integers(-2, 6, n, np.int32), labels)
+        np.testing.assert_array_equal(
+            class_distances(kept, labels, 5), class_distances(Neighbours.among(means, k), labels, 5)
+        )
+
+
+def test_only_what_lies_near_a_changed_label_is_found_anew():
+    means = scene(5, 5000)[0]
+    labels, neighbours = np.digitize(means[:, 0], [-1, 0, 1]).astype(np.int32), Neighbours.among(means, 10)
+    class_distances(neighbours, labels, 5)
+    of_point = labels[neighbours.tree.order]
+    assert not class_distances_module._to_be_found(neighbours.tree, of_point, neighbours.by_class[0], 10).any()
+    of_point[700] = 4 - of_point[700]
+    found = class_distances_module._to_be_found(neighbours.tree, of_point, neighbours.by_class[0], 10)
+    assert 0 < found.sum() < 100
 
 
 def test_in_place_the_rows_that_changed_come_back_as_they_were():
