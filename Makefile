@@ -14,7 +14,7 @@ COLCON_READY := $(COLCON_VENV)/.ready
 WARM_UP := $(BIN)/python -c 'from gsseg_core.warm_up import warm_up; warm_up(say=print)'
 
 INSTALLED := setup.py package.xml $(wildcard config/* foxglove/* launch/* resource/* rviz/* scripts/* sros2/*)
-KERNELS := $(shell grep -rl --include='*.py' numba gsseg_core)
+KERNELS := $(shell grep -rlE --include='*.py' 'numba|gsseg_core.kernels' gsseg_core)
 MSGS := $(wildcard msg_defs/*.* msg_defs/action/* msg_defs/msg/* msg_defs/srv/*)
 
 # Of tests that run beside each other: those that start nodes wait more than they work.

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from gsseg_core import kernel_cache as _kernel_cache  # noqa: F401 - before any kernel is defined
+from gsseg_core.kernels.compiler import kernel
 from gsseg_core.simd import prefetch
 
 _NONE = np.uint32(2**32 - 1)
@@ -105,7 +105,7 @@ def starts(counts: np.ndarray) -> np.ndarray:  # (n,)
     return np.concatenate([[0], np.cumsum(counts)])
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def largest(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # (N, K) float32
     """Find the largest entry of each row, (N,) float32, and its column, (N,) int32: the first of equal ones.
 
@@ -121,7 +121,7 @@ def largest(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # (N, K) float
     return entries, columns
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _count(array: np.ndarray, counts: np.ndarray) -> None:
     for i in nb.prange(array.shape[0]):
         n = 0
@@ -130,7 +130,7 @@ def _count(array: np.ndarray, counts: np.ndarray) -> None:
         counts[i] = n
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _fill(array: np.ndarray, rows: CSRRows) -> None:
     indptr, indices, data = rows
     for i in nb.prange(array.shape[0]):
@@ -142,7 +142,7 @@ def _fill(array: np.ndarray, rows: CSRRows) -> None:
                     z += 1
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _write(rows: CSRRows, out: np.ndarray) -> None:
     indptr, indices, data = rows
     for i in nb.prange(out.shape[0]):
@@ -150,7 +150,7 @@ def _write(rows: CSRRows, out: np.ndarray) -> None:
             out[i, indices[z]] = data[z]
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _normalise(rows: CSRRows) -> None:
     indptr, _, data = rows
     for i in nb.prange(indptr.shape[0] - 1):
@@ -162,7 +162,7 @@ def _normalise(rows: CSRRows) -> None:
                 data[z] /= total
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _take(rows: CSRRows, ids: np.ndarray, taken: CSRRows) -> None:
     indptr, indices, data = rows
     taken_indptr, taken_indices, taken_data = taken
@@ -179,7 +179,7 @@ def _take(rows: CSRRows, ids: np.ndarray, taken: CSRRows) -> None:
             taken_indices[z], taken_data[z] = indices[first + j], data[first + j]
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _put(rows: CSRRows, ids: np.ndarray, others: CSRRows) -> None:
     indptr, _, data = rows
     other_indptr, _, other_data = others
@@ -189,7 +189,7 @@ def _put(rows: CSRRows, ids: np.ndarray, others: CSRRows) -> None:
             data[first + j] = other_data[other_indptr[m] + j]
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _count_united(one: CSRRows, other: CSRRows, counts: np.ndarray) -> None:
     indptr, indices, _ = one
     other_indptr, other_indices, _ = other
@@ -204,7 +204,7 @@ def _count_united(one: CSRRows, other: CSRRows, counts: np.ndarray) -> None:
         counts[i] = n
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _unite(one: CSRRows, other: CSRRows, united: CSRRows, united_other: np.ndarray) -> None:
     indptr, indices, data = one
     other_indptr, other_indices, other_data = other

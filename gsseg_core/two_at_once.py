@@ -13,8 +13,6 @@ from typing import TypeVar
 
 import numba
 
-from gsseg_core import kernel_cache as _kernel_cache  # noqa: F401 - before any kernel is defined
-
 T = TypeVar("T")
 R = TypeVar("R")
 

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numba.core import event
 
-from gsseg_core import kernel_cache
 from gsseg_core.data.view import View
+from gsseg_core.kernels import kernel_cache
 from gsseg_core.learn.em.boundary_alignment import align_boundaries
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.vote_learner import VoteLearner

@@ -19,7 +19,7 @@ PAGE = REPOSITORY / "docs/architecture.md"
 CORE, ROS = "gsseg_core", "gsseg_ros"
 BEGIN = {
     "align": "placing.py", "cli": "arguments.py", "data": "dataset.py", "demo": "run.py", "export": "class_files.py",
-    "files": "atomic.py",
+    "files": "atomic.py", "kernels": "compiler.py",
     "learn": "learner.py", "live": "session.py", "objects": "object_table.py", "raster": "view_operator.py",
     "refine": "settings.py", "report": "page.py", "scene": "gaussian_scene.py", "spatial": "neighbourhood.py",
     "viewer": "viewer.py",

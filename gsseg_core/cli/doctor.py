@@ -20,10 +20,10 @@ from importlib import metadata
 from itertools import groupby
 from pathlib import Path
 
-from gsseg_core import kernel_cache
 from gsseg_core.cli.shared import add_dataparser, add_device, add_quiet, load_kernels
 from gsseg_core.cli.terminal import note, tell
 from gsseg_core.errors import GssegError, SettingsError
+from gsseg_core.kernels import kernel_cache
 from gsseg_core.progress import progress_bars
 
 DESCRIPTION = """

@@ -25,7 +25,7 @@ import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_images import UNKNOWN
-from gsseg_core.kernel_cache import called_by_kernels
+from gsseg_core.kernels.compiler import called_by_kernels, kernel
 
 _ROUNDS = 50
 
@@ -225,7 +225,7 @@ def vote_units(weight: np.float32, votes: np.float64, units: float) -> np.int64:
     return np.int64(np.rint(np.float64(weight) * votes * units))
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def is_resolved(votes: np.ndarray, possible: np.ndarray) -> np.ndarray:  # (N, K) int64; (K,) bool, ids that are classes
     """Tell which Gaussians have a vote for a class, or only one class left, (N,) bool."""
     out = np.empty(votes.shape[0], np.bool_)
@@ -277,7 +277,7 @@ def resolve_row(
     return n
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _resolve(rows: CSRRows, ids: np.ndarray, kept: CSRRows) -> None:
     indptr, classes, votes = rows
     kept_indptr, kept_classes, kept_votes = kept

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import numba as nb
 import numpy as np
 import numpy.typing as npt
 
@@ -19,7 +18,7 @@ from gsseg_core.data.label_images import UNKNOWN, PackedLabels
 from gsseg_core.errors import MaskFormatError, MaskSizeError, UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.npz_files import Header
-from gsseg_core.kernel_cache import called_by_kernels
+from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.scene.undistortion import Undistortion
 from gsseg_core.text import clipped
 
@@ -324,7 +323,7 @@ def _check_range(values: npt.NDArray[np.generic], what: str) -> None:
         raise MaskFormatError(f"{what}: values are {found}; expected probabilities from 0 to 1")
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def _group(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # (P, C) uint8
     """Assign numbers to different rows in order of first occurrence: number of each row (P,), and first row of each."""
     count, size = rows.shape[0], 64

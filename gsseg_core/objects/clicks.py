@@ -18,12 +18,12 @@ import heapq
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numba as nb
 import numpy as np
 from scipy import ndimage
 
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import NoUsableViewsError, SettingsError
+from gsseg_core.kernels.compiler import kernel
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -141,7 +141,7 @@ def merge_tree(features: np.ndarray) -> MergeTree:
     return MergeTree(*_merge(np.ascontiguousarray(features.reshape(height * width, -1), np.float64), height, width))
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def _price(means: np.ndarray, size: np.ndarray, a: int, b: int, border: int) -> float:
     distance = 0.0
     for d in range(means.shape[1]):
@@ -150,7 +150,7 @@ def _price(means: np.ndarray, size: np.ndarray, a: int, b: int, border: int) -> 
     return price
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def _merge(cells: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Merge; a region's neighbours are listed by the names that they had when it came into being."""
     n = height * width

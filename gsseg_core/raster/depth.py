@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
+from gsseg_core.kernels.compiler import kernel
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import Blended
 from gsseg_core.scene.camera import Camera
@@ -50,7 +51,7 @@ def depths(scene: GaussianScene, camera: Camera, ids: np.ndarray | None = None) 
     return depth
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _depths(means: np.ndarray, ids: np.ndarray, row: np.ndarray) -> np.ndarray:  # (N, 3), (M,), (4,) float64
     depth = np.empty(ids.shape[0], np.float32)
     for m in nb.prange(ids.shape[0]):

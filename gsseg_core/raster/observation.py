@@ -12,6 +12,7 @@ import numpy as np
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence, vote_units
 from gsseg_core.errors import SceneValueError
+from gsseg_core.kernels.compiler import kernel
 from gsseg_core.raster.constants import AHEAD
 from gsseg_core.raster.view_renderer import ViewRenderer
 from gsseg_core.scene.camera import Camera
@@ -137,7 +138,7 @@ class Observation(ABC):
     def _shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares: ...
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def add_votes(
     total: np.ndarray, ids: np.ndarray,  # (N, K) int64, added to; (M,) int32, ascending
     start: np.ndarray, labels: np.ndarray,  # (M + 1,); (P,) int32: label of each pair

@@ -21,6 +21,7 @@ import numpy as np
 
 from gsseg_core.csr_rows import largest
 from gsseg_core.errors import SceneValueError, SettingsError
+from gsseg_core.kernels.compiler import kernel
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.simd import LANES, add_scaled, load_row, nothing, store_row
 from gsseg_core.spatial.knn import CHUNK
@@ -127,7 +128,7 @@ def propagate(
     return out
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _gather(codes: np.ndarray, order: np.ndarray, first: int) -> np.ndarray:  # (N, K), (N,)
     """Take sixteen columns of the codes, in the order of places: (N, 16), with zeros after the last column."""
     some, count = np.zeros((codes.shape[0], LANES), np.float32), min(codes.shape[1] - first, LANES)
@@ -137,7 +138,7 @@ def _gather(codes: np.ndarray, order: np.ndarray, first: int) -> np.ndarray:  # 
     return some
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _scatter(some: np.ndarray, order: np.ndarray, first: int, out: np.ndarray, total: np.ndarray) -> None:
     """Put such columns back into all codes (N, K), and add their sum to that of each place, (N,)."""
     count = min(out.shape[1] - first, LANES)
@@ -147,7 +148,7 @@ def _scatter(some: np.ndarray, order: np.ndarray, first: int, out: np.ndarray, t
             total[i] += some[i, c]
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _scale(codes: np.ndarray, order: np.ndarray, total: np.ndarray) -> None:
     """Divide the codes of each place, (N, K), by a number, (N,)."""
     for i in nb.prange(order.shape[0]):
@@ -177,7 +178,7 @@ def _spread(
     return codes
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _step(
     indptr: np.ndarray, indices: np.ndarray, weights: np.ndarray, learnt: np.ndarray, weight: np.ndarray,
     reached: np.ndarray, step: int, places: np.ndarray, codes: np.ndarray,
@@ -207,7 +208,7 @@ def _step(
     return values, changed
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _take(
     places: np.ndarray, values: np.ndarray, changed: np.ndarray, indptr: np.ndarray, indices: np.ndarray,
     codes: np.ndarray, awake: np.ndarray,
@@ -221,7 +222,7 @@ def _take(
                 awake[indices[e]] = True
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def _steps_to_reach(indptr: np.ndarray, indices: np.ndarray, known: np.ndarray, steps: int) -> np.ndarray:
     """Tell after how many steps the code of each place is known, (N,) int32, or NEVER."""
     reached = np.where(known, np.int32(0), np.int32(NEVER))
@@ -243,7 +244,7 @@ def _steps_to_reach(indptr: np.ndarray, indices: np.ndarray, known: np.ndarray, 
     return reached
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def _readers(indptr: np.ndarray, indices: np.ndarray, moving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """List, for each place, the places that move and have it as a neighbour, as CSR rows."""
     ends = np.zeros(moving.shape[0] + 1, np.int64)

@@ -7,7 +7,7 @@ from math import pi, sqrt
 import numba as nb
 import numpy as np
 
-from gsseg_core.kernel_cache import called_by_kernels
+from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.simd import prefetch
 
 _C0, _C1, _C2 = np.float32(sqrt(1 / (4 * pi))), np.float32(sqrt(3 / (4 * pi))), np.float32(sqrt(15 / (4 * pi)))
@@ -38,7 +38,7 @@ def _evaluate(x: np.float32, y: np.float32, z: np.float32, degree: int, out: np.
         out[12] = _C3_MIDDLE * z * (_TWO * zz - _THREE * xx - _THREE * yy)
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def evaluate(directions: np.ndarray, degree: int) -> np.ndarray:  # (N, 3) float32
     """Evaluate all harmonics up to a degree for unit vectors: (N, B) float32, band after band."""
     out = np.empty((directions.shape[0], (degree + 1) ** 2), np.float32)
@@ -47,7 +47,7 @@ def evaluate(directions: np.ndarray, degree: int) -> np.ndarray:  # (N, 3) float
     return out
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def seen_colors(
     coefficients: np.ndarray, means: np.ndarray,  # (N, 3 B) as in a PLY; (N, 3)
     ids: np.ndarray, center: np.ndarray, degree: int,  # (M,) int32; (3,) float32; up to which harmonics count

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numba as nb
 import numpy as np
 
-from gsseg_core.kernel_cache import called_by_kernels
+from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.simd import at_most, load_row
 from gsseg_core.spatial import knn
 from gsseg_core.spatial.kd_tree import LEAF, Tree, leaf_range
@@ -75,7 +75,7 @@ def _to_be_found(tree: Tree, labels: np.ndarray, before: Found, k: int) -> np.nd
     return wanted
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _want_those_near(
     tree: Tree, moved: np.ndarray, still: np.ndarray,  # (n,) bool, (2 L,) int32: 1 for nodes without any that moved
     labels: np.ndarray, before: np.ndarray, radii: np.ndarray,  # (n,) now; before; squared
@@ -117,7 +117,7 @@ def _is_near(
     return False
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def pure_distances(
     tree: Tree, labels: np.ndarray, wanted: np.ndarray, radii: np.ndarray, distances: np.ndarray
 ) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from gsseg_core.kernel_cache import called_by_kernels
+from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 
@@ -63,7 +63,7 @@ def _depth(count: int) -> int:
     return ((count - 1) // LEAF).bit_length()
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _grow(points: np.ndarray, order: np.ndarray, depth: int) -> None:
     top = depth - SUBTREE
     for level in range(top):
@@ -73,7 +73,7 @@ def _grow(points: np.ndarray, order: np.ndarray, depth: int) -> None:
         _grow_subtree(points, order, depth, top, j)
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def _grow_subtree(points: np.ndarray, order: np.ndarray, depth: int, top: int, root: int) -> None:
     for level in range(top, depth):
         for j in range(root << (level - top), (root + 1) << (level - top)):
@@ -120,7 +120,7 @@ def _partition(points: np.ndarray, order: np.ndarray, low: int, high: int, middl
             return
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _leaves(points: np.ndarray, leaves: int) -> tuple[np.ndarray, np.ndarray]:
     """Make the boxes of all nodes, and the blocks of the leaves, of points (3, n) in tree order."""
     boxes, blocks = np.empty((2 * leaves, 6), np.float32), np.full((leaves, 3, LEAF), np.float32(np.inf))

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from gsseg_core.kernel_cache import called_by_kernels
+from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.simd import count_at_most, squared_distances, store_row
 from gsseg_core.spatial.kd_tree import LEAF, Tree, gap, leaf_of, leaf_range
 
@@ -26,7 +26,7 @@ SLACK = np.float32(1.00001)  # covers float32 rounding in a bound
 LEAST = np.finfo(np.float32).tiny  # a bound that even points in one place are below
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def nearest(tree: Tree, places: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
     """Find the squared distance to the k-th nearest other point, (M,) float32, and the mean of the k, (M,) float64.
 

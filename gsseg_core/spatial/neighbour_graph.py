@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
+from gsseg_core.kernels.compiler import kernel
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 from gsseg_core.simd import at_most, first_bit, load_row
@@ -70,7 +71,7 @@ def graph_of(scene: GaussianScene, k: int = NEIGHBOURS) -> Graph:
     return _KNOWN.of(scene, build, lambda known: known.k == k)
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _list_near(
     tree: Tree, radii: np.ndarray, most: int,  # (n,) squared; for one point
     indptr: np.ndarray,  # (n + 1,) where the list of each point goes; out, with empty lists: counts, from entry 1 on
@@ -98,7 +99,7 @@ def _list_near(
                 indptr[own + 1] = count
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _compare(colors: np.ndarray, indptr: np.ndarray, indices: np.ndarray) -> np.ndarray:
     """Difference of the colours (n, 3) of neighbours, (E,) float32."""
     contrast = np.empty(len(indices), np.float32)
@@ -110,7 +111,7 @@ def _compare(colors: np.ndarray, indptr: np.ndarray, indices: np.ndarray) -> np.
     return contrast
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _weigh(
     points: np.ndarray, radii: np.ndarray,  # (3, n), (n,) squared distance to the k-th neighbour
     contrast: np.ndarray,  # (E,) difference of the colours, in units of a typical one

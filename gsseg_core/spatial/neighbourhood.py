@@ -20,6 +20,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
+from gsseg_core.kernels.compiler import kernel
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 from gsseg_core.simd import at_most, first_bit, load_row
@@ -149,7 +150,7 @@ def find_neighbours(scene: GaussianScene, k: int) -> None:
         neighbours.look_for()
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def average(
     tree: Tree, codes: CSRRows, counted: np.ndarray,  # n rows, int32 in steps of CODE_UNIT; (n,) bool, by row
     empty: np.ndarray,  # (2 L,) int32: 1 for nodes of which no point counts
@@ -215,7 +216,7 @@ def _add(
                 sums[codes.indices[e]] += codes.data[e]
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def nodes_without(counted: np.ndarray, order: np.ndarray, leaves: int) -> np.ndarray:
     """Tell of which nodes no point counts, (2 L,) int32: 1 for these, 0 for others."""
     without = np.ones(2 * leaves, np.int32)

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from gsseg_core import kernel_cache
 from gsseg_core.cli import doctor
 from gsseg_core.cli.arguments import COMMANDS, build_parser, command_module
 from gsseg_core.cli.completion import SHELLS, subparsers
 from gsseg_core.cli.doctor import Finding, describe, examine, works
 from gsseg_core.cli.main import main
+from gsseg_core.kernels import kernel_cache
 
 
 def help_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -64,7 +64,7 @@ SLOW = (
     "inspect",
     "importlib.metadata",
     "webbrowser",
-    "gsseg_core.kernel_cache",
+    "gsseg_core.kernels.kernel_cache",
     "gsseg_core.cli.segment",
 )
 

@@ -28,7 +28,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import starts
-from gsseg_core.kernel_cache import called_by_kernels
+from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.learn.em.mask_offset import LOG_OFFSETS, likeliest_offset, move_mask
 from gsseg_core.learn.em.rejected_regions import connected_pixels
 
@@ -159,7 +159,7 @@ def _edge_log_likelihood(lengths: np.ndarray, strengths: np.ndarray) -> np.ndarr
     return np.where(there, _lengths_and_weights(lengths)[1][:, None] * mean, VANISHED)
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def _mean_field_round(
     pairs: np.ndarray, log_likelihood: np.ndarray, begin: np.ndarray, ends: np.ndarray, log_prior: np.ndarray,
     posterior: np.ndarray,
@@ -183,7 +183,7 @@ def _mean_field_round(
         posterior[region] = field / field.sum()
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _nearest_regions(region: np.ndarray, farthest: int) -> tuple[np.ndarray, np.ndarray]:  # (H, W) int32
     """Find for each pixel the nearest other region, by spreading from boundary pixels, band by band.
 
@@ -257,7 +257,7 @@ def _spread_region(
             nearest[j] = own if nearer else nearest[j]
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def _boundary_strengths(
     region: np.ndarray, other: np.ndarray, ring: np.ndarray, edges: np.ndarray, count: int, farthest: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -309,7 +309,7 @@ def _sort_by_lower_region(of_pixel: np.ndarray, of_other: np.ndarray, count: int
     return begin, order
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def _move(
     region: np.ndarray, other: np.ndarray, ring: np.ndarray, pair: np.ndarray, pairs: np.ndarray, moved: np.ndarray,
     label: np.ndarray, labels: np.ndarray,

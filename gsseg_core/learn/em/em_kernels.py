@@ -16,6 +16,7 @@ from llvmlite import ir
 from numba.core import types
 
 from gsseg_core.csr_rows import CSRRows
+from gsseg_core.kernels.compiler import kernel
 from gsseg_core.raster.observation import Observation
 from gsseg_core.simd import intrinsic
 
@@ -68,7 +69,7 @@ def rounded_to_units(_: Any, __: Any) -> Any:
     return types.int64(types.float32), write
 
 
-@nb.njit(parallel=True, nogil=True, cache=True, fastmath={"contract", "reassoc"})
+@kernel(parallel=True, fastmath={"contract", "reassoc"})
 def pair_likelihood(codes: CSRRows, pairs: ViewPairs, likelihood: np.ndarray) -> np.ndarray:
     """Likelihood of the label of each (Gaussian, label) pair, codes[i] . likelihood[y]: (P,) float32."""
     indptr, classes, data = codes
@@ -85,7 +86,7 @@ def pair_likelihood(codes: CSRRows, pairs: ViewPairs, likelihood: np.ndarray) ->
     return out
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def accumulate(gradient: CSRRows, pairs: ViewPairs, likelihood: np.ndarray, shares: np.ndarray) -> None:
     """Add one view's term to the gradient: sum over a Gaussian's pairs of share times likelihood of the label."""
     indptr, classes, data = gradient
@@ -99,7 +100,7 @@ def accumulate(gradient: CSRRows, pairs: ViewPairs, likelihood: np.ndarray, shar
                 entries[z] += rounded_to_units(share * by_class[which[z]])
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def m_step(codes: CSRRows, gradient: np.ndarray, prior: np.ndarray) -> None:
     """M-step: set the codes to normalise(codes * gradient + prior), in place; rows of zeros stay zero."""
     indptr, _, data = codes
@@ -113,7 +114,7 @@ def m_step(codes: CSRRows, gradient: np.ndarray, prior: np.ndarray) -> None:
                 data[z] /= total
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def predicted_gain(codes: CSRRows, gradient: np.ndarray, prior: np.ndarray) -> float:
     """Slope of J along the step that `m_step` takes, in nats, at least 0: an upper bound of what it gains.
 
@@ -134,7 +135,7 @@ def predicted_gain(codes: CSRRows, gradient: np.ndarray, prior: np.ndarray) -> f
     return float(blocks.sum())
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def m_step_without_view(
     codes: CSRRows, gradient: np.ndarray, prior: np.ndarray, pairs: ViewPairs, likelihood: np.ndarray,
     shares: np.ndarray, stepped: CSRRows,
@@ -170,7 +171,7 @@ def confusion_counts(
     return np.asarray(parts.sum(axis=0))
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _count_confusions(codes: CSRRows, pairs: ViewPairs, shares: np.ndarray, parts: np.ndarray) -> None:
     indptr, classes, data = codes
     ids, start, labels = pairs
@@ -182,7 +183,7 @@ def _count_confusions(codes: CSRRows, pairs: ViewPairs, shares: np.ndarray, part
                     part[classes[z], labels[s]] += shares[s] * data[z]
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def normalise_votes(votes: np.ndarray, possible: np.ndarray, codes: np.ndarray) -> int:
     """Divide the votes (N, K) int64 for classes by their sum, into codes (N, K) float32; rows of zeros stay zero.
 

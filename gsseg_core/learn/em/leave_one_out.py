@@ -7,7 +7,7 @@ import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence, resolve_row, vote_units
-from gsseg_core.kernel_cache import called_by_kernels
+from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.learn.em.em_kernels import BLOCKS, ViewPairs
 from gsseg_core.learn.learner import UNITS
 from gsseg_core.raster.observation import Observation
@@ -32,7 +32,7 @@ def leave_one_out_counts(
     return np.asarray(parts.sum(axis=0))
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def subtract_votes(total: CSRRows, pairs: ViewPairs, own: np.ndarray, label_votes: CSRRows) -> None:
     """Subtract one view's votes from those of all, N rows of int64, in place.
 
@@ -71,7 +71,7 @@ def _raised(x: np.float32, power: float) -> np.float32:
     return result
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _count(
     votes: CSRRows, pairs: ViewPairs, own: np.ndarray, label_votes: CSRRows, possible: np.ndarray,
     power: float, most: float, parts: np.ndarray,

@@ -11,6 +11,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.kernels.compiler import kernel
 
 FARTHEST = 8  # rows or columns
 
@@ -51,7 +52,7 @@ def _overlap(by: int) -> tuple[slice, slice]:
     return (slice(by, None), slice(None, -by or None)) if by >= 0 else (slice(None, by), slice(-by, None))
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _strengths(rows: np.ndarray, columns: np.ndarray, weights: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Sum up weighed edges along boundaries moved by each offset, (2 FARTHEST + 1, 2 FARTHEST + 1) float64.
 

@@ -9,13 +9,13 @@ view's vocabulary, of which the confusion matrix tells what it means. docs/metho
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import SeenLabels
+from gsseg_core.kernels.compiler import kernel
 from gsseg_core.learn.em.leave_one_out import leave_one_out_counts
 from gsseg_core.raster.observation import Observation
 
@@ -65,7 +65,7 @@ def find_rejected(votes: CSRRows, observation: Observation, possible: np.ndarray
     return rejected
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def connected_pixels(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # (H, W) int32
     """Label the 4-connected components of pixels of one label, in the order of their first pixels.
 
@@ -113,7 +113,7 @@ def connected_pixels(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
     return connected, first[:count].copy(), area
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def _root(parent: np.ndarray, i: int) -> int:
     while parent[i] != i:
         parent[i] = parent[parent[i]]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
+from gsseg_core.kernels.compiler import kernel
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
@@ -38,7 +39,7 @@ def _in_units(edges: np.ndarray) -> np.ndarray:
     return np.minimum(edges / unit, np.float32(STRONGEST)) if unit > 0 else np.zeros_like(edges)
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _luminance_and_inverse_depth(
     means: np.ndarray, light: np.ndarray, ids: np.ndarray, ahead: np.ndarray  # (N, 3), (N,), (M,), (4,) row of depths
 ) -> np.ndarray:  # fmt: skip
@@ -52,7 +53,7 @@ def _luminance_and_inverse_depth(
     return channels
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _differences(image: np.ndarray, left_over: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Length of the gradient of luminance, and second differences of inverse depth, (H, W) float32 each.
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
+from gsseg_core.kernels.compiler import kernel
+
 DIGIT_BITS = 11  # three digits make up a key; counts of one fit the fastest cache
 PARTS = 4  # parts that are counted and moved beside each other; fixed, so that threads change nothing
 
@@ -28,7 +30,7 @@ def sort_by_depth(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return order, keys.view(np.float32)
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _count_digits(keys: np.ndarray, shift: int, counts: np.ndarray) -> None:
     count, mask = keys.shape[0], np.uint32((1 << DIGIT_BITS) - 1)
     for chunk in nb.prange(PARTS):
@@ -36,7 +38,7 @@ def _count_digits(keys: np.ndarray, shift: int, counts: np.ndarray) -> None:
             counts[chunk, (keys[i] >> np.uint32(shift)) & mask] += 1
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _move(
     keys: np.ndarray, order: np.ndarray, shift: int,  # (M,) uint32, (M,) int32
     place: np.ndarray,  # (PARTS, 2^DIGIT_BITS) where the next key of each digit goes

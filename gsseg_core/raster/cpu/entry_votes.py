@@ -7,6 +7,7 @@ import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence, vote_units
+from gsseg_core.kernels.compiler import kernel
 from gsseg_core.raster.constants import AHEAD, CHUNKS
 from gsseg_core.raster.cpu.lifting import Lifted
 from gsseg_core.raster.cpu.tiling import Tiles
@@ -29,7 +30,7 @@ def add_entry_votes(
     _vote(total, ids, tiles, facts, votes, lifted.sums, labels.present, evidence.votes, units, sign)
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _put_beside(start: np.ndarray, facts: np.ndarray, sums: np.ndarray, present: np.ndarray) -> np.ndarray:
     """Put beside each other what an entry votes, (E, 2) float32, in one place of memory: its label and the weight.
 
@@ -54,7 +55,7 @@ def _put_beside(start: np.ndarray, facts: np.ndarray, sums: np.ndarray, present:
     return votes
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _vote(
     total: np.ndarray, ids: np.ndarray, tiles: Tiles,  # (N, K) int64, added to; (M,) int32
     facts: np.ndarray, entry_votes: np.ndarray, sums: np.ndarray, present: np.ndarray,  # as in `_put_beside`

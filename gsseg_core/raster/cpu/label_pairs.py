@@ -12,7 +12,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core import simd
-from gsseg_core.kernel_cache import called_by_kernels
+from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.raster.constants import AHEAD, CHUNKS, TINY
 from gsseg_core.raster.cpu.blending import open_rays, stride_of, tile_of_turn
 from gsseg_core.raster.cpu.lifting import Labels
@@ -28,7 +28,7 @@ _NUMBER = (1 << _CHUNK) - 1
 PARTS = 4  # parts of the image whose sums are added up beside each other
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def keep_entries(start: np.ndarray, reached: np.ndarray, kept_start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Give a number to every entry that reaches a labelled pixel, from where those of its tile begin, (T + 1,).
 
@@ -45,7 +45,7 @@ def keep_entries(start: np.ndarray, reached: np.ndarray, kept_start: np.ndarray)
     return kept, blocks
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def number_pairs(
     tiles: Tiles, kept: np.ndarray,  # (E, 2)
     facts: np.ndarray,  # (T, 6) int64: first of all entries, of all slots, of the entries kept, of their slots, of the
@@ -104,7 +104,7 @@ def number_pairs(
     return found, gaussians, counts, labels, votes
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def renumber(numbers: np.ndarray, before: np.ndarray, count: int) -> np.ndarray:
     """Give numbers of int32, which begin anew in every chunk, others in the order in which they occur; -1 stays.
 
@@ -124,7 +124,7 @@ def renumber(numbers: np.ndarray, before: np.ndarray, count: int) -> np.ndarray:
     return new
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def put_in_order(
     order: np.ndarray, first: np.ndarray, start: np.ndarray,  # (M,); (M,), (M + 1,) where pairs begin, before and after
     pair_numbers: np.ndarray, labels: np.ndarray, votes: np.ndarray,  # (P,)
@@ -139,7 +139,7 @@ def put_in_order(
     return numbers, new_labels, new_votes
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def take(table: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """Copy some rows (M',) of a table (M, K); several times as fast as numpy."""
     out = np.empty((chosen.shape[0], table.shape[1]), table.dtype)
@@ -149,7 +149,7 @@ def take(table: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     return out
 
 
-@nb.njit(parallel=True, nogil=True, cache=True, fastmath=simd.FAST, error_model="numpy")
+@kernel(parallel=True, fastmath=simd.FAST, error_model="numpy")
 def share(
     tiles: Tiles, labels: Labels, blocks: np.ndarray,  # (E,) of each entry
     records: np.ndarray,  # (T,) blocks of all the tile's entries
@@ -280,7 +280,7 @@ def sum_shares(
             sums[e * label_count + current] += simd.sum_row(lanewise)
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def add_up(slot_start: np.ndarray, pair: np.ndarray, sums: np.ndarray, num_pairs: int) -> np.ndarray:
     """Add up what `share` summed for each pair, in tile order: (PARTS, P) float32, of each part of the image."""
     tiles, parts = slot_start.shape[0] - 1, np.zeros((PARTS, num_pairs), np.float32)

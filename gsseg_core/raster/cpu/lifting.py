@@ -13,7 +13,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import starts
-from gsseg_core.kernel_cache import called_by_kernels
+from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.raster.cpu.blending import aim_next, in_tile, open_rays, stride_of, tile_of_turn
 from gsseg_core.raster.cpu.splat import OPEN, WIDTH, blend_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
@@ -59,7 +59,7 @@ class Lifted(NamedTuple):
         return bool(self.counts[:, 0].any())
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def _cut(mask: np.ndarray, columns: int, rows: int, num_labels: int) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
     """Make what `Labels` holds of a mask (H, W) int32, and count the pixels of each label, (num_labels,) int64."""
     height, width = mask.shape
@@ -109,7 +109,7 @@ def _is_uniform(mask: np.ndarray, left: int, top: int) -> bool:
     return different == 0
 
 
-@nb.njit(parallel=True, nogil=True, cache=True, fastmath=FAST, error_model="numpy")
+@kernel(parallel=True, fastmath=FAST, error_model="numpy")
 def _lift(tiles: Tiles, labels: Labels, slot_start: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Blend the view, and sum weights by entry and label: the last three attributes of `Lifted`."""
     reached, sums = np.empty(len(tiles.entries), np.uint16), np.empty(slot_start[-1], np.float32)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
+from gsseg_core.kernels.compiler import kernel
 from gsseg_core.raster.cpu.blending import aim_next, in_block, open_rays, stride_of, tile_of_turn
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.splat import OPEN, WIDTH, blend_block
@@ -55,7 +56,7 @@ def _entry_depths(
     return found
 
 
-@nb.njit(parallel=True, nogil=True, cache=True, fastmath=FAST, error_model="numpy")
+@kernel(parallel=True, fastmath=FAST, error_model="numpy")
 def _find_ends(tiles: Tiles, mask: np.ndarray) -> np.ndarray:
     """Find the entry of each tile at which its last labelled block ends, as `lifting` would, (T,) int64."""
     ends = np.empty(tiles.rows * tiles.columns, np.int64)

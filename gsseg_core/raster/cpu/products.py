@@ -9,7 +9,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.kernel_cache import called_by_kernels
+from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.raster.constants import AHEAD
 from gsseg_core.raster.cpu.blending import (
     aim_next,
@@ -43,7 +43,7 @@ def _put(
                 out[top + r, left + c, k] = values[b, k, lane]
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def render(tiles: Tiles, codes: CSRRows, channels: int) -> tuple[np.ndarray, np.ndarray]:
     """Blend codes of the M projected Gaussians, float32: W q, (H, W, K) float32, and final transmittance, (H, W)."""
     out, left_over = _blank(tiles, channels)
@@ -56,7 +56,7 @@ def render(tiles: Tiles, codes: CSRRows, channels: int) -> tuple[np.ndarray, np.
     return out, left_over
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def strongest(
     tiles: Tiles, codes: CSRRows, channels: int, background: bool, first: int, step: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -141,7 +141,7 @@ def _blend_codes(
             return
 
 
-@nb.njit(parallel=True, nogil=True, cache=True, fastmath={"contract"}, error_model="numpy")
+@kernel(parallel=True, fastmath={"contract"}, error_model="numpy")
 def render_few(tiles: Tiles, codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Do what `render` does for codes (M, K) float32 with few zeros, K small: weights are used where they are made."""
     channels = codes.shape[1]
@@ -179,7 +179,7 @@ def _blank(tiles: Tiles, channels: int) -> tuple[np.ndarray, np.ndarray]:
     return np.empty((*size, channels), np.float32), np.empty(size, np.float32)
 
 
-@nb.njit(parallel=True, nogil=True, cache=True, fastmath=FAST)
+@kernel(parallel=True, fastmath=FAST)
 def adjoint(tiles: Tiles, residual: np.ndarray) -> np.ndarray:
     """Carry values of pixels, (H, W, C) float32 with C <= CHANNELS, back to the Gaussians: W^T r, (M, C) float32."""
     channels = residual.shape[2]
@@ -208,7 +208,7 @@ def adjoint(tiles: Tiles, residual: np.ndarray) -> np.ndarray:
     return out
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def list_weights(
     tiles: Tiles, wanted: np.ndarray,  # (U,) tiles
     place: np.ndarray,  # (U + 1,) int64: where each tile's part begins; with empty lists, counts out (in place[1:])

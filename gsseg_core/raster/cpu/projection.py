@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from gsseg_core.kernel_cache import called_by_kernels
+from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.raster.constants import CHUNKS, DILATION, NEAR
 from gsseg_core.raster.cpu.depth_sort import sort_by_depth
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
@@ -118,7 +118,7 @@ def _scratch(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return kept
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def _break_ties(
     order: np.ndarray, rows: np.ndarray,  # (M,) of the next, sorted by depth, changed in place; (M,) of the table
     tied: np.ndarray, table: np.ndarray,  # (Z,) places whose depth is that of the next place, ascending; (N, 8)
@@ -148,7 +148,7 @@ def _is_before(table: np.ndarray, rows: np.ndarray, one: int, other: int) -> boo
     return bool(one < other)
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _gather(rows: np.ndarray, order: np.ndarray, ids: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     sorted_ids, sorted_table = np.empty(order.shape[0], np.int32), np.empty((order.shape[0], 8), np.float32)
     for m in nb.prange(order.shape[0]):
@@ -162,7 +162,7 @@ def _gather(rows: np.ndarray, order: np.ndarray, ids: np.ndarray, table: np.ndar
     return sorted_ids, sorted_table
 
 
-@nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+@kernel(parallel=True, error_model="numpy")
 def _project(
     splats: _Splats, lens: _Lens,
     table: np.ndarray, depth: np.ndarray, ids: np.ndarray,  # (N, 8), (N,), (N,) out, where each chunk's part begins

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from gsseg_core.kernel_cache import called_by_kernels
+from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.raster.constants import AHEAD, T_MIN
 from gsseg_core.raster.cpu.blending import corner_of, in_block, open_rays, stride_of, tile_of_turn
 from gsseg_core.raster.cpu.splat import WIDTH, aim, alpha_of
@@ -18,7 +18,7 @@ _UNKNOWN, _MIXED = np.int32(-1), np.int32(-2)  # in place of the one label that 
 _FAST = {"contract", "reassoc", "nnan", "nsz"}
 
 
-@nb.njit(nogil=True, cache=True)
+@kernel
 def choose(start: np.ndarray, entries: np.ndarray, labels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Keep the entries of Gaussians with a label, (M',) int32, above 0, and number these as they occur.
 
@@ -46,7 +46,7 @@ def choose(start: np.ndarray, entries: np.ndarray, labels: np.ndarray) -> tuple[
     return kept_start, kept[:e].copy(), former[:n].copy()
 
 
-@nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath=_FAST)
+@kernel(parallel=True, error_model="numpy", fastmath=_FAST)
 def reasons_to_go(
     tiles: Tiles, labels: np.ndarray, depths: np.ndarray,  # (M,) int32 above 0, (M,)
     shown: np.ndarray, hidden_from: np.ndarray,  # (H, W), (H, W)
@@ -85,7 +85,7 @@ def reasons_to_go(
             go[e] = total
 
 
-@nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy", fastmath=_FAST)
+@kernel(parallel=True, error_model="numpy", fastmath=_FAST)
 def reasons_to_stay(
     tiles: Tiles, labels: np.ndarray, num_labels: int,  # (M,) int32 above 0
     kept: np.ndarray, asked: np.ndarray, shown: np.ndarray,  # (M,) float32, (M,) bool, (H, W)

@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import starts
-from gsseg_core.kernel_cache import called_by_kernels
+from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.raster.constants import CHUNKS
 from gsseg_core.raster.cpu.projection import Projected
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
@@ -123,7 +123,7 @@ def _touch_two_rows(
         found[5 * BATCH + j] = begin + np.int32(columns) + (two[1] if low + np.int32(1) < high else np.int32(0))
 
 
-@nb.njit(parallel=True, nogil=True, cache=True, error_model="numpy")
+@kernel(parallel=True, error_model="numpy")
 def _list(
     table: np.ndarray, columns: int, rows: int,  # (M, 8)
     per_gaussian: np.ndarray,  # (M,) out: tiles that it touches
@@ -183,7 +183,7 @@ def _list_many(
     return n
 
 
-@nb.njit(parallel=True, nogil=True, cache=True)
+@kernel(parallel=True)
 def _fill(
     touched: np.ndarray, gaussian_start: np.ndarray,  # (CHUNKS, R), (M + 1,)
     place: np.ndarray,  # (CHUNKS, T) where each chunk's next entry of a tile goes

@@ -1,8 +1,8 @@
-"""How kernels are compiled: where they are kept from one run to the next, and what is done where they cannot be.
+"""Where compiled kernels are kept from one run to the next, and what is done where they cannot be.
 
 numba looks for a folder when a kernel is defined, that is, when its module is imported, and raises an error if it may
-write to none. So each room with kernels imports this module first, which looks before numba does; where there is no
-such folder, the kernels do without.
+write to none. So the decorators of kernels import this module, which looks before numba does; where there is no such
+folder, the kernels do without.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ import contextlib
 import os
 import sys
 import tempfile
-from collections.abc import Callable
-from typing import Any
+from pathlib import Path
+
+_PACKAGE = Path(__file__).resolve().parents[1]
 
 REMEDY = "set NUMBA_CACHE_DIR to a folder that you can write to"
 
@@ -20,7 +21,7 @@ REMEDY = "set NUMBA_CACHE_DIR to a folder that you can write to"
 def candidates() -> list[str]:
     """List the folders that numba tries, in its order."""
     user = "~/Library/Caches" if sys.platform == "darwin" else os.environ.get("XDG_CACHE_HOME", "~/.cache")
-    own = os.path.join(os.path.dirname(os.path.abspath(__file__)), "__pycache__")
+    own = str(_PACKAGE / "__pycache__")
     chosen = filter(None, [os.environ.get("NUMBA_CACHE_DIR")])
     return [*chosen, own, os.path.join(os.path.expanduser(user), "numba")]
 
@@ -36,17 +37,6 @@ def writable(folder: str) -> bool:
     return True
 
 
-def called_by_kernels(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """Compile a function that only kernels call, never Python: without the code that Python would call it by.
-
-    That code, which takes arrays apart and puts them together, is a tenth of what there is to compile.
-    """
-    import numba
-
-    njit: Any = numba.njit  # Its types know fewer options than it takes.
-    return njit(function, no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)
-
-
 def _do_without() -> None:
     """Have numba compile the kernels of gsseg as if nobody had asked to keep them."""
     from numba.core.dispatcher import Dispatcher
@@ -54,7 +44,7 @@ def _do_without() -> None:
     keep = Dispatcher.enable_caching
 
     def enable_caching(self: Dispatcher) -> None:
-        if not self.py_func.__module__.startswith(__package__):
+        if not self.py_func.__module__.startswith(_PACKAGE.name):
             keep(self)
 
     Dispatcher.enable_caching = enable_caching  # type: ignore[method-assign]

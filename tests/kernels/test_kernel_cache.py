@@ -11,17 +11,18 @@ from pathlib import Path
 import pytest
 
 import gsseg_core
-from gsseg_core import kernel_cache, warm_up
+from gsseg_core import warm_up
+from gsseg_core.kernels import kernel_cache
 
 # Every module with kernels is imported; one is compiled and run.
 EVERY_KERNEL = """
 import importlib, os, pathlib, gsseg_core
 folder = pathlib.Path(gsseg_core.__file__).parent
-kernels = [path for path in folder.rglob("*.py") if "cache=True" in path.read_text()]
+kernels = [path for path in folder.rglob("*.py") if "@kernel" in path.read_text()]
 for path in kernels:
     importlib.import_module(".".join(path.relative_to(folder.parent).with_suffix("").parts))
 import numpy as np
-from gsseg_core import kernel_cache
+from gsseg_core.kernels import kernel_cache
 from gsseg_core.learn.em.rejected_regions import _root
 print(len(kernels) > 15, kernel_cache.FOLDER, _root(np.array([0, 0, 1]), 2), _root.stats.cache_path)
 """

@@ -1,0 +1,99 @@
+"""What a kernel calls is but a part of it, and everything computes what it computes for numba."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+
+import numba as nb
+import numpy as np
+import pytest
+from numba.core.codegen import JITCodeLibrary
+
+KERNELS = """
+import numba as nb
+import numpy as np
+from gsseg_core.kernels.compiler import called_by_kernels, kernel
+
+@nb.njit
+def plain(x):
+    return x + 1
+
+@called_by_kernels
+def part(x):
+    return 2.5 * plain(x)
+
+@kernel
+def inner(x):
+    return part(x) - 1
+
+@kernel(parallel=True)
+def outer(xs):
+    squares = np.zeros(len(xs))
+    for i in nb.prange(len(xs)):
+        squares[i] = inner(xs[i]) ** 2
+    rest = np.zeros(len(xs) - 1)
+    for i in nb.prange(1, len(xs)):
+        rest[i - 1] = squares[i] - squares[i - 1]
+    return rest
+"""
+XS = np.linspace(0, 1, 9)
+
+
+@pytest.fixture
+def load(tmp_path: Path) -> Callable[[], ModuleType]:
+    """Load a module with kernels that nobody compiled before; loaded again, it finds in the cache what it had."""
+    path = tmp_path / "made_for_a_test.py"
+    path.write_text(KERNELS)
+
+    def load() -> ModuleType:
+        spec = importlib.util.spec_from_file_location(path.stem, path)
+        assert spec is not None and spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module
+
+    return load
+
+
+@pytest.fixture
+def with_code(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """Names of all that becomes machine code, but for numba's runtime, which may do so at the first kernel."""
+    names: list[str] = []
+    make = JITCodeLibrary._finalize_specific
+
+    def note(self: JITCodeLibrary) -> None:
+        names.extend({self.name} - {"nrt"})
+        make(self)
+
+    monkeypatch.setattr(JITCodeLibrary, "_finalize_specific", note)
+    yield names
+
+
+def test_only_what_python_may_call_becomes_machine_code(load: Callable[[], ModuleType], with_code: list[str]) -> None:
+    module = load()
+    made = module.outer(XS)
+    assert with_code == ["plain", "inner", "outer"]
+    assert np.array_equal(made, np.diff((2.5 * (XS + 1) - 1) ** 2))
+    assert module.plain(2.0) == 3.0 and module.inner(1.0) == 4.0 and len(with_code) == 3
+    assert np.array_equal(made, nb.njit(parallel=True)(module.outer.py_func)(XS))
+    assert len(with_code) > 8  # numba's own way: wrappers of both loops, and all that they call.
+
+
+def test_a_kernel_calls_another_that_is_in_the_cache(load: Callable[[], ModuleType], with_code: list[str]) -> None:
+    assert load().inner(1.0) == 4.0
+    module = load()
+    assert np.array_equal(module.outer(XS), np.diff((2.5 * (XS + 1) - 1) ** 2))
+    assert module.inner.stats.cache_hits and module.inner(1.0) == 4.0
+    again = load()
+    assert np.array_equal(again.outer(XS), module.outer(XS)) and again.outer.stats.cache_hits
+
+
+def test_numba_compiles_as_it_did_after_a_kernel_that_fails(with_code: list[str]) -> None:
+    from gsseg_core.kernels.compiler import kernel
+
+    with pytest.raises(nb.TypingError):
+        kernel(lambda x: x.no_such_thing)(1)
+    assert nb.njit(lambda x: x + 1)(1) == 2 and with_code
