@@ -1,32 +1,24 @@
-"""Decorators of kernels: what they optimise twice and make machine code of once, numba would four times.
-
-For numba each function is one that Python, C or other functions may call at any time. So it optimises the body of a
-parallel loop as a function, as a ufunc of that, as a parallel kernel of that and once more within the function that has
-the loop, makes machine code of each, and of all functions called there; Python then calls one of these. Here only what
-Python calls becomes machine code. What it calls is a *part* of it: optimised by itself, and then with the whole. Some
-kernels need both rounds: `strongest` of raster/cpu/products.py takes half as long again without the first.
-"""
+"""Decorators of kernels: what Python calls, and what only kernels call."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any, TypeVar, overload
 
 import numba
-from llvmlite.ir import Module
-from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
-from numba.core.compiler import CompilerBase, DefaultPassBuilder
-from numba.core.compiler_machinery import AnalysisPass, PassManager, register_pass
 from numba.core.dispatcher import Dispatcher
-from numba.core.typed_passes import IRLegalization
-from numba.parfors.parfor import Parfor
 
 from gsseg_core.kernels import kernel_cache as _kernel_cache  # noqa: F401 - before any kernel is defined
 
 F = TypeVar("F", bound=Callable[..., object])
 
 _njit: Any = numba.njit  # Its types know fewer options than it takes.
+_LESS: dict[str, Any] = {}
+# Versions that were not tried compile in numba's own way, which takes longer.
+if numba.__version__.startswith("0.68."):
+    from gsseg_core.kernels.parts import KernelCompiler
+
+    _LESS = {"no_cfunc_wrapper": True, "pipeline_class": KernelCompiler}
 
 
 @overload
@@ -39,102 +31,9 @@ def kernel(**options: Any) -> Callable[[F], Dispatcher[F]]: ...
 
 def kernel(function: Callable[..., object] | None = None, **options: Any) -> Any:
     """Compile a function that Python calls, and keep it from one run to the next; other threads run beside it."""
-    options |= {"cache": True, "nogil": True, "no_cfunc_wrapper": True, "pipeline_class": _KernelCompiler}
-    return _njit(function, **options)
+    return _njit(function, cache=True, nogil=True, **_LESS, **options)
 
 
 def called_by_kernels(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     """Compile a function that only kernels call, never Python: without the code that Python would call it by."""
     return _njit(function, no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)
-
-
-_LOOP_WRAPPERS = {"_gufunc_wrapper", "parallel.gufunc.wrapper"}
-
-
-class _Part(JITCodeLibrary):
-    """Code that is handed on to the functions that call it, and becomes machine code there.
-
-    Whoever asks for an address in it gets machine code all the same.
-    """
-
-    _wraps_loop = _has_code = False
-
-    def add_ir_module(self, module: Module) -> None:
-        self._wraps_loop |= module.name in _LOOP_WRAPPERS
-        if module.name != "cfunc_wrapper":  # C calls none of our functions.
-            super().add_ir_module(module)
-
-    def _optimize_final_module(self) -> None:
-        if not self._wraps_loop:  # A few lines around a loop that is optimised before, and will be with its function.
-            super()._optimize_final_module()
-
-    def _finalize_final_module(self) -> None:
-        self._finalized = True
-
-    def get_pointer_to_function(self, name: str) -> int:
-        self._ensure_finalized()
-        if not self._has_code and any(function.name == name for function in self.get_defined_functions()):
-            self._has_code = True
-            super()._finalize_final_module()
-        address: int = super().get_pointer_to_function(name)
-        return address
-
-
-class _PartsCodegen(JITCPUCodegen):
-    """What numba's code generator becomes while a kernel is compiled: all that it is asked for is a part of that."""
-
-    _library_class = _Part
-
-    def set_env(self, name: str, environment: object) -> None:
-        if self._engine.is_symbol_defined(name):  # A part without machine code has no variable for it.
-            super().set_env(name, environment)
-
-    def unserialize_library(self, state: object) -> JITCodeLibrary:
-        with _taken_for(JITCPUCodegen, self):  # Machine code of a kernel that calls this one or is called by it.
-            library: JITCodeLibrary = JITCPUCodegen.unserialize_library(self, state)
-            return library
-
-
-@contextmanager
-def _taken_for(kind: type[JITCPUCodegen], codegen: JITCPUCodegen) -> Iterator[None]:
-    """Within the context, of one thread as all compiling is, the code generator is of this kind."""
-    before, codegen.__class__ = codegen.__class__, kind
-    try:
-        yield
-    finally:
-        codegen.__class__ = before
-
-
-@register_pass(mutates_CFG=False, analysis_only=True)
-class _BodiesAreParts(AnalysisPass):
-    """Have bodies of parallel loops compiled without code for Python to call them by."""
-
-    _name = "gsseg_bodies_are_parts"
-
-    def __init__(self) -> None:
-        super().__init__()
-
-    def run_pass(self, state: Any) -> bool:
-        flags = state.flags.copy()
-        flags.no_cpython_wrapper = True
-        for block in state.func_ir.blocks.values():
-            for loop in block.find_insts(Parfor):
-                loop.flags = flags
-        return False
-
-
-class _KernelCompiler(CompilerBase):
-    """numba's compiler, for which what a kernel calls is but a part of it."""
-
-    def define_pipelines(self) -> list[PassManager]:
-        passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        passes.add_pass_after(_BodiesAreParts, IRLegalization)
-        passes.finalize()
-        return [passes]
-
-    def compile_extra(self, function: Callable[..., Any]) -> Any:
-        codegen = self.state.targetctx.codegen()
-        self.state.library = JITCodeLibrary(codegen, function.__qualname__)
-        self.state.library.enable_object_caching()
-        with _taken_for(_PartsCodegen, codegen):
-            return super().compile_extra(function)

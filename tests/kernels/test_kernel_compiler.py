@@ -97,3 +97,18 @@ def test_numba_compiles_as_it_did_after_a_kernel_that_fails(with_code: list[str]
     with pytest.raises(nb.TypingError):
         kernel(lambda x: x.no_such_thing)(1)
     assert nb.njit(lambda x: x + 1)(1) == 2 and with_code
+
+
+def test_numba_of_a_version_that_was_not_tried_compiles_in_its_own_way(
+    load: Callable[[], ModuleType], with_code: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from gsseg_core.kernels import compiler
+
+    monkeypatch.setattr(nb, "__version__", "0.99.0")
+    spec = importlib.util.spec_from_file_location("compiler_of_another_numba", compiler.__file__)
+    assert spec is not None and spec.loader is not None
+    other = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(other)
+    made = other.kernel(parallel=True)(load().outer.py_func)(XS)
+    assert np.array_equal(made, np.diff((2.5 * (XS + 1) - 1) ** 2))
+    assert len(with_code) > 5  # wrappers of both loops, and all that they call
