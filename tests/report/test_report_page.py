@@ -136,10 +136,9 @@ def test_packages_carry_the_files_that_are_no_modules() -> None:
     root = Path(__file__).parents[2]
     declared = re.search(r"package_data=\{(.*?)\}", (root / "setup.py").read_text(), re.DOTALL)
     assert declared is not None
-    names = {name for name in re.findall(r'"(.*?)"', declared[1]) if not name.startswith("gsseg_core")}
-    others = {
-        path.name for path in (root / "gsseg_core").rglob("*.*") if path.suffix not in (".py", ".pyc", ".nbi", ".nbc")
-    }
+    names = {name for name in re.findall(r'"(.*?)"', declared[1]) if not name.startswith("gsseg_")}
+    files = (path for package in ("gsseg_core", "gsseg_ros") for path in (root / package).rglob("*.*"))
+    others = {path.name for path in files if path.suffix not in (".py", ".pyc", ".nbi", ".nbc")}
     assert {"page.css", "page.html.j2", "page.js"} <= others == names
 
 

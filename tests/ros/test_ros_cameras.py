@@ -27,6 +27,7 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from geometry_msgs.msg import Transform
 from nav_msgs.msg import Odometry
+from pairing_events import expire
 from sensor_msgs.msg import Image
 
 from gsseg_core.errors import SettingsError
@@ -212,9 +213,7 @@ def test_pixels_where_somebody_stands_in_front_do_not_vote_and_are_counted(
         assert said["views gated by depth"] == "3"
         assert abs(int(said["pixels unknown by depth"]) - hidden) <= 3 < hidden
         here.hand(messages(views[0], here.stamp + 10, similarity))
-        camera = here.inputs.cameras[""].pairing
-        camera.expire(0.0)
-        camera.expire(9.0)
+        expire(here.inputs.cameras[""].pairing)
         assert here.inputs.dropped == {"no_depth": 1}
         assert "no depth image with their stamp" in diagnostics.why_dropped(here.inputs, "no_depth")
 

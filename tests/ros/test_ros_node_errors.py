@@ -208,12 +208,12 @@ MORE_CASES = [
 
 @pytest.fixture(scope="module")
 def starved(shared: Ros, root: Path) -> Robot:
-    """A node with so many Gaussians and classes that the votes take 200 MB."""
+    """A node with so many Gaussians and classes that the votes take 300 MB, and class probabilities half of that."""
     rng = np.random.default_rng(0)
     scene = build(np.zeros(250_000, np.int64), rng.uniform(-1, 1, (250_000, 3)), np.full((250_000, 3), 0.004))
     scene.save(root / "large.ply")
     core_session(scene, clean_views(1)).save(root / "narrow_state.npz")
-    names = [f"class {k}" for k in range(100)]
+    names = [f"class {k}" for k in range(150)]
     robot = Robot(shared, "/starved")
     robot.started({"scene_path": root / "large.ply", "data_root": root, "class_names": names})
     robot.drive(clean_views(1))
@@ -223,7 +223,7 @@ def starved(shared: Ros, root: Path) -> Robot:
 
 @contextmanager
 def short_of_memory(robot: Robot) -> Iterator[None]:
-    """Leave the node too little memory for another set of votes."""
+    """Leave the node too little memory for another set of votes, or for class probabilities."""
     assert robot.process is not None
     pages = int(Path(f"/proc/{robot.process.pid}/statm").read_text().split()[0])
     with limited(robot, resource.RLIMIT_AS, pages * resource.getpagesize() + (90 << 20)):
