@@ -128,7 +128,7 @@ class Neighbours:
         rows = codes.with_data(units.astype(np.int32))
         self.look_for(selected)
         empty = nodes_without(counted, order, len(self.tree.blocks))
-        below = (self.radii.view(np.int32) - np.int32(1)).view(np.float32)
+        below = np.nextafter(self.radii, np.float32(-np.inf))
         means_of = partial(average, self.tree, rows, counted, empty, self.radii, below, self.k)
         return np.flatnonzero(selected).astype(np.int32), means_of
 

@@ -27,8 +27,8 @@ _HELD_BACK = 30  # Messages, by `Timeline`.
 _RARE_S = 1.0
 _LONGEST_STEP_S = 0.5
 
-WAIT_S, MOST_WAITING, MOST_BYTES = 10.0, 300, 256 << 20
-"""Limits on the masks of a camera that wait; see `PairingSettings`."""
+MOST_BYTES = 256 << 20
+"""Of masks of a camera that wait."""
 
 
 class Paired(NamedTuple):
@@ -60,8 +60,8 @@ class PairingSettings:
         Whether a mask waits for the depth image of exactly its stamp, too.
     """
 
-    wait_s: float = WAIT_S
-    max_waiting: int = MOST_WAITING
+    wait_s: float = 10.0
+    max_waiting: int = 300
     max_bytes: int = MOST_BYTES
     with_depth: bool = False
 

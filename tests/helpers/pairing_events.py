@@ -36,7 +36,12 @@ def at_all(stamps: Iterable[int]) -> list[Event]:
     return [(kind, stamp) for stamp in stamps for kind in ("info", "pose", "mask")]
 
 
+def wait(pairing: Pairing, seconds: float) -> None:
+    """Let time pass in which nothing comes."""
+    for tick in range(round(seconds * 10) + 1):
+        pairing.expire(tick / 10)
+
+
 def expire(pairing: Pairing) -> None:
     """Let all waiting time pass."""
-    for tick in range(120):
-        pairing.expire(tick / 10)
+    wait(pairing, 12)

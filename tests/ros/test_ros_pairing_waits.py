@@ -8,18 +8,11 @@ from types import SimpleNamespace
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pairing_events import MS, S, at_all, expire, send
+from pairing_events import MS, S, at_all, expire, send, wait
 
 from gsseg_ros.node.jobs import Worker
 from gsseg_ros.node.pairing import Pairing, PairingSettings
 from gsseg_ros.node.pose_sources import MessagePoses
-
-
-def wait(pairing: Pairing, seconds: float) -> None:
-    """Let time pass in which nothing comes."""
-    pairing.expire(0.0)
-    for tick in range(round(seconds * 10)):
-        pairing.expire((tick + 1) / 10)
 
 
 @given(st.permutations(["mask", "info", "pose"]), st.floats(0, 4.4), st.floats(0, 4.4))

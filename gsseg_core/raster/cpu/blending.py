@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numba as nb
 import numpy as np
 
+from gsseg_core.kernels.compiler import called_by_kernels
 from gsseg_core.raster.constants import AHEAD
 from gsseg_core.raster.cpu.splat import OPEN, SIDE, WIDTH, aim, blend_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
@@ -100,7 +101,7 @@ def aim_next(tiles: Tiles, e: int, last: int, left: float, top: float, lines: np
     return aim(tiles.table, tiles.entries[e + 1], left, top, lines[(e + 1) % 2])  # type: ignore[no-any-return]
 
 
-@nb.njit(fastmath={"contract"}, error_model="numpy")
+@called_by_kernels(fastmath={"contract"}, error_model="numpy")
 def blend_tile(tiles: Tiles, tile: int) -> Records:
     """Make the records of one tile."""
     first, last = tiles.start[tile], tiles.start[tile + 1]
