@@ -35,6 +35,8 @@ for (const field of document.querySelectorAll(".search")) {
     layout(location = 6) in vec3 trueColor;
     layout(location = 7) in float confidence;
     uniform vec3 low, span, eye;
+    uniform vec3 core[2];
+    uniform float farFrom;
     uniform vec2 logScales, viewport, nearFar;
     uniform mat3 toCamera;
     uniform float focal;
@@ -45,8 +47,10 @@ for (const field of document.querySelectorAll(".search")) {
     void main() {
       gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
       vec4 ownClass = texelFetch(classes, ivec2(int(label) & 255, int(label) >> 8), 0);
-      vec3 p = toCamera * (low + span * position - eye);
+      vec3 world = low + span * position, p = toCamera * (world - eye);
       if (ownClass.a < 0.5 || opacity <= THRESHOLD || p.z < nearFar.x) return;
+      // From outside, what is around the scene does not stand before it.
+      if (p.z < farFrom && (any(lessThan(world, core[0])) || any(greaterThan(world, core[1])))) return;
       vec4 q = normalize(quat);
       mat3 rotation = mat3(
         1.0 - 2.0 * (q.z * q.z + q.w * q.w), 2.0 * (q.y * q.z + q.x * q.w), 2.0 * (q.y * q.w - q.x * q.z),
@@ -123,10 +127,14 @@ for (const field of document.querySelectorAll(".search")) {
   const plus = (a, t, b) => a.map((x, i) => x + t * b[i]);
   const unit = (a) => a.map((x) => x / (Math.hypot(...a) || 1));
 
-  const span = sub(data.high, data.low), extent = Math.hypot(...span) || 1;
+  const span = sub(data.high, data.low), reach = Math.hypot(...span);
+  const inner = sub(data.core[1], data.core[0]), extent = Math.hypot(...inner) || 1, middle = plus(data.core[0], 0.5, inner);
+  // Farther from the middle than that is outside; no camera that one can look from is.
+  const outside = 1.01 * Math.max(extent / 2, ...data.cameras.map((from) => Math.hypot(...sub(from.eye, middle))));
   gl.uniform3fv(uniform("low"), data.low);
   gl.uniform3fv(uniform("span"), span);
   gl.uniform2fv(uniform("logScales"), data.logScales);
+  gl.uniform3fv(uniform("core"), data.core.flat());
 
   // One texel a class: its colour, and whether it is shown. 256 in a row.
   const rows = Math.ceil(data.colors.length / 256), classes = new Uint8Array(1024 * rows);
@@ -162,7 +170,7 @@ for (const field of document.querySelectorAll(".search")) {
   function look(index) {
     const from = data.cameras[index];
     if (from) return lookFrom(from.eye, from.target, from.fov);
-    const middle = plus(data.low, 0.5, span), slope = plus(plus([0, 0, 0], 0.75, up), 0.66, side);
+    const slope = plus(plus([0, 0, 0], 0.75, up), 0.66, side);
     return lookFrom(plus(middle, 1.1 * extent, slope), middle, 0.7);
   }
   function axes() {
@@ -182,12 +190,14 @@ for (const field of document.querySelectorAll(".search")) {
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     const { back, forward, right, above } = axes();
     const near = Math.max(extent / 2000, cut * 1.5 * camera.distance);
-    gl.uniform3fv(uniform("eye"), plus(camera.target, camera.distance, back));
+    const eye = plus(camera.target, camera.distance, back);
+    gl.uniform3fv(uniform("eye"), eye);
+    gl.uniform1f(uniform("farFrom"), Math.hypot(...sub(eye, middle)) > outside ? camera.distance : 0);
     gl.uniformMatrix3fv(uniform("toCamera"), false, [0, 1, 2].flatMap((i) => [right[i], above[i], forward[i]]));
     // A narrow canvas keeps the width of what is seen, not its height.
     gl.uniform1f(uniform("focal"), Math.min(height, width) / 2 / Math.tan(camera.fov / 2));
     gl.uniform2f(uniform("viewport"), width, height);
-    gl.uniform2f(uniform("nearFar"), near, near + 4 * extent + 2 * camera.distance);
+    gl.uniform2f(uniform("nearFar"), near, near + 4 * extent + reach + 2 * camera.distance);
     gl.uniform1i(uniform("mode"), mode);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, data.count);
     canvas.dataset.frames = Number(canvas.dataset.frames || 0) + 1;

@@ -19,6 +19,8 @@ FEWEST_OF_CLASS = 200
 """Gaussians of a class that the preview keeps before it thins the class out."""
 CORE = 0.01
 """Share of the Gaussians at either end of each axis that does not count for where the scene lies."""
+LARGEST_GROWTH = 3.0
+"""So many times larger at most does a Gaussian become that stands for others."""
 
 RECORD = np.dtype(
     [
@@ -40,6 +42,8 @@ class Preview:
         in the segmentation, `first` where unobserved, and where removed `first` + 1 more than the most probable class.
     low, high : (3,) float64
         The box that holds them, in scene units.
+    core : (2, 3) float64
+        Corners of the box that holds all but those around the scene; what is looked at from outside.
     log_scales : (2,) float64
         Natural logarithms of the smallest and the largest scale.
     left_out : int
@@ -49,6 +53,7 @@ class Preview:
     records: np.ndarray
     low: np.ndarray
     high: np.ndarray
+    core: np.ndarray
     log_scales: np.ndarray
     left_out: int
 
@@ -58,6 +63,7 @@ class Preview:
             "count": len(self.records),
             "low": self.low.tolist(),
             "high": self.high.tolist(),
+            "core": self.core.tolist(),
             "logScales": self.log_scales.tolist(),
         }
 
@@ -71,35 +77,33 @@ def make_preview(
 ) -> Preview:
     """Choose the Gaussians that show most of the scene, and quantise them; `first` is the number of classes by default.
 
-    Those that lie far from all others are left out. Of the others, `most` are drawn at random, large and opaque ones
-    rather than small and faint ones, always the same; they are made larger so that surfaces stay closed. A class keeps
-    `FEWEST_OF_CLASS` of its own.
+    `most` are drawn at random, large and opaque ones rather than small and faint ones, always the same. The less likely
+    one was to be drawn, the more others it stands for, and the larger it is made, so that surfaces stay closed. A class
+    keeps `FEWEST_OF_CLASS` of its own. Those far from all others, walls and sky behind what was captured, come as near
+    and become as small as leaves them where and as large as cameras see them.
     """
-    outer = np.quantile(scene.means[:: max(len(scene) // 50_000, 1)], [CORE, 1 - CORE], axis=0).astype(np.float64)
-    margin = 0.15 * (outer[1] - outer[0]).max()
-    near = np.flatnonzero(((scene.means >= outer[0] - margin) & (scene.means <= outer[1] + margin)).all(axis=1))
-    area = np.prod(np.sort(scene.scales[near], axis=1)[:, 1:], axis=1, dtype=np.float64)
-    labels = segmentation.labels[near]
-    chosen = _draw(np.sqrt(area) * scene.opacities[near], labels, most)
-    growth = float(np.sqrt(area.sum() / max(area[chosen].sum(), np.finfo(float).tiny)))
-    picked = near[chosen]
-    means = scene.means[picked].astype(np.float64)
-    low, high = (means.min(axis=0), means.max(axis=0)) if len(means) else outer
+    core = _core(scene.means)
+    area = np.prod(np.sort(scene.scales, axis=1)[:, 1:], axis=1, dtype=np.float64)
+    picked, chance = _draw(np.sqrt(area) * scene.opacities, segmentation.labels, most)
+    labels = segmentation.labels[picked]
+    means, nearer = _contracted(scene.means[picked].astype(np.float64), core)
+    low, high = (means.min(axis=0), means.max(axis=0)) if len(means) else core
     extent = max(float((high - low).max()), 1e-9)
+    sizes = scene.scales[picked] * (nearer * np.minimum(chance**-0.5, LARGEST_GROWTH))[:, None]
     # Gaussians thinner than a thousandth of a pixel of any screen look like those that are not.
-    logs = np.log(np.clip(scene.scales[picked] * min(growth, 3.0), 1e-5 * extent, extent))
+    logs = np.log(np.clip(sizes, 1e-5 * extent, extent))
     log_scales = np.array([logs.min(), logs.max()] if len(logs) else [0.0, 1.0], np.float64)
     covered = 1 + segmentation.class_ids[segmentation.probabilities[picked].argmax(axis=1)]
-    others = (segmentation.num_classes if first is None else first) + np.where(labels[chosen] == UNOBSERVED, 0, covered)
+    others = (segmentation.num_classes if first is None else first) + np.where(labels == UNOBSERVED, 0, covered)
     records = np.zeros(len(picked), RECORD)
     records["position"] = _quantised(means, low, high, 65535)
-    records["label"] = np.where(labels[chosen] < 0, others, labels[chosen])
+    records["label"] = np.where(labels < 0, others, labels)
     records["quat"] = np.rint(127 * scene.quats[picked])
     records["scale"] = _quantised(logs, log_scales[0], log_scales[1], 255)
     records["opacity"] = np.rint(255 * scene.opacities[picked])
     records["color"] = np.rint(255 * np.clip(scene.colors()[picked], 0, 1))
     records["confidence"] = np.rint(255 * np.clip(segmentation.confidence[picked], 0, 1))
-    return Preview(records, low, high, log_scales, len(scene) - len(picked))
+    return Preview(records, low, high, core, log_scales, len(scene) - len(picked))
 
 
 def look_from(cameras: Iterable[Camera], preview: Preview) -> list[dict[str, Any]]:
@@ -111,6 +115,7 @@ def look_from(cameras: Iterable[Camera], preview: Preview) -> list[dict[str, Any
         `name`; `eye` and `target` (3,), in scene units; `fov`, vertical, in radians.
     """
     low, high = preview.low, preview.high
+    half = float(np.linalg.norm(preview.core[1] - preview.core[0])) / 2
     # A distance is a quantile of depths: one in eight of many says it as well.
     some = preview.records[:: 8 if len(preview.records) > MOST_GAUSSIANS // 8 else 1]
     means = low + some["position"] * ((high - low) / 65535)
@@ -119,7 +124,7 @@ def look_from(cameras: Iterable[Camera], preview: Preview) -> list[dict[str, Any
         (uv, depth), size = camera.project(means), (camera.width, camera.height)
         # Around the middle of the image; what is nearest there may be a floater.
         central = (depth > 0) & (np.abs(np.nan_to_num(uv, nan=np.inf) / size - 0.5) < 0.2).all(axis=1)
-        distance = float(np.quantile(depth[central], 0.25)) if central.any() else float(np.linalg.norm(high - low)) / 2
+        distance = float(np.quantile(depth[central], 0.25)) if central.any() else half
         places.append(
             {
                 "name": camera.name,
@@ -138,28 +143,59 @@ def up_of(cameras: Iterable[Camera]) -> list[float]:
     return (up / length).tolist() if length > 1e-6 else [0.0, -1.0, 0.0]
 
 
-def _draw(weights: np.ndarray, labels: np.ndarray, most: int) -> np.ndarray:
-    """Draw `most` of M without replacement, by weights (M,), the first few of each label (M,) before all; ascending.
+def _core(means: np.ndarray) -> np.ndarray:
+    """Find the box, (2, 3), that holds all Gaussians of means (N, 3) but those far from the others."""
+    outer = np.quantile(means[:: max(len(means) // 50_000, 1)], [CORE, 1 - CORE], axis=0).astype(np.float64)
+    margin = 0.15 * (outer[1] - outer[0]).max()
+    low, high = np.maximum(outer[0] - margin, means.min(axis=0)), np.minimum(outer[1] + margin, means.max(axis=0))
+    return np.array([low, high])
+
+
+def _contracted(means: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Move what is far from the core (2, 3) towards its middle: means (M, 3) and, (M,), how much nearer each is.
+
+    By the contraction of mip-NeRF 360 (Barron et al. 2022, eq. 10): within a sphere around the core nothing moves, and
+    the infinite comes to twice its radius.
+    """
+    middle, radius = core.mean(axis=0), float(np.linalg.norm(core[1] - core[0])) / 2
+    offsets = means - middle
+    ratio = radius / np.maximum(np.linalg.norm(offsets, axis=1), max(radius, np.finfo(float).tiny))
+    nearer = ratio * (2 - ratio)
+    return np.where(nearer[:, None] < 1, middle + offsets * nearer[:, None], means), nearer
+
+
+def _draw(weights: np.ndarray, labels: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Draw `most` of N without replacement, by weights (N,), the first few of each label (N,) before all.
 
     By Efraimidis and Spirakis (2006): the largest of u^(1 / w).
+
+    Returns
+    -------
+    picked : (M,) int64
+        Which, ascending.
+    chance : (M,) float64
+        How likely each was to be drawn, in (0, 1].
     """
     if len(weights) <= most:
-        return np.arange(len(weights))
-    keys = np.random.default_rng(0).exponential(size=len(weights)) / np.maximum(weights, np.finfo(float).tiny)
-    wanted = np.zeros(len(weights), bool)
+        return np.arange(len(weights)), np.ones(len(weights))
+    weights = np.maximum(weights, 1e-300)  # No key is infinite.
+    keys = np.random.default_rng(0).exponential(size=len(weights)) / weights
+    limits = np.zeros(len(weights))  # Who has a smaller key is drawn.
     for label in np.flatnonzero(np.bincount(labels - labels.min())) + labels.min():
         own = np.flatnonzero(labels == label)
-        wanted[own[_smallest(keys[own], FEWEST_OF_CLASS)]] = True
-    first = np.flatnonzero(wanted)
-    if len(first) > most:
-        return np.sort(first[_smallest(keys[first], most)])
-    others = np.flatnonzero(~wanted)
-    return np.sort(np.concatenate([first, others[_smallest(keys[others], most - len(first))]]))
+        limits[own] = _limit(keys[own], FEWEST_OF_CLASS)
+    first = keys < limits
+    if first.sum() > most:
+        limits = np.where(first, _limit(np.where(first, keys, np.inf), most), 0.0)
+    else:
+        limits = np.maximum(limits, _limit(np.where(first, np.inf, keys), most - int(first.sum())))
+    picked = np.flatnonzero(keys < limits)
+    return picked, -np.expm1(-weights[picked] * limits[picked])
 
 
-def _smallest(keys: np.ndarray, count: int) -> np.ndarray:
-    """Find the places of so many of the smallest keys, in any order; of all, if there are no more."""
-    return np.argpartition(keys, count)[:count] if count < len(keys) else np.arange(len(keys))
+def _limit(keys: np.ndarray, count: int) -> float:
+    """Find what so many of the keys are smaller than; infinity, if there are no more."""
+    return float(np.partition(keys, count)[count]) if count < len(keys) else np.inf
 
 
 def _quantised(values: np.ndarray, low: Any, high: Any, largest: int) -> np.ndarray:

@@ -30,20 +30,20 @@ def test_preview_reads_back_to_half_a_step_and_marks_what_has_no_class() -> None
     labels[:3], labels[3:5] = UNOBSERVED, REMOVED
     preview = make_preview(SCENE, result_of(labels))
     assert RECORD.itemsize == 20 and len(base64.b64decode(preview.as_text())) == 20 * len(preview.records)
-    assert preview.left_out == 5 and preview.records["position"].max() == 65535  # those that hang far above
-    kept = slice(0, len(SCENE) - 5)
+    assert preview.left_out == 0 and preview.records["position"].max() == 65535
+    kept = slice(0, len(SCENE) - 5)  # the others hang far above
     step = (preview.high - preview.low) / 65535
     means = preview.low + preview.records["position"] * step
-    assert (np.abs(means - SCENE.means[kept]) <= 0.51 * step + 1e-6).all()
-    np.testing.assert_array_equal(preview.records["label"][5:], labels[5:-5])
+    assert (np.abs(means - SCENE.means)[kept] <= 0.51 * step + 1e-6).all()
+    np.testing.assert_array_equal(preview.records["label"][5:], labels[5:])
     assert (preview.records["label"][:3] == NUM_CLASSES).all() and (
         preview.records["label"][3:5] == NUM_CLASSES + 1
     ).all()
     low, high = preview.log_scales
     scales = np.exp(low + preview.records["scale"] / 255 * (high - low))
-    np.testing.assert_allclose(scales, SCENE.scales[kept], rtol=0.51 * (high - low) / 255 + 1e-6)
-    np.testing.assert_allclose(preview.records["color"] / 255, SCENE.colors()[kept], atol=0.51 / 255)
-    np.testing.assert_allclose(preview.records["quat"] / 127, SCENE.quats[kept], atol=0.51 / 127)
+    np.testing.assert_allclose(scales[kept], SCENE.scales[kept], rtol=0.51 * (high - low) / 255 + 1e-6)
+    np.testing.assert_allclose(preview.records["color"] / 255, SCENE.colors(), atol=0.51 / 255)
+    np.testing.assert_allclose(preview.records["quat"] / 127, SCENE.quats, atol=0.51 / 127)
     assert (preview.records["confidence"] == 191).all()
     json.dumps(preview.header(), allow_nan=False)
 
@@ -59,8 +59,48 @@ def test_a_thinned_preview_keeps_small_classes_covers_as_much_and_is_always_the_
     np.testing.assert_array_equal(preview.records, again.records)
     assert len(preview.records) == 1000 and preview.left_out == 4000
     assert np.bincount(preview.records["label"]).tolist() == [0, 900, 60, 40]
-    growth = np.exp(preview.log_scales[0]) / 0.01
-    assert growth == pytest.approx(np.sqrt(5), rel=0.05)
+    low, high = preview.log_scales
+    areas = np.exp(2 * (low + preview.records["scale"][:, 0] / 255 * (high - low)))
+    np.testing.assert_allclose(np.bincount(preview.records["label"], areas)[1:] / 1e-4, [4900, 60, 40], rtol=0.1)
+
+
+def test_a_thinned_preview_makes_small_gaussians_larger_and_leaves_large_ones_as_they_are() -> None:
+    rng = np.random.default_rng(1)
+    scales = np.repeat([0.001, 0.1], [4000, 400])
+    scene = GaussianScene.from_arrays(
+        rng.uniform(-1, 1, (4400, 3)), np.tile([1.0, 0, 0, 0], (4400, 1)), np.repeat(scales[:, None], 3, axis=1),
+        np.full(4400, 0.9), np.zeros((4400, 1, 3)),
+    )  # fmt: skip
+    preview = make_preview(scene, result_of(np.ones(4400, int), scene), 1000)
+    low, high = preview.log_scales
+    sizes = np.exp(low + preview.records["scale"][:, 0] / 255 * (high - low))
+    assert (sizes > 0.09).sum() == 400 and sizes.max() == pytest.approx(0.1, rel=0.03)
+    assert (sizes[sizes < 0.09] ** 2).sum() == pytest.approx(4000 * 0.001**2, rel=0.1)
+
+
+def test_what_is_far_around_the_scene_is_shown_where_and_as_large_as_from_its_middle() -> None:
+    rng = np.random.default_rng(2)
+    ball, directions = rng.normal(size=(4000, 3)), rng.normal(size=(40, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    distances = np.geomspace(8, 1e4, 40)
+    scene = GaussianScene.from_arrays(
+        np.concatenate([ball, directions * distances[:, None]]), np.tile([1.0, 0, 0, 0], (4040, 1)),
+        np.repeat(np.concatenate([np.full(4000, 0.01), distances / 20])[:, None], 3, axis=1),
+        np.full(4040, 0.9), np.zeros((4040, 1, 3)),
+    )  # fmt: skip
+    preview = make_preview(scene, result_of(np.ones(4040, int), scene))
+    assert preview.left_out == 0
+    middle, step = preview.core.mean(axis=0), (preview.high - preview.low) / 65535
+    assert (preview.core[0] < -2).all() and (preview.core[1] > 2).all()
+    offsets = (preview.low + preview.records["position"] * step - middle)[4000:]
+    true_offsets = scene.means[4000:] - middle
+    shown, true = (np.linalg.norm(each, axis=1) for each in (offsets, true_offsets))
+    np.testing.assert_allclose(offsets / shown[:, None], true_offsets / true[:, None], atol=1e-3)
+    low, high = preview.log_scales
+    sizes = np.exp(low + preview.records["scale"][4000:, 0] / 255 * (high - low))
+    np.testing.assert_allclose(sizes / shown, scene.scales[4000:, 0] / true, rtol=0.05)
+    # What was farther stays farther, and the infinite has an end, so that what is near keeps its precision.
+    assert (np.diff(shown) > -step.max()).all() and (preview.high - preview.low).max() < 50
 
 
 @given(st.integers(1, 40), st.integers(1, 50), st.integers(0, 1000))
