@@ -99,7 +99,7 @@ def run_demo(out: Path, nodes: ChildNodes, *, seed: int = 0, rate: float = 10.0,
 
 
 def _start(client: SegmentationClient, nodes: ChildNodes, demo: DemoScene, progress: Progress) -> None:
-    stage = "start the node (the first time, kernels compile for a minute)"
+    stage = "start the node (the first time, kernels compile for half a minute or more)"
     progress(stage, 0, 1)
     nodes.start(
         "segment_node",

@@ -119,7 +119,7 @@ def _examine_frame(options: argparse.Namespace) -> int:
 def examine(say: Callable[[str], object] = lambda text: None) -> list[Finding]:
     """Look at this machine, and segment a handful of Gaussians to see whether the core works.
 
-    `say` is told if kernels have to be compiled, which takes a minute.
+    `say` is told if kernels have to be compiled, which takes half a minute or more.
     """
     return [*_versions(), *_devices(), *_kernels(say), *_formats(), *_extras(), *_ros()]
 
@@ -238,7 +238,7 @@ def _kernels(say: Callable[[str], object]) -> Iterator[Finding]:
         yield Finding("kernels", "cache", add_votes.stats.cache_path or kernel_cache.FOLDER)
     else:
         state = f"none: cannot write to {' or '.join(kernel_cache.candidates())}"
-        fix = f"{kernel_cache.REMEDY}; else every run compiles for a minute or two"
+        fix = f"{kernel_cache.REMEDY}; else every run compiles for about half a minute on two cores"
         yield Finding("kernels", "cache", state, "-", fix)
 
 

@@ -79,7 +79,7 @@ class Connection:
         self._spinner.close()
 
     def wait_until_active(self, timeout: float = 120.0) -> None:
-        """Wait until the node is there and active. At its first start after installing, kernels compile for a minute.
+        """Wait until the node is there and active. At its first start after installing, kernels compile.
 
         Raises
         ------

@@ -318,7 +318,7 @@ def main(args: list[str] | None = None) -> int:
         return 2
     executor = MultiThreadedExecutor(THREADS)
     executor.add_node(node)
-    # Not here: signals are heard in this thread, and to compile kernels takes minutes.
+    # Not here: signals are heard in this thread, and to compile kernels takes half a minute and more.
     starting = threading.Thread(target=node.autostart, name="autostart", daemon=True)
     starting.start()
     try:
