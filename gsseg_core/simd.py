@@ -15,6 +15,7 @@ import struct
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic as typed_intrinsic
@@ -164,6 +165,14 @@ def operation(result: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Any]:
     return make
 
 
+def empty_rows(count: int) -> np.ndarray:
+    """Make room for rows, (count, 16) float32, each of which is one line of the processor's cache and not in two."""
+    line = LANES * np.dtype(np.float32).itemsize
+    room = np.empty((count + 1) * line, np.uint8)
+    first = -room.ctypes.data % line
+    return room[first : first + count * line].view(np.float32).reshape(count, LANES)
+
+
 @operation(types.int64, types.int64)
 def first_bit(row: Builder, bits: Any) -> Any:
     """Position of the lowest bit that is set; there must be one."""
@@ -250,6 +259,20 @@ def add_product_where(row: Builder, total: Any, a: Any, b: Any, bits: Any) -> An
 def add_scaled_where(row: Builder, total: Any, a: Any, factor: Any, bits: Any) -> Any:
     """Add a multiple of a row in the lanes of the bits that are set."""
     return row.llvm.select(row.lanes(bits), row.fma(row.spread(factor), a, total), total)
+
+
+@operation(row_type, None, types.float32)
+def divided(row: Builder, a: Any, number: Any) -> Any:
+    """Divide a row by a number."""
+    return row.llvm.fdiv(a, row.spread(number))
+
+
+@operation(types.int64, None, None, types.float32)
+def apart(row: Builder, a: Any, b: Any, limit: Any) -> Any:
+    """Bits of the lanes in which two rows differ by more than a limit."""
+    difference = row.llvm.fsub(a, b)
+    size = row.most(difference, row.llvm.fneg(difference))
+    return row.bits(row.llvm.fcmp_ordered(">", size, row.spread(limit)))
 
 
 @operation(types.float32, None)

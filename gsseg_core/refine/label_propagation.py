@@ -23,7 +23,7 @@ from gsseg_core.csr_rows import largest
 from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.kernels.compiler import kernel
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.simd import LANES, add_scaled, load_row, nothing, store_row
+from gsseg_core.simd import LANES, add_scaled, apart, divided, empty_rows, load_row, nothing, prefetch, store_row
 from gsseg_core.spatial.knn import CHUNK
 from gsseg_core.spatial.neighbour_graph import NEIGHBOURS, Graph, graph_of
 
@@ -34,6 +34,8 @@ SCARCE = 1 / 6
 """Share of Gaussians seen with less px than all neighbours count, from which on the graph is worth its time."""
 
 NEVER = 2**31 - 1
+
+_AHEAD = 8  # places between the one that is worked on and the one that is fetched from memory
 
 
 @dataclass(frozen=True)
@@ -118,9 +120,9 @@ def propagate(
     moving = weight < 100
     readers = _readers(graph.indptr, graph.indices, moving)
     reached = _steps_to_reach(graph.indptr, graph.indices, known, settings.steps)
-    total = np.zeros(len(codes), np.float32)
+    total, learnt = np.zeros(len(codes), np.float32), empty_rows(len(codes))
     for first in range(0, codes.shape[1], LANES):
-        learnt = _gather(codes, graph.order, first)
+        _gather(codes, graph.order, first, learnt)
         spread = _spread(graph, readers, learnt, weight, moving & (reached <= 1), reached, settings.steps)
         _scatter(spread, graph.order, first, out, total)
     # Classes settle apart from each other, so that the sum of a row is 1 only about as precisely as they do.
@@ -129,13 +131,13 @@ def propagate(
 
 
 @kernel(parallel=True)
-def _gather(codes: np.ndarray, order: np.ndarray, first: int) -> np.ndarray:  # (N, K), (N,)
-    """Take sixteen columns of the codes, in the order of places: (N, 16), with zeros after the last column."""
-    some, count = np.zeros((codes.shape[0], LANES), np.float32), min(codes.shape[1] - first, LANES)
+def _gather(codes: np.ndarray, order: np.ndarray, first: int, some: np.ndarray) -> None:  # (N, K), (N,); (N, 16) out
+    """Take sixteen columns of the codes, in the order of places, with zeros after the last column."""
+    count, last = min(codes.shape[1] - first, LANES), len(order) - 1
     for i in nb.prange(order.shape[0]):
-        for c in range(count):
-            some[i, c] = codes[order[i], first + c]
-    return some
+        prefetch(codes, order[min(i + 2 * _AHEAD, last)])
+        for c in range(LANES):
+            some[i, c] = codes[order[i], first + c] if c < count else np.float32(0)
 
 
 @kernel(parallel=True)
@@ -165,15 +167,16 @@ def _spread(
 
     Who reads a place is as `_readers` lists it.
     """
-    codes = learnt.copy()
+    codes = empty_rows(len(learnt))
+    codes[:] = learnt
+    # Taken once: to get memory from the system anew in each step took a third of the time.
+    values, changed = empty_rows(len(learnt)), np.empty(len(learnt), bool)
     for step in range(steps):
         places = np.flatnonzero(awake).astype(np.int32)
         if len(places) == 0:
             break
         awake[:] = False
-        values, changed = _step(
-            graph.indptr, graph.indices, graph.weights, learnt, weight, reached, step, places, codes
-        )
+        _step(graph.indptr, graph.indices, graph.weights, learnt, weight, reached, step, places, codes, values, changed)
         _take(places, values, changed, *readers, codes, awake)
     return codes
 
@@ -182,30 +185,30 @@ def _spread(
 def _step(
     indptr: np.ndarray, indices: np.ndarray, weights: np.ndarray, learnt: np.ndarray, weight: np.ndarray,
     reached: np.ndarray, step: int, places: np.ndarray, codes: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Compute the codes of some places, (M, 16), from those around them, and tell which change, (M,).
+    values: np.ndarray, changed: np.ndarray,  # (M, 16), (M,) out
+) -> None:  # fmt: skip
+    """Compute the codes of M places from those around them, and tell which change.
 
     Codes are by place, (N, 16): as `learnt` and as they are. The evidence, `weight`, (N,), is a multiple of the
     strength; `reached`, (N,) int32, is the step after which a code is known.
     """
-    count = learnt.shape[1]
-    values, changed = np.empty((places.shape[0], count), np.float32), np.empty(places.shape[0], np.bool_)
     for chunk in nb.prange((places.shape[0] + CHUNK - 1) // CHUNK):
-        for m in range(chunk * CHUNK, min((chunk + 1) * CHUNK, places.shape[0])):
+        last = min((chunk + 1) * CHUNK, places.shape[0])
+        for m in range(chunk * CHUNK, last):
+            later = places[min(m + _AHEAD, last - 1)]
+            prefetch(learnt, later)
+            for e in range(indptr[later], indptr[later + 1]):
+                prefetch(codes, indices[e])
             i = places[m]
             mass = weight[i]
             total = add_scaled(nothing(), load_row(learnt, i), weight[i])
             for e in range(indptr[i], indptr[i + 1]):
-                if reached[indices[e]] <= step:
-                    mass += weights[e]
-                    total = add_scaled(total, load_row(codes, indices[e]), weights[e])
-            store_row(values, m, total)
-            change = np.float32(0)
-            for c in range(count):
-                values[m, c] /= mass
-                change = max(change, abs(values[m, c] - codes[i, c]))
-            changed[m] = change > SETTLED or reached[i] == step + 1
-    return values, changed
+                # What is not reached yet is zero, and without a branch.
+                mass += weights[e] if reached[indices[e]] <= step else np.float32(0)
+                total = add_scaled(total, load_row(codes, indices[e]), weights[e])
+            value = divided(total, mass)
+            store_row(values, m, value)
+            changed[m] = apart(value, load_row(codes, i), SETTLED) != 0 or reached[i] == step + 1
 
 
 @kernel(parallel=True)
@@ -214,9 +217,10 @@ def _take(
     codes: np.ndarray, awake: np.ndarray,
 ) -> None:  # fmt: skip
     """Write the codes of some places, and wake those that read what changed."""
+    last = places.shape[0] - 1
     for m in nb.prange(places.shape[0]):
-        for c in range(codes.shape[1]):
-            codes[places[m], c] = values[m, c]
+        prefetch(indices, indptr[places[min(m + 2 * _AHEAD, last)]])
+        store_row(codes, places[m], load_row(values, m))
         if changed[m]:
             for e in range(indptr[places[m]], indptr[places[m] + 1]):
                 awake[indices[e]] = True
