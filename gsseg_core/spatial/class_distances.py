@@ -70,7 +70,7 @@ def _to_be_found(tree: Tree, labels: np.ndarray, before: Found, k: int) -> np.nd
     members, members_before = (np.bincount(of, minlength=count) for of in (labels, before.labels))
     few = (np.minimum(members - 1, k) != np.minimum(members_before - 1, k))[labels] & (labels > 0)
     wanted |= few
-    still = nodes_without(moved, np.arange(len(labels), dtype=np.int32), len(tree.blocks))
+    still = nodes_without(moved, len(tree.blocks))
     _want_those_near(tree, moved, still, labels, before.labels, before.radii, wanted)
     return wanted
 

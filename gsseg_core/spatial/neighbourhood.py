@@ -123,11 +123,13 @@ class Neighbours:
         """Find the places in the tree that are wanted, and prepare `average` for all but its last four arguments."""
         order = self.tree.order
         selected = np.ones(len(order), bool) if wanted is None else wanted[order]
-        read = np.repeat(counted, np.diff(codes.indptr))
-        units = np.rint(codes.data * np.float32(1 / CODE_UNIT), where=read, out=np.zeros_like(codes.data))
-        rows = codes.with_data(units.astype(np.int32))
+        # In the order of the tree, neighbours lie beside each other.
+        ordered, counted = codes.take(order), counted[order]
+        read = np.repeat(counted, np.diff(ordered.indptr))
+        units = np.rint(ordered.data * np.float32(1 / CODE_UNIT), where=read, out=np.zeros_like(ordered.data))
+        rows = ordered.with_data(units.astype(np.int32))
         self.look_for(selected)
-        empty = nodes_without(counted, order, len(self.tree.blocks))
+        empty = nodes_without(counted, len(self.tree.blocks))
         below = np.nextafter(self.radii, np.float32(-np.inf))
         means_of = partial(average, self.tree, rows, counted, empty, self.radii, below, self.k)
         return np.flatnonzero(selected).astype(np.int32), means_of
@@ -152,7 +154,7 @@ def find_neighbours(scene: GaussianScene, k: int) -> None:
 
 @kernel(parallel=True)
 def average(
-    tree: Tree, codes: CSRRows, counted: np.ndarray,  # n rows, int32 in steps of CODE_UNIT; (n,) bool, by row
+    tree: Tree, codes: CSRRows, counted: np.ndarray,  # n rows, int32 in steps of CODE_UNIT; (n,) bool, by place
     empty: np.ndarray,  # (2 L,) int32: 1 for nodes of which no point counts
     radii: np.ndarray, below: np.ndarray,  # (n,): squared distance to the k-th nearest other; the next smaller float32
     k: int,
@@ -189,9 +191,9 @@ def average(
                     near = load_row(candidates.near, h)
                     inside = at_most(near, below[own]) & others
                     tied = at_most(near, radii[own]) & others & ~inside
-                    _add(codes, counted, tree.order, start, inside, sums[0], counts[0])
+                    _add(codes, counted, start, inside, sums[0], counts[0])
                     if tied:
-                        _add(codes, counted, tree.order, start, tied, sums[1], counts[1])
+                        _add(codes, counted, start, tied, sums[1], counts[1])
                 if counts[0, 1] + counts[1, 1] > 0:
                     share = (k - counts[0, 0]) / counts[1, 0]
                     total = (counts[0, 1] + share * counts[1, 1]) / CODE_UNIT
@@ -202,28 +204,26 @@ def average(
 
 
 @nb.njit(inline="always")
-def _add(
-    codes: CSRRows, counted: np.ndarray, order: np.ndarray, start: int, lanes: int, sums: np.ndarray, counts: np.ndarray
-) -> None:
+def _add(codes: CSRRows, counted: np.ndarray, start: int, lanes: int, sums: np.ndarray, counts: np.ndarray) -> None:
     """Add up the codes of some points of a leaf, by the bits of their lanes: of those that count."""
     while lanes:
-        row = order[start + first_bit(lanes)]
+        place = start + first_bit(lanes)
         lanes &= lanes - 1
         counts[0] += 1
-        if counted[row]:
+        if counted[place]:
             counts[1] += 1
-            for e in range(codes.indptr[row], codes.indptr[row + 1]):
+            for e in range(codes.indptr[place], codes.indptr[place + 1]):
                 sums[codes.indices[e]] += codes.data[e]
 
 
 @kernel(parallel=True)
-def nodes_without(counted: np.ndarray, order: np.ndarray, leaves: int) -> np.ndarray:
+def nodes_without(counted: np.ndarray, leaves: int) -> np.ndarray:  # (n,) bool, by place
     """Tell of which nodes no point counts, (2 L,) int32: 1 for these, 0 for others."""
     without = np.ones(2 * leaves, np.int32)
     for leaf in nb.prange(leaves):
-        first, last = leaf_range(leaf, leaves, len(order))
+        first, last = leaf_range(leaf, leaves, len(counted))
         for i in range(first, last):
-            if counted[order[i]]:
+            if counted[i]:
                 without[leaves + leaf] = 0
     for node in range(leaves - 1, 0, -1):
         without[node] = without[2 * node] & without[2 * node + 1]
