@@ -128,10 +128,9 @@ class Robot:
         self.wait(lambda: state().current_state.label == "active", "the node to be active")
 
     def settled(self) -> None:
-        """Wait until all that was received has been fused or rejected."""
-        idle = ("masks waiting for pose or camera_info", "masks waiting to be fused")
+        """Wait until all that was received has been fused or rejected, the mask in hand too."""
         time.sleep(1.5)  # Diagnostics come once a second.
-        self.wait(lambda: all(self.status.get(key) == "0" for key in idle), "fusion to end")
+        self.wait(lambda: all_handled(self.status), "fusion to end")
 
     def listen(self, topics: list[str]) -> None:
         """Subscribe to clouds."""
@@ -320,6 +319,12 @@ def real_size(robot: Robot, data: Path) -> None:
         segment(robot, "3,000,000 Gaussians, 20 classes", 5)
         status = Path(f"/proc/{process.pid}/status").read_text()
         print(f"peak resident memory of the node: {int(status.split('VmHWM:')[1].split()[0]) / 2**20:.2f} GiB")
+
+
+def all_handled(status: Mapping[str, str]) -> bool:
+    """Tell by `/diagnostics` whether every mask that came was fused or rejected; one in hand waits nowhere."""
+    ended = sum(int(count) for key, count in status.items() if key == "views accepted" or key.startswith("rejected "))
+    return "/mask received" in status and int(status["/mask received"]) == ended
 
 
 def topics_of(report: SegmentationReport) -> list[str]:
