@@ -17,13 +17,15 @@ cluster are those of the cluster.
    is; two objects only where both happen to be whole and have been merged as well. And that half of C went with D, as
    where many neighbours are merged, says nothing.
 2. **Clusters merge**, the most agreed pairs first; what has merged is compared anew, with the evidence of all its
-   segments together.
-3. **The views tell where to stop.** Let views show an object whole with the probability w, and merge neighbours with
-   the probability m. Two objects are under one id, both whole, in w w m of the views, which is an agreement of w m, and
-   parts of one in w of them. Both are read off the clusters so far: w is how often they are shown whole, m how often
-   those that touch are under one id where both are whole. As pairs differ, the level is a multiple of sqrt(w m), and at
-   least 0.4 w. Where hardly any clusters that touch agree by 0.3 to 0.6, no object comes in parts, and merging stops at
-   one half: small ones must not go to large ones.
+   segments together. Down to an agreement of 0.6 that is so whatever the segmenter does. Where then hardly any clusters
+   that touch agree by 0.3 to 0.6, no object comes in parts, and merging goes on to one half only: small ones must not
+   go to large ones.
+3. **The surface has its say where objects come in parts**, and merging begins again. With e the mean strength of the
+   depth edges along the borders of C and D in all views, agreement counts exp(4 (0.75 - e)) times, as parts of one
+   object meet on its surface and different objects do not. And the views tell where to stop. Let them show an object
+   whole with the probability w, and merge neighbours with the probability m. Two objects are under one id, both whole,
+   in w w m of the views, which is an agreement of w m, and parts of one in w of them: so merging goes on down to w, if
+   that is less than one half. It is read off the clusters at 0.6, as how often they are shown whole.
 4. **Segments move** to the object that explains them best by what the other views say, until none does. That gives
    leftovers, one half of something, say, to the whole, and clutter to the background; objects left without a segment
    are gone.
@@ -42,15 +44,16 @@ import numpy as np
 from scipy import sparse
 
 from gsseg_core.errors import SettingsError
+from gsseg_core.objects.depth_edges import Borders
 from gsseg_core.objects.lifted_segments import Lifted, Profiles, sums
 
 _PAIRS = 1 << 15  # so many pairs at a time, to keep memory small
 _BEST = 0.75  # pairs that agree nearly as well as the best one merge at once, before anything is compared anew
 _MOST = 0.6  # agreement above which clusters are one object whatever the segmenter does
 _WHOLE = 0.5  # the level where segmenters hardly ever split an object, or too little is known
-_LEVEL, _LEAST = 3.0, 0.4  # the level by sqrt(w m), fitted to made-up masks, and by w at least
 _DOUBTED, _SPLIT = 0.3, 0.1  # agreement of parts of one object, at least; share of such pairs that means often split
-_DIFFERENT = 0.4  # clusters that touch and agree by less where both are whole are taken for different objects
+_USUAL, _BORDER = 0.75, 100.0  # strength of depth edges between any two, taken for so many px more of their border
+_SURFACE, _FACTORS = 4.0, (0.75, 4.0)  # by how much agreement grows as edges get weaker, and between what
 _OFTEN = 5  # views in which clusters touch, or that see one, from which on they tell how the segmenter works
 
 
@@ -144,6 +147,11 @@ class _Stack:
         self.views = [replace(view, gaussians=ids) for view, ids in zip(views, numbers, strict=True)]
         self.num_gaussians = len(present)
 
+    def borders(self) -> Borders:
+        """Between the segments of each view."""
+        parts = zip(*(view.borders or Borders.empty(len(view)) for view in self.views), strict=True)
+        return Borders(*(sparse.block_diag(part, format="csr") for part in parts))
+
     def overlaps(self) -> tuple[sparse.csr_matrix, np.ndarray]:
         """O (n, n), and V (n, views)."""
         scaled, seen = [], []
@@ -161,34 +169,59 @@ def _merge(stack: _Stack, settings: AssociationSettings) -> tuple[np.ndarray, fl
 
     All of the background are cluster 0, the others are numbered from 1.
     """
-    overlap, seen = stack.overlaps()
-    nodes = np.flatnonzero(~stack.background)
-    touching = _same_view(overlap, stack.view)[nodes][:, nodes]
-    cluster = np.arange(len(nodes))
-    hidden = np.zeros_like(seen)
-    hidden[:, stack.view[stack.background]] = overlap[:, stack.background].toarray()
-    overlap.data[stack.background[overlap.indices]] = 0
-    overlap.eliminate_zeros()
-    overlap, seen, hidden = overlap[nodes], seen[nodes], hidden[nodes]
-    agreement, split = settings.agreement or _MOST, np.nan
-    while len(seen) > 1:
-        votes = _Votes.of(overlap, seen, hidden, stack.view, settings)
-        pairs = votes.pairs()
-        if settings.agreement is None and not (pairs.score > agreement).any():
-            groups = _grouping(cluster)
-            beside = groups @ touching @ groups.T
-            split = votes.split(beside) if np.isnan(split) else split
-            agreement = min(agreement, votes.told_level(beside, split))
-        target = _match(pairs, len(seen), agreement)
+    single, sure = _Clusters.single(stack), max(settings.agreement or 0, _MOST)
+    clusters, votes = _merged(single, stack.view, settings, sure, surface=0.0)
+    split = votes.split(clusters.touching)
+    # Begun again: where objects come in parts, the surface has its say from the first pair on.
+    clusters, votes = _merged(single, stack.view, settings, sure, surface=split)
+    agreement = settings.agreement or votes.told_level(split)
+    clusters, _ = _merged(clusters, stack.view, settings, agreement, surface=split)
+    merged = np.zeros(len(stack.view), np.int64)
+    merged[~stack.background] = clusters.of + 1
+    return merged, agreement
+
+
+class _Clusters(NamedTuple):
+    """C clusters that segments of objects make up, and what they have in common with all n segments."""
+
+    of: np.ndarray  # the cluster of each segment that is not background
+    overlap: sparse.csr_matrix  # (C, n): O, that with the background left out
+    seen: np.ndarray  # (C, views): V
+    hidden: np.ndarray  # (C, views): what of it the view calls background
+    touching: sparse.csr_matrix  # (C, C): pairs of segments of one view that touch
+    borders: Borders  # of C clusters
+
+    @classmethod
+    def single(cls, stack: _Stack) -> _Clusters:
+        """Start with each segment by itself."""
+        overlap, seen = stack.overlaps()
+        nodes = np.flatnonzero(~stack.background)
+        touching = _same_view(overlap, stack.view)[nodes][:, nodes]
+        hidden = np.zeros_like(seen)
+        hidden[:, stack.view[stack.background]] = overlap[:, stack.background].toarray()
+        overlap.data[stack.background[overlap.indices]] = 0
+        overlap.eliminate_zeros()
+        borders = Borders(*(part[nodes][:, nodes] for part in stack.borders()))
+        return cls(np.arange(len(nodes)), overlap[nodes], seen[nodes], hidden[nodes], touching, borders)
+
+    def merged(self, target: np.ndarray) -> _Clusters:  # (C,): whom each one becomes
+        number = np.unique(target, return_inverse=True)[1]
+        groups = _grouping(number)
+        touching, *borders = ((groups @ part @ groups.T).tocsr() for part in (self.touching, *self.borders))
+        overlap, seen, hidden = (groups @ self.overlap).tocsr(), groups @ self.seen, groups @ self.hidden
+        return _Clusters(number[self.of], overlap, seen, hidden, touching, Borders(*borders))
+
+
+def _merged(
+    clusters: _Clusters, view: np.ndarray, settings: AssociationSettings, level: float, surface: float
+) -> tuple[_Clusters, _Votes]:
+    """Merge clusters down to a level, the surface having its say by so much, 0 to 1; also return the last votes."""
+    while True:
+        votes = _Votes.of(clusters, view, settings)
+        target = _match(votes.pairs(clusters.borders, surface), len(clusters.seen), level)
         if target is None:
-            break
-        merged = np.unique(target, return_inverse=True)[1]
-        groups = _grouping(merged)
-        overlap, seen, hidden = (groups @ overlap).tocsr(), groups @ seen, groups @ hidden
-        cluster = merged[cluster]
-    clusters = np.zeros(len(stack.view), np.int64)
-    clusters[nodes] = cluster + 1
-    return clusters, agreement
+            return clusters, votes
+        clusters = clusters.merged(target)
 
 
 def _grouping(cluster: np.ndarray) -> sparse.csr_matrix:  # (n,)
@@ -213,18 +246,11 @@ class _Votes(NamedTuple):
     settings: AssociationSettings
 
     @classmethod
-    def of(
-        cls,
-        overlap: sparse.csr_matrix,  # (C, n): what clusters and segments have in common
-        seen: np.ndarray,  # (C, views): what views see of clusters
-        hidden: np.ndarray,  # (C, views): how much of that is background there
-        view: np.ndarray,  # (n,): of the segments
-        settings: AssociationSettings,
-    ) -> _Votes:
+    def of(cls, clusters: _Clusters, view: np.ndarray, settings: AssociationSettings) -> _Votes:
         """Let the views vote. Who calls a cluster background says nothing of which object it is."""
-        foreground = np.maximum(seen - hidden, 0)
-        counts = settings.sight(foreground, seen.max(axis=1, keepdims=True))
-        entries = overlap.tocoo()
+        foreground = np.maximum(clusters.seen - clusters.hidden, 0)
+        counts = settings.sight(foreground, clusters.seen.max(axis=1, keepdims=True, initial=0))
+        entries = clusters.overlap.tocoo()
         share = entries.data / np.maximum(foreground[entries.row, view[entries.col]], 1e-9)
         strong = share > settings.least_share
         row, col = entries.row[strong], entries.col[strong]
@@ -232,13 +258,15 @@ class _Votes(NamedTuple):
         whole = np.minimum(grown, 1) * counts[row, view[col]]
         shown = np.zeros_like(counts)
         np.maximum.at(shown, (row, view[col]), whole)
-        return cls(sparse.csr_matrix((whole, (row, col)), shape=overlap.shape), counts, shown, settings)
+        return cls(sparse.csr_matrix((whole, (row, col)), shape=clusters.overlap.shape), counts, shown, settings)
 
-    def pairs(self) -> _Pairs:
-        """Compare all clusters that any id shows whole together."""
+    def pairs(self, borders: Borders, surface: float) -> _Pairs:
+        """Compare all clusters that any id shows whole together; the surface has its say by so much, 0 to 1."""
         together = sparse.triu(self.whole @ self.whole.T, 1).tocoo()
         see, show = self._views_of_both(together.row, together.col)
         score = self._agreement(together.data, see, show)
+        if surface > 0:
+            score *= _goes_on(borders, together.row, together.col) ** surface
         return _Pairs(together.row, together.col, np.where(see >= self.settings.evidence, score, 0))
 
     def _agreement(self, together: np.ndarray, see: np.ndarray, show: np.ndarray) -> np.ndarray:
@@ -252,25 +280,14 @@ class _Votes(NamedTuple):
         doubted = self._agreement(together, see, show)[see > _OFTEN] > _DOUBTED
         return min(float(np.mean(doubted)) / _SPLIT, 1) if len(doubted) else 0.0
 
-    def told_level(self, touching: sparse.csr_matrix, split: float) -> float:
-        """Agreement above which clusters are one object, by how often views show them whole and merge neighbours.
-
-        Takes in how many views clusters touch, (C, C), and what `split` told.
-        """
+    def told_level(self, split: float) -> float:
+        """Agreement above which clusters are one object, by how often views show them whole, and what `split` told."""
         seen = self.counts.sum(axis=1)
         known = seen >= _OFTEN
         if not known.any():
             return _WHOLE
         whole = float(np.mean(self.shown[known].sum(axis=1) / seen[known]))
-        level = max(_LEVEL * np.sqrt(whole * self._merged(touching)), _LEAST * whole)
-        return float(_WHOLE + split * (min(level, _MOST) - _WHOLE))
-
-    def _merged(self, touching: sparse.csr_matrix) -> float:
-        """How often clusters that touch, but differ, are under one id where each of them is shown whole."""
-        together, see, show = self._compared(*_often(touching))
-        rate = together / (show + self.settings.doubt)
-        differ = (show > 1) & (rate < _DIFFERENT)
-        return float(np.average(rate[differ], weights=see[differ])) if differ.any() else 0.0
+        return _WHOLE - split * max(_WHOLE - whole, 0)
 
     def _compared(self, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Count, for pairs of clusters, views that show both whole under one id, see both, and show each whole."""
@@ -285,6 +302,16 @@ class _Votes(NamedTuple):
             for row, votes in zip(count, (self.counts, self.shown), strict=True):
                 row[part] = np.einsum("pv,pv->p", votes[first[part]], votes[second[part]])
         return count
+
+
+def _goes_on(borders: Borders, first: np.ndarray, second: np.ndarray) -> np.ndarray:  # (P,), (P,)
+    """Tell how much more likely pairs of clusters are one object for what the surface does between them, (P,)."""
+    if not len(first):
+        return np.ones(0)
+    length, edges = (np.asarray(part[first, second], np.float64).ravel() for part in borders)
+    share = (edges + _USUAL * _BORDER) / (length + _BORDER)
+    factor: np.ndarray = np.clip(np.exp(_SURFACE * (_USUAL - share)), *_FACTORS)
+    return factor
 
 
 def _often(touching: sparse.csr_matrix) -> tuple[np.ndarray, np.ndarray]:

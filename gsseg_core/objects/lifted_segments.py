@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import sparse
 
 from gsseg_core.metrics import iou
+from gsseg_core.objects.depth_edges import Borders, borders, depth_edges
 from gsseg_core.raster.observation import Observation
+from gsseg_core.raster.view_operator import ViewOperator
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,6 +21,7 @@ class Lifted:
     ids: np.ndarray  # (L,) int32: of each segment in the mask; 0 is the background; those on no Gaussian are left out
     gaussians: np.ndarray  # (M,) int32: those that the segments are on, ascending
     weights: sparse.csr_matrix  # (L, M) float32: w_a, in px
+    borders: Borders | None = None  # between them; None where nothing is known of the surface
 
     @classmethod
     def of(cls, observation: Observation, kept: float = 0.8) -> Lifted:
@@ -43,6 +47,17 @@ class Lifted:
     def __len__(self) -> int:
         """Count the segments."""
         return len(self.ids)
+
+
+def lift(
+    scene: GaussianScene,
+    operator: ViewOperator,
+    labels: np.ndarray,  # (H, W) integers, negative where unknown
+    kept: float = 0.8,
+) -> Lifted:
+    """Lift the ids of a mask as `Lifted.of` does, and measure the borders between them on the surface of the scene."""
+    lifted = Lifted.of(operator.observe(labels), kept)
+    return replace(lifted, borders=borders(labels, lifted.ids, depth_edges(scene, operator)))
 
 
 class Profiles:

@@ -15,7 +15,7 @@ from gsseg_core.errors import UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.objects.association import AssociationSettings, associate
-from gsseg_core.objects.lifted_segments import Lifted, Profiles, sums
+from gsseg_core.objects.lifted_segments import Lifted, Profiles, lift, sums
 from gsseg_core.objects.tree_growing import grow_tree
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -259,8 +259,8 @@ class ObjectTable:
         labels = replace(view, class_names=None).read_labels()
         if not (labels >= 0).any():
             return None
-        observation = make_operator(self.scene, view.camera, self.device).observe(labels)
-        return Lifted.of(observation, self.settings.kept) if len(observation.ids) else None
+        operator = make_operator(self.scene, view.camera, self.device)
+        return lift(self.scene, operator, labels, self.settings.kept) if len(operator.ids) else None
 
     def _give(self, name: str, objects: np.ndarray) -> None:
         self._objects[name] = objects.astype(np.int32)
