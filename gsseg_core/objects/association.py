@@ -53,7 +53,7 @@ _MOST = 0.6  # agreement above which clusters are one object whatever the segmen
 _WHOLE = 0.5  # the level where segmenters hardly ever split an object, or too little is known
 _DOUBTED, _SPLIT = 0.3, 0.1  # agreement of parts of one object, at least; share of such pairs that means often split
 _USUAL, _BORDER = 0.75, 100.0  # strength of depth edges between any two, taken for so many px more of their border
-_SURFACE, _FACTORS = 4.0, (0.75, 4.0)  # by how much agreement grows as edges get weaker, and between what
+_SURFACE, _FACTORS = 4.0, (0.75, 1.8)  # by how much agreement grows as edges get weaker, and between what
 _OFTEN = 5  # views in which clusters touch, or that see one, from which on they tell how the segmenter works
 
 
