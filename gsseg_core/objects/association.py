@@ -172,8 +172,8 @@ def _merge(stack: _Stack, settings: AssociationSettings) -> tuple[np.ndarray, fl
     single, sure = _Clusters.single(stack), max(settings.agreement or 0, _MOST)
     clusters, votes = _merged(single, stack.view, settings, sure, surface=0.0)
     split = votes.split(clusters.touching)
-    # Begun again: where objects come in parts, the surface has its say from the first pair on.
-    clusters, votes = _merged(single, stack.view, settings, sure, surface=split)
+    if split > 0:  # Begun again, so that the surface has its say from the first pair on.
+        clusters, votes = _merged(single, stack.view, settings, sure, surface=split)
     agreement = settings.agreement or votes.told_level(split)
     clusters, _ = _merged(clusters, stack.view, settings, agreement, surface=split)
     merged = np.zeros(len(stack.view), np.int64)
@@ -218,7 +218,7 @@ def _merged(
     """Merge clusters down to a level, the surface having its say by so much, 0 to 1; also return the last votes."""
     while True:
         votes = _Votes.of(clusters, view, settings)
-        target = _match(votes.pairs(clusters.borders, surface), len(clusters.seen), level)
+        target = _match(votes.pairs(clusters.borders, surface, level), len(clusters.seen), level)
         if target is None:
             return clusters, votes
         clusters = clusters.merged(target)
@@ -260,14 +260,19 @@ class _Votes(NamedTuple):
         np.maximum.at(shown, (row, view[col]), whole)
         return cls(sparse.csr_matrix((whole, (row, col)), shape=clusters.overlap.shape), counts, shown, settings)
 
-    def pairs(self, borders: Borders, surface: float) -> _Pairs:
-        """Compare all clusters that any id shows whole together; the surface has its say by so much, 0 to 1."""
+    def pairs(self, borders: Borders, surface: float, level: float) -> _Pairs:
+        """Compare all clusters that any id shows whole together; the surface has its say by so much, 0 to 1.
+
+        It is not asked of pairs that it can not lift above a level.
+        """
         together = sparse.triu(self.whole @ self.whole.T, 1).tocoo()
-        see, show = self._views_of_both(together.row, together.col)
-        score = self._agreement(together.data, see, show)
+        first, second = together.row, together.col
+        see, show = self._views_of_both(first, second)
+        score = np.where(see >= self.settings.evidence, self._agreement(together.data, see, show), 0)
         if surface > 0:
-            score *= _goes_on(borders, together.row, together.col) ** surface
-        return _Pairs(together.row, together.col, np.where(see >= self.settings.evidence, score, 0))
+            asked = score * _FACTORS[1] > level
+            score[asked] *= _goes_on(borders, first[asked], second[asked]) ** surface
+        return _Pairs(first, second, score)
 
     def _agreement(self, together: np.ndarray, see: np.ndarray, show: np.ndarray) -> np.ndarray:
         doubt = self.settings.doubt
