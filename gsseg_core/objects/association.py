@@ -261,17 +261,18 @@ class _Votes(NamedTuple):
         return cls(sparse.csr_matrix((whole, (row, col)), shape=clusters.overlap.shape), counts, shown, settings)
 
     def pairs(self, borders: Borders, surface: float, level: float) -> _Pairs:
-        """Compare all clusters that any id shows whole together; the surface has its say by so much, 0 to 1.
+        """Compare all clusters that any id shows whole together, and that may agree by more than a level.
 
-        It is not asked of pairs that it can not lift above a level.
+        The surface has its say by so much, 0 to 1.
         """
         together = sparse.triu(self.whole @ self.whole.T, 1).tocoo()
-        first, second = together.row, together.col
+        # No fewer views see both, or show each whole, than show both whole together.
+        likely = together.data * (_FACTORS[1] if surface > 0 else 1) > level * (together.data + self.settings.doubt)
+        first, second = together.row[likely], together.col[likely]
         see, show = self._views_of_both(first, second)
-        score = np.where(see >= self.settings.evidence, self._agreement(together.data, see, show), 0)
+        score = np.where(see >= self.settings.evidence, self._agreement(together.data[likely], see, show), 0)
         if surface > 0:
-            asked = score * _FACTORS[1] > level
-            score[asked] *= _goes_on(borders, first[asked], second[asked]) ** surface
+            score *= _goes_on(borders, first, second) ** surface
         return _Pairs(first, second, score)
 
     def _agreement(self, together: np.ndarray, see: np.ndarray, show: np.ndarray) -> np.ndarray:
