@@ -55,7 +55,7 @@ view: $(KERNELS_READY)  ## segment a small scene and look at it in the browser; 
 	$(BIN)/gsseg view demo_out/scene/scene.ply --segmentation demo_out/segmented/segmentation.npz \
 		--data demo_out/scene --open
 
-check: $(READY) $(ROS_READY) $(MSGS_READY)  ## lint, check the types, the order of the rooms and all that starts no process: a minute or two
+check: $(READY) $(ROS_READY) $(MSGS_READY)  ## lint, check the types, the order of the rooms and all that starts no process: about a minute
 	@$(MAKE) --no-print-directory --jobs=2 --keep-going lint run-fast-tests
 
 house: $(KERNELS_READY)  ## print what the house measures, with the bar beside each; HOUSE=--times runs all tests, too

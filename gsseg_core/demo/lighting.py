@@ -60,7 +60,6 @@ def sky_share(part: Part, parts: list[Part], start: np.ndarray, normals: np.ndar
         if other.label and (other is not part or (isinstance(part.solid, Cone) and part.solid.hollow)):
             near, far = other.corners.min(axis=0) - REACH, other.corners.max(axis=0) + REACH
             close = np.flatnonzero(((start > near) & (start < far)).all(axis=1))
-            for way, left in zip(towards, seen, strict=True):
-                distance = other.hit(start[close], way[close])
-                left[close] = np.minimum(left[close], np.clip(distance / REACH, 0, 1))
+            distance = other.hit(start[close], towards[:, close])
+            seen[:, close] = np.minimum(seen[:, close], np.clip(distance / REACH, 0, 1))
     return np.asarray(seen.mean(axis=0))

@@ -178,13 +178,14 @@ def test_conventions_are_found_exactly(
 
 
 @pytest.mark.usefixtures("few_axes")
-@pytest.mark.parametrize("number", [4, 17])  # the second is 2 px off, by the few features that match
+@pytest.mark.parametrize("number", [4, 17])  # the second is 1.5 px off, by the few features that match
 def test_a_table_seen_from_another_side_is_not_taken_for_right_because_it_looks_alike(
     real_data: Path, number: int
 ) -> None:
     scene, true = GaussianScene.load(real_data / "kitchen_table/scene.ply"), Dataset(real_data / "kitchen_table")
     turned = true.moved(Convention(world_axes=AXIS_ROTATIONS[number]).camera)
-    found = find_alignment(scene, turned.views("train"), replace(SETTINGS, photos=4, survivors=0.02, photo_px=320))
+    few = replace(SETTINGS, views=3, photos=3, survivors=0.02, photo_px=320, refinements=1)
+    found = find_alignment(scene, turned.views("train"), few)
     assert found.before.agrees
     assert poses_apart(turned.moved(found.alignment.camera), true) < 1e-9
 

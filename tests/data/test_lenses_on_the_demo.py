@@ -23,7 +23,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.lens import MODELS_BY_NAME, Lens, Projection
 from gsseg_core.segmentation import Segmentation
 
-WIDTH, HEIGHT, FOCAL = 200, 150, 175.0
+WIDTH, HEIGHT, FOCAL = 160, 120, 140.0
 TRAIN, TEST = slice(0, 36, 6), slice(1, 36, 9)
 
 
@@ -46,7 +46,7 @@ def cast(parts: list[Part], lens: Lens, camera: Camera) -> np.ndarray:
 
 def lens_of_demo(name: str) -> Lens:
     if MODELS_BY_NAME[name].projection is Projection.PANORAMA:
-        return Lens(MODELS_BY_NAME[name], 960, 480)
+        return Lens(MODELS_BY_NAME[name], 768, 384)
     middle = (WIDTH / 2, HEIGHT / 2)
     return Lens(MODELS_BY_NAME[name], WIDTH, HEIGHT, (FOCAL, FOCAL), middle, COEFFICIENTS.get(name, ()))
 

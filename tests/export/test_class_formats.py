@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -14,12 +15,14 @@ from pxr import Usd, UsdGeom, UsdPhysics, UsdSemantics
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table
 
 from gsseg_core.errors import EmptySceneError, SettingsError
+from gsseg_core.export import class_files
 from gsseg_core.export.class_files import class_file_name, export_classes, write_selection
 from gsseg_core.export.collision import HULL, KINDS, POISSON, SURFACE, collision_meshes
 from gsseg_core.files.run_folder import RUN_FILE
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_writers import SCENE_WRITERS
+from gsseg_core.scene.triangle_mesh import TriangleMesh
 from gsseg_core.segmentation import Segmentation
 
 SCENE, TRUTH = balls_on_a_table()
@@ -31,6 +34,17 @@ HOSTILE = {
 def segmented(names: Mapping[int, str] = NAMES, scene: GaussianScene = SCENE) -> Segmentation:
     codes = np.eye(NUM_CLASSES, dtype=np.float32)[TRUTH[: len(scene)]]
     return Segmentation.from_codes(scene, codes, names, RefineSettings(cluster=False, filter=False))
+
+
+@functools.cache
+def meshes_of(kind: str) -> dict[int, TriangleMesh]:
+    return collision_meshes(SCENE, segmented(), kind)
+
+
+@pytest.fixture
+def meshes_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have the meshes of SCENE made once, which takes most of the time; for tests of what is written of them."""
+    monkeypatch.setattr(class_files, "collision_meshes", lambda scene, segmentation, kind: meshes_of(kind))
 
 
 def visible(folder: Path) -> list[str]:
@@ -87,6 +101,7 @@ def test_names_that_become_the_same_are_kept_apart_by_their_ids(tmp_path: Path) 
     assert visible(tmp_path) == ["objects.usdc"]  # The files of the export before it are gone.
 
 
+@pytest.mark.usefixtures("meshes_made_once")
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_object_but_the_background_has_a_closed_mesh(tmp_path: Path, kind: str) -> None:
     export_classes(SCENE, segmented(), tmp_path, "ply", kind)
@@ -161,13 +176,14 @@ def test_a_sheet_that_is_seen_from_both_sides_gets_the_surface_around_it() -> No
     np.testing.assert_array_equal(around.points, found.points)
 
 
+@pytest.mark.usefixtures("meshes_made_once")
 @pytest.mark.parametrize("kind", KINDS)
 def test_meshes_are_in_the_usd_with_the_collision_schemas(tmp_path: Path, kind: str) -> None:
     export_classes(SCENE, segmented(), tmp_path, "usd", kind)
     stage = Usd.Stage.Open(str(tmp_path / "objects.usdc"))
     parents = stage.GetDefaultPrim().GetChildren()
     assert [prim.GetChild("collision").IsValid() for prim in parents] == [False, True, True, True]
-    meshes = collision_meshes(SCENE, segmented(), kind)
+    meshes = meshes_of(kind)
     for k, parent in enumerate(parents[1:], start=1):
         prim = parent.GetChild("collision")
         assert prim.HasAPI(UsdPhysics.CollisionAPI) and UsdGeom.Imageable(prim).GetPurposeAttr().Get() == "guide"
