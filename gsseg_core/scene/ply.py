@@ -63,7 +63,11 @@ def read_elements(path: Path, within: Path | None = None) -> dict[str, npt.NDArr
 
 def _native(data: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
     """Copy rows in native byte order, so that a scene outlives changes to the memory-mapped file."""
-    return np.array(data, dtype=data.dtype.newbyteorder("="), subok=False)
+    native = data.dtype.newbyteorder("=")
+    if native == data.dtype and native.itemsize and not native.hasobject:
+        # As plain bytes: NumPy copies records field after field.
+        return np.array(data.view(np.uint8), subok=False).view(native)
+    return np.array(data, dtype=native, subok=False)
 
 
 def _parse(path: Path, within: Path | None) -> Any:
