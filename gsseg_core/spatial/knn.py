@@ -14,7 +14,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
-from gsseg_core.simd import count_at_most, squared_distances, store_row
+from gsseg_core.simd import at_most, count_at_most, first_bit, load_row, squared_distances, store_row
 from gsseg_core.spatial.kd_tree import LEAF, Tree, gap, leaf_of, leaf_range
 
 CHUNK = 256  # consecutive points of one thread
@@ -27,21 +27,25 @@ LEAST = np.finfo(np.float32).tiny  # a bound that even points in one place are b
 
 
 @kernel(parallel=True)
-def nearest(tree: Tree, places: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+def nearest(tree: Tree, places: np.ndarray, k: int, most: int) -> tuple[np.ndarray, ...]:
     """Find the squared distance to the k-th nearest other point, (M,) float32, and the mean of the k, (M,) float64.
 
     They are looked for from the points at ascending places, (M,) int32. By the triangle inequality the radius of one
     point bounds those of all others in its leaf.
+
+    If asked for, up to `most` places of each point are listed that are no farther. Then come how many these are, (M,),
+    and room with the lists of each chunk of points one after the other, from chunk CHUNK * most on.
     """
     points, boxes = tree.points, tree.boxes
     m, n, leaves = places.shape[0], points.shape[1], boxes.shape[0] // 2
     radii, distances = np.empty(m, np.float32), np.empty(m, np.float64)
     bits, skip = radii.view(np.int32), np.empty(0, np.int32)
+    counts, room = np.zeros(m, np.int64), np.empty(m * most, np.int32)  # of which what no list fills is not touched
     for chunk in nb.prange((m + CHUNK - 1) // CHUNK):
         gaps, close, candidates = np.empty(DEPTH, np.float32), np.empty(3 * k + 2 * LEAF, np.float32), scratch_for(128)
         box, bounds = np.empty(6, np.float32), np.empty((2, LEAF), np.float32)
         bound_bits = bounds.view(np.int32)
-        before, first = -1, chunk * CHUNK
+        before, first, end = -1, chunk * CHUNK, chunk * CHUNK * most
         while first < min((chunk + 1) * CHUNK, m):
             last = end_of_group(tree, places, first)
             middle = middle_of(points, places, first, last, box)
@@ -60,8 +64,25 @@ def nearest(tree: Tree, places: np.ndarray, k: int) -> tuple[np.ndarray, np.ndar
                 _leave_out(own, leaf_of(own, leaves, n), leaves, n, rows, candidates)
                 bits[q] = _smallest(near_bits, rows, k, bound_bits[0, q - first], bound_bits[1, q - first])
                 distances[q] = _mean_root(near, LEAF * rows, k, radii[q])
+                if most > 0:
+                    counts[q] = _list(candidates, rows, radii[q], leaves, n, room[end : end + most])
+                    end += counts[q]
             before, first = middle, last
-    return radii, distances
+    return radii, distances, counts, room
+
+
+@called_by_kernels
+def _list(candidates: LeafCandidates, rows: int, radius: float, leaves: int, n: int, out: np.ndarray) -> int:
+    """List places of what was measured and is within the radius, as many as there is room for; returns how many."""
+    count = 0
+    for h in range(rows):
+        start = leaf_range(candidates.leaves[candidates.reached[h]], leaves, n)[0]
+        within = at_most(load_row(candidates.near, h), radius)
+        while within and count < len(out):
+            out[count] = start + first_bit(within)
+            within &= within - 1
+            count += 1
+    return count
 
 
 @called_by_kernels

@@ -19,11 +19,9 @@ from gsseg_core.csr_rows import starts
 from gsseg_core.kernels.compiler import kernel
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
-from gsseg_core.simd import at_most, first_bit, load_row
-from gsseg_core.spatial.kd_tree import Tree, leaf_range, scaled, tree_of
-from gsseg_core.spatial.knn import find_leaves, measure, nearest, scratch_for
+from gsseg_core.spatial.kd_tree import Tree, scaled, tree_of
+from gsseg_core.spatial.knn import CHUNK, nearest
 
-PARTS = 64  # of the points, whose neighbours are listed one after the other
 NEIGHBOURS = 12  # neighbours of a Gaussian in its graph, unless others are asked for
 
 
@@ -47,12 +45,12 @@ class Graph:
             return cls(k, np.arange(len(means), dtype=np.int32), np.zeros(len(means) + 1, np.int64),
                        np.empty(0, np.int32), np.empty(0, np.float32))  # fmt: skip
         tree, num = tree or Tree.build(scaled(means)), min(k, len(means) - 1)
-        radii, _ = nearest(tree, np.arange(len(means), dtype=np.int32), num)
         # A thousand points in one place are all tied: without a limit, each would have a thousand neighbours.
-        most, counts = 2 * num, np.empty(len(means), np.int64)
-        room = np.empty(most * len(means), np.int32)  # Of which about half is touched.
-        lists = _list_near(tree, radii, most, counts, room)
-        indptr, indices = starts(counts), np.concatenate([room[first:last] for first, last in lists.tolist()])
+        most = 2 * num
+        radii, _, counts, room = nearest(tree, np.arange(len(means), dtype=np.int32), num, most)
+        lengths = np.add.reduceat(counts, np.arange(0, len(means), CHUNK))
+        lists = (room[CHUNK * most * chunk :][:length] for chunk, length in enumerate(lengths.tolist()))
+        indptr, indices = starts(counts), np.concatenate(list(lists))
         del room
         contrast = _compare(np.ascontiguousarray(colors[tree.order], np.float32), indptr, indices)
         # Painted scenes have areas of one colour; where there is only one, it tells nothing.
@@ -71,39 +69,6 @@ def graph_of(scene: GaussianScene, k: int = NEIGHBOURS) -> Graph:
         return Graph.build(scene.means, scene.colors(), k, tree_of(scene) if len(scene) else None)
 
     return _KNOWN.of(scene, build, lambda known: known.k == k)
-
-
-@kernel(parallel=True)
-def _list_near(
-    tree: Tree, radii: np.ndarray, most: int,  # (n,) squared; for one point
-    counts: np.ndarray, room: np.ndarray,  # (n,) int64 out; (n most,) int32 out
-) -> np.ndarray:  # fmt: skip
-    """List the others within the radius of each point, and count them.
-
-    Returns where in the room the lists of each part of the points begin and end, (PARTS, 2).
-    """
-    n, leaves, skip, lists = len(radii), len(tree.blocks), np.empty(0, np.int32), np.empty((PARTS, 2), np.int64)
-    for part in nb.prange(PARTS):
-        candidates = scratch_for(128)
-        begin, end = part * leaves // PARTS, (part + 1) * leaves // PARTS
-        e = begin * n // leaves * most
-        lists[part, 0] = e
-        for leaf in range(begin, end):
-            first, last = leaf_range(leaf, leaves, n)
-            box, reach = tree.boxes[leaves + leaf], radii[first:last].max()
-            candidates, found = find_leaves(tree.boxes, box, reach, skip, np.int32(0), candidates)
-            for own in range(first, last):
-                before = e
-                for h in range(measure(tree, own, radii[own], found, candidates)):
-                    start = leaf_range(candidates.leaves[candidates.reached[h]], leaves, n)[0]
-                    within = at_most(load_row(candidates.near, h), radii[own])
-                    while within and e < before + most:
-                        room[e] = start + first_bit(within)
-                        within &= within - 1
-                        e += room[e] != own
-                counts[own] = e - before
-        lists[part, 1] = e
-    return lists
 
 
 @kernel(parallel=True)

@@ -70,7 +70,7 @@ class Neighbours:
             missing = np.isnan(self.radii)
             places = np.flatnonzero(missing if wanted is None else missing & wanted).astype(np.int32)
             if len(places):
-                self.radii[places], self.distances[places] = knn.nearest(self.tree, places, self.k)
+                self.radii[places], self.distances[places] = knn.nearest(self.tree, places, self.k, 0)[:2]
         return self
 
     def mean_codes(

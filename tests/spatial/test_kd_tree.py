@@ -63,7 +63,7 @@ def test_a_tree_holds_every_point_once_inside_the_boxes_of_all_its_nodes(points:
 def test_the_nearest_others_are_as_far_as_scipy_finds_them(points: np.ndarray, k: int) -> None:
     k, tree = min(k, len(points) - 1), Tree.build(points)
     expected = of_others(points, k)
-    radii, means = nearest(tree, np.arange(len(points), dtype=np.int32), k)
+    radii, means, _, _ = nearest(tree, np.arange(len(points), dtype=np.int32), k, 0)
     size = np.abs(points).max()
     np.testing.assert_allclose(np.sqrt(radii), expected[tree.order, -1], rtol=1e-5, atol=1e-6 * size)
     np.testing.assert_allclose(means, expected[tree.order].mean(axis=1), rtol=1e-5, atol=1e-6 * size)
@@ -76,7 +76,7 @@ def test_a_part_of_a_tree_is_a_tree_of_these_points(points: np.ndarray, seed: in
         return
     part = Tree.build(points).part(chosen)
     k = min(3, len(chosen) - 1)
-    radii, _ = nearest(part, np.arange(len(chosen), dtype=np.int32), k)
+    radii, *_ = nearest(part, np.arange(len(chosen), dtype=np.int32), k, 0)
     expected = of_others(part.points.T, k)[:, -1]
     np.testing.assert_allclose(np.sqrt(radii), expected, rtol=1e-5, atol=1e-6 * np.abs(points).max())
 
