@@ -135,6 +135,7 @@ def _learn_something(device: str) -> None:
     learner.observe(View.from_arrays(replace(camera, name="wrong"), 1 - labels))
     learner.fit()
     learner.predict_without(view)
+    learner.evidence()
 
 
 def refine_something(device: str = "cpu") -> None:

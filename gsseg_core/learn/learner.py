@@ -16,7 +16,7 @@ from gsseg_core.data.label_evidence import impute_probabilities, is_resolved
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
-from gsseg_core.learn.em.em_kernels import normalise_votes
+from gsseg_core.learn.em.em_kernels import count_votes, normalise_votes
 from gsseg_core.learn.learner_state import State
 from gsseg_core.learn.prepared_views import PreparedViews, default_budget
 from gsseg_core.progress import Progress as Progress
@@ -266,7 +266,7 @@ class Learner(ABC):
     def evidence(self) -> np.ndarray:
         """Weight of the labelled pixels that saw each Gaussian, over all views, in px, (N,) float32."""
         # Votes against a class are evidence as much as votes for one.
-        evidence: np.ndarray = (np.abs(self._votes).sum(axis=1) * VOTE_UNIT).astype(np.float32)
+        evidence: np.ndarray = (count_votes(self._votes) * VOTE_UNIT).astype(np.float32)
         return evidence
 
     def reject_summary(self) -> dict[str, int]:

@@ -206,3 +206,14 @@ def normalise_votes(votes: np.ndarray, possible: np.ndarray, codes: np.ndarray) 
             else:
                 unsure += 1
     return unsure
+
+
+@kernel(parallel=True)
+def count_votes(votes: np.ndarray) -> np.ndarray:
+    """Add up the sizes of votes, (N, K) int64, for and against classes: (N,) int64."""
+    total = np.empty(votes.shape[0], np.int64)
+    for i in nb.prange(votes.shape[0]):
+        total[i] = 0
+        for k in range(votes.shape[1]):
+            total[i] += abs(votes[i, k])
+    return total
