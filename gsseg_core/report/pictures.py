@@ -72,14 +72,12 @@ class ViewImages:
         return image
 
 
-def draw_triple(
-    check: ViewCheck, view: View, images: ViewImages, colors: np.ndarray, largest: int = PICTURE_PX
-) -> Triple:
+def draw_triple(check: ViewCheck, view: View, images: ViewImages, colors: np.ndarray) -> Triple:
     """Lay a view's mask and what is predicted over its image, in colours (K, 3) of classes; show where they differ.
 
-    Large ones are thinned out, to be shown with at most `largest` px a side.
+    Large ones are thinned out, to be shown with at most `PICTURE_PX` px a side.
     """
-    image, mask, predicted = shown_at(largest, images.of(view), view.read_labels(), check.prediction())
+    image, mask, predicted = shown_at(PICTURE_PX, images.of(view), view.read_labels(), check.prediction())
     grey = image.mean(axis=2, keepdims=True)
     unknown = (mask == UNKNOWN) | (predicted == UNKNOWN)
     tint = np.where(unknown[..., None], _UNKNOWN, np.where((mask != predicted)[..., None], _DIFFER, _AGREE))

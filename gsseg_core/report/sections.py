@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gsseg_core.data.object_tree import ObjectTree
-from gsseg_core.export.pictures import palette
+from gsseg_core.export.pictures import overlay, palette, shown_at
 from gsseg_core.report.findings import TRUSTED, Evidence, class_ious, largest_confusions, most_confused
 from gsseg_core.report.pictures import PICTURE_PX, THUMBNAIL_PX, ViewImages, draw_triple, jpeg_uri, thumbnails
 from gsseg_core.report.preview import look_from, make_preview, up_of
@@ -104,7 +104,9 @@ def preview(run: PageInputs) -> Content:
     cameras = [views[check.name].camera for check in ranked[:LOOKS]]
     poster = None
     if ranked:
-        poster = draw_triple(ranked[0], views[ranked[0].name], run.images, run.colors, POSTER_PX).prediction
+        seen = run.images.of(views[ranked[0].name])
+        seen, predicted = shown_at(POSTER_PX, seen, ranked[0].prediction())
+        poster = overlay(seen, predicted, run.colors)
     legend = [
         {"label": k, "name": name, "color": colors[k].tolist(), "count": count, "now": k < segmentation.num_classes}
         for k, name, count in run.nodes
