@@ -29,6 +29,7 @@ from gsseg_core.files.run_folder import settle
 from gsseg_core.learn.temperature import tempered
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.view_operator import ViewOperator
+from gsseg_core.raster.view_renderer import Blended
 from gsseg_core.refine.knn_filter import cluster_in_place, statistical_filter
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.refine.silhouette_carving import Silhouette, carve
@@ -264,9 +265,14 @@ class Segmentation:
 
     def label_map(self, operator: ViewOperator) -> np.ndarray:
         """Class of every pixel of a view, (H, W) int32: those of `render`, without the confidence."""
+        return self.label_map_beside(operator, np.empty((len(operator.ids), 0), np.float32))[0]
+
+    def label_map_beside(self, operator: ViewOperator, others: np.ndarray) -> tuple[np.ndarray, Blended]:
+        """Do the same, and blend in one pass what else Gaussians carry, (M, C) of the operator's `ids`, as colours."""
         codes, shows_background = self._blended
-        strongest = operator.strongest(codes, len(self.class_names), shows_background)
-        return np.asarray(self.class_ids[strongest.classes])
+        found = operator.strongest(codes, len(self.class_names), shows_background, beside=others)
+        assert found.beside is not None
+        return self.class_ids[found.classes], found.beside
 
     def blend(self, operator: ViewOperator) -> np.ndarray:
         """Blend what was learnt into a view, (H, W, K) float32, not calibrated; rows sum to what is known of a pixel.

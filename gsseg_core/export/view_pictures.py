@@ -16,7 +16,7 @@ from gsseg_core.data.view import View
 from gsseg_core.export.pictures import CELL_PX, contact_sheet, legend, overlay, palette, save_png, shown_at
 from gsseg_core.learn.mask_reliability import WORST, ViewCheck, worst_views
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.raster.depth import colours_and_depth, surface_of
+from gsseg_core.raster.depth import surface_of, with_depths
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.refine.silhouette_carving import Silhouette
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -83,8 +83,8 @@ def draw_views(
 
     def draw(view: View) -> Drawn:
         operator = make_operator(scene, view.camera, device)
-        labels = segmentation.label_map(operator)
-        return Drawn.of(view, labels, background_image(scene, operator), segmentation.num_classes)
+        labels, seen = segmentation.label_map_beside(operator, scene.colors(view.camera.center, operator.ids))
+        return Drawn.of(view, labels, as_pixels(seen.image), segmentation.num_classes)
 
     yield from two_at_once(draw, views, device)
 
@@ -102,13 +102,13 @@ def look_at(
     names = {view.name for view in pictured}
 
     def look(view: View) -> Silhouette:
-        operator, depth = make_operator(scene, view.camera, device), None
-        labels = segmentation.label_map(operator)
-        if view.name in names:
-            image, left_over = colours_and_depth(scene, operator)
-            depth = surface_of(image[..., 3], left_over).depth
+        operator, pictured = make_operator(scene, view.camera, device), view.name in names
+        nothing = np.empty((len(operator.ids), 0), np.float32)
+        colors = scene.colors(view.camera.center, operator.ids) if pictured else nothing
+        labels, (image, left_over) = segmentation.label_map_beside(operator, with_depths(scene, operator, colors))
+        if pictured:
             drawn[view.name] = Drawn.of(view, labels, as_pixels(image[..., :3]), segmentation.num_classes)
-        return Silhouette.of(scene, operator, labels, depth)
+        return Silhouette.of(scene, operator, labels, surface_of(image[..., -1], left_over).depth)
 
     yield from two_at_once(look, views, device)
 

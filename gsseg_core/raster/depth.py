@@ -40,8 +40,12 @@ def surface_of(depth: np.ndarray, left_over: np.ndarray) -> Surface:  # (H, W), 
 
 def colours_and_depth(scene: GaussianScene, operator: ViewOperator) -> Blended:
     """Blend the colours of a scene and the depths of its centres into a view: (H, W, 4) float32, and what is left."""
-    colors, depth = scene.colors(operator.camera.center, operator.ids), depths(scene, operator.camera, operator.ids)
-    return operator.blend_seen(np.concatenate([colors, depth[:, None]], axis=1))
+    return operator.blend_seen(with_depths(scene, operator, scene.colors(operator.camera.center, operator.ids)))
+
+
+def with_depths(scene: GaussianScene, operator: ViewOperator, others: np.ndarray) -> np.ndarray:
+    """Put the depth of each Gaussian of an operator behind what else it is to blend, (M, C): (M, C + 1) float32."""
+    return np.concatenate([others, depths(scene, operator.camera, operator.ids)[:, None]], axis=1)
 
 
 def depths(scene: GaussianScene, camera: Camera, ids: np.ndarray | None = None) -> np.ndarray:

@@ -37,12 +37,13 @@ class Strongest(NamedTuple):
     classes: np.ndarray  # (H, W) int32: the column of the largest blended probability
     known: np.ndarray  # (H, W) float32: what is known of the pixel, the sum of its probabilities
     some: np.ndarray  # (R, C, K) float32: all probabilities of the pixels of a grid; R and C are 0 without one
+    beside: Blended | None = None  # what else was blended
 
     @classmethod
-    def of(cls, image: np.ndarray, grid: PixelGrid | None = None) -> Strongest:  # (H, W, K)
-        """Find it in an image of probabilities."""
+    def of(cls, image: np.ndarray, grid: PixelGrid | None = None, beside: Blended | None = None) -> Strongest:
+        """Find it in an image of probabilities, (H, W, K)."""
         some = image[:0, :0] if grid is None else grid.of(image)
-        return cls(image.argmax(axis=2).astype(np.int32), image.sum(axis=2), some)
+        return cls(image.argmax(axis=2).astype(np.int32), image.sum(axis=2), some, beside)
 
     def labels(self) -> np.ndarray:
         """Class of each pixel of which more than half is known, (H, W) int32; `UNKNOWN` elsewhere."""
@@ -96,16 +97,31 @@ class ViewRenderer(ABC):
     def blend_seen(self, codes: np.ndarray) -> Blended:
         """Do the same for codes (M, K) of `ids` alone."""
 
-    def blend_rows(self, codes: CSRRows, num_classes: int) -> Blended:
-        """Do the same for codes (N, K) of which only the entries that are not zero are at hand."""
-        return self.blend_seen(codes.take(self.ids).dense(num_classes))
+    def blend_rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None = None) -> Blended:
+        """Do the same for codes (N, K) of which only the entries that are not zero are at hand.
 
-    def strongest(self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid | None = None) -> Strongest:
-        """Find the class of each pixel, from codes (N, K) of which only the entries that are not zero are at hand.
-
-        What a ray has left over is `background`, class 0, or else nothing.
+        If they are those of some Gaussians, (R, K), `of` says of which, (R,) distinct: all of `ids` are among them.
         """
-        image, left_over = self.blend_rows(codes, num_classes)
+        return self.blend_seen(codes.take(self._rows(of)).dense(num_classes))
+
+    def strongest(
+        self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid | None = None,
+        of: np.ndarray | None = None, beside: np.ndarray | None = None,
+    ) -> Strongest:  # fmt: skip
+        """Find the class of each pixel, from codes as `blend_rows` takes them.
+
+        What a ray has left over is `background`, class 0, or else nothing. Codes `beside` these, (M, C) of `ids`, as
+        colours, are blended in the same pass, as `blend_seen` does.
+        """
+        image, left_over = self.blend_rows(codes, num_classes, of)
         if background:
             image[..., 0] += left_over
-        return Strongest.of(image, grid)
+        return Strongest.of(image, grid, None if beside is None else self.blend_seen(beside))
+
+    def _rows(self, of: np.ndarray | None) -> np.ndarray:
+        """Tell which row of such codes each of `ids` has, (M,) int32."""
+        if of is None:
+            return self.ids
+        place = np.empty(self.num_gaussians, np.int32)
+        place[of] = np.arange(len(of), dtype=np.int32)
+        return np.asarray(place[self.ids])

@@ -94,6 +94,30 @@ def test_the_strongest_class_is_the_largest_of_all_that_are_rendered(backend, ch
     np.testing.assert_array_equal(found.labels(), np.where(found.known > 0.5, found.classes, -1))
 
 
+@pytest.mark.parametrize("others", [0, 1, 4])
+def test_what_is_blended_beside_the_strongest_class_is_what_is_blended_alone(backend, others):
+    scene, camera = random_view(others, 150, 37, 21)
+    operator, rng = backend.make(scene, camera), np.random.default_rng(others)
+    codes = CSRRows.from_dense(rng.choice([0, 0.25, 1], (len(scene), 5)).astype(np.float32))
+    beside = rng.normal(size=(len(operator.ids), others)).astype(np.float32)
+    found, alone = operator.strongest(codes, 5, True, beside=beside), operator.blend_seen(beside)
+    np.testing.assert_allclose(found.beside.image, alone.image, atol=1e-5)
+    np.testing.assert_allclose(found.beside.transmittance, alone.transmittance, atol=1e-7)
+    np.testing.assert_array_equal(found.classes, operator.strongest(codes, 5, True).classes)
+
+
+def test_codes_of_some_gaussians_blend_as_those_of_all(backend):
+    scene, camera = random_view(1, 150, 37, 21)
+    operator, rng = backend.make(scene, camera), np.random.default_rng(1)
+    codes = CSRRows.from_dense(rng.choice([0, 0.25, 1], (len(scene), 5)).astype(np.float32))
+    some = np.unique(np.append(operator.ids, [0, len(scene) - 1])).astype(np.int32)
+    few = codes.take(some)
+    np.testing.assert_array_equal(operator.blend_rows(few, 5, some).image, operator.blend_rows(codes, 5).image)
+    np.testing.assert_array_equal(
+        operator.strongest(few, 5, False, of=some).classes, operator.strongest(codes, 5, False).classes
+    )
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_visibility_agrees_with_the_naive_rasteriser(backend, seed):
     scene, camera = random_view(seed)

@@ -217,22 +217,24 @@ class EMLearner(Learner):
 
         The spatial prior is left out, too, so rows sum to less where no other view has seen anything.
         """
-        codes, background, operator = self._without(view, only_labelled)
-        image, left_over = operator.blend_rows(codes, self.num_classes)
+        codes, of, background, operator = self._without(view, only_labelled)
+        image, left_over = operator.blend_rows(codes, self.num_classes, of)
         if background:
             image[..., 0] += left_over
         return image
 
     def strongest_without(self, view: View, only_labelled: bool = False, grid: PixelGrid | None = None) -> Strongest:
         """Tell the class of each pixel by `predict_without`, without an image of all classes."""
-        codes, background, operator = self._without(view, only_labelled)
-        return operator.strongest(codes, self.num_classes, background, grid)
+        codes, of, background, operator = self._without(view, only_labelled)
+        return operator.strongest(codes, self.num_classes, background, grid, of)
 
-    def _without(self, view: View, only_labelled: bool) -> tuple[CSRRows, bool, ViewRenderer]:
-        """Take the last step of `fit` once more, without a view's mask: codes, N rows, and what to blend them with.
+    def _without(
+        self, view: View, only_labelled: bool
+    ) -> tuple[CSRRows, np.ndarray | None, bool, ViewRenderer]:  # fmt: skip
+        """Take the last step of `fit` once more, without a view's mask: codes, and what to blend them with.
 
-        If only its labelled pixels count, what they see is at hand, and all other rows are empty. Between the two is
-        told whether any code has a share of the background.
+        If only its labelled pixels count, what they see is at hand, and the codes are those of these Gaussians, whose
+        ids come second; else of all. Third is told whether any code has a share of the background.
         """
         assert self._last_step is not None, "expected fit() first"
         codes, gradient = self._last_step
@@ -240,9 +242,8 @@ class EMLearner(Learner):
         stepped = codes_without(observation, self.error_models_[view.name], codes, gradient, no_prior)
         background = bool((codes.indices == 0).any())
         if only_labelled:
-            seen = stepped.scattered(observation.ids, len(self.scene))
-            return seen, background, observation.operator(view.camera, len(self.scene))
-        return codes.with_rows(observation.ids, stepped), background, self._operator_of(view)
+            return stepped, observation.ids, background, observation.operator(view.camera, len(self.scene))
+        return codes.with_rows(observation.ids, stepped), None, background, self._operator_of(view)
 
     def rejected_share(self, view: View) -> float:
         """Share of a view's labelled pixels that lie in rejected regions."""

@@ -44,36 +44,44 @@ def _put(
 
 
 @kernel(parallel=True)
-def render(tiles: Tiles, codes: CSRRows, channels: int) -> tuple[np.ndarray, np.ndarray]:
-    """Blend codes of the M projected Gaussians, float32: W q, (H, W, K) float32, and final transmittance, (H, W)."""
-    out, left_over = _blank(tiles, channels)
+def render(tiles: Tiles, codes: CSRRows, rows: np.ndarray, channels: int) -> tuple[np.ndarray, np.ndarray]:
+    """Blend codes of the M projected Gaussians, float32: W q, (H, W, K) float32, and final transmittance, (H, W).
+
+    Which row of the codes each of them has say `rows`, (M,) int32.
+    """
+    (out, left_over), nothing_else = _blank(tiles, channels), np.empty((len(rows), 0), np.float32)
     stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
         tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
         values, rays = np.zeros((TILE, channels, TILE), np.float32), np.empty((TILE, TILE), np.float32)
-        _blend_codes(tiles, tile, codes, values, rays)
+        _blend_codes(tiles, tile, codes, rows, nothing_else, values, np.empty((TILE, 0, TILE), np.float32), rays)
         _put(tiles, tile, values, rays, out, left_over)
     return out, left_over
 
 
 @kernel(parallel=True)
 def strongest(
-    tiles: Tiles, codes: CSRRows, channels: int, background: bool, first: int, step: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    tiles: Tiles, codes: CSRRows, rows: np.ndarray, channels: int, background: bool, first: int, step: int,
+    beside: np.ndarray,  # (M, C) float32
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Find the column of the largest blended code in each pixel, (H, W) int32, the first of equal ones, and the sum.
 
     What a ray has left over is added to column 0, if that is the background. No image of all columns is written, but
-    for each step-th pixel of rows and columns, from the first on: (R, C, K).
+    for each step-th pixel of rows and columns, from the first on: (R, C, K). Then comes what `render_few` makes of the
+    codes `beside` these.
     """
     out, total = np.empty((tiles.height, tiles.width), np.int32), np.empty((tiles.height, tiles.width), np.float32)
     some = np.empty((len(range(first, tiles.height, step)), len(range(first, tiles.width, step)), channels), np.float32)
+    image, left_over = _blank(tiles, beside.shape[1])
     stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
         tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
         values, rays = np.zeros((TILE, channels, TILE), np.float32), np.empty((TILE, TILE), np.float32)
+        others = np.zeros((TILE, beside.shape[1], TILE), np.float32)
         best, known = np.zeros((TILE, TILE), np.int32), np.empty((TILE, TILE), np.float32)
-        _blend_codes(tiles, tile, codes, values, rays)
+        _blend_codes(tiles, tile, codes, rows, beside, values, others, rays)
         _compare(values, rays, background, best, known)
+        _put(tiles, tile, others, rays, image, left_over)
         left, top = corner_of(tiles, tile)
         for r in range(min(TILE, tiles.height - top)):
             for c in range(min(TILE, tiles.width - left)):
@@ -86,7 +94,7 @@ def strongest(
                     for k in range(channels):
                         some[(top + r) // step, (left + c) // step, k] = values[b, k, lane]
                     some[(top + r) // step, (left + c) // step, 0] += rays[b, lane] if background else np.float32(0)
-    return out, total, some
+    return out, total, some, image, left_over
 
 
 @called_by_kernels
@@ -110,10 +118,13 @@ def _compare(
 
 @called_by_kernels(fastmath={"contract"}, error_model="numpy")
 def _blend_codes(
-    tiles: Tiles, tile: int, codes: CSRRows,
-    values: np.ndarray, rays: np.ndarray,  # (16, K, 16) in: zeros; (16, 16) out: final transmittance, by block
+    tiles: Tiles, tile: int, codes: CSRRows, rows: np.ndarray, beside: np.ndarray,  # as `strongest` takes them
+    values: np.ndarray, others: np.ndarray, rays: np.ndarray,  # (16, K, 16), (16, C, 16) in: zeros; (16, 16) out
 ) -> None:  # fmt: skip
-    """Blend the codes of a tile; weights are used where they are made."""
+    """Blend the codes of a tile, and others beside them; weights are used where they are made.
+
+    Blocks come first, as in the final transmittances, `rays`.
+    """
     last, channels, (indptr, indices, data) = tiles.start[tile + 1], values.shape[1], codes
     lines = np.empty((2, 2, TILE), np.float32)
     left, top, live = open_rays(tiles, tile, rays)
@@ -121,11 +132,13 @@ def _blend_codes(
     for e in range(tiles.start[tile], last):
         g = tiles.entries[e]
         # Rows are anywhere in memory: they are asked for before they are needed.
-        prefetch(indptr, tiles.entries[min(e + 2 * AHEAD, last - 1)])
-        later = indptr[tiles.entries[min(e + AHEAD, last - 1)]]
+        prefetch(rows, tiles.entries[min(e + 3 * AHEAD, last - 1)])
+        prefetch(beside, tiles.entries[min(e + AHEAD, last - 1)])
+        prefetch(indptr, rows[tiles.entries[min(e + 2 * AHEAD, last - 1)]])
+        later = indptr[rows[tiles.entries[min(e + AHEAD, last - 1)]]]
         prefetch(indices, later)
         prefetch(data, later)
-        first, end = indptr[g], indptr[g + 1]
+        first, end = indptr[rows[g]], indptr[rows[g] + 1]
         reached, own, wide = ahead & live, lines[e % 2], tiles.table[g, WIDTH]
         ahead = aim_next(tiles, e, last, left, top, lines)
         while reached:
@@ -135,6 +148,9 @@ def _blend_codes(
             for z in range(first, end):
                 k = np.int64(b) * channels + np.int64(indices[z])
                 store_row(values, k, add_scaled(load_row(values, k), weight, data[z]))
+            for c in range(beside.shape[1]):
+                k = np.int64(b) * beside.shape[1] + c
+                store_row(others, k, add_scaled(load_row(others, k), weight, beside[g, c]))
             if not bits & OPEN:
                 live &= ~(1 << b)
         if not live:
