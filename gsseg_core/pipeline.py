@@ -191,15 +191,15 @@ def segment(
             run.claim(segment_places(inputs.class_names, inputs.pictured, settings))
             fitted = _learn(inputs, settings, client, watch, progress)
             assessment = _assess(fitted, inputs.class_names, watch, progress)
-        probabilities, evidence = fitted.codes_, fitted.evidence()
+        codes, evidence = fitted.codes_, fitted.evidence()
         graph_settings = settings.graph if is_scarce(evidence) else None
         settings = replace(settings, graph=graph_settings, learner_settings=getattr(fitted, "settings", None))
         del fitted  # Its votes take as much memory as all that follows.
         with watch.stage("refine"):
             if settings.graph:
-                probabilities = spread_if_scarce(inputs.scene, probabilities, evidence)
-            result = Segmentation.from_codes(inputs.scene, probabilities, inputs.class_names, settings.refine)
-            del probabilities
+                codes = spread_if_scarce(inputs.scene, codes, evidence)
+            result = Segmentation.from_codes(inputs.scene, codes, inputs.class_names, settings.refine, copy=False)
+            del codes
         drawn: dict[str, Drawn] = {}
         if settings.refine.carve:
             with watch.stage("carve"):

@@ -101,6 +101,7 @@ class Segmentation:
         codes: np.ndarray,
         class_names: Mapping[int, str],
         settings: RefineSettings | None = None,
+        copy: bool = True,
     ) -> Segmentation:
         """Refine learnt codes by their neighbours, and label every Gaussian by its largest entry.
 
@@ -114,9 +115,12 @@ class Segmentation:
             Classes without a name get one like "class_07".
         settings : RefineSettings, optional
             Without the filter by default. What needs views is left to `carved`.
+        copy : bool
+            Whether the codes stay as they are; else they are changed, and no memory is taken for others.
         """
         settings = settings or RefineSettings()
-        result = cls.unfiltered(scene, np.array(codes, np.float32, order="C"), class_names, settings)
+        codes = np.array(codes, np.float32, order="C") if copy else np.ascontiguousarray(codes, np.float32)
+        result = cls.unfiltered(scene, codes, class_names, settings)
         return result.filtered(scene, settings) if settings.filter else result
 
     @classmethod

@@ -16,7 +16,7 @@ from gsseg_core.data.label_evidence import impute_probabilities, is_resolved
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
-from gsseg_core.learn.em.em_kernels import count_votes, normalise_votes
+from gsseg_core.learn.em.em_kernels import normalise_votes, weigh_votes
 from gsseg_core.learn.learner_state import State
 from gsseg_core.learn.prepared_views import PreparedViews, default_budget
 from gsseg_core.progress import Progress as Progress
@@ -266,7 +266,7 @@ class Learner(ABC):
     def evidence(self) -> np.ndarray:
         """Weight of the labelled pixels that saw each Gaussian, over all views, in px, (N,) float32."""
         # Votes against a class are evidence as much as votes for one.
-        evidence: np.ndarray = (count_votes(self._votes) * VOTE_UNIT).astype(np.float32)
+        evidence: np.ndarray = (weigh_votes(self._votes)[0] * VOTE_UNIT).astype(np.float32)
         return evidence
 
     def reject_summary(self) -> dict[str, int]:
@@ -372,12 +372,11 @@ class Learner(ABC):
 
     def _finish(self) -> None:
         """Clear codes without evidence, and impute those of Gaussians with votes only against classes."""
-        unsure = np.flatnonzero(~self.observed_)
+        unsure, against = ~self.observed_, weigh_votes(self._votes)[1] < 0
         # A Gaussian with votes for a class that is not `observed_` was seen in rejected regions only: it stays unknown.
-        seen = (self._votes[unsure] < 0).any(axis=1)
-        self.codes_[unsure[~seen]] = 0.0
-        if seen.any():
-            impute_probabilities(self.codes_, self._votes, self._possible(), unsure[seen])
+        self.codes_[unsure & ~against] = 0.0
+        if (unsure & against).any():
+            impute_probabilities(self.codes_, self._votes, self._possible(), np.flatnonzero(unsure & against))
             self.observed_[unsure] = self.codes_[unsure].any(axis=1)
 
     def _blend_codes(self, codes: np.ndarray, view: View) -> np.ndarray:

@@ -209,11 +209,11 @@ def normalise_votes(votes: np.ndarray, possible: np.ndarray, codes: np.ndarray) 
 
 
 @kernel(parallel=True)
-def count_votes(votes: np.ndarray) -> np.ndarray:
-    """Add up the sizes of votes, (N, K) int64, for and against classes: (N,) int64."""
-    total = np.empty(votes.shape[0], np.int64)
+def weigh_votes(votes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sum of the sizes of votes (N, K) int64, for and against classes, and the least of them and 0, (N,) int64 each."""
+    total, least = np.zeros(votes.shape[0], np.int64), np.zeros(votes.shape[0], np.int64)
     for i in nb.prange(votes.shape[0]):
-        total[i] = 0
         for k in range(votes.shape[1]):
             total[i] += abs(votes[i, k])
-    return total
+            least[i] = min(least[i], votes[i, k])
+    return total, least
