@@ -16,6 +16,7 @@ import numpy as np
 from numba.core import event
 
 from gsseg_core.data.view import View
+from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.kernels import kernel_cache
 from gsseg_core.learn.em.boundary_alignment import align_boundaries
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
@@ -149,3 +150,4 @@ def refine_something(device: str = "cpu") -> None:
     operator = make_operator(scene, camera, device)
     result.render(operator)
     operator.render(scene.colors(camera.center))
+    overlay(np.zeros((*labels.shape, 3), np.uint8), labels, palette(2))

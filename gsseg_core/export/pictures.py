@@ -6,11 +6,13 @@ from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 
+import numba as nb
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from gsseg_core.data.label_images import run_text
 from gsseg_core.files.atomic import write_atomically
+from gsseg_core.kernels.compiler import kernel
 
 BACKGROUND = (58, 60, 66)
 """The colour of label 0, a dark neutral grey."""
@@ -73,21 +75,32 @@ def overlay(image: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.nda
     colors : ndarray (K, 3) uint8
         `palette(K)`.
     """
-    named, own = labels > 0, np.maximum(labels, 0)
-    seen = image.astype(np.float32)
-    grey = (seen[..., 0] + seen[..., 1] + seen[..., 2]) / 3
-    # Of a named pixel, its grey and its tint; of another, what was seen, greyed: one sum for both.
     tints = FILL * colors.astype(np.float32)
     tints[:1] = 0.65 * 30
-    blend = seen
-    blend *= np.where(named, np.float32(0), np.float32(0.35))[..., None]
-    blend += (np.where(named, np.float32(1 - FILL), np.float32(0.65 * 0.75)) * grey)[..., None]
-    blend += tints[own]
-    line = outline(labels)
-    blend[line & named] = np.minimum(1.12 * colors[own[line & named]], 255)
-    blend[line & ~named] *= 0.45
-    picture: np.ndarray = np.rint(blend, out=blend).astype(np.uint8)
+    lines = np.minimum(1.12 * colors, 255).astype(np.float32)
+    picture: np.ndarray = _tinted(np.array(image), np.array(labels, np.int32), tints, lines)
     return picture
+
+
+@kernel(parallel=True)
+def _tinted(image: np.ndarray, labels: np.ndarray, tints: np.ndarray, lines: np.ndarray) -> np.ndarray:
+    """Tint an image (H, W, 3) uint8 by labels (H, W) int32, with what areas and lines get of each, (K, 3) float32."""
+    height, width = labels.shape
+    out = np.empty((height, width, 3), np.uint8)
+    for y in nb.prange(height):
+        for x in range(width):
+            label, r, g, b = labels[y, x], image[y, x, 0], image[y, x, 1], image[y, x, 2]
+            line = (x > 0 and labels[y, x - 1] != label) or (x + 1 < width and labels[y, x + 1] != label)
+            line |= (y > 0 and labels[y - 1, x] != label) or (y + 1 < height and labels[y + 1, x] != label)
+            grey = (np.float32(r) + np.float32(g) + np.float32(b)) / np.float32(3)
+            for c in range(3):
+                if label > 0:
+                    value = lines[label, c] if line else np.float32(1 - FILL) * grey + tints[label, c]
+                else:
+                    value = np.float32(0.35) * np.float32(image[y, x, c]) + np.float32(0.65 * 0.75) * grey
+                    value = (value + tints[0, c]) * np.float32(0.45 if line else 1)
+                out[y, x, c] = np.uint8(np.rint(value))
+    return out
 
 
 def shown_at(px: int, image: np.ndarray, *labels: np.ndarray) -> tuple[np.ndarray, ...]:
