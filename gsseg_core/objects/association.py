@@ -25,7 +25,8 @@ cluster are those of the cluster.
    object meet on its surface and different objects do not. And the views tell where to stop. Let them show an object
    whole with the probability w, and merge neighbours with the probability m. Two objects are under one id, both whole,
    in w w m of the views, which is an agreement of w m, and parts of one in w of them: so merging goes on down to w, if
-   that is less than one half. It is read off the clusters at 0.6, as how often they are shown whole.
+   that is less than one half. It is read off the clusters at 0.6, as how often they are shown whole. Where more than a
+   fifth of those that touch agree by 0.3 to 0.6, any two are the likelier one object, and w counts less.
 4. **Segments move** to the object that explains them best by what the other views say, until none does. That gives
    leftovers, one half of something, say, to the whole, and clutter to the background; objects left without a segment
    are gone.
@@ -52,6 +53,7 @@ _BEST = 0.75  # pairs that agree nearly as well as the best one merge at once, b
 _MOST = 0.6  # agreement above which clusters are one object whatever the segmenter does
 _WHOLE = 0.5  # the level where segmenters hardly ever split an object, or too little is known
 _DOUBTED, _SPLIT = 0.3, 0.1  # agreement of parts of one object, at least; share of such pairs that means often split
+_MANY = 0.2  # such share beyond which any two are the likelier one object, the more there are
 _USUAL, _BORDER = 0.75, 100.0  # strength of depth edges between any two, taken for so many px more of their border
 _SURFACE, _FACTORS = 4.0, (0.75, 1.8)  # by how much agreement grows as edges get weaker, and between what
 _OFTEN = 5  # views in which clusters touch, or that see one, from which on they tell how the segmenter works
@@ -171,10 +173,11 @@ def _merge(stack: _Stack, settings: AssociationSettings) -> tuple[np.ndarray, fl
     """
     single, sure = _Clusters.single(stack), max(settings.agreement or 0, _MOST)
     clusters, votes = _merged(single, stack.view, settings, sure, surface=0.0)
-    split = votes.split(clusters.touching)
+    doubted = votes.doubted(clusters.touching)
+    split = min(doubted / _SPLIT, 1)
     if split > 0:  # Begun again, so that the surface has its say from the first pair on.
         clusters, votes = _merged(single, stack.view, settings, sure, surface=split)
-    agreement = settings.agreement or votes.told_level(split)
+    agreement = settings.agreement or votes.told_level(split, doubted)
     clusters, _ = _merged(clusters, stack.view, settings, agreement, surface=split)
     merged = np.zeros(len(stack.view), np.int64)
     merged[~stack.background] = clusters.of + 1
@@ -280,20 +283,24 @@ class _Votes(NamedTuple):
         agreement: np.ndarray = together / np.sqrt((see + doubt) * (show + doubt))
         return agreement
 
-    def split(self, touching: sparse.csr_matrix) -> float:
-        """Tell whether objects come in parts, 0 to 1, by how many of the clusters that touch may be one."""
+    def doubted(self, touching: sparse.csr_matrix) -> float:
+        """Tell which share of the clusters that touch, (C, C), may be parts of one object."""
         together, see, show = self._compared(*_often(touching))
         doubted = self._agreement(together, see, show)[see > _OFTEN] > _DOUBTED
-        return min(float(np.mean(doubted)) / _SPLIT, 1) if len(doubted) else 0.0
+        return float(np.mean(doubted)) if len(doubted) else 0.0
 
-    def told_level(self, split: float) -> float:
-        """Agreement above which clusters are one object, by how often views show them whole, and what `split` told."""
+    def told_level(self, split: float, doubted: float) -> float:
+        """Agreement above which clusters are one object, by how often views show them whole.
+
+        Takes whether objects come in parts at all, 0 to 1, and what `doubted` told.
+        """
         seen = self.counts.sum(axis=1)
         known = seen >= _OFTEN
         if not known.any():
             return _WHOLE
         whole = float(np.mean(self.shown[known].sum(axis=1) / seen[known]))
-        return _WHOLE - split * max(_WHOLE - whole, 0)
+        level = whole * np.sqrt(min(_MANY / doubted, 1)) if doubted else whole
+        return float(_WHOLE - split * max(_WHOLE - level, 0))
 
     def _compared(self, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Count, for pairs of clusters, views that show both whole under one id, see both, and show each whole."""
