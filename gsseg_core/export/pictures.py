@@ -74,7 +74,16 @@ def overlay(image: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.nda
         Label of each pixel; every one below K.
     colors : ndarray (K, 3) uint8
         `palette(K)`.
+
+    Raises
+    ------
+    ValueError
+        Labels are of another size, or have no colour: a kernel would read beyond the arrays.
     """
+    largest = int(labels.max(initial=0))
+    if labels.shape != image.shape[:2] or largest >= len(colors):
+        found, expected = f"{labels.shape} labels, up to {largest}", f"{image.shape[:2]}, below {len(colors)}"
+        raise ValueError(f"overlay: found {found}; expected {expected}")
     tints = FILL * colors.astype(np.float32)
     tints[:1] = 0.65 * 30
     lines = np.minimum(1.12 * colors, 255).astype(np.float32)

@@ -45,6 +45,12 @@ def test_more_classes_than_colours_still_get_one_each() -> None:
     assert palette(5000).shape == (5000, 3)
 
 
+@pytest.mark.parametrize("labels", [np.full((4, 5), 3), np.zeros((5, 5), int)])
+def test_labels_without_a_colour_or_of_another_size_are_refused(labels: np.ndarray) -> None:
+    with pytest.raises(ValueError, match=r"overlay: found .* expected \(4, 5\), below 3"):
+        overlay(np.zeros((4, 5, 3), np.uint8), labels, palette(3))
+
+
 def test_an_overlay_draws_lines_exactly_where_labels_change() -> None:
     labels = np.zeros((20, 30), int)
     labels[5:15, 10:20] = 1
