@@ -25,7 +25,7 @@ def two_at_once(work: Callable[[T], R], items: Iterable[T], device: str = "cpu")
     caller's.
     """
     threads = numba.get_num_threads()
-    if device != "cpu" or threads == 1 or not _kernels_run_beside_each_other():
+    if device != "cpu" or threads == 1 or not kernels_run_beside_each_other():
         yield from map(work, items)
         return
     begun: deque[Future[R]] = deque()
@@ -42,7 +42,7 @@ def two_at_once(work: Callable[[T], R], items: Iterable[T], device: str = "cpu")
                 future.cancel()
 
 
-def _kernels_run_beside_each_other() -> bool:
+def kernels_run_beside_each_other() -> bool:
     """Tell whether numba's threads are of a kind that serves several callers; it is known after the first kernel."""
     try:
         return bool(numba.threading_layer() != "workqueue")  # type: ignore[attr-defined]

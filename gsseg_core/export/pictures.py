@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 
-import numba as nb
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
@@ -91,12 +90,12 @@ def overlay(image: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.nda
     return picture
 
 
-@kernel(parallel=True)
+@kernel  # By one thread: several pictures are drawn at once.
 def _tinted(image: np.ndarray, labels: np.ndarray, tints: np.ndarray, lines: np.ndarray) -> np.ndarray:
     """Tint an image (H, W, 3) uint8 by labels (H, W) int32, with what areas and lines get of each, (K, 3) float32."""
     height, width = labels.shape
     out = np.empty((height, width, 3), np.uint8)
-    for y in nb.prange(height):
+    for y in range(height):
         for x in range(width):
             label, r, g, b = labels[y, x], image[y, x, 0], image[y, x, 1], image[y, x, 2]
             line = (x > 0 and labels[y, x - 1] != label) or (x + 1 < width and labels[y, x + 1] != label)

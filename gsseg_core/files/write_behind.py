@@ -7,6 +7,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Concatenate, ParamSpec
 
+from gsseg_core.two_at_once import kernels_run_beside_each_other
+
 Arguments = ParamSpec("Arguments")
 
 WriteBehind = Callable[Concatenate[Callable[Arguments, object], Arguments], None]
@@ -19,12 +21,16 @@ def writing_behind() -> Iterator[WriteBehind[...]]:
 
     To compress and to wait for the disk takes little of the cores that the body works on. Only what writes, or gets
     something ready for that, belongs there: nothing else may change what it is given. The first error of a writer is
-    raised with the next call, or at the end.
+    raised with the next call, or at the end. Where kernels of two threads cannot run beside each other, who calls it
+    writes: what is got ready may take a kernel, and numba would end the process.
     """
     with ThreadPoolExecutor(2, "gsseg-write") as threads:
         waiting: list[Future[object]] = []
 
         def write(job: Callable[..., object], *arguments: object, **named: object) -> None:
+            if not kernels_run_beside_each_other():
+                job(*arguments, **named)
+                return
             for done in [future for future in waiting if future.done()]:
                 waiting.remove(done)
                 done.result()

@@ -263,7 +263,8 @@ class SegmentNode(LifecycleNode):
 
     def _publish_again(self) -> None:
         """Publish anew what was published when the scene lay elsewhere, if the node is active; else it is due then."""
-        if not self.workspace.active or self.inputs is None:
+        inputs = self.inputs  # In another thread the node may be cleaned up meanwhile.
+        if not self.workspace.active or inputs is None:
             return
         self._out_of_place = False
         session = self.workspace.session if self.workspace.has_scene else None
@@ -277,7 +278,7 @@ class SegmentNode(LifecycleNode):
         notes += [f"; votes of {left} that are not kept any more stay as they were"] * (left > 0)
         self.get_logger().info(f"the scene was moved, and {following} views have followed{''.join(notes)}")
         if not self._requests.publish_again():
-            self.inputs.live.show_objects()
+            inputs.live.show_objects()
 
     def _show_change(self) -> None:
         if (inputs := self.inputs) is not None:

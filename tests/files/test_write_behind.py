@@ -11,6 +11,13 @@ from gsseg_core.errors import WriteError
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.write_behind import writing_behind
 
+KERNELS = "gsseg_core.files.write_behind.kernels_run_beside_each_other"
+
+
+@pytest.fixture(autouse=True)
+def kernels_of_two_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(KERNELS, lambda: True)
+
 
 def write(path: Path, text: str) -> None:
     with write_atomically(path) as temporary:
@@ -55,3 +62,11 @@ def test_an_error_of_the_work_itself_is_the_one_that_is_raised(tmp_path: Path) -
     with pytest.raises(KeyError), writing_behind() as behind:
         behind(write, tmp_path / "file" / "a", "text")
         raise KeyError
+
+
+def test_where_kernels_cannot_run_beside_each_other_the_caller_writes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(KERNELS, lambda: False)
+    threads = []
+    with writing_behind() as behind:
+        behind(lambda: threads.append(threading.current_thread()))
+    assert threads == [threading.current_thread()]
