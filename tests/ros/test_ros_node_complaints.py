@@ -76,6 +76,12 @@ def test_masks_that_are_lost_on_the_way_are_counted_and_said(ros: Ros, parameter
     robot.process.wait_for("dropped because they were lost on the way to this node (/mask: best effort, volatile)")
     status = robot.status()
     assert int(status["/mask lost on the way"]) == int(status["rejected lost"]) > 0
+
+    def fused() -> bool:
+        robot.drive(clean_views(1))
+        return bool(robot.ask("segment").error_code == 0)
+
+    ros.wait_until(fused, "a view to be fused, of which none was lost")
     assert "lost" in robot.ask("segment").report.rejection_reasons
 
 
