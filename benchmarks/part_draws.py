@@ -34,7 +34,7 @@ from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.photos import read_photo
 from gsseg_core.data.view import View
 from gsseg_core.objects.association import AssociationSettings, associate
-from gsseg_core.objects.lifted_segments import Lifted, lift
+from gsseg_core.objects.lifted_segments import Lifted
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.observation import Observation
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -130,10 +130,8 @@ class Trial:
         self.observations, self.lifted = dict[str, Observation](), dict[str, Lifted]()
         for view in views:
             operator, labels = make_operator(scene, view.camera), view.read_labels()
-            self.observations[view.name], self.lifted[view.name] = (
-                operator.observe(labels),
-                lift(scene, operator, labels),
-            )
+            self.observations[view.name] = observation = operator.observe(labels)
+            self.lifted[view.name] = Lifted.of(observation).bordered(scene, operator, labels)
 
     def score(self, settings: AssociationSettings) -> tuple[float, int, float]:
         """IoU of the objects one to one, how many were found, and the level."""

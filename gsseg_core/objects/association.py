@@ -299,7 +299,7 @@ class _Votes(NamedTuple):
         if not known.any():
             return _WHOLE
         whole = float(np.mean(self.shown[known].sum(axis=1) / seen[known]))
-        level = whole * np.sqrt(min(_MANY / doubted, 1)) if doubted else whole
+        level = whole * np.sqrt(_MANY / max(doubted, _MANY))
         return float(_WHOLE - split * max(_WHOLE - level, 0))
 
     def _compared(self, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

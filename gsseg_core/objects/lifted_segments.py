@@ -44,20 +44,13 @@ class Lifted:
         lifted = sparse.csr_matrix((weights, (row[segments], column)), shape=(len(order), len(gaussians)))
         return cls(observation.classes[order], gaussians, lifted)
 
+    def bordered(self, scene: GaussianScene, operator: ViewOperator, labels: np.ndarray) -> Lifted:
+        """Measure the borders between the segments of a mask, (H, W) integers, on the surface of the scene, too."""
+        return replace(self, borders=borders(labels, self.ids, depth_edges(scene, operator)))
+
     def __len__(self) -> int:
         """Count the segments."""
         return len(self.ids)
-
-
-def lift(
-    scene: GaussianScene,
-    operator: ViewOperator,
-    labels: np.ndarray,  # (H, W) integers, negative where unknown
-    kept: float = 0.8,
-) -> Lifted:
-    """Lift the ids of a mask as `Lifted.of` does, and measure the borders between them on the surface of the scene."""
-    lifted = Lifted.of(operator.observe(labels), kept)
-    return replace(lifted, borders=borders(labels, lifted.ids, depth_edges(scene, operator)))
 
 
 class Profiles:

@@ -15,7 +15,7 @@ from gsseg_core.errors import UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.objects.association import AssociationSettings, associate
-from gsseg_core.objects.lifted_segments import Lifted, Profiles, lift, sums
+from gsseg_core.objects.lifted_segments import Lifted, Profiles, sums
 from gsseg_core.objects.tree_growing import grow_tree
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -260,7 +260,10 @@ class ObjectTable:
         if not (labels >= 0).any():
             return None
         operator = make_operator(self.scene, view.camera, self.device)
-        return lift(self.scene, operator, labels, self.settings.kept) if len(operator.ids) else None
+        observation = operator.observe(labels)
+        if not len(observation.ids):
+            return None
+        return Lifted.of(observation, self.settings.kept).bordered(self.scene, operator, labels)
 
     def _give(self, name: str, objects: np.ndarray) -> None:
         self._objects[name] = objects.astype(np.int32)

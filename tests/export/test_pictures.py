@@ -13,9 +13,11 @@ from gsseg_core.errors import WriteError
 from gsseg_core.export.pictures import (
     BACKGROUND,
     CELL_PX,
+    FILL,
     PAPER,
     contact_sheet,
     legend,
+    outline,
     overlay,
     palette,
     save_png,
@@ -63,6 +65,27 @@ def test_an_overlay_draws_lines_exactly_where_labels_change() -> None:
     assert (picture[:4] == outside).all()
     assert len({tuple(inside), tuple(line), tuple(outside)}) == 3
     assert (image == 120).all()
+
+
+def slow_overlay(image: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.ndarray:
+    """Do the same with whole arrays."""
+    own, seen = np.maximum(labels, 0), image.astype(np.float32)
+    grey = ((seen[..., 0] + seen[..., 1] + seen[..., 2]) / 3)[..., None]
+    named, line = (labels > 0)[..., None], outline(labels)[..., None]
+    area = np.float32(1 - FILL) * grey + (FILL * colors.astype(np.float32))[own]
+    other = (np.float32(0.35) * seen + np.float32(0.65 * 0.75) * grey + np.float32(0.65 * 30)) * np.where(line, 0.45, 1)
+    return np.rint(np.where(named, np.where(line, np.minimum(1.12 * colors[own], 255), area), other)).astype(np.uint8)
+
+
+def test_an_overlay_is_that_of_whole_arrays() -> None:
+    random = np.random.default_rng(0)
+    image, labels = (
+        random.integers(0, 256, (40, 50, 3), np.uint8),
+        np.kron(random.integers(-1, 4, (8, 10)), np.ones((5, 5), int)),
+    )
+    found, expected = overlay(image, labels, palette(4)), slow_overlay(image, labels, palette(4))
+    assert np.abs(found.astype(int) - expected).max() <= 1, "halves may be rounded either way"
+    assert (found == expected).mean() > 0.999
 
 
 def test_unknown_pixels_are_shown_like_background() -> None:

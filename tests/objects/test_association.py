@@ -181,6 +181,14 @@ def test_no_view_one_view_and_views_without_evidence_are_no_special_case() -> No
     assert (table.relabelled(unknown).read_labels() == UNKNOWN).all()
 
 
+def test_a_view_of_which_labelled_pixels_see_no_gaussian_is_not_taken() -> None:
+    operator = make_operator(SCENE, VIEWS[0].camera)
+    empty = operator.blend_seen(np.ones((len(operator.ids), 1), np.float32)).transmittance == 1
+    view = with_labels(VIEWS[0], np.where(empty, 1, UNKNOWN))
+    table = ObjectTable(SCENE)
+    assert empty.any() and len(operator.ids) and not table.sees_any(view) and not table.add(view)
+
+
 def test_pixels_that_are_unknown_stay_unknown() -> None:
     views = []
     for view in VIEWS:
