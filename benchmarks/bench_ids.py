@@ -10,7 +10,8 @@ The real scene's ids are numbers modulo 40: objects far apart share one. The row
 the truth alone: pixels of an id, placed in space by the rendered depth, are one instance where they hang together.
 
 "Parts" are the scenes that have `labels_parts/`: masks as automatic generators make them, objects split into up to four
-parts in every view anew, neighbours merged, masks missing. There the background has ids, too, and is left out.
+parts in every view anew, neighbours merged, masks missing. There the background has ids, too, and is left out; only the
+expected calibration error (ECE) counts it, all of it as one object.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 from matching import Contingency, renamed
+from reliability_diagrams import ReliabilityDiagram
 from results import markdown, points
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
@@ -35,7 +37,9 @@ from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.demo.table_scene import build_demo
+from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.learn.temperature import tempered
 from gsseg_core.metrics import Evaluation
 from gsseg_core.objects.object_table import find_objects
 from gsseg_core.raster.backends import make_operator
@@ -121,13 +125,35 @@ def parts(data: Path) -> str:
         scene, truth = GaussianScene.load(folder / "scene.ply"), Dataset(folder)
         views = [replace(view, class_names=None) for view in Dataset(folder, "labels_parts").views("train")]
         tests = truth.views("test")
-        found, seconds = learnt(scene, views, True, tests)
-        ious, objects = object_ious(labels_of(tests), found)
+        learner, seconds = learnt(scene, views, True)
+        result = Segmentation.from_codes(scene, learner.codes_, {}).calibrated(calibrate(learner).temperature)
+        ious, objects = object_ious(labels_of(tests), label_maps(scene, result, tests))
         lines.append([
-            folder.name, str(len(ious)), str(objects), points(float(ious.mean())), points(float(ious.min())), *seconds,
+            folder.name, str(len(ious)), str(objects), points(float(ious.mean())), points(float(ious.min())),
+            f"{reliability(scene, result, tests).ece:.4f}", *seconds,
         ])  # fmt: skip
         print(*lines[-1], sep=", ", flush=True)
-    return markdown(["scene", "objects", "found", "IoU one-to-one", "least", "find, s", "learn, s"], lines)
+    return markdown(["scene", "objects", "found", "IoU one-to-one", "least", "ECE", "find, s", "learn, s"], lines)
+
+
+def reliability(scene: GaussianScene, result: Segmentation, tests: list[View]) -> ReliabilityDiagram:
+    """Hold the probability of what a pixel shows against the truth.
+
+    The true background comes in parts, as every other object may: probabilities of found ids that share most pixels
+    with one true id are summed.
+    """
+    score, out = Contingency(), ReliabilityDiagram()
+    for view, labels in zip(tests, label_maps(scene, result, tests).values(), strict=True):
+        score.add(view.read_labels(), labels)
+    names = score.many_to_one()
+    for view in tests:
+        image = tempered(result.blend(make_operator(scene, view.camera)), result.temperature)
+        of = np.array([names.get(k, UNKNOWN) for k in range(image.shape[2])])
+        true = np.unique(of[of != UNKNOWN])
+        summed, labels = np.stack([image[..., of == k].sum(axis=2) for k in true], axis=2), view.read_labels()
+        known = labels != UNKNOWN
+        out.add(summed.max(axis=2)[known], (true[summed.argmax(axis=2)] == labels)[known])
+    return out
 
 
 def object_ious(truth: Masks, found: Masks) -> tuple[np.ndarray, int]:
@@ -161,7 +187,8 @@ def measure(scene: GaussianScene, data: Dataset, rows: list[Case]) -> str:
     for case in rows:
         views = [view for view in data.views("train") if view.name in case.labels]
         views = [View.from_arrays(view.camera, case.labels[view.name]) for view in views]
-        found, seconds = learnt(scene, views, case.find, data.views("test"))
+        learner, seconds = learnt(scene, views, case.find)
+        found = label_maps(scene, Segmentation.from_codes(scene, learner.codes_, {}), data.views("test"))
         score = Contingency()
         for name, labels in case.truth.items():
             score.add(labels, found[name])
@@ -177,8 +204,8 @@ def measure(scene: GaussianScene, data: Dataset, rows: list[Case]) -> str:
     return markdown(COLUMNS, lines)
 
 
-def learnt(scene: GaussianScene, views: list[View], find: bool, tests: list[View]) -> tuple[Masks, list[str]]:
-    """Find objects if asked to, and learn them; return label maps of other views, and the seconds of both."""
+def learnt(scene: GaussianScene, views: list[View], find: bool) -> tuple[EMLearner, list[str]]:
+    """Find objects if asked to, and learn them; the seconds of both come second."""
     start = time.perf_counter()
     if find:
         table = find_objects(scene, views)
@@ -188,9 +215,12 @@ def learnt(scene: GaussianScene, views: list[View], find: bool, tests: list[View
     learner.observe_all(views)
     learner.fit()
     end = time.perf_counter()
-    result = Segmentation.from_codes(scene, learner.codes_, {})
-    found = {view.name: result.render(make_operator(scene, view.camera)).labels for view in tests}
-    return found, [f"{middle - start:.1f}" if find else "", f"{end - middle:.1f}"]
+    return learner, [f"{middle - start:.1f}" if find else "", f"{end - middle:.1f}"]
+
+
+def label_maps(scene: GaussianScene, result: Segmentation, views: list[View]) -> Masks:
+    """Render label maps of views."""
+    return {view.name: result.render(make_operator(scene, view.camera)).labels for view in views}
 
 
 def mean_iou(truth: Masks, found: Masks, names: dict[int, int]) -> float:
