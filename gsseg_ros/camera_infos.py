@@ -36,19 +36,34 @@ def is_rectified(setting: str, *topics: str) -> bool:
 
 
 def intrinsics_from_info(info: CameraInfo, topic: str) -> tuple[npt.NDArray[np.float64], int, int]:
-    """Read `K` (3, 3) in pixels, width and height of a pinhole camera.
+    """Read `K` (3, 3) in pixels, width and height of a pinhole camera, of the image that is cut out and binned.
 
     Raises
     ------
     IntrinsicsError
-        The lens is distorted, the image binned or cut, the size zero, or `k` not that of a pinhole camera.
+        The lens is distorted, the size zero, what is cut out not in the image, or `k` not that of a pinhole camera.
     """
     if np.any(info.d):
         raise IntrinsicsError(
             f"{topic}: distortion d is {list(info.d)}; expected zeros: what is drawn is what a pinhole camera sees"
         )
-    K = _matrix_of_full_image(info, np.reshape(info.k, (3, 3)), topic)
-    return K, int(info.width), int(info.height)
+    K, size = _matrix_of_window(info, np.reshape(info.k, (3, 3)), topic), image_size(info, topic)
+    return _scale(info, size, topic, topic) @ K, *size
+
+
+def image_size(info: CameraInfo, topic: str) -> tuple[int, int]:
+    """Width and height of the images of a camera_info: its `roi`, in which `binning` makes one pixel of several.
+
+    Raises
+    ------
+    IntrinsicsError
+        There is no pixel, or `roi` is not in the image.
+    """
+    _, _, width, height = _window(info, topic)
+    size = width // max(info.binning_x, 1), height // max(info.binning_y, 1)
+    if min(size) < 1:
+        raise IntrinsicsError(f"{topic}: images are {size[0]} x {size[1]} pixels; expected at least 1 x 1")
+    return size
 
 
 def camera_from_messages(
@@ -96,12 +111,12 @@ def camera_of_image(
     projection = np.reshape(info.p, (3, 4))[:, :3]
     has_projection = projection[0, 0] != 0
     matrix = projection if rectified and has_projection else np.reshape(info.k, (3, 3))
-    K, scale = _matrix_of_full_image(info, matrix, info_topic), _scale(info, size, topic, info_topic)
+    K, scale = _matrix_of_window(info, matrix, info_topic), _scale(info, size, topic, info_topic)
     if rectified or not np.any(info.d):
         return Camera(name, *size, scale @ K, world_to_camera)
     lens = _lens_of(info, size, scale @ K, info_topic)
     if has_projection:
-        rectified_K = scale @ _matrix_of_full_image(info, projection, info_topic)
+        rectified_K = scale @ _matrix_of_window(info, projection, info_topic)
         view = Undistortion(lens, *size, *_focal_and_principal(rectified_K), _rotation(info, info_topic))
     else:
         view = _view_of(lens, info_topic)
@@ -109,14 +124,15 @@ def camera_of_image(
 
 
 def _scale(info: CameraInfo, size: tuple[int, int], topic: str, info_topic: str) -> npt.NDArray[np.float64]:
-    """Make the matrix (3, 3) that scales intrinsics of a camera_info to an image of another size."""
-    (width, height), across, down = size, info.width, info.height
+    """Make the matrix (3, 3) that scales intrinsics of what a camera_info cuts out to an image of another size."""
+    (width, height), (across, down) = size, image_size(info, info_topic)
     if min(abs(width - height * across / down), abs(height - width * down / across)) >= 1:
         raise MaskSizeError(
-            f"{topic}: image is {width} x {height} pixels; expected {info.width} x {info.height}, as {info_topic} "
+            f"{topic}: image is {width} x {height} pixels; expected {across} x {down}, as {info_topic} "
             "says, or a size of the same proportions"
         )
-    return np.diag([width / across, height / down, 1.0])
+    # Binning leaves out what is no whole pixel.
+    return np.diag([width / (across * max(info.binning_x, 1)), height / (down * max(info.binning_y, 1)), 1.0])
 
 
 def _rotation(info: CameraInfo, topic: str) -> tuple[float, ...]:
@@ -127,22 +143,31 @@ def _rotation(info: CameraInfo, topic: str) -> tuple[float, ...]:
     return tuple(turn.T.ravel().tolist())
 
 
-def _matrix_of_full_image(
+def _matrix_of_window(
     info: CameraInfo,
     matrix: npt.NDArray[np.float64],  # (3, 3)
     topic: str,
 ) -> npt.NDArray[np.float64]:
-    """Return an intrinsic matrix (3, 3) of a camera_info, if it is one, and that of the full image."""
-    if max(info.binning_x, info.binning_y) > 1:
-        raise IntrinsicsError(f"{topic}: binning is {info.binning_x} x {info.binning_y}; expected images without it")
-    roi, size = info.roi, f"{info.width} x {info.height}"
-    if (roi.x_offset, roi.y_offset, roi.width, roi.height) not in ((0,) * 4, (0, 0, info.width, info.height)):
+    """Return an intrinsic matrix (3, 3) of a camera_info, if it is one, for what is cut out of the full image."""
+    # Camera checks it; the message names the topic in the camera's place.
+    K = Camera(topic, info.width, info.height, matrix, np.eye(4)).K.copy()
+    K[:2, 2] -= _window(info, topic)[:2]
+    return K
+
+
+def _window(info: CameraInfo, topic: str) -> tuple[int, int, int, int]:
+    """Corner x, y, width and height of what a camera_info cuts out of the full image: all, where `roi` is zeros."""
+    roi = info.roi
+    window = int(roi.x_offset), int(roi.y_offset), int(roi.width), int(roi.height)
+    if not any(window):
+        return 0, 0, int(info.width), int(info.height)
+    x, y, width, height = window
+    if not (0 < width <= info.width - x and 0 < height <= info.height - y):
         raise IntrinsicsError(
-            f"{topic}: roi is {roi.width} x {roi.height} at ({roi.x_offset}, {roi.y_offset}); expected the full image "
-            f"of {size}, or zeros"
+            f"{topic}: roi is {width} x {height} at ({x}, {y}); expected a part of the full image of {info.width} x "
+            f"{info.height}, or zeros"
         )
-    # Camera checks the rest; the message names the topic in the camera's place.
-    return Camera(topic, info.width, info.height, matrix, np.eye(4)).K
+    return window
 
 
 def _lens_of(

@@ -20,7 +20,7 @@ from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError
 from gsseg_core.live.results import SCENE_CHANGED, Rejection
-from gsseg_ros.camera_infos import camera_of_image, is_rectified
+from gsseg_ros.camera_infos import camera_of_image, image_size, is_rectified
 from gsseg_ros.errors import DepthImageError, NoSceneError, TooManyPixelsError
 from gsseg_ros.node.camera_images import CameraImages
 from gsseg_ros.node.camera_streams import CameraStreams, mask_class
@@ -321,10 +321,10 @@ class Inputs:
         size, rectified = seen.labels.shape[::-1], is_rectified(settings.rectified, topic, info_topic)
         pose = settings.scene_to_map.world_to_camera(paired.pose)
         camera = camera_of_image(paired.name, info, size, pose, topic, info_topic, rectified=rectified)
-        if size != (info.width, info.height):
+        if size != (said := image_size(info, info_topic)):
             self._say_once(
-                f"{topic}: masks are {size[0]} x {size[1]} pixels, {info_topic} says {info.width} x "
-                f"{info.height}: its intrinsics are scaled"
+                f"{topic}: masks are {size[0]} x {size[1]} pixels, {info_topic} says {said[0]} x {said[1]}: its "
+                "intrinsics are scaled"
             )
         if camera.undistortion is not None:
             self._say_once(

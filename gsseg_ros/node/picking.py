@@ -18,7 +18,7 @@ from gsseg_core.export.pictures import palette
 from gsseg_core.objects.oriented_boxes import class_box
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_ros.camera_infos import camera_of_image
+from gsseg_ros.camera_infos import camera_of_image, image_size
 from gsseg_ros.conversions import byte_array, cloud
 from gsseg_ros.errors import InvalidRequestError, TooManyPixelsError, ViewpointError
 from gsseg_ros.frames import Similarity
@@ -89,12 +89,11 @@ def fill_answer(
 def _camera(request: PickService.Request, settings: Settings, lookup: Lookup | None, *, rectified: bool) -> Camera:
     """Make the scene's camera of the view, of the size of the mask if there is one."""
     info, mask = request.viewpoint_camera, request.mask
-    size = (mask.width, mask.height) if mask.width else (info.width, info.height)
     try:
         for message, what in ((info, "viewpoint_camera"), (mask, "mask")):
             require_size(message, settings.max_pixels, what)
-        if not info.width or not info.height:
-            raise IntrinsicsError(f"viewpoint_camera: is {info.width} x {info.height} pixels; expected at least 1 x 1")
+        size = image_size(info, "viewpoint_camera")
+        size = (mask.width, mask.height) if mask.width else size
         pose = settings.scene_to_map.world_to_camera(viewpoint_pose(request, settings, lookup))
         return camera_of_image("viewpoint", info, size, pose, "mask", "viewpoint_camera", rectified=rectified)
     except (PoseError, IntrinsicsError, MaskSizeError, TooManyPixelsError) as error:

@@ -19,7 +19,13 @@ from sensor_msgs.msg import CameraInfo, RegionOfInterest
 
 from gsseg_core.errors import IntrinsicsError, MaskSizeError, PoseError
 from gsseg_core.scene.camera import Camera
-from gsseg_ros.camera_infos import camera_from_messages, camera_of_image, intrinsics_from_info, is_rectified
+from gsseg_ros.camera_infos import (
+    camera_from_messages,
+    camera_of_image,
+    image_size,
+    intrinsics_from_info,
+    is_rectified,
+)
 from gsseg_ros.conversions import (
     array_from_point,
     camera_info,
@@ -52,8 +58,9 @@ def test_no_distortion_no_binning_and_the_full_image_can_be_said_in_several_ways
         ({"d": [math.nan]}, "nan"),
         ({"width": 0}, "width is 0"),
         ({"height": 0}, "height is 0"),
-        ({"binning_x": 2, "binning_y": 2}, "2 x 2"),
-        ({"roi": RegionOfInterest(width=32, height=24)}, "32 x 24 at (0, 0)"),
+        ({"binning_x": 65}, "0 x 48"),
+        ({"roi": RegionOfInterest(x_offset=33, width=32, height=24)}, "32 x 24 at (33, 0)"),
+        ({"roi": RegionOfInterest(y_offset=2**32 - 1, width=32, height=24)}, "at (0, 4294967295)"),
         ({"roi": RegionOfInterest(x_offset=4)}, "at (4, 0)"),
         ({"k": np.zeros(9)}, "0 and 0"),
         ({"k": np.diag([100.0, -1.0, 1.0]).ravel()}, "-1"),
@@ -215,6 +222,32 @@ def test_without_p_a_raw_image_becomes_the_view_that_keeps_its_focal_length() ->
     assert camera.image_size == (64, 48)
 
 
+def test_what_a_camera_info_cuts_out_and_bins_is_the_camera_of_the_image() -> None:
+    cut = info(**BENT, p=P.ravel(), roi=RegionOfInterest(x_offset=10, y_offset=4, width=41, height=32), binning_x=2)
+    of_cut = np.diag([0.5, 1, 1]) @ np.array([[1, 0, -10], [0, 1, -4], [0, 0, 1]])
+    assert image_size(cut, "/some/topic") == (20, 32)
+    np.testing.assert_allclose(of_image(cut, (20, 32), rectified=True).K, of_cut @ P[:, :3])
+    np.testing.assert_allclose(of_image(cut, (10, 16), rectified=True).K, np.diag([0.5, 0.5, 1]) @ of_cut @ P[:, :3])
+    cut.d = []
+    matrix, width, height = intrinsics_from_info(cut, "/some/topic")
+    np.testing.assert_allclose(matrix, of_cut @ K)
+    assert (width, height) == (20, 32)
+    message = refusal(MaskSizeError, of_image, cut, (64, 48))
+    assert message.startswith("/mask: image is 64 x 48 pixels; expected 20 x 32, as /some/topic says")
+
+
+def test_of_a_raw_image_a_part_is_undistorted_as_that_part_of_the_whole() -> None:
+    image = np.arange(64 * 48, dtype=np.int32).reshape(48, 64)
+    part = RegionOfInterest(x_offset=16, y_offset=8, width=32, height=24)
+    whole = of_image(info(**BENT, p=P.ravel())).undistortion
+    seen = of_image(info(**BENT, p=P.ravel(), roi=part), (32, 24)).undistortion
+    assert whole is not None and seen is not None
+    expected = whole.sample(image, -1)[8:32, 16:48]
+    got = seen.sample(image[8:32, 16:48], -1)
+    inside = got >= 0
+    assert inside.mean() > 0.75 and np.array_equal(got[inside], expected[inside])
+
+
 def test_intrinsics_are_scaled_to_the_size_of_the_mask() -> None:
     half = np.diag([0.5, 0.5, 1])
     np.testing.assert_allclose(of_image(info(), (32, 24)).K, half @ K)
@@ -241,7 +274,7 @@ def test_intrinsics_are_scaled_to_the_size_of_the_mask() -> None:
         ({**BENT, "p": np.where(P == 105, -1, P).ravel()}, "focal lengths are 90 and -1"),
         ({**BENT, "k": np.zeros(9)}, "focal lengths are 0 and 0"),
         ({**BENT, "width": 0}, "width is 0"),
-        ({**BENT, "binning_x": 2}, "binning is 2 x 0"),
+        ({**BENT, "roi": RegionOfInterest(width=65, height=48)}, "roi is 65 x 48 at (0, 0)"),
     ],
 )
 def test_an_absurd_lens_is_refused_by_the_name_of_its_topic(changes: dict[str, Any], found: str) -> None:

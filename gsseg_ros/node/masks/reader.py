@@ -11,6 +11,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from gsseg_core.data.label_images import PER_VIEW, UNKNOWN
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.live.session import LiveSession
+from gsseg_ros.camera_infos import image_size
 from gsseg_ros.node.masks.compressed import decompress_mask
 from gsseg_ros.node.masks.detections import Beside, Detected
 from gsseg_ros.node.masks.encodings import mask_from_image
@@ -81,7 +82,7 @@ class MaskReader:
 
     def _read_detections(self, found: Detected, topic: str, session: LiveSession, info: CameraInfo) -> SeenLabels:
         labels = None if found.mask is None else read_image(found.mask[1], found.mask[0], self._settings).named()
-        heard, size = self._label_space.heard or {}, (info.width, info.height)
+        heard, size = self._label_space.heard or {}, image_size(info, "camera_info")
         beside = Beside(size, self._settings.max_pixels, labels, heard)
         labels, names = found.adapter.named_mask(found.message, topic, beside)
         if self._settings.ids == PER_VIEW:
