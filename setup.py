@@ -74,6 +74,7 @@ setup(
             "pyyaml>=6.0",
             "ruff>=0.9",
             "rosbags>=0.10",
+            "rosdep>=0.26",
             "scikit-image>=0.25",
             "scikit-learn>=1.5",
             "threadpoolctl>=3.1",
