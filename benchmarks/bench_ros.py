@@ -85,10 +85,10 @@ class Robot:
             process.terminate()
             process.wait(20)
 
-    def replay(self, parameters: Mapping[str, Any]) -> None:
+    def replay(self, parameters: Mapping[str, Any], patience: float = PATIENCE) -> None:
         """Replay to the end."""
         with self.running("replay_node", parameters) as process:
-            if process.wait(PATIENCE):
+            if process.wait(patience):
                 raise RuntimeError(f"replay_node failed; see {self.folder}/replay_node.log")
 
     def wait(self, condition: Callable[[], Any], what: str) -> None:
@@ -274,7 +274,7 @@ def memory(robot: Robot, views: int) -> None:
 
         thread = threading.Thread(target=watch)
         thread.start()
-        robot.replay({"data": str(DATA), "rate": 15.0, "loop": loops})
+        robot.replay({"data": str(DATA), "rate": 15.0, "loop": loops}, PATIENCE + loops * 105 / 15)
         robot.settled()
         done.set()
         thread.join()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from types import SimpleNamespace as Fields
 from typing import Any
 
@@ -176,7 +177,8 @@ def test_the_type_of_detections_is_found_once_somebody_publishes_them(monkeypatc
     assert graph.gone == ["DetectionArray subscription"]
 
 
-def test_without_the_package_of_their_type_it_is_named() -> None:
+def test_without_the_package_of_their_type_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "yolo_msgs.msg", None)  # It may be installed here.
     said = Joined(Graph("yolo_msgs/msg/DetectionArray")).input.look()
     assert (
         said == "/some/topic: is of type yolo_msgs/msg/DetectionArray, but yolo_msgs cannot be imported; is it sourced?"

@@ -105,7 +105,8 @@ def test_no_objects_are_no_detections(vision: None) -> None:
 
 
 def test_without_vision_msgs_there_is_no_such_topic(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "vision_msgs", None)
+    monkeypatch.setitem(sys.modules, "vision_msgs.msg", None)  # It may be installed here.
+    sys.modules.pop("gsseg_ros.vision_messages", None)
     ours, sent = outputs()
     ours.publish_objects(mug())
     assert "~/objects" in sent and "~/detections_3d" not in sent and not ours.wants_objects
