@@ -269,7 +269,8 @@ class Segmentation:
 
     def label_map(self, operator: ViewOperator) -> np.ndarray:
         """Class of every pixel of a view, (H, W) int32: those of `render`, without the confidence."""
-        return self.label_map_beside(operator, np.empty((len(operator.ids), 0), np.float32))[0]
+        codes, shows_background = self._blended
+        return np.asarray(self.class_ids[operator.strongest(codes, len(self.class_names), shows_background).classes])
 
     def label_map_beside(self, operator: ViewOperator, others: np.ndarray) -> tuple[np.ndarray, Blended]:
         """Do the same, and blend in one pass what else Gaussians carry, (M, C) of the operator's `ids`, as colours."""

@@ -267,6 +267,24 @@ def divided(row: Builder, a: Any, number: Any) -> Any:
     return row.llvm.fdiv(a, row.spread(number))
 
 
+@operation(row_type, None, None)
+def larger(row: Builder, a: Any, b: Any) -> Any:
+    """Take the larger one of two rows in each lane."""
+    return row.most(a, b)
+
+
+@operation(row_type, None, None)
+def smaller(row: Builder, a: Any, b: Any) -> Any:
+    """Take the smaller one of two rows in each lane."""
+    return row.least(a, b)
+
+
+@operation(types.int64, None, None, types.float32)
+def above(row: Builder, a: Any, b: Any, margin: Any) -> Any:
+    """Bits of the lanes in which one row exceeds another by more than a margin."""
+    return row.bits(row.llvm.fcmp_ordered(">", row.llvm.fsub(a, b), row.spread(margin)))
+
+
 @operation(types.int64, None, None, types.float32)
 def apart(row: Builder, a: Any, b: Any, limit: Any) -> Any:
     """Bits of the lanes in which two rows differ by more than a limit."""

@@ -35,19 +35,19 @@ class Strongest(NamedTuple):
     """The class that a view shows most of in each pixel."""
 
     classes: np.ndarray  # (H, W) int32: the column of the largest blended probability
-    known: np.ndarray  # (H, W) float32: what is known of the pixel, the sum of its probabilities
+    known: np.ndarray  # (H, W) bool: whether more than half of the pixel is, by the sum of its probabilities
     some: np.ndarray  # (R, C, K) float32: all probabilities of the pixels of a grid; R and C are 0 without one
-    beside: Blended | None = None  # what else was blended
+    beside: Blended | None = None  # what else was blended, if anything
 
     @classmethod
     def of(cls, image: np.ndarray, grid: PixelGrid | None = None, beside: Blended | None = None) -> Strongest:
         """Find it in an image of probabilities, (H, W, K)."""
         some = image[:0, :0] if grid is None else grid.of(image)
-        return cls(image.argmax(axis=2).astype(np.int32), image.sum(axis=2), some, beside)
+        return cls(image.argmax(axis=2).astype(np.int32), image.sum(axis=2) > 0.5, some, beside)
 
     def labels(self) -> np.ndarray:
         """Class of each pixel of which more than half is known, (H, W) int32; `UNKNOWN` elsewhere."""
-        return np.where(self.known > 0.5, self.classes, np.int32(UNKNOWN))
+        return np.where(self.known, self.classes, np.int32(UNKNOWN))
 
 
 class ViewRenderer(ABC):
@@ -108,7 +108,7 @@ class ViewRenderer(ABC):
         self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid | None = None,
         of: np.ndarray | None = None, beside: np.ndarray | None = None,
     ) -> Strongest:  # fmt: skip
-        """Find the class of each pixel, from codes as `blend_rows` takes them.
+        """Find the class of each pixel, from codes in [0, 1] as `blend_rows` takes them.
 
         What a ray has left over is `background`, class 0, or else nothing. Codes `beside` these, (M, C) of `ids`, as
         colours, are blended in the same pass, as `blend_seen` does.
@@ -116,7 +116,7 @@ class ViewRenderer(ABC):
         image, left_over = self.blend_rows(codes, num_classes, of)
         if background:
             image[..., 0] += left_over
-        return Strongest.of(image, grid, None if beside is None else self.blend_seen(beside))
+        return Strongest.of(image, grid, None if beside is None or not beside.shape[1] else self.blend_seen(beside))
 
     def _rows(self, of: np.ndarray | None) -> np.ndarray:
         """Tell which row of such codes each of `ids` has, (M,) int32."""

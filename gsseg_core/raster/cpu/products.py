@@ -21,10 +21,23 @@ from gsseg_core.raster.cpu.blending import (
     stride_of,
     tile_of_turn,
 )
-from gsseg_core.raster.cpu.splat import OPEN, WIDTH, blend_block
+from gsseg_core.raster.cpu.splat import OPEN, SIDE, WIDTH, blend_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
-from gsseg_core.simd import FAST, add_scaled, dot, first_bit, load_row, prefetch, store_row
+from gsseg_core.simd import (
+    FAST,
+    above,
+    add_scaled,
+    dot,
+    first_bit,
+    larger,
+    load_row,
+    nothing,
+    prefetch,
+    smaller,
+    store_row,
+)
 
+_ROUNDING = np.float32(1e-5)  # of blended codes, and more
 FEW = 4  # channels up to which `render_few` is the faster one: colours, depths
 
 
@@ -54,7 +67,8 @@ def render(tiles: Tiles, codes: CSRRows, rows: np.ndarray, channels: int) -> tup
     for turn in nb.prange(tiles.rows * tiles.columns):
         tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
         values, rays = np.zeros((TILE, channels, TILE), np.float32), np.empty((TILE, TILE), np.float32)
-        _blend_codes(tiles, tile, codes, rows, nothing_else, values, np.empty((TILE, 0, TILE), np.float32), rays)
+        others = np.empty((TILE, 0, TILE), np.float32)
+        _blend_codes(tiles, tile, codes, rows, nothing_else, 0, values, others, rays)
         _put(tiles, tile, values, rays, out, left_over)
     return out, left_over
 
@@ -64,13 +78,16 @@ def strongest(
     tiles: Tiles, codes: CSRRows, rows: np.ndarray, channels: int, background: bool, first: int, step: int,
     beside: np.ndarray,  # (M, C) float32
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Find the column of the largest blended code in each pixel, (H, W) int32, the first of equal ones, and the sum.
+    """Find the column of the largest blended code in each pixel, (H, W) int32, the first of equal ones.
 
-    What a ray has left over is added to column 0, if that is the background. No image of all columns is written, but
-    for each step-th pixel of rows and columns, from the first on: (R, C, K). Then comes what `render_few` makes of the
-    codes `beside` these.
+    Second is told whether the sum of all is more than a half, (H, W) bool. What a ray has left over is added to column
+    0, if that is the background. No image of all columns is written, but for each step-th pixel of rows and columns,
+    from the first on: (R, C, K). Then comes what `render_few` makes of the codes `beside` these, if there are any.
+
+    Codes are at most 1. So once one column leads by more than a ray has left, nothing farther changes that, and a block
+    in which all rays are so far takes no more codes.
     """
-    out, total = np.empty((tiles.height, tiles.width), np.int32), np.empty((tiles.height, tiles.width), np.float32)
+    out, half = np.empty((tiles.height, tiles.width), np.int32), np.empty((tiles.height, tiles.width), np.bool_)
     some = np.empty((len(range(first, tiles.height, step)), len(range(first, tiles.width, step)), channels), np.float32)
     image, left_over = _blank(tiles, beside.shape[1])
     stride = stride_of(tiles.rows)
@@ -79,14 +96,15 @@ def strongest(
         values, rays = np.zeros((TILE, channels, TILE), np.float32), np.empty((TILE, TILE), np.float32)
         others = np.zeros((TILE, beside.shape[1], TILE), np.float32)
         best, known = np.zeros((TILE, TILE), np.int32), np.empty((TILE, TILE), np.float32)
-        _blend_codes(tiles, tile, codes, rows, beside, values, others, rays)
+        left, top = corner_of(tiles, tile)
+        ending = OPEN & ~_blocks_of_grid(first, step, left, top)
+        _blend_codes(tiles, tile, codes, rows, beside, ending, values, others, rays)
         _compare(values, rays, background, best, known)
         _put(tiles, tile, others, rays, image, left_over)
-        left, top = corner_of(tiles, tile)
         for r in range(min(TILE, tiles.height - top)):
             for c in range(min(TILE, tiles.width - left)):
                 b, lane = in_block(r, c)
-                out[top + r, left + c], total[top + r, left + c] = best[b, lane], known[b, lane]
+                out[top + r, left + c], half[top + r, left + c] = best[b, lane], known[b, lane] > np.float32(0.5)
         for r in range((first - top) % step, min(TILE, tiles.height - top), step):
             for c in range((first - left) % step, min(TILE, tiles.width - left), step):
                 if top + r >= first and left + c >= first:
@@ -94,7 +112,36 @@ def strongest(
                     for k in range(channels):
                         some[(top + r) // step, (left + c) // step, k] = values[b, k, lane]
                     some[(top + r) // step, (left + c) // step, 0] += rays[b, lane] if background else np.float32(0)
-    return out, total, some, image, left_over
+    return out, half, some, image, left_over
+
+
+@called_by_kernels
+def _blocks_of_grid(first: int, step: int, left: int, top: int) -> int:
+    """Which blocks of a tile have pixels of a grid, as bits."""
+    rows, columns = 0, 0
+    for i in range(TILE):
+        rows |= (top + i >= first and (top + i - first) % step == 0) << i // SIDE
+        columns |= (left + i >= first and (left + i - first) % step == 0) << i // SIDE
+    blocks = 0
+    for b in range(TILE):
+        blocks |= (rows >> b // SIDE & columns >> b % SIDE & 1) << b
+    return blocks
+
+
+@nb.njit(inline="always")
+def _is_decided(values: np.ndarray, b: int, rays: np.ndarray, live: int) -> bool:  # (16, K, 16), (16, 16)
+    """Tell whether nothing that rays of a block meet yet changes the largest column, or that more than half is known.
+
+    Rays that are not `live`, by the bits of their lanes, meet nothing.
+    """
+    channels = values.shape[1]
+    most, second, known = load_row(values, b * channels), nothing(), load_row(values, b * channels)
+    for k in range(b * channels + 1, (b + 1) * channels):
+        value = load_row(values, k)
+        second, most = larger(second, smaller(most, value)), larger(most, value)
+        known = add_scaled(known, value, np.float32(1))
+    ahead = above(add_scaled(most, second, np.float32(-1)), load_row(rays, b), _ROUNDING)
+    return (ahead & above(known, nothing(), np.float32(0.5) + _ROUNDING) | ~live) & OPEN == OPEN  # type: ignore[no-any-return]
 
 
 @called_by_kernels
@@ -119,6 +166,7 @@ def _compare(
 @called_by_kernels(fastmath={"contract"}, error_model="numpy")
 def _blend_codes(
     tiles: Tiles, tile: int, codes: CSRRows, rows: np.ndarray, beside: np.ndarray,  # as `strongest` takes them
+    ending: int,  # bits of blocks of which only the largest column is wanted
     values: np.ndarray, others: np.ndarray, rays: np.ndarray,  # (16, K, 16), (16, C, 16) in: zeros; (16, 16) out
 ) -> None:  # fmt: skip
     """Blend the codes of a tile, and others beside them; weights are used where they are made.
@@ -127,27 +175,36 @@ def _blend_codes(
     """
     last, channels, (indptr, indices, data) = tiles.start[tile + 1], values.shape[1], codes
     lines = np.empty((2, 2, TILE), np.float32)
+    turns, patience = np.zeros(TILE, np.int64), 6 + channels // 4  # the more there is to look through, the less often
     left, top, live = open_rays(tiles, tile, rays)
-    ahead = aim_next(tiles, tiles.start[tile] - 1, last, left, top, lines)
+    wanted, ahead = live, aim_next(tiles, tiles.start[tile] - 1, last, left, top, lines)
     for e in range(tiles.start[tile], last):
         g = tiles.entries[e]
-        # Rows are anywhere in memory: they are asked for before they are needed.
-        prefetch(rows, tiles.entries[min(e + 3 * AHEAD, last - 1)])
-        prefetch(beside, tiles.entries[min(e + AHEAD, last - 1)])
-        prefetch(indptr, rows[tiles.entries[min(e + 2 * AHEAD, last - 1)]])
-        later = indptr[rows[tiles.entries[min(e + AHEAD, last - 1)]]]
-        prefetch(indices, later)
-        prefetch(data, later)
-        first, end = indptr[rows[g]], indptr[rows[g] + 1]
         reached, own, wide = ahead & live, lines[e % 2], tiles.table[g, WIDTH]
+        # Rows are anywhere in memory: they are asked for before they are needed, while they are.
+        prefetch(beside, tiles.entries[min(e + AHEAD, last - 1)])
+        if wanted:
+            prefetch(rows, tiles.entries[min(e + 3 * AHEAD, last - 1)])
+            prefetch(indptr, rows[tiles.entries[min(e + 2 * AHEAD, last - 1)]])
+            later = indptr[rows[tiles.entries[min(e + AHEAD, last - 1)]]]
+            prefetch(indices, later)
+            prefetch(data, later)
+        first, end = (indptr[rows[g]], indptr[rows[g] + 1]) if wanted & reached else (0, 0)
         ahead = aim_next(tiles, e, last, left, top, lines)
         while reached:
             b = first_bit(reached)
             reached &= reached - 1
             weight, bits = blend_block(rays, b, own, wide)
-            for z in range(first, end):
-                k = np.int64(b) * channels + np.int64(indices[z])
-                store_row(values, k, add_scaled(load_row(values, k), weight, data[z]))
+            if wanted >> b & 1:
+                for z in range(first, end):
+                    k = np.int64(b) * channels + np.int64(indices[z])
+                    store_row(values, k, add_scaled(load_row(values, k), weight, data[z]))
+                turns[b] += ending >> b & 1
+                if turns[b] == patience:
+                    turns[b] = 0
+                    if _is_decided(values, b, rays, bits):
+                        wanted &= ~(1 << b)
+                        live &= wanted if beside.shape[1] == 0 else live
             for c in range(beside.shape[1]):
                 k = np.int64(b) * beside.shape[1] + c
                 store_row(others, k, add_scaled(load_row(others, k), weight, beside[g, c]))

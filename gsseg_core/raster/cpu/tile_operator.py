@@ -82,7 +82,7 @@ class TileOperator(ViewOperator):
         classes, known, some, image, left_over = products.strongest(
             self._tiles, *self._in_place(codes, of), num_classes, background, first, step, others
         )
-        return Strongest(classes, known, some, Blended(image, left_over))
+        return Strongest(classes, known, some, Blended(image, left_over) if others.shape[1] else None)
 
     def _in_place(self, codes: CSRRows, of: np.ndarray | None) -> tuple[CSRRows, np.ndarray]:
         """Give codes and which row of them each of `ids` has; of some Gaussians, in the order of these."""
