@@ -83,7 +83,8 @@ def make_preview(
     and become as small as leaves them where and as large as cameras see them.
     """
     core = _core(scene.means)
-    area = np.prod(np.sort(scene.scales, axis=1)[:, 1:], axis=1, dtype=np.float64)
+    a, b, c = scene.scales.T.astype(np.float64)
+    area = np.maximum(np.maximum(a * b, b * c), a * c)
     picked, chance = _draw(np.sqrt(area) * scene.opacities, segmentation.labels, most)
     labels = segmentation.labels[picked]
     means, nearer = _contracted(scene.means[picked].astype(np.float64), core)
@@ -101,7 +102,7 @@ def make_preview(
     records["quat"] = np.rint(127 * scene.quats[picked])
     records["scale"] = _quantised(logs, log_scales[0], log_scales[1], 255)
     records["opacity"] = np.rint(255 * scene.opacities[picked])
-    records["color"] = np.rint(255 * np.clip(scene.colors()[picked], 0, 1))
+    records["color"] = np.rint(255 * np.clip(scene.colors(ids=picked), 0, 1))
     records["confidence"] = np.rint(255 * np.clip(segmentation.confidence[picked], 0, 1))
     return Preview(records, low, high, core, log_scales, len(scene) - len(picked))
 
@@ -147,8 +148,8 @@ def _core(means: np.ndarray) -> np.ndarray:
     """Find the box, (2, 3), that holds all Gaussians of means (N, 3) but those far from the others."""
     outer = np.quantile(means[:: max(len(means) // 50_000, 1)], [CORE, 1 - CORE], axis=0).astype(np.float64)
     margin = 0.15 * (outer[1] - outer[0]).max()
-    low, high = np.maximum(outer[0] - margin, means.min(axis=0)), np.minimum(outer[1] + margin, means.max(axis=0))
-    return np.array([low, high])
+    low, high = np.transpose([(column.min(), column.max()) for column in means.T])  # in a tenth of the time of axis 0
+    return np.array([np.maximum(outer[0] - margin, low), np.minimum(outer[1] + margin, high)])
 
 
 def _contracted(means: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

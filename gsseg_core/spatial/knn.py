@@ -33,12 +33,12 @@ def nearest(tree: Tree, places: np.ndarray, k: int, most: int) -> tuple[np.ndarr
     They are looked for from the points at ascending places, (M,) int32. By the triangle inequality the radius of one
     point bounds those of all others in its leaf.
 
-    If asked for, up to `most` places of each point are listed that are no farther. Then come how many these are, (M,),
-    and room with the lists of each chunk of points one after the other, from chunk CHUNK * most on.
+    If `most` is above 0, no means are told, but up to so many places of each point that are no farther: how many these
+    are, (M,), and room with the lists of each chunk of points one after the other, from chunk CHUNK * most on.
     """
     points, boxes = tree.points, tree.boxes
     m, n, leaves = places.shape[0], points.shape[1], boxes.shape[0] // 2
-    radii, distances = np.empty(m, np.float32), np.empty(m, np.float64)
+    radii, distances = np.empty(m, np.float32), np.empty(m if most == 0 else 0, np.float64)
     bits, skip = radii.view(np.int32), np.empty(0, np.int32)
     counts, room = np.zeros(m, np.int64), np.empty(m * most, np.int32)  # of which what no list fills is not touched
     for chunk in nb.prange((m + CHUNK - 1) // CHUNK):
@@ -63,10 +63,11 @@ def nearest(tree: Tree, places: np.ndarray, k: int, most: int) -> tuple[np.ndarr
                 rows = measure(tree, own, bounds[1, q - first], found, candidates)
                 _leave_out(own, leaf_of(own, leaves, n), leaves, n, rows, candidates)
                 bits[q] = _smallest(near_bits, rows, k, bound_bits[0, q - first], bound_bits[1, q - first])
-                distances[q] = _mean_root(near, LEAF * rows, k, radii[q])
-                if most > 0:
-                    counts[q] = _list(candidates, rows, radii[q], leaves, n, room[end : end + most])
-                    end += counts[q]
+                if most == 0:
+                    distances[q] = _mean_root(near, LEAF * rows, k, radii[q])
+                    continue
+                counts[q] = _list(candidates, rows, radii[q], leaves, n, room[end : end + most])
+                end += counts[q]
             before, first = middle, last
     return radii, distances, counts, room
 
