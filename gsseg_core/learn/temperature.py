@@ -26,6 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gsseg_core.learn.minimum import minimum
 from gsseg_core.raster.view_renderer import PixelGrid
 
 LOWEST, HIGHEST = 0.2, 5.0  # temperatures that are tried
@@ -123,8 +124,6 @@ def fit_temperature(samples: Sequence[Sample]) -> float:
     float
         In [`LOWEST`, `HIGHEST`]; 1 where there is no pixel to go by.
     """
-    from scipy.optimize import minimize_scalar  # It loads half of SciPy, which most programs do not need.
-
     samples = [sample for sample in samples if len(sample.seen)]
     if not samples:
         return 1.0
@@ -133,9 +132,7 @@ def fit_temperature(samples: Sequence[Sample]) -> float:
         temperature = float(np.exp(log_temperature))
         return -sum(log_likelihood(sample, temperature) for sample in samples)
 
-    bounds = float(np.log(LOWEST)), float(np.log(HIGHEST))
-    found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"xatol": _PRECISION})
-    return float(np.exp(found.x))
+    return float(np.exp(minimum(loss, float(np.log(LOWEST)), float(np.log(HIGHEST)), _PRECISION)))
 
 
 def log_likelihood(sample: Sample, temperature: float) -> float:
