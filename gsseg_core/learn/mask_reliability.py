@@ -192,14 +192,12 @@ def compare_mask(
     """
     seen = seen or view.read_seen()
     labels, evidence = seen.named(), seen.evidence
-    # Where a partial mask names no class, it says "none of these", its last word.
-    unnamed = (seen.labels >= 0) & (labels < 0) if evidence is not None and evidence.has_none_of_these else np.False_
-    known = (labels >= 0) | unnamed
-    occurs = np.bincount(labels[labels >= 0]) > 0
-    classes = np.flatnonzero(occurs).astype(np.int32) if evidence is None else evidence.vocabulary
-    both = known & (predicted >= 0)
-    word = np.full(len(occurs) + 1, len(classes) - 1)  # of each label; the last one is of -1, no name
-    word[:-1] = np.searchsorted(classes[classes >= 0], np.arange(len(occurs)))
-    cells = predicted[both] * np.int64(len(classes)) + word[labels[both]]
-    counts = np.bincount(cells, minlength=num_classes * len(classes)).reshape(num_classes, len(classes))
+    width = int(max(labels.max(initial=-1), -1 if evidence is None else evidence.classes.max(initial=-1))) + 1
+    # Of all pixels at once: where a partial mask names no class, it may say "none of these", and else nothing.
+    column = np.where(labels >= 0, labels, np.where(seen.labels >= 0, width, width + 1))
+    cells = (predicted.astype(np.int64) + 1) * (width + 2) + column
+    table = np.bincount(cells.ravel(), minlength=(num_classes + 1) * (width + 2)).reshape(-1, width + 2)
+    classes = np.flatnonzero(table[:, :width].any(axis=0)).astype(np.int32) if evidence is None else evidence.vocabulary
+    known = table[:, : width + 1 if evidence is not None and evidence.has_none_of_these else width]
+    counts = table[1:, np.where(classes >= 0, classes, width)]
     return ViewCheck(view.name, int(known.sum()), classes, counts, PackedLabels(predicted), evidence)

@@ -78,11 +78,11 @@ def draw_triple(check: ViewCheck, view: View, images: ViewImages, colors: np.nda
     Large ones are thinned out, to be shown with at most `PICTURE_PX` px a side.
     """
     image, mask, predicted = shown_at(PICTURE_PX, images.of(view), view.read_labels(), check.prediction())
-    grey = image.mean(axis=2, keepdims=True)
-    unknown = (mask == UNKNOWN) | (predicted == UNKNOWN)
-    tint = np.where(unknown[..., None], _UNKNOWN, np.where((mask != predicted)[..., None], _DIFFER, _AGREE))
-    strength = np.where((mask != predicted) | unknown, 0.75, 0.6)[..., None]
-    difference = ((1 - strength) * grey + strength * tint).round().astype(np.uint8)
+    # There are three tints, and 766 greys to lay them over.
+    strength, tints = np.array([0.6, 0.75, 0.75])[:, None, None], np.array([_AGREE, _DIFFER, _UNKNOWN])[:, None]
+    table = ((1 - strength) * (np.arange(3 * 255 + 1) / 3)[:, None] + strength * tints).round().astype(np.uint8)
+    which = np.where((mask == UNKNOWN) | (predicted == UNKNOWN), 2, mask != predicted)
+    difference = table[which, image[..., 0].astype(np.int16) + image[..., 1] + image[..., 2]]
     return Triple(overlay(image, mask, colors), overlay(image, predicted, colors), difference)
 
 
