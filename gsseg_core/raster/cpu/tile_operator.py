@@ -70,7 +70,7 @@ class TileOperator(ViewOperator):
 
     def blend_rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None = None) -> Blended:
         """Blend codes without their zeros."""
-        return Blended(*products.render(self._tiles, *self._in_place(codes, of), num_classes))
+        return Blended(*products.render(self._tiles, codes, self._rows(of), num_classes))
 
     def strongest(
         self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid | None = None,
@@ -80,15 +80,9 @@ class TileOperator(ViewOperator):
         first, step = grid or (1 << 30, 1 << 30)  # of which no image has a pixel
         others = np.ascontiguousarray(np.empty((len(self.ids), 0)) if beside is None else beside, np.float32)
         classes, known, some, image, left_over = products.strongest(
-            self._tiles, *self._in_place(codes, of), num_classes, background, first, step, others
+            self._tiles, codes, self._rows(of), num_classes, background, first, step, others
         )
         return Strongest(classes, known, some, Blended(image, left_over) if others.shape[1] else None)
-
-    def _in_place(self, codes: CSRRows, of: np.ndarray | None) -> tuple[CSRRows, np.ndarray]:
-        """Give codes and which row of them each of `ids` has; of some Gaussians, in the order of these."""
-        if of is None:  # To copy those of a whole scene would take longer than it saves.
-            return codes, self.ids
-        return codes.take(self._rows(of)), np.arange(len(self.ids), dtype=np.int32)
 
     def _adjoint(self, residual: np.ndarray) -> np.ndarray:
         out = np.zeros((self.num_gaussians, residual.shape[2]), np.float32)
