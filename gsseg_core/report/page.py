@@ -19,6 +19,7 @@ from gsseg_core.report import sections
 from gsseg_core.report.findings import warnings_of
 from gsseg_core.report.sections import PageInputs
 from gsseg_core.text import percent, printable
+from gsseg_core.two_at_once import two_at_once
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -55,7 +56,9 @@ def write_report_page(path: str | os.PathLike[str], run: PageInputs) -> None:
 def report_page(run: PageInputs) -> str:
     """Put the page together, as HTML."""
     report, labelled = run.report, run.segmentation.labels >= 0
-    contents = [(anchor, title, content(run)) for anchor, (title, content) in SECTIONS.items()]
+    contents = [
+        (anchor, title, content) for (anchor, (title, _)), content in zip(SECTIONS.items(), _contents(run), strict=True)
+    ]
     style, script = (files("gsseg_core.report").joinpath(f"page.{kind}").read_text("utf-8") for kind in ("css", "js"))
     policy = (
         f"default-src 'none'; img-src data:; style-src {_hash(style)}; script-src {_hash(script)}; "
@@ -75,6 +78,14 @@ def report_page(run: PageInputs) -> str:
             script=script,
         )
     )
+
+
+def _contents(run: PageInputs) -> list[sections.Content | None]:
+    """Make the contents of the sections, two at once."""
+    makers = [content for _, content in SECTIONS.values()]
+    # The others choose views by what the first two have rendered.
+    parts = (makers[:2], makers[2:])
+    return [made for part in parts for made in two_at_once(lambda make: make(run), part, run.images.device)]
 
 
 @functools.cache  # Compiling the templates takes longer than filling them in.
