@@ -15,13 +15,7 @@ import numpy as np
 from gsseg_core.data.class_names import BACKGROUND_NAME, class_name
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View, spread
-from gsseg_core.errors import (
-    GssegError,
-    NoCodesError,
-    NoUsableViewsError,
-    SettingsError,
-    StateFileError,
-)
+from gsseg_core.errors import GssegError, NoCodesError, NoUsableViewsError, SettingsError, StateFileError
 from gsseg_core.learn.learner_state import Learnt, State
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.learn.vote_learner import VoteLearner
@@ -342,8 +336,14 @@ class LiveSession:
         return state.learnt.num_views if state.learnt is not None else state.num_fused
 
     def prepare(self, settings: RefineSettings) -> None:
-        """Find the neighbours that refinement needs, in a thread of their own, so that the first request has them."""
-        threading.Thread(target=find_neighbours, args=(self.scene, settings.k), name="neighbours").start()
+        """Find what the first request needs of the scene, in a thread of its own: its digest, and all neighbours."""
+        scene = self.scene
+
+        def find() -> None:
+            _ = scene.digest  # It is kept.
+            find_neighbours(scene, settings.k)
+
+        threading.Thread(target=find, name="neighbours").start()
 
     def retire(self) -> None:
         """Begin another `era`, so that what is still being fused or learnt is refused; what is known stays."""

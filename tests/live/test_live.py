@@ -27,7 +27,8 @@ from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live import class_numbers
 from gsseg_core.live.session import LiveSession
-from gsseg_core.refine.settings import UNREFINED
+from gsseg_core.refine.settings import UNREFINED, RefineSettings
+from gsseg_core.spatial.neighbourhood import neighbours_of
 
 SCENE, TRUTH = balls_on_a_table()
 VIEWS = clean_views(6)
@@ -41,6 +42,17 @@ def fed(session: LiveSession, views: list[View] = VIEWS) -> LiveSession:
 
 def blank(view: View, label: int = UNKNOWN) -> View:
     return View.from_arrays(view.camera, np.full((view.camera.height, view.camera.width), label))
+
+
+def test_what_the_first_request_needs_of_the_scene_is_found_before() -> None:
+    scene, settings = balls_on_a_table()[0], RefineSettings(k=7)
+    LiveSession(scene, NAMES).prepare(settings)
+    for thread in threading.enumerate():
+        if thread.name == "neighbours":
+            thread.join(PATIENCE)
+    neighbours = neighbours_of(scene, settings.k)
+    assert "digest" in vars(scene) and neighbours is not None
+    assert not np.isnan(neighbours.radii).any()
 
 
 def test_codes_of_fused_views_are_those_of_the_votes() -> None:
