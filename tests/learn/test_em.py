@@ -175,7 +175,7 @@ def scaled(rows: np.ndarray, otherwise: np.ndarray | float = 0.0) -> np.ndarray:
         ({"max_steps": 4, "tolerance": 0.0}, [4]),
         ({"max_steps": 4, "tolerance": 0.0, "errors": False}, [4]),
         ({"max_steps": 9, "tolerance": 0.001, "errors": False}, [3]),
-        ({"max_steps": 9, "tolerance": 0.0005}, [2, 2]),
+        ({"max_steps": 9, "tolerance": 0.0005}, [3, 2]),
         ({"max_steps": 9, "tolerance": 1e9}, [1, 1]),
         ({"max_steps": 9, "tolerance": 1e9, "refits": 2}, [1, 1, 1]),
         ({"max_steps": 9, "tolerance": 1e9, "least_agreement": 0.0}, [1, 1]),

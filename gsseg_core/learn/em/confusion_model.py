@@ -8,7 +8,7 @@ import numpy as np
 
 from gsseg_core.data.label_evidence import LabelEvidence
 
-PART_PRIOR = 300.0
+PART_PRIOR = 3000.0
 """Weight of the prior on how a class's pixels under one word divide between rejected regions and the rest, in px.
 
 A class with few pixels there is taken to divide as all classes together do.

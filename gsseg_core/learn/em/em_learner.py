@@ -46,7 +46,7 @@ from gsseg_core.raster.view_renderer import PixelGrid, Strongest, ViewRenderer
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import neighbours_of
 
-REFIT_FACTOR = 8  # error models are re-estimated once a step gains less than this many times the tolerance
+REFIT_FACTOR = 4  # error models are re-estimated once a step gains less than this many times the tolerance
 
 Tick = Callable[[], None]
 """Called for each view, so that whoever listens can stop the work at once."""
