@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from gsseg_core.data.label_images import UNKNOWN, PackedLabels
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.photos import read_photo
 from gsseg_core.data.view import View
 from gsseg_core.export.pictures import outline, overlay, shown_at
@@ -99,28 +99,26 @@ def thumbnails(
     dict of int to (str, (THUMBNAIL_PX, THUMBNAIL_PX, 3) uint8)
         For each of the classes that some view shows: the view's name, and the picture.
     """
-    # Of each view only once, however many classes ask for it; packed, since they may be many and large.
-    agreed: dict[str, PackedLabels] = {}
+    borders: dict[str, np.ndarray] = {}  # Of each view only once, however many classes ask for it.
     chosen: dict[str, list[int]] = {}
+    checks = {check.name: check for check in evidence.checks}
     for k in classes:
         best = None
-        for check in _candidates(evidence, k):
+        for pixels, check in _candidates(evidence, k):
             view = evidence.views[check.name]
-            if check.name not in agreed:
-                mask, predicted = view.read_labels(), check.prediction()
-                agreed[check.name] = PackedLabels(np.where(mask == predicted, mask, UNKNOWN))
-            own = agreed[check.name].unpack() == k
-            is_cut = own[0].any() or own[-1].any() or own[:, 0].any() or own[:, -1].any()
-            score = own.sum() * (CUT if is_cut else 1) * (1 if images.at_hand(view) else 0.5)
+            if check.name not in borders:
+                borders[check.name] = _agreed_at_border(view.read_labels(), check.prediction())
+            score = pixels * (CUT if k in borders[check.name] else 1) * (1 if images.at_hand(view) else 0.5)
             if best is None or score > best[0]:
                 best = score, view.name
         if best is not None:
             chosen.setdefault(best[1], []).append(k)
     found = {}
     for name, shown in chosen.items():
-        image, labels = images.of(evidence.views[name]), agreed[name].unpack()
+        view = evidence.views[name]
+        image, mask, predicted = images.of(view), view.read_labels(), checks[name].prediction()
         for k in shown:
-            found[k] = name, _crop(image, labels == k, colors[k])
+            found[k] = name, _crop(image, (mask == k) & (predicted == k), colors[k])
     return found
 
 
@@ -134,10 +132,16 @@ def jpeg_uri(image: np.ndarray, largest: int) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
-def _candidates(evidence: Evidence, k: int) -> list[ViewCheck]:
-    """Find the views with most pixels on which mask and prediction agree that they are of a class."""
+def _candidates(evidence: Evidence, k: int) -> list[tuple[int, ViewCheck]]:
+    """Find the views with most pixels on which mask and prediction agree that they are of a class, and how many."""
     pixels = [(int(check.counts[k, check.classes == k].sum()), check) for check in evidence.checks]
-    return [check for agreed, check in sorted(pixels, key=lambda pair: -pair[0])[:CANDIDATES] if agreed]
+    return [pair for pair in sorted(pixels, key=lambda pair: -pair[0])[:CANDIDATES] if pair[0]]
+
+
+def _agreed_at_border(mask: np.ndarray, predicted: np.ndarray) -> np.ndarray:  # (H, W), (H, W)
+    """List the labels on which both agree along the border of an image."""
+    mask, predicted = (np.concatenate([one[0], one[-1], one[:, 0], one[:, -1]]) for one in (mask, predicted))
+    return np.unique(mask[mask == predicted])
 
 
 def _crop(image: np.ndarray, own: np.ndarray, color: np.ndarray) -> np.ndarray:
