@@ -20,13 +20,12 @@ expectation-maximisation, with a prior of `RIGHT` times the pixels of each class
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 
-from gsseg_core.learn.minimum import minimum
 from gsseg_core.raster.view_renderer import PixelGrid
 
 LOWEST, HIGHEST = 0.2, 5.0  # temperatures that are tried
@@ -132,7 +131,27 @@ def fit_temperature(samples: Sequence[Sample]) -> float:
         temperature = float(np.exp(log_temperature))
         return -sum(log_likelihood(sample, temperature) for sample in samples)
 
-    return float(np.exp(minimum(loss, float(np.log(LOWEST)), float(np.log(HIGHEST)), _PRECISION)))
+    return float(np.exp(golden_section(loss, float(np.log(LOWEST)), float(np.log(HIGHEST)), _PRECISION)))
+
+
+def golden_section(f: Callable[[float], float], low: float, high: float, precision: float) -> float:
+    """Find where a function with one minimum is least between two bounds, by sections in the golden ratio.
+
+    SciPy's search takes longer to load than this one takes to find.
+    """
+    kept = (5**0.5 - 1) / 2
+    left, right = high - kept * (high - low), low + kept * (high - low)
+    at_left, at_right = f(left), f(right)
+    while high - low > precision:
+        if at_left <= at_right:
+            high, right, at_right = right, left, at_left
+            left = high - kept * (high - low)
+            at_left = f(left)
+        else:
+            low, left, at_left = left, right, at_right
+            right = low + kept * (high - low)
+            at_right = f(right)
+    return (low + high) / 2
 
 
 def log_likelihood(sample: Sample, temperature: float) -> float:

@@ -22,6 +22,7 @@ from gsseg_core.learn.temperature import (
     PIXELS,
     Sample,
     fit_temperature,
+    golden_section,
     sample_pixels,
     tempered,
 )
@@ -180,6 +181,19 @@ def test_calibration_keeps_labels_and_pictures_and_changes_confidences() -> None
         np.testing.assert_allclose(tempered(raw.blend(operator), 0.5).max(axis=2), two.confidence, atol=1e-5)
     assert raw.calibrated(1.0).probabilities is raw.probabilities
     np.testing.assert_allclose(result.calibrated(1.0).probabilities, raw.probabilities, atol=1e-6)
+
+
+@pytest.mark.parametrize("place", [-9.0, -1.0, 0.2, 0.99, 1.7, 9.0])
+@pytest.mark.parametrize("power", [0.5, 1.0, 4.0])
+def test_a_golden_section_finds_the_least_value_between_bounds(place: float, power: float) -> None:
+    asked: list[float] = []
+
+    def f(x: float) -> float:
+        asked.append(x)
+        return abs(x - place) ** power
+
+    assert abs(golden_section(f, -1.5, 1.8, 0.01) - np.clip(place, -1.5, 1.8)) <= 0.01
+    assert min(asked) >= -1.5 and max(asked) <= 1.8 and len(asked) < 16
 
 
 def test_a_calibrated_segmentation_comes_back_exactly(tmp_path: Path) -> None:
