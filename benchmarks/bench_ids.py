@@ -127,25 +127,23 @@ def parts(data: Path) -> str:
         tests = truth.views("test")
         learner, seconds = learnt(scene, views, True)
         result = Segmentation.from_codes(scene, learner.codes_, {}).calibrated(calibrate(learner).temperature)
-        ious, objects = object_ious(labels_of(tests), label_maps(scene, result, tests))
+        found = label_maps(scene, result, tests)
+        ious, objects = object_ious(labels_of(tests), found)
         lines.append([
             folder.name, str(len(ious)), str(objects), points(float(ious.mean())), points(float(ious.min())),
-            f"{reliability(scene, result, tests).ece:.4f}", *seconds,
+            f"{reliability(scene, result, tests, found).ece:.4f}", *seconds,
         ])  # fmt: skip
         print(*lines[-1], sep=", ", flush=True)
     return markdown(["scene", "objects", "found", "IoU one-to-one", "least", "ECE", "find, s", "learn, s"], lines)
 
 
-def reliability(scene: GaussianScene, result: Segmentation, tests: list[View]) -> ReliabilityDiagram:
+def reliability(scene: GaussianScene, result: Segmentation, tests: list[View], found: Masks) -> ReliabilityDiagram:
     """Hold the probability of what a pixel shows against the truth.
 
     The true background comes in parts, as every other object may: probabilities of found ids that share most pixels
     with one true id are summed.
     """
-    score, out = Contingency(), ReliabilityDiagram()
-    for view, labels in zip(tests, label_maps(scene, result, tests).values(), strict=True):
-        score.add(view.read_labels(), labels)
-    names = score.many_to_one()
+    names, out = overlaps(labels_of(tests), found).many_to_one(), ReliabilityDiagram()
     for view in tests:
         image = tempered(result.blend(make_operator(scene, view.camera)), result.temperature)
         of = np.array([names.get(k, UNKNOWN) for k in range(image.shape[2])])
@@ -158,9 +156,7 @@ def reliability(scene: GaussianScene, result: Segmentation, tests: list[View]) -
 
 def object_ious(truth: Masks, found: Masks) -> tuple[np.ndarray, int]:
     """IoU of each true object with its match, best matching of all; and how many found ones show objects at all."""
-    score = Contingency()
-    for name, labels in truth.items():
-        score.add(labels, found[name])
+    score = overlaps(truth, found)
     size = np.bincount(np.concatenate([labels[truth[name] != UNKNOWN] for name, labels in found.items()]))
     shown = [k for k, true in score.many_to_one().items() if true > 0 and size[k] > SHOWN]
     ious = evaluated(truth, found, score.one_to_one()).iou[1:]
@@ -189,9 +185,7 @@ def measure(scene: GaussianScene, data: Dataset, rows: list[Case]) -> str:
         views = [View.from_arrays(view.camera, case.labels[view.name]) for view in views]
         learner, seconds = learnt(scene, views, case.find)
         found = label_maps(scene, Segmentation.from_codes(scene, learner.codes_, {}), data.views("test"))
-        score = Contingency()
-        for name, labels in case.truth.items():
-            score.add(labels, found[name])
+        score = overlaps(case.truth, found)
         shown = len(np.unique(np.concatenate([labels.ravel() for labels in found.values()])))
         true = len(np.unique(np.concatenate([labels.ravel() for labels in case.truth.values()])))
         lines.append([
@@ -221,6 +215,14 @@ def learnt(scene: GaussianScene, views: list[View], find: bool) -> tuple[EMLearn
 def label_maps(scene: GaussianScene, result: Segmentation, views: list[View]) -> Masks:
     """Render label maps of views."""
     return {view.name: result.render(make_operator(scene, view.camera)).labels for view in views}
+
+
+def overlaps(truth: Masks, found: Masks) -> Contingency:
+    """Count the pixels of each pair of a true and a found id."""
+    score = Contingency()
+    for name, labels in truth.items():
+        score.add(labels, found[name])
+    return score
 
 
 def mean_iou(truth: Masks, found: Masks, names: dict[int, int]) -> float:

@@ -15,7 +15,6 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.errors import MaskSizeError, SceneValueError, SettingsError
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu import blending as blend
-from gsseg_core.raster.view_renderer import PixelGrid
 from gsseg_core.scene.camera import Camera
 
 SIZES = [(37, 21), (16, 16), (33, 50), (70, 5), (1, 1), (1, 40)]
@@ -74,61 +73,6 @@ def test_few_channels_are_rendered_as_they_are_among_many(backend, seed):
     many = operator.render(codes)
     for few in (1, 2, 3, 4, 5):
         assert np.abs(operator.render(codes[:, :few]) - many[..., :few]).max() <= backend.weight * (backend is not CPU)
-
-
-@pytest.mark.parametrize("background", [True, False])
-@pytest.mark.parametrize("channels", [1, 3, 40])
-def test_the_strongest_class_is_the_largest_of_all_that_are_rendered(backend, channels, background):
-    scene, camera = random_view(channels, 150, 37, 21)
-    operator, rng = backend.make(scene, camera), np.random.default_rng(channels)
-    codes = rng.choice([0, 0.25, 1], (len(scene), channels)).astype(np.float32)
-    image, left_over = operator.blend(codes)
-    image[..., 0] += left_over if background else 0
-    grid = PixelGrid(2, 5)
-    found = operator.strongest(CSRRows.from_dense(codes), channels, background, grid)
-    assert found.classes.dtype == np.int32 and found.known.dtype == bool
-    np.testing.assert_array_equal(found.classes, image.argmax(axis=2))
-    sure = np.abs(image.sum(axis=2) - 0.5) > 1e-5
-    np.testing.assert_array_equal(found.known[sure], image.sum(axis=2)[sure] > 0.5)
-    np.testing.assert_allclose(found.some, image[2::5, 2::5], atol=1e-6)
-    assert operator.strongest(CSRRows.from_dense(codes), channels, background).some.shape == (0, 0, channels)
-    np.testing.assert_array_equal(found.labels(), np.where(found.known, found.classes, -1))
-
-
-@pytest.mark.parametrize("background", [True, False])
-@pytest.mark.parametrize("others", [0, 1])
-@pytest.mark.parametrize("most", [0, 0.1, 1])
-def test_the_strongest_class_is_the_same_where_blending_ends_early(backend, others, background, most):
-    scene, camera = random_view(3, 4_000, 37, 21)
-    operator, rng = backend.make(scene, camera), np.random.default_rng(3)
-    # Mostly of one class, of a few, or of none: some pixels are decided by the first Gaussians, others never.
-    codes = rng.dirichlet(np.full(9, 0.2), len(scene)) * (rng.random((len(scene), 1)) < 0.9)
-    codes = ((1 - most) * codes + most * np.eye(9)[scene.means[:, 0].argsort().argsort() % 2]).astype(np.float32)
-    image, left_over = operator.blend(codes)
-    image[..., 0] += left_over if background else 0
-    beside = np.ones((len(operator.ids), others), np.float32)
-    found = operator.strongest(CSRRows.from_dense(codes), 9, background, beside=beside)
-    ranked, known = np.sort(image, axis=2), image.sum(axis=2)
-    sure = ranked[..., -1] - ranked[..., -2] > 1e-5
-    assert sure.mean() > 0.9
-    np.testing.assert_array_equal(found.classes[sure], image.argmax(axis=2)[sure])
-    np.testing.assert_array_equal(found.known[np.abs(known - 0.5) > 1e-5], (known > 0.5)[np.abs(known - 0.5) > 1e-5])
-    if others:
-        np.testing.assert_allclose(found.beside.transmittance, left_over, atol=1e-7)
-
-
-@pytest.mark.parametrize("others", [0, 1, 4])
-def test_what_is_blended_beside_the_strongest_class_is_what_is_blended_alone(backend, others):
-    scene, camera = random_view(others, 150, 37, 21)
-    operator, rng = backend.make(scene, camera), np.random.default_rng(others)
-    codes = CSRRows.from_dense(rng.choice([0, 0.25, 1], (len(scene), 5)).astype(np.float32))
-    beside = rng.normal(size=(len(operator.ids), others)).astype(np.float32)
-    found, alone = operator.strongest(codes, 5, True, beside=beside), operator.blend_seen(beside)
-    assert (found.beside is None) == (others == 0)
-    if found.beside is not None:
-        np.testing.assert_allclose(found.beside.image, alone.image, atol=1e-5)
-        np.testing.assert_allclose(found.beside.transmittance, alone.transmittance, atol=1e-7)
-    np.testing.assert_array_equal(found.classes, operator.strongest(codes, 5, True).classes)
 
 
 def test_codes_of_some_gaussians_blend_as_those_of_all(backend):
