@@ -115,7 +115,7 @@ def _start(client: SegmentationClient, nodes: ChildNodes, demo: DemoScene, progr
 
 def _replay(client: SegmentationClient, nodes: ChildNodes, demo: DemoScene, rate: float, progress: Progress) -> None:
     count = len(demo.train)
-    nodes.start("replay_node", {"data": str(demo.root.resolve()), "rate": rate, "wait_for_subscribers": 60.0})
+    nodes.start("replay_node", {"data": str(demo.root.resolve()), "rate": rate})
     _in_slices(
         nodes,
         lambda timeout: client.wait_for_views(count, timeout, lambda views: progress("fuse", views, count)),

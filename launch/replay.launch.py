@@ -17,7 +17,7 @@ ARGUMENTS = (
     ("grow", bool, "False", "whether the scene of data arrives in five submaps, and a loop closes at the end"),
     ("frame_id", str, "camera", "frame of the camera, with data"),
     ("map_frame", str, "map", "frame of the poses, with data"),
-    ("wait_for_subscribers", float, "5.0", "seconds to wait for somebody who listens"),
+    ("wait_for_subscribers", float, "60.0", "seconds to wait for somebody who listens"),
     ("mask_topic", str, "", "topic of bag with the masks; empty: the one whose name ends in mask"),
     ("camera_info_topic", str, "", "topic of bag with the CameraInfo; empty: the one whose name ends in camera_info"),
     ("pose_topic", str, "", "topic of bag with the poses; empty: the one whose name ends in pose"),

@@ -44,7 +44,7 @@ _PARAMETERS: tuple[tuple[str, str | int | float, float | None, float | None, str
     ("grow", False, None, None, "Whether the scene of 'data' arrives in five submaps, and a loop closes at the end"),
     ("frame_id", "camera", None, None, "Frame of the camera, in the headers of mask, camera_info and image ('data')"),
     ("map_frame", "map", None, None, "Frame in which the poses are ('data')"),
-    ("wait_for_subscribers", 5.0, 0.0, 3600.0, "Seconds to wait for somebody who listens to 'mask'"),
+    ("wait_for_subscribers", 60.0, 0.0, 3600.0, "Seconds to wait for somebody who listens to 'mask'"),
     *(
         (f"{role}_topic", "", None, None, f"Topic of 'bag' to replay as '{role}'; empty: the one named so at its end")
         for role in TYPES
@@ -166,9 +166,11 @@ class ReplayNode(Node):
         """Wait until somebody listens to `mask`, or warn that nobody does."""
         deadline = time.monotonic() + seconds
         masks = self._topics["mask"].publisher
+        topic = masks.topic_name
+        if masks.get_subscription_count() == 0:
+            self.get_logger().info(f"waiting up to {seconds:g} s for somebody who listens to '{topic}'")
         while masks.get_subscription_count() == 0:
             if time.monotonic() >= deadline:
-                topic = masks.topic_name
                 self.get_logger().warning(f"nobody listens to '{topic}' after {seconds:g} s: publishing all the same")
                 return
             self._spin_until(min(deadline, time.monotonic() + _SLICE_S))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import signal
 import time
@@ -172,16 +173,16 @@ def test_labels_of_sixteen_bits_arrive_bit_for_bit(ros: Ros, tmp_path: Path) -> 
     np.testing.assert_array_equal(labels_from_image(heard["mask"][0], "mask"), labels)
 
 
-def test_a_loop_starts_again_with_later_stamps_at_the_same_rate(ros: Ros, folder: Path) -> None:
+def test_a_loop_starts_again_with_later_stamps_and_no_mask_early(ros: Ros, folder: Path) -> None:
     heard = listen(ros)
     output = finished(ros.start("replay_node", {"data": folder, "rate": 20.0, "loop": 3}))
     ros.wait_until(lambda: len(heard["mask"]) == 12, "12 masks")
     times = stamps(heard["mask"])
     assert times == sorted(set(times))
     np.testing.assert_array_equal(heard["mask"][0].data, heard["mask"][8].data)
-    # Eleven intervals; generous, for a busy machine.
-    assert 0.3 < (times[-1] - times[0]) / 1e9 < 5
-    assert "published 12 mask" in output
+    # Masks that are late on a busy machine follow each other faster; none is early.
+    done = re.search(r"published 12 mask, .* in ([\d.]+) s", output)
+    assert done and float(done[1]) >= 12 / 20
 
 
 def test_views_without_a_mask_are_left_out_with_a_warning(ros: Ros, folder: Path, tmp_path: Path) -> None:
@@ -201,7 +202,7 @@ def test_without_a_subscriber_it_warns_and_goes_on(ros: Ros, folder: Path) -> No
 
 
 def test_it_waits_for_a_subscriber_that_comes_late(ros: Ros, folder: Path) -> None:
-    process = ros.start("replay_node", {"data": folder, "rate": 40.0, "wait_for_subscribers": 60.0})
+    process = ros.start("replay_node", {"data": folder, "rate": 40.0})
     ros.wait_until(lambda: ros.node.count_publishers("mask") == 1, "the node")
     heard = listen(ros)
     finished(process)
