@@ -28,9 +28,9 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
-FIRST_RUN = "compiling kernels, about half a minute on two cores; only the first run after installing does this"
+FIRST_RUN = "compiling kernels, about a minute on two cores; only the first run after installing does this"
 EVERY_RUN = (
-    "compiling kernels, about half a minute on two cores, as in every run: they cannot be kept; " + kernel_cache.REMEDY
+    "compiling kernels, about a minute on two cores, as in every run: they cannot be kept; " + kernel_cache.REMEDY
 )
 
 SIDE = 72
@@ -55,7 +55,7 @@ class _FirstCompilation(event.Listener):
 def warm_up(device: str = "cpu", say: Callable[[str], object] = lambda text: None) -> None:
     """Take some thousand Gaussians through everything that segmenting does, so that all its kernels are there.
 
-    That takes a second when they are in the cache, and about half a minute on two cores at the first time after an
+    That takes a second when they are in the cache, and about a minute on two cores at the first time after an
     installation; then `say` is told, and a second process compiles beside this one. In a process that is warm, nothing
     is done.
     """

@@ -238,7 +238,7 @@ def _kernels(say: Callable[[str], object]) -> Iterator[Finding]:
         yield Finding("kernels", "cache", add_votes.stats.cache_path or kernel_cache.FOLDER)
     else:
         state = f"none: cannot write to {' or '.join(kernel_cache.candidates())}"
-        fix = f"{kernel_cache.REMEDY}; else every run compiles for about half a minute on two cores"
+        fix = f"{kernel_cache.REMEDY}; else every run compiles for about a minute on two cores"
         yield Finding("kernels", "cache", state, "-", fix)
 
 
