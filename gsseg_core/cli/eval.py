@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import suppress
 from pathlib import Path
 
 from gsseg_core.cli.terminal import tell
@@ -33,14 +34,13 @@ def run(options: argparse.Namespace) -> int:
     from gsseg_core.data.class_names import read_classes
     from gsseg_core.data.mask_formats.table import open_masks
     from gsseg_core.errors import ClassesFileError, SettingsError
-    from gsseg_core.files.atomic import check_writable
     from gsseg_core.files.input_files import is_there
     from gsseg_core.files.json_files import write_json
     from gsseg_core.metrics import evaluate_folders, evaluate_masks, predicted_maps
     from gsseg_core.text import evaluation_summary
 
     if options.json:
-        check_writable(options.json)
+        _check_replaceable(Path(options.json))
     root = Path(options.truth).parent
     classes = root / "classes.json"
     names = read_classes(classes) if is_there(classes, ClassesFileError) else None
@@ -60,3 +60,18 @@ def run(options: argparse.Namespace) -> int:
         write_json(options.json, scores)
     tell(evaluation_summary(scores))
     return 0
+
+
+def _check_replaceable(path: Path) -> None:
+    """Raise `PathTakenError` if something else than scores is there, or, as `check_writable` does, `WriteError`."""
+    from gsseg_core.errors import PathTakenError
+    from gsseg_core.files.atomic import check_writable
+    from gsseg_core.files.json_files import read_object
+
+    check_writable(path)
+    if not path.exists() or not path.stat().st_size:
+        return
+    with suppress(PathTakenError):
+        if "mean_iou" in read_object(path, PathTakenError, "scores"):
+            return
+    raise PathTakenError(f"{path}: is there and holds no scores; expected a new file, or scores to replace")

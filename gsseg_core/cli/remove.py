@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 
 from gsseg_core.cli.shared import add_collision, add_format
 from gsseg_core.cli.terminal import tell
@@ -37,6 +38,7 @@ def run(options: argparse.Namespace) -> int:
     import numpy as np
 
     from gsseg_core.data.class_names import class_ids, listed
+    from gsseg_core.errors import PathTakenError, SettingsError
     from gsseg_core.export.class_files import write_selection
     from gsseg_core.export.collision import check_collision, collision_meshes
     from gsseg_core.files.atomic import check_writable
@@ -47,13 +49,19 @@ def run(options: argparse.Namespace) -> int:
     from gsseg_core.text import clipped, counted
 
     check_writable(options.out)
+    for what, path in (("scene", options.scene), ("segmentation", options.segmentation)):
+        if os.path.exists(options.out) and os.path.exists(path) and os.path.samefile(options.out, path):
+            raise PathTakenError(f"{options.out}: is the {what} that is read, and would be lost; expected another file")
     scene_format = format_of(options.out, options.format)
     check_format(scene_format)
     check_collision(options.collision)
     scene = GaussianScene.load(options.scene)
     segmentation = Segmentation.load(options.segmentation, scene)
     names = segmentation.node_names
-    chosen = class_ids(options.classes, names)
+    try:
+        chosen = class_ids(options.classes, names)
+    except SettingsError as error:
+        raise SettingsError(f"{options.segmentation}: {error}") from error
     rest = left_without(scene, segmentation, chosen)
     left = replace(segmentation, labels=np.where(rest, segmentation.labels, np.int32(REMOVED)))
     meshes = collision_meshes(scene, left, options.collision) if options.collision else {}

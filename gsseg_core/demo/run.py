@@ -10,6 +10,7 @@ import numpy as np
 from gsseg_core import pipeline
 from gsseg_core.demo.table_scene import DemoScene, build_demo
 from gsseg_core.learn.learner import Progress, silent
+from gsseg_core.learn.registry import check_seed
 from gsseg_core.metrics import evaluate_folders, iou
 from gsseg_core.progress import Stopwatch
 from gsseg_core.segmentation import Segmentation
@@ -24,6 +25,7 @@ def run_demo(out: str | os.PathLike[str], *, seed: int = 0, progress: Progress =
     str
         Tables for the terminal.
     """
+    check_seed(seed)
     out = Path(out)
     watch = Stopwatch()
     with watch.stage("build the scene"):

@@ -15,7 +15,7 @@ from gsseg_core.data.object_tree import check_granularity
 from gsseg_core.data.view import QUALITIES
 from gsseg_core.errors import SettingsError
 from gsseg_core.export.collision import check_collision
-from gsseg_core.learn.registry import check_learner
+from gsseg_core.learn.registry import check_learner, check_seed
 from gsseg_core.objects.oriented_boxes import object_boxes
 from gsseg_core.refine.label_propagation import GraphSettings
 from gsseg_core.refine.settings import RefineSettings
@@ -64,6 +64,7 @@ class RunSettings:
     def check(self) -> None:
         """Raise `SettingsError` where they do not go together."""
         check_learner(self.learner, self.scheduler)
+        check_seed(self.seed)
         if self.ids not in (*IDS, None):
             raise SettingsError(f"ids is {self.ids!r}; expected one of {', '.join(IDS)}")
         if self.granularity is not None:

@@ -9,17 +9,19 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gsseg_core.data.class_names import class_name
 from gsseg_core.data.label_evidence import LabelEvidence
-from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.label_images import PER_VIEW, UNKNOWN
 from gsseg_core.data.soft_masks import TOLERANCE, SeenLabels
 from gsseg_core.data.view import View
-from gsseg_core.errors import GssegError, PathTakenError
+from gsseg_core.errors import GssegError, PathTakenError, StateFileError
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.limits import LIMITS, MAX_LABEL
 from gsseg_core.files.npz_files import (
@@ -66,11 +68,24 @@ class State:
     class_names: dict[int, str] = field(default_factory=dict)  # as far as they are known
     learnt: Learnt | None = None  # the best codes
     living: LivingScene | None = None  # the scene, if it changes and so is in the file
+    per_view: bool = False  # whether its classes are objects that its session found and numbered itself
 
     @property
     def num_classes(self) -> int:
         """Classes of votes or codes."""
         return max(int(self.votes.shape[1]), 0 if self.learnt is None else int(self.learnt.codes.shape[1]))
+
+    def check_names(self, known: Mapping[int, str], source: str | os.PathLike[str], where: str) -> None:
+        """Raise `StateFileError` if this state, of `source`, calls a class otherwise than it is called elsewhere.
+
+        Names like "class_07", which were made up where there were none, may be any.
+        """
+        for k in sorted(self.class_names.keys() & known.keys()):
+            here, there = self.class_names[k], known[k]
+            if here != there and class_name({}, k) not in (here, there):
+                raise StateFileError(
+                    f"{source}: calls class {k} {quoted(here)}; expected {quoted(there)}, as in {where}"
+                )
 
     def save(self, path: str | os.PathLike[str], digest: str) -> None:
         """Write the state of the scene with this digest, atomically. Colours of the scene are not in the file.
@@ -93,6 +108,8 @@ class State:
             "num_fused": self.num_fused,
             "class_names": self.class_names,
         }
+        if self.per_view:
+            header["ids"] = PER_VIEW
         arrays = {"seen": seen.astype(np.int64), "votes": self.votes[seen]}
         if self.learnt is not None:
             header["learnt"] = {name: value for name, value in vars(self.learnt).items() if name != "codes"}
@@ -178,7 +195,7 @@ class State:
             check_shares("codes", codes)
             num_views = whole_number(entry["num_views"], "num_views of what was learnt", 0, _MOST_VIEWS)
             learnt = Learnt(str(entry["learner"]), codes, num_views, temperature_of(entry))
-        return cls(votes, views, num_fused, class_names_of(header), learnt, living)
+        return cls(votes, views, num_fused, class_names_of(header), learnt, living, header.get("ids") == PER_VIEW)
 
 
 def _entry(view: View) -> dict[str, Any]:

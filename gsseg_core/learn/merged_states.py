@@ -14,7 +14,6 @@ from gsseg_core.errors import StateFileError, StateMismatchError
 from gsseg_core.learn.learner_state import State
 from gsseg_core.scene.group_frames import is_same_relation
 from gsseg_core.scene.living_scene import LivingScene
-from gsseg_core.text import quoted
 
 
 class Saved(NamedTuple):
@@ -36,7 +35,7 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
     StateMismatchError
         They are of different scenes.
     StateFileError
-        They have different names for one class.
+        They have different names for one class, or ids that each session gave to the objects that it found.
     """
     first = saved[0]
     names: dict[int, str] = {}
@@ -48,6 +47,11 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
                 f"{one.source}: belongs to the scene {one.scene[:12]}; expected {first.scene[:12]}, that of "
                 f"{first.source}, with the same groups"
             )
+        if one.state.per_view and len(saved) > 1:
+            raise StateFileError(
+                f"{one.source}: holds objects that its own session found and numbered (ids per-view); expected classes "
+                "whose ids mean the same in all states"
+            )
         _add_names(names, one)
         votes[:, : one.state.votes.shape[1]] += one.state.votes
         for view in one.state.views:
@@ -58,15 +62,9 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
 
 
 def _add_names(names: dict[int, str], one: Saved) -> None:
-    for k, name in one.state.class_names.items():
-        known = names.get(k)
-        # One like "class_07" was made up where none was known.
-        if known is None or known == class_name({}, k):
-            names[k] = name
-        elif name not in (known, class_name({}, k)):
-            raise StateFileError(
-                f"{one.source}: calls class {k} {quoted(name)}; expected {quoted(known)}, as in the states before it"
-            )
+    one.state.check_names(names, one.source, "in the states before it")
+    given = one.state.class_names.items()
+    names.update({k: name for k, name in given if k not in names or name != class_name({}, k)})
 
 
 def _free_name(name: str, taken: dict[str, View]) -> str:

@@ -50,6 +50,12 @@ def check_learner(name: str, scheduler: str | None = None) -> None:
         )
 
 
+def check_seed(seed: int) -> None:
+    """Raise `SettingsError` if random numbers cannot begin with it."""
+    if seed < 0:
+        raise SettingsError(f"seed is {seed}; expected at least 0")
+
+
 def make_learner(
     name: str, scene: GaussianScene, num_classes: int, *,
     max_steps: int | None = None, seed: int = 0, client: Client | None = None, **where: Any,

@@ -228,7 +228,8 @@ class LivingSession(LiveSession):
         gone = {group for group in saved.frames if group not in self._living.frames or change.has_flattened(group)}
         votes.change(change, {view.name: None for view in state.views if view.group in gone})
         learnt = state.learnt and replace(state.learnt, codes=change.carry(state.learnt.codes))
-        return replace(votes.state(), num_fused=state.num_fused, class_names=state.class_names, learnt=learnt)
+        now = votes.state()
+        return replace(state, votes=now.votes, views=now.views, living=now.living, learnt=learnt)
 
     def _places_in(self, saved: LivingScene, path: Path) -> np.ndarray:
         if saved is self._first or not self._numbered:

@@ -32,7 +32,7 @@ class PerViewSession(LiveSession):
     the background counted, is refused.
     """
 
-    _LABEL, _REMEDY = "would show the first of object", ""
+    _LABEL, _REMEDY, _PER_VIEW = "would show the first of object", "", True
     _with_tree: tuple[Segmentation, Segmentation] | None = None  # a result, and the same with its tree
 
     @property

@@ -62,7 +62,7 @@ class LiveSession:
         Views in the votes.
     """
 
-    _LABEL, _REMEDY = "mask holds the label", ", or class_names that declare it"
+    _LABEL, _REMEDY, _PER_VIEW = "mask holds the label", ", or class_names that declare it", False
     _learnt: Learnt | None
     _segmented: tuple[object, Segmentation] | None
     _cameras: list[Camera]  # of the dataset that was learnt from
@@ -306,7 +306,8 @@ class LiveSession:
             if not self.has_codes:
                 raise NoCodesError(f"{path}: nothing to save; expected at least one view to be fused first")
             learnt, fused, scene = self._learnt, self.num_fused, self.scene
-            state = replace(self._live.state(), num_fused=fused, class_names=self.class_names, learnt=learnt)
+            known, names = self._live.state(), self.class_names
+            state = replace(known, num_fused=fused, class_names=names, learnt=learnt, per_view=self._PER_VIEW)
         state.save(path, scene.digest)
         return learnt.num_views if learnt is not None else fused
 
@@ -317,7 +318,7 @@ class LiveSession:
         ------
         StateFileError
             The file is missing or damaged, or has more classes than there are names for, or without names than
-            `max_classes`. Nothing has changed.
+            `max_classes`, or other names than were given. Nothing has changed.
         StateMismatchError
             It belongs to another scene. Nothing has changed.
         PathNotAllowedError
@@ -373,10 +374,12 @@ class LiveSession:
         return State.load(path, self.scene.digest, len(self.scene), within)
 
     def _check_classes(self, path: str | os.PathLike[str], state: State) -> None:
-        """Raise `StateFileError` if a state has too many classes."""
+        """Raise `StateFileError` if a state has too many classes, or other names than were declared."""
         most, why = (len(self._names), ", as were named") if self._declared else (self.max_classes, " (max_classes)")
         if state.num_classes > most:
             raise StateFileError(f"{path}: holds {state.num_classes} classes; expected at most {most}{why}")
+        if self._declared:
+            state.check_names(self._names, path, "the names that were given")
 
     def _posed_views(self) -> list[View]:
         """List the views that are kept, posed in the scene as it is now."""

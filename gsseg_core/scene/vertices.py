@@ -102,7 +102,8 @@ def columns(vertices: npt.NDArray[np.void], names: tuple[str, ...]) -> npt.NDArr
 
 def logits(opacities: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
     """Logits of opacities in [0, 1], kept finite; of what is no opacity, NaN, which validation reports."""
-    given = np.asarray(opacities, np.float64)
+    with np.errstate(invalid="ignore"):  # There are NaN that are signalled when they are converted.
+        given = np.asarray(opacities, np.float64)
     inside = np.clip(np.where((given >= 0) & (given <= 1), given, np.nan), _MARGIN, 1 - _MARGIN)
     found: npt.NDArray[np.float64] = np.log(inside / (1 - inside))
     return found

@@ -115,6 +115,7 @@ def test_bad_input_is_one_clear_line_with_exit_code_2_and_changes_nothing(
 @pytest.mark.parametrize(
     ("settings", "names"),
     [(["--scheduler", "tcp://x"], "scheduler is 'tcp://x'"), (["--k", "0"], "k = 0"),
+     (["--learner", "gradient", "--seed", "-1"], "seed is -1"),
      (["--beta", "2"], "beta"), (["--views", "0"], "views is 0"), (["--views", "-1"], "views is -1")],
 )  # fmt: skip
 def test_impossible_settings_are_one_clear_line_with_exit_code_2(

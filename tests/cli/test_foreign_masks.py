@@ -82,14 +82,16 @@ def test_masks_that_lie_where_the_command_is_typed_are_found(place: Path, monkey
     assert "masks" in json.loads((place / "out/report.json").read_text())
 
 
+@pytest.mark.parametrize(("suffix", "content"), [(".json", "{}"), (".txt", "-1 .1 .1 .9 .1 .9 .9")])
 def test_a_folder_of_unknown_files_is_refused_with_what_is_read(
-    place: Path, capsys: pytest.CaptureFixture[str]
+    place: Path, capsys: pytest.CaptureFixture[str], suffix: str, content: str
 ) -> None:
     (place / "data/strange").mkdir()
     for view in range(6):
-        (place / f"data/strange/view{view}.json").write_text("{}")
+        (place / f"data/strange/view{view}{suffix}").write_text(content)
     assert main([*segment(place), "--labels", "strange"]) == 2
-    assert_one_line(capsys.readouterr().err, "strange/view0.json: is no file of masks that is known; gsseg reads label")
+    said = f"strange/view0{suffix}: is no file of masks that is known; gsseg reads label"
+    assert_one_line(capsys.readouterr().err, said)
 
 
 @pytest.mark.parametrize("name", ["COCO polygons", "LabelMe masks", "SAM 2 video"])

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from segmented_place import assert_one_line
 from small_scenes import balls_on_a_table, write_dataset
 
 from gsseg_core.cli.main import main
@@ -194,6 +195,30 @@ def test_single_files_replace_no_device_and_keep_links(place: Path, capsys: pyte
     (place / "link.ply").symlink_to("rest.ply")
     assert main([*remove, "--out", f"{place}/link.ply"]) == 0
     assert (place / "link.ply").is_symlink() and len(GaussianScene.load(place / "rest.ply")) > 0
+
+
+@pytest.mark.parametrize("read", ["data/scene.ply", "out/segmentation.npz"])
+def test_remove_never_writes_over_what_it_reads(place: Path, capsys: pytest.CaptureFixture[str], read: str) -> None:
+    before = (place / read).read_bytes()
+    (place / "link").symlink_to(place / read)
+    given = [f"{place}/data/scene.ply", "--segmentation", f"{place}/out/segmentation.npz", "--class", "1"]
+    for out in (read, "link"):
+        assert main(["remove", *given, "--out", f"{place}/{out}"]) == 2
+        assert_one_line(capsys.readouterr().err, f"{place}/{out}: is the {Path(read).stem} that is read")
+    assert (place / read).read_bytes() == before
+
+
+def test_scores_replace_nothing_but_scores(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data, scores = place / "data", place / "scores.json"
+    given = ["eval", "--pred", f"{data}/labels", "--truth", f"{data}/labels", "--json"]
+    for other in ("classes.json", "split.json", "cameras.json", "scene.ply"):
+        before = (data / other).read_bytes()
+        assert main([*given, f"{data}/{other}"]) == 2
+        assert_one_line(capsys.readouterr().err, f"{other}: is there and holds no scores; expected a new file")
+        assert (data / other).read_bytes() == before
+    scores.touch()  # As mktemp leaves it.
+    for _ in range(2):
+        assert main([*given, str(scores)]) == 0 and json.loads(scores.read_text())["mean_iou"] == 1
 
 
 def test_segment_writes_the_classes_in_the_format_asked_for_and_meshes_beside_them(place: Path) -> None:

@@ -11,7 +11,9 @@ from small_scenes import NAMES, balls_on_a_table, clean_views
 
 from gsseg_core.cli.main import main
 from gsseg_core.data.view import View
+from gsseg_core.errors import StateFileError
 from gsseg_core.live.living_session import LivingSession
+from gsseg_core.live.per_view_session import PerViewSession
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_delta import SceneDelta
 
@@ -80,6 +82,25 @@ def test_states_that_do_not_belong_together_are_refused_with_one_error_and_nothi
         with pytest.raises(Exception, match=Path(other).name):
             session.merge([one, other])
         np.testing.assert_array_equal(session._live._votes, before)
+
+
+def test_objects_that_robots_have_numbered_themselves_are_not_added_up(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robots = [str(tmp_path / name) for name in ("a.npz", "b.npz")]
+    for path, views in zip(robots, (VIEWS[:3], VIEWS[3:]), strict=True):
+        finder = PerViewSession(SCENE)
+        for view in views:
+            assert finder.fuse(view) is None
+        finder.save(path)
+    session = LivingSession(SCENE)
+    session.fuse(VIEWS[0])
+    before = session._live._votes.copy()
+    with pytest.raises(StateFileError, match=r"a\.npz: holds objects that its own session found and numbered"):
+        session.merge(robots[:1])
+    np.testing.assert_array_equal(session._live._votes, before)
+    assert main(["merge", *robots, "-o", str(tmp_path / "c.npz")]) == 2
+    assert "a.npz: holds objects that" in capsys.readouterr().err and not (tmp_path / "c.npz").exists()
 
 
 def test_names_that_were_made_up_give_way_to_real_ones(tmp_path: Path) -> None:

@@ -272,7 +272,8 @@ def test_a_state_that_does_not_fit_is_refused_and_changes_nothing(tmp_path: Path
     fed(other, VIEWS[:1])
     few = LiveSession(SCENE, {0: "background", 1: "ball"})
     few.fuse(blank(VIEWS[0], 1))
-    for session, error in ((other, StateMismatchError), (few, StateFileError)):
+    renamed = fed(LiveSession(SCENE, {**NAMES, 1: NAMES[2], 2: NAMES[1]}))
+    for session, error in ((other, StateMismatchError), (few, StateFileError), (renamed, StateFileError)):
         before = session.codes()
         with pytest.raises(error):
             session.load(path)

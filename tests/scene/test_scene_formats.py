@@ -22,7 +22,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.moving import move
 from gsseg_core.scene.quaternions import covariances
 from gsseg_core.scene.scene_formats import SCENE_FORMATS, find_format, read_scene
-from gsseg_core.scene.vertices import pack_vertices
+from gsseg_core.scene.vertices import log_scales, logits, pack_vertices
 
 Write = Callable[[Path, GaussianScene], None]
 
@@ -312,3 +312,8 @@ def test_real_files_of_other_programs_are_read(real_data: Path) -> None:
     for name, count, degree in files:
         scene = GaussianScene.load(folder / name)
         assert len(scene) == count and scene.sh_degree == degree
+
+
+def test_a_nan_that_is_signalled_when_it_is_converted_is_nan_without_a_warning() -> None:
+    signalling = np.array([0x7F800001], np.uint32).view(np.float32)
+    assert np.isnan(logits(signalling)).all() and np.isnan(log_scales(signalling)).all()

@@ -131,10 +131,10 @@ def known_formats() -> str:
 
 
 def _unknown(place: Place) -> Path | None:
-    """Find a file that is meant as masks: the place itself, or JSON of a view where there is none of gsseg's own."""
+    """Find a file that is meant as masks: the place itself, or what a view has where there is none of gsseg's own."""
     if not place.path.is_dir():
         return place.path
-    described = next(iter(place.by_view(".json").values()), None)
+    described = next(iter([*place.by_view(".json").values(), *place.by_view(".txt").values()]), None)
     return None if mask_files(place.path, place.stems, place.within) else described
 
 
