@@ -48,6 +48,7 @@ def run(options: argparse.Namespace) -> int:
     from gsseg_core.align.placing import place
     from gsseg_core.data.dataset import Dataset
     from gsseg_core.data.view import View, spread
+    from gsseg_core.errors import NoUsableViewsError
     from gsseg_core.export.collision import check_collision, collision_mesh
     from gsseg_core.export.pictures import overlay, palette, save_png
     from gsseg_core.export.view_pictures import background_image
@@ -84,6 +85,11 @@ def run(options: argparse.Namespace) -> int:
             for name, mask in zip(options.views, options.masks, strict=True)
         ]
         picked = pick_masks(scene, views, device=options.device)
+        if not len(picked.ids):
+            raise NoUsableViewsError(
+                f"{', '.join(options.masks)}: no Gaussian lies more in the object than beside it; expected a mask of "
+                "what the scene shows there as Gaussians of its own"
+            )
         shown = picked.silhouette(scene, views[0].camera, device=options.device)
         image = background_image(scene, make_operator(scene, views[0].camera, options.device))
         kind, part = options.collision, scene.subset(picked.ids)

@@ -158,6 +158,22 @@ def test_render_and_eval_refuse_what_does_not_fit(place: Path, capsys: pytest.Ca
     assert not (place / "maps").exists()
 
 
+def test_a_mask_of_what_no_gaussian_is_part_of_picks_nothing_and_is_named(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def swell(vertices: np.ndarray) -> np.ndarray:
+        for axis in range(3):
+            vertices[f"scale_{axis}"] = 20
+        return vertices
+
+    edit_scene(place, swell)
+    data, out = place / "data", place / "picked"
+    mask = ["--view", "view0", "--mask", f"{data}/labels/view0.png", "--label", "1"]
+    assert main(["pick", f"{data}/scene.ply", "--data", str(data), *mask, "--out", str(out), "--quiet"]) == 2
+    assert_one_line(capsys.readouterr().err, "labels/view0.png: no Gaussian lies more in the object than beside it")
+    assert not out.exists()
+
+
 def test_an_out_that_cannot_be_written_is_one_clear_line(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (place / "file").write_text("in the way")
     assert main([*segment(place), "--out", f"{place}/file/out"]) == 2
