@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from unittest.mock import patch
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -14,6 +16,7 @@ from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.demo.mask_errors import resize
 from gsseg_core.errors import SettingsError
+from gsseg_core.learn.em import boundary_alignment
 from gsseg_core.learn.em.boundary_alignment import _boundary_strengths, _nearest_regions, align_boundaries
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.em.mask_offset import move_mask
@@ -24,6 +27,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 
 SCENE, _ = balls_on_a_table()
 FARTHEST = 3
+whatever_edges_tell = patch.object(boundary_alignment, "TELLING", 0)
 SMALL_MASKS = arrays.arrays(np.int32, st.tuples(st.integers(1, 20), st.integers(1, 20)), elements=st.integers(-1, 2))
 
 
@@ -108,17 +112,19 @@ def test_without_edges_nothing_moves() -> None:
 def test_where_edges_are_no_stronger_along_boundaries_than_elsewhere_nothing_moves() -> None:
     labels = discs()
     posters = 12 * ndimage.gaussian_filter(np.random.default_rng(2).random(labels.shape, np.float32), 1)
-    assert (align_boundaries(labels, posters, FARTHEST, telling=0) != labels).any()
+    with whatever_edges_tell:
+        assert (align_boundaries(labels, posters, FARTHEST) != labels).any()
     np.testing.assert_array_equal(align_boundaries(labels, posters, FARTHEST), labels)
 
 
+@whatever_edges_tell
 @given(SMALL_MASKS, st.integers(1, 3), st.integers(0, 2**32 - 1))
 def test_pixels_move_to_regions_near_by_and_the_unknown_stays_unknown(
     labels: np.ndarray, farthest: int, seed: int
 ) -> None:
     edges = np.random.default_rng(seed).random(labels.shape, np.float32)
     before = labels.copy()
-    aligned = align_boundaries(labels, edges, farthest, telling=0)
+    aligned = align_boundaries(labels, edges, farthest)
     np.testing.assert_array_equal(labels, before)
     np.testing.assert_array_equal(aligned < 0, labels < 0)
     for row, column in np.argwhere(aligned != labels):
@@ -127,13 +133,14 @@ def test_pixels_move_to_regions_near_by_and_the_unknown_stays_unknown(
         assert aligned[row, column] in labels[near]
 
 
+@whatever_edges_tell
 @given(st.lists(st.integers(1, 19), min_size=1, max_size=30), st.integers(1, 3), st.integers(0, 2**32 - 1))
 def test_a_view_turned_around_settles_turned_around(widths: list[int], farthest: int, seed: int) -> None:
     # Two regions, side by side: where there are more, some pixels are equally near to two, and either may be named.
     labels = (np.arange(20) < np.array(widths)[:, None]).astype(np.int32)
     edges = np.random.default_rng(seed).random(labels.shape, np.float32)
-    aligned = align_boundaries(labels, edges, farthest, telling=0)
-    turned = align_boundaries(labels[::-1, ::-1].copy(), edges[::-1, ::-1].copy(), farthest, telling=0)[::-1, ::-1]
+    aligned = align_boundaries(labels, edges, farthest)
+    turned = align_boundaries(labels[::-1, ::-1].copy(), edges[::-1, ::-1].copy(), farthest)[::-1, ::-1]
     np.testing.assert_array_equal(aligned, turned)
 
 

@@ -54,7 +54,7 @@ BAND = 64  # rows of the image that are gone through at once
 ROUNDS = 6  # of the mean field, each with a better prior
 
 
-def align_boundaries(labels: np.ndarray, edges: np.ndarray, farthest: int, telling: float = TELLING) -> np.ndarray:
+def align_boundaries(labels: np.ndarray, edges: np.ndarray, farthest: int) -> np.ndarray:
     """Align a mask and its boundaries with edges of the scene.
 
     Parameters
@@ -65,19 +65,17 @@ def align_boundaries(labels: np.ndarray, edges: np.ndarray, farthest: int, telli
         Their strength, from `scene_edges`.
     farthest : int
         S, in px: regions are drawn too wide or too narrow by this much at most.
-    telling : float
-        How many times as strong as in the whole view edges must be within S px of the boundaries.
 
     Returns
     -------
     (H, W) int32
         A new mask; unknown, too, along the sides that it was moved away from.
     """
-    here = _align_regions(labels, edges, farthest, telling)
+    here = _align_regions(labels, edges, farthest)
     offset = likeliest_offset(here.beside, here.weights, edges)
     if offset == (0, 0):
         return here.labels
-    moved = _align_regions(move_mask(labels, offset), edges, farthest, telling)
+    moved = _align_regions(move_mask(labels, offset), edges, farthest)
     return moved.labels if moved.tells and moved.evidence - LOG_OFFSETS > here.evidence + CLEAR else here.labels
 
 
@@ -91,7 +89,7 @@ class _Alignment(NamedTuple):
     weights: np.ndarray  # (P,) what edges of one unit are worth in each of them, in nats
 
 
-def _align_regions(labels: np.ndarray, edges: np.ndarray, farthest: int, telling: float) -> _Alignment:
+def _align_regions(labels: np.ndarray, edges: np.ndarray, farthest: int) -> _Alignment:
     """Align the boundaries of a mask that as a whole stays in its place; `align_boundaries` says what is what."""
     region, first, area = connected_pixels(labels)
     other, ring = _nearest_regions(region, 2 * farthest)
@@ -103,7 +101,7 @@ def _align_regions(labels: np.ndarray, edges: np.ndarray, farthest: int, telling
     log_likelihood = _edge_log_likelihood(lengths[moving], strengths[moving])
     still = float(log_likelihood[:, 2 * farthest - 1].sum())
     near = slice(farthest, 3 * farthest)  # a boundary may lie this far from its edge
-    tells = bool(strengths[:, near].sum() >= telling * edges.mean() * lengths[:, near].sum())
+    tells = bool(strengths[:, near].sum() >= TELLING * edges.mean() * lengths[:, near].sum())
     aligned = labels.copy()
     if not tells:
         return _Alignment(aligned, still, tells, beside, weights)
