@@ -23,7 +23,7 @@ import numba as nb
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsseg_core.refine.knn_filter import cluster, statistical_filter
+from gsseg_core.refine.knn_filter import cluster_in_place, statistical_filter
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import Neighbours
@@ -43,12 +43,12 @@ def main() -> None:
     means = GaussianScene.load(path).means
     labels, probabilities, observed = make_codes(means)
     k, beta = RefineSettings.k, RefineSettings.beta
-    unsure = cluster(means, probabilities, observed, k, beta).changed.mean()
+    unsure = cluster_in_place(means, probabilities.copy(), observed, k, beta)[0].mean()
 
     print(f"{processor()}, {nb.get_num_threads()} threads, load {load()} before, numba {nb.__version__}")
     print(f"{len(means)} Gaussians, {CLASSES} classes, {unsure:.1%} unsure or unobserved, k = {k}, {REPEATS} runs\n")
     steps = {
-        "cluster": lambda: cluster(means, probabilities, observed, k, beta),
+        "cluster": lambda: cluster_in_place(means, probabilities.copy(), observed, k, beta),
         "filter": lambda: statistical_filter(means, labels, k, 1.0, CLASSES),
     }
     steps["cluster + filter"] = lambda: (steps["cluster"](), steps["filter"]())

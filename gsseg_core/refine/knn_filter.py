@@ -1,12 +1,10 @@
 """Refinement of learnt probabilities: KNN clustering of unsure Gaussians, and a statistical filter per object.
 
-Both steps are pure functions of positions and probabilities (or labels), take all classes at once, and say what they
-changed. Results are bit-identical whatever the order of the Gaussians and the number of threads.
+Both steps take all classes at once, and say what they changed. Results are bit-identical whatever the order of the
+Gaussians and the number of threads.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,21 +14,14 @@ from gsseg_core.spatial.class_distances import class_distances
 from gsseg_core.spatial.neighbourhood import Neighbours
 
 
-class Clustered(NamedTuple):
-    """What `cluster` returns."""
-
-    probabilities: np.ndarray  # (N, K) float32: a new array; rows that did not change are those that went in
-    changed: np.ndarray  # (N,) bool: which Gaussians took the mean code of their neighbours
-
-
-def cluster(
+def cluster_in_place(
     means: np.ndarray,
-    probabilities: np.ndarray,
+    codes: np.ndarray,
     observed: np.ndarray,
     k: int = RefineSettings.k,
     beta: float = RefineSettings.beta,
     neighbours: Neighbours | None = None,
-) -> Clustered:
+) -> tuple[np.ndarray, np.ndarray]:
     """Give every unsure and every unobserved Gaussian the mean code of the observed ones among its k nearest.
 
     Unsure are those whose largest probability is below `beta`. All neighbours' codes are those from before the step.
@@ -42,8 +33,8 @@ def cluster(
     ----------
     means : array (N, 3) of float32
         Finite positions, scene units.
-    probabilities : array (N, K) of float32
-        Rows on the simplex; those of unobserved Gaussians are not read.
+    codes : array (N, K) of float32
+        Rows on the simplex, contiguous; written to. Those of unobserved Gaussians are not read.
     observed : array (N,) of bool
         Whether any view saw the Gaussian.
     k : int
@@ -53,32 +44,19 @@ def cluster(
     neighbours : Neighbours, optional
         Those of `means` for this k, if they are known already.
 
+    Returns
+    -------
+    (N,) bool, (M, K) float32
+        Which rows changed, and what these were before.
+
     Examples
     --------
     >>> import numpy as np
     >>> means = np.array([[0, 0, 0], [1, 0, 0], [3, 0, 0]], np.float32)
     >>> codes = np.array([[0, 1], [0.5, 0.5], [0.25, 0.75]], np.float32)
-    >>> cluster(means, codes, np.array([True, True, True]), k=1).probabilities.tolist()
+    >>> changed, before = cluster_in_place(means, codes, np.array([True, True, True]), k=1)
+    >>> codes.tolist()
     [[0.0, 1.0], [0.0, 1.0], [0.25, 0.75]]
-    """
-    refined = np.array(probabilities, np.float32, order="C")
-    return Clustered(refined, cluster_in_place(means, refined, observed, k, beta, neighbours)[0])
-
-
-def cluster_in_place(
-    means: np.ndarray,  # (N, 3) float32
-    codes: np.ndarray,  # (N, K) float32, contiguous
-    observed: np.ndarray,  # (N,) bool
-    k: int,
-    beta: float,
-    neighbours: Neighbours | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Do what `cluster` does in an array of millions of rows, without another one.
-
-    Returns
-    -------
-    (N,) bool, (M, K) float32
-        Which rows changed, and what these were before.
     """
     wanted = ~observed | (largest(codes)[0] < beta)
     if len(means) < 2 or not wanted.any() or not observed.any():
