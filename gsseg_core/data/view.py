@@ -10,11 +10,11 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.data.label_images import UNKNOWN, mask_header, read_mask
+from gsseg_core.data.label_images import UNKNOWN, mask_header
 from gsseg_core.data.label_map import LabelMap
 from gsseg_core.data.mask_files import read_soft_mask
+from gsseg_core.data.mask_formats.images import read_label_image
 from gsseg_core.data.mask_formats.masks import ViewMask
-from gsseg_core.data.mask_formats.shapes import check_fit, scaled
 from gsseg_core.data.soft_masks import PackedMask, SeenLabels, combine_detections, quantise, restrict
 from gsseg_core.errors import GssegError, MaskFormatError, SettingsError, UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
@@ -274,9 +274,7 @@ class View:
         if path.suffix.lower() != ".png":
             names = self.class_names if self.label_map is None else None
             return read_soft_mask(path, names, self.camera, self.within)
-        header = mask_header(path, self.within)  # Before any pixel is read.
-        check_fit(header.width, header.height, self.camera, str(path))
-        labels = scaled(read_mask(path, self.within).labels, self.camera)
+        labels = read_label_image(path, self.camera, self.within)
         return SeenLabels(labels) if self.supervised is None else restrict(labels, self.supervised, str(path))
 
     def _check_seen(self, seen: SeenLabels, source: str) -> None:

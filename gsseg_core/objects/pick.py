@@ -29,9 +29,9 @@ from pathlib import Path
 import numpy as np
 
 from gsseg_core.data.class_names import class_ids
-from gsseg_core.data.label_images import UNKNOWN, mask_header, read_mask
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.mask_files import CLASS_ID, mask_files
-from gsseg_core.data.mask_formats.shapes import check_fit, scaled
+from gsseg_core.data.mask_formats.images import read_label_image
 from gsseg_core.data.mask_formats.table import open_masks
 from gsseg_core.data.view import View
 from gsseg_core.errors import MaskFormatError, NoUsableViewsError, SettingsError
@@ -186,8 +186,8 @@ def read_object_mask(path: str | os.PathLike[str], camera: Camera, label: str | 
     Parameters
     ----------
     path : path
-        A label image as `read_mask` takes it; in one of black and white only, 255 is the object and not unknown. Or
-        masks of another program, see docs/formats.md; a file with the mask of one image may have any name.
+        A label image, a PNG of ids; in one of black and white only, 255 is the object and not unknown. Or masks of
+        another program, see docs/formats.md; a file with the mask of one image may have any name.
     camera : Camera
         Of the view. The mask is drawn on the image as it was taken, of its size or the same larger or smaller.
     label : int or str, optional
@@ -209,9 +209,7 @@ def read_object_mask(path: str | os.PathLike[str], camera: Camera, label: str | 
     masks = None if path.suffix.lower() == ".png" else open_masks(path, [camera.image])
     if masks is None:
         path = mask_files(path, [camera.image]).get(camera.image, path) if path.is_dir() else path
-        header = mask_header(path)  # Before any pixel is read.
-        check_fit(header.width, header.height, camera, str(path))
-        labels = scaled(read_mask(path).labels, camera)
+        labels = read_label_image(path, camera)
     else:
         names, labels = masks.class_names, masks.views[camera.image].labels(camera)
     mask = object_mask(labels, None if label is None else _label_id(str(label), names), str(path))

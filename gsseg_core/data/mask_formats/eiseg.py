@@ -15,11 +15,12 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.data.class_names import BACKGROUND_NAME
-from gsseg_core.data.label_images import mask_header, read_mask
+from gsseg_core.data.label_images import mask_header
+from gsseg_core.data.mask_formats.images import read_label_image
 from gsseg_core.data.mask_formats.masks import MaskSet, ViewMask, check_id, check_name
 from gsseg_core.data.mask_formats.place import Place
 from gsseg_core.data.mask_formats.record import Record, records
-from gsseg_core.data.mask_formats.shapes import Drawing, Polygons, Shape, check_fit, scaled
+from gsseg_core.data.mask_formats.shapes import Drawing, Polygons, Shape
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.files.json_files import read_json
 from gsseg_core.scene.camera import Camera
@@ -47,7 +48,8 @@ def read_eiseg(place: Place) -> MaskSet:
     views = {view: ViewMask(str(path), partial(_read_polygons, place, path)) for view, path in texts.items()}
     for view, path in images.items():
         header = mask_header(path, place.within)
-        views[view] = ViewMask(str(path), partial(_read_image, place, path), (header.width, header.height))
+        read = partial(read_label_image, path, within=place.within)
+        views[view] = ViewMask(str(path), read, (header.width, header.height))
     return MaskSet(views, {0: BACKGROUND_NAME, **dict(sorted(names.items()))} if names else None)
 
 
@@ -73,9 +75,3 @@ def _read_polygons(place: Place, path: Path, camera: Camera) -> npt.NDArray[np.i
         Shape(shape.id("labelIdx"), Polygons.of(shape.value("points"), shape.where)) for shape in _shapes(place, path)
     ]
     return Drawing(*camera.image_size, shapes).labels(camera, str(path))
-
-
-def _read_image(place: Place, path: Path, camera: Camera) -> npt.NDArray[np.int32]:
-    header = mask_header(path, place.within)
-    check_fit(header.width, header.height, camera, str(path))
-    return scaled(read_mask(path, place.within).labels, camera)

@@ -1,35 +1,50 @@
-"""Images of one object each: binary PNGs, as trackers and mask generators write them."""
+"""Images as masks of a view: label images, and binary PNGs of one object each as trackers and generators write them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from gsseg_core.data.label_images import mask_header, read_mask
+from gsseg_core.data.mask_formats.shapes import check_fit, scaled
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.files.input_files import open_image
+from gsseg_core.scene.camera import Camera
 
 _MODES = ("1", "L", "P", "I;16")
 
 
-def image_size(path: Path, within: Path | None) -> tuple[int, int]:
-    """Read width and height from the header of a mask; raises as `read_binary` does."""
-    with open_image(path, MaskFormatError, "mask", "a PNG of one object", ("PNG",), within) as image:
-        return image.size
-
-
-def read_binary(path: Path, within: Path | None) -> npt.NDArray[np.bool_]:
-    """Read where the object of a mask (H, W) is: all that is not 0, in a PNG of one channel.
+def read_label_image(path: Path, camera: Camera, within: Path | None = None) -> npt.NDArray[np.int32]:
+    """Read a label image (H, W) in the size of the image that a camera took, which is checked before any pixel is read.
 
     Raises
     ------
-    MaskFormatError
-        It is missing, broken, or another kind of image.
+    MaskFormatError, MaskSizeError
+        It is missing, broken, or another kind of image, or has another shape than the camera's.
+    PathNotAllowedError
+        It lies outside `within`.
     """
-    with open_image(path, MaskFormatError, "mask", "a PNG of one object", ("PNG",), within) as image:
-        if image.mode not in _MODES:
-            raise MaskFormatError(
-                f"{path}: is an image of kind {image.mode}; expected one channel, 0 outside of the object"
-            )
-        return np.array(image) > 0
+    header = mask_header(path, within)
+    check_fit(header.width, header.height, camera, str(path))
+    return scaled(read_mask(path, within).labels, camera)
+
+
+def paint_objects(masks: Iterable[tuple[int, Path]], camera: Camera, within: Path | None) -> npt.NDArray[np.int32]:
+    """Paint labels (H, W) where PNGs of one channel are not 0, each on top of those before it, 0 elsewhere.
+
+    Errors are those of `read_label_image`.
+    """
+    labels = np.zeros(camera.image_size[::-1], np.int32)
+    for label, path in masks:
+        with open_image(path, MaskFormatError, "mask", "a PNG of one object", ("PNG",), within) as image:
+            check_fit(*image.size, camera, str(path))
+            if image.mode not in _MODES:
+                raise MaskFormatError(
+                    f"{path}: is an image of kind {image.mode}; expected one channel, 0 outside of the object"
+                )
+            inside = np.array(image) > 0
+        labels[scaled(inside, camera)] = label
+    return labels

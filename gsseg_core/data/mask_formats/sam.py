@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.data.mask_formats.images import image_size, read_binary
+from gsseg_core.data.mask_formats.images import paint_objects
 from gsseg_core.data.mask_formats.masks import MaskSet, ViewMask
 from gsseg_core.data.mask_formats.place import Place
 from gsseg_core.data.mask_formats.record import records
 from gsseg_core.data.mask_formats.rle import run_lengths
-from gsseg_core.data.mask_formats.shapes import Drawing, Runs, Shape, check_fit, scaled
+from gsseg_core.data.mask_formats.shapes import Drawing, Runs, Shape
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.files.input_files import check_pixels
 from gsseg_core.files.json_files import read_json
@@ -110,8 +110,4 @@ def _read_folder(place: Place, folder: Path, camera: Camera) -> npt.NDArray[np.i
                 f"{folder / METADATA}: has a mask {quoted(number)} of {quoted(area)} pixels; expected whole numbers"
             )
         masks.append((-int(area), int(number) + 1, folder / f"{int(number)}.png"))
-    labels = np.zeros(camera.image_size[::-1], np.int32)
-    for _, label, path in sorted(masks):
-        check_fit(*image_size(path, place.within), camera, str(path))
-        labels[scaled(read_binary(path, place.within), camera)] = label
-    return labels
+    return paint_objects([(label, path) for _, label, path in sorted(masks)], camera, place.within)

@@ -14,10 +14,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.data.mask_formats.images import image_size, read_binary
+from gsseg_core.data.mask_formats.images import paint_objects
 from gsseg_core.data.mask_formats.masks import MaskSet, ViewMask
 from gsseg_core.data.mask_formats.place import Place
-from gsseg_core.data.mask_formats.shapes import check_fit, scaled
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.files.input_files import list_folder
 from gsseg_core.files.limits import MAX_LABEL
@@ -60,8 +59,4 @@ def _objects(place: Place) -> dict[int, dict[str, Path]]:
 
 
 def _read(place: Place, files: dict[int, Path], camera: Camera) -> npt.NDArray[np.int32]:
-    labels = np.zeros(camera.image_size[::-1], np.int32)
-    for label, path in files.items():
-        check_fit(*image_size(path, place.within), camera, str(path))
-        labels[scaled(read_binary(path, place.within), camera)] = label
-    return labels
+    return paint_objects(files.items(), camera, place.within)
