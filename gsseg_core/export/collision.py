@@ -16,17 +16,15 @@ import numpy.typing as npt
 
 from gsseg_core.errors import SettingsError
 from gsseg_core.export.poisson_surface import Voxels, poisson_surface
+from gsseg_core.objects.occupied_cells import OPAQUE
 from gsseg_core.objects.oriented_boxes import without_floaters
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.scene.quaternions import rotations
+from gsseg_core.scene.quaternions import half_axes
 from gsseg_core.scene.triangle_mesh import TriangleMesh
 from gsseg_core.segmentation import Segmentation
 
 HULL, SURFACE, POISSON = "hull", "surface", "poisson"
 KINDS = (HULL, SURFACE, POISSON)
-
-OPAQUE = 0.1
-"""Opacity from which on a Gaussian is solid."""
 
 VOXELS = 64
 """Of a surface, along the longest side of the object."""
@@ -81,14 +79,9 @@ def collision_mesh(
     index = ids[scene.opacities[ids] >= OPAQUE]
     if not len(index):
         return None
-    kept = without_floaters(scene.means[index].astype(np.float64), scene.opacities[index] * confidence[index])
+    kept = index[without_floaters(scene.means[index].astype(np.float64), scene.opacities[index] * confidence[index])]
     make = {HULL: _hull, SURFACE: _surface, POISSON: _poisson}[kind]
-    return make(scene.means[index[kept]], _half_axes(scene, index[kept]))
-
-
-def _half_axes(scene: GaussianScene, index: npt.NDArray[np.int64]) -> npt.NDArray[np.float32]:  # (M,)
-    """Half axes (M, 3, 3) of ellipsoids, one in each column."""
-    return rotations(scene.quats[index]) * scene.scales[index, None, :]
+    return make(scene.means[kept], half_axes(scene.quats[kept], scene.scales[kept]))
 
 
 def _hull(

@@ -12,7 +12,7 @@ from gsseg_core.data.class_names import class_name
 from gsseg_core.data.view import View
 from gsseg_core.errors import StateFileError, StateMismatchError
 from gsseg_core.learn.learner_state import State
-from gsseg_core.scene.group_frames import is_same_relation
+from gsseg_core.scene.group_frames import is_same
 from gsseg_core.scene.living_scene import LivingScene
 
 
@@ -83,5 +83,5 @@ def _is_same_map(one: LivingScene | None, other: LivingScene | None) -> bool:
         np.array_equal(one.ids, other.ids)
         and np.array_equal(one.groups, other.groups)
         and one.frames.keys() == other.frames.keys()
-        and all(is_same_relation(frame, other.frames[group]) for group, frame in one.frames.items())
+        and all(is_same(frame, other.frames[group]) for group, frame in one.frames.items())
     )

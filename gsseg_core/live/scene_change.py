@@ -12,7 +12,7 @@ import numpy as np
 
 from gsseg_core.data.view import View
 from gsseg_core.raster.cpu.occlusion import nearest_depths
-from gsseg_core.scene.group_frames import is_same_relation, relation
+from gsseg_core.scene.group_frames import is_same, relation
 from gsseg_core.scene.living_scene import LivingScene
 
 _MARGIN = 1 + 1e-5
@@ -95,7 +95,7 @@ class SceneChange:
         before, after = self.before, self.after
         return {
             other: other in after.frames
-            and is_same_relation(relation(before.frame(group), frame), relation(after.frame(group), after.frame(other)))
+            and is_same(relation(before.frame(group), frame), relation(after.frame(group), after.frame(other)))
             for other, frame in before.frames.items()
         }
 

@@ -25,10 +25,11 @@ from gsseg_core.scene.vertices import (
     QUATS,
     REST_COUNTS,
     SCALES,
+    check_properties,
     columns,
     logits,
     pack_vertices,
-    rest_names,
+    rest_of,
 )
 
 # Logits and log scales beyond these change nothing that can be seen, but the activated values would leave (0, 1), or
@@ -145,7 +146,7 @@ class GaussianScene:
     def from_vertices(cls, vertices: npt.NDArray[np.void], path: Path | None) -> GaussianScene:
         """Build a scene from the vertices of a PLY, validated and activated; raises what `load` raises of values."""
         source = "scene" if path is None else str(path)
-        sh_names = _check_properties(vertices, source)
+        sh_names = _sh_names(vertices, source)
         if len(vertices) == 0:
             raise EmptySceneError(f"{source}: holds no Gaussian (0 vertices); expected at least one")
         means, opacities, log_scales, quats = (columns(vertices, names) for names in (MEANS, OPACITY, SCALES, QUATS))
@@ -199,7 +200,7 @@ class GaussianScene:
     @property
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 3."""
-        return REST_COUNTS.index(_count_rest(self.vertices))
+        return REST_COUNTS.index(len(rest_of(self.vertices)))
 
     @cached_property
     def ids(self) -> npt.NDArray[np.int64] | None:
@@ -223,7 +224,7 @@ class GaussianScene:
     @cached_property
     def _coefficients(self) -> npt.NDArray[np.float32]:
         """Coefficients as they lie in a PLY, (N, 3 B): of degree 0, then all others of red, of green, and of blue."""
-        return columns(self.vertices, DC + rest_names(_count_rest(self.vertices)))
+        return columns(self.vertices, DC + rest_of(self.vertices))
 
     @cached_property
     def log_opacities(self) -> npt.NDArray[np.float32]:
@@ -254,19 +255,12 @@ class GaussianScene:
         return seen
 
 
-def _count_rest(vertices: npt.NDArray[np.void]) -> int:
-    return sum(name.startswith("f_rest_") for name in vertices.dtype.names or ())
-
-
-def _check_properties(vertices: npt.NDArray[np.void], source: str) -> tuple[str, ...]:
+def _sh_names(vertices: npt.NDArray[np.void], source: str) -> tuple[str, ...]:
     """Names of the SH properties, after making sure that all properties of 3DGS are there."""
-    names = set(vertices.dtype.names or ())
-    missing = [name for name in MEANS + DC + OPACITY + SCALES + QUATS if name not in names]
-    if missing:
-        raise ScenePropertyError(f"{source}: not a 3DGS scene, lacks the vertex properties {', '.join(missing)}")
-    count = _count_rest(vertices)
-    rest = rest_names(count)
-    if count not in REST_COUNTS or not names.issuperset(rest):
+    check_properties(vertices, MEANS + DC + OPACITY + SCALES + QUATS, source)
+    rest = rest_of(vertices)
+    count = len(rest)
+    if count not in REST_COUNTS or not set(vertices.dtype.names or ()).issuperset(rest):
         expected = ", ".join(map(str, REST_COUNTS))
         raise ScenePropertyError(
             f"{source}: has {count} properties f_rest_*; expected {expected} (SH degree 0, 1, 2, 3), numbered from 0"

@@ -19,6 +19,7 @@ from gsseg_core.files.input_files import open_input, reason
 from gsseg_core.files.limits import LIMITS
 from gsseg_core.files.npz_files import UnfitError
 from gsseg_core.scene.moving import move
+from gsseg_core.scene.quaternions import rotations
 from gsseg_core.scene.scene_file import check_count, check_size, open_scene, size_of
 from gsseg_core.scene.spz import decode_spz
 from gsseg_core.scene.vertices import ReadScene, log_scales, logits, pack_vertices
@@ -206,14 +207,7 @@ def _matrix(node: Any) -> npt.NDArray[np.float64]:
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
     matrix = np.eye(4)
-    matrix[:3, :3] = turn * np.array(node.get("scale", (1, 1, 1)), np.float64)
+    matrix[:3, :3] = rotations(np.array([[w, x, y, z]]))[0] * np.array(node.get("scale", (1, 1, 1)), np.float64)
     matrix[:3, 3] = node.get("translation", (0, 0, 0))
     return matrix

@@ -16,7 +16,7 @@ from gsseg_core.scene import spherical_harmonics
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_ids import with_ids
 from gsseg_core.scene.similarity import Similarity
-from gsseg_core.scene.vertices import MEANS, QUATS, SCALES, columns, rest_names
+from gsseg_core.scene.vertices import MEANS, QUATS, SCALES, columns, put, rest_of
 
 IDENTITY = Similarity()
 """The frame of the scene, and of a group that has not moved."""
@@ -24,22 +24,18 @@ IDENTITY = Similarity()
 
 def is_identity(frame: Similarity) -> bool:
     """Whether a frame is that of the scene, exactly."""
-    return _is_same(frame, IDENTITY)
+    return is_same(frame, IDENTITY)
 
 
 def relation(to: Similarity, frame: Similarity) -> Similarity:
     """How a frame lies in another one; `IDENTITY` itself if they are the same, bit for bit."""
-    if _is_same(to, frame):
+    if is_same(to, frame):
         return IDENTITY
     return frame if is_identity(to) else to.inverse().after(frame)
 
 
-def is_same_relation(one: Similarity, other: Similarity) -> bool:
-    """Whether two relations are the same, bit for bit."""
-    return _is_same(one, other)
-
-
-def _is_same(one: Similarity, other: Similarity) -> bool:
+def is_same(one: Similarity, other: Similarity) -> bool:
+    """Whether two frames, or relations, are the same, bit for bit."""
     return one is other or (
         one.scale == other.scale
         and np.array_equal(one.rotation, other.rotation)
@@ -64,15 +60,13 @@ def moved_scene(scene: GaussianScene, frame: Similarity) -> GaussianScene:
     """Move a scene from a frame to the one that it lies in, colours and all, as a file would hold it."""
     vertices = scene.vertices.copy()
     logs = columns(vertices, SCALES).astype(np.float64) + np.log(frame.scale)
-    changed = {MEANS: _points(scene.means, frame), QUATS: _turned(scene.quats, frame), SCALES: logs}
-    for names, values in changed.items():
-        for name, column in zip(names, values.T, strict=True):
-            vertices[name] = column
-    if names := rest_names(sum(name.startswith("f_rest_") for name in vertices.dtype.names or ())):
+    put(vertices, MEANS, _points(scene.means, frame))
+    put(vertices, QUATS, _turned(scene.quats, frame))
+    put(vertices, SCALES, logs)
+    if names := rest_of(vertices):
         turned = spherical_harmonics.turned(frame.rotation, scene.sh_degree)[1:, 1:]
         rest = columns(vertices, names).reshape(len(vertices), 3, -1) @ turned.T.astype(np.float32)
-        for name, column in zip(names, rest.reshape(len(vertices), -1).T, strict=True):
-            vertices[name] = column
+        put(vertices, names, rest.reshape(len(vertices), -1))
     return GaussianScene.from_vertices(vertices, scene.path)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.scene import spherical_harmonics
-from gsseg_core.scene.vertices import MEANS, QUATS, REST_COUNTS, SCALES, columns, rest_names
+from gsseg_core.scene.vertices import MEANS, QUATS, REST_COUNTS, SCALES, columns, put, rest_of
 
 
 def move(
@@ -21,18 +21,18 @@ def move(
 
     What `pack_vertices` returned is changed, positions to colours. Raises nothing: what is NaN stays NaN.
     """
-    names = rest_names(sum(name.startswith("f_rest_") for name in vertices.dtype.names or ()))
+    names = rest_of(vertices)
     harmonics = _turned(turn.tobytes(), REST_COUNTS.index(len(names)))
     with np.errstate(all="ignore"):
-        _put(vertices, MEANS, scale * (columns(vertices, MEANS) @ turn.T) + np.asarray(shift))
+        put(vertices, MEANS, scale * (columns(vertices, MEANS) @ turn.T) + np.asarray(shift))
         if scale != 1:
-            _put(vertices, SCALES, columns(vertices, SCALES) + np.log(scale))
+            put(vertices, SCALES, columns(vertices, SCALES) + np.log(scale))
         if not (turn - np.diag(np.diag(turn))).any():  # Axes that only change their sign need no product of matrices.
             _change_signs(vertices, np.diag(turn), names, np.diag(harmonics))
             return
         # A Gaussian is its own mirror image through its centre, so a mirror is half a turn of it.
         rotation = _quaternion(turn if np.linalg.det(turn) > 0 else -turn)
-        _put(vertices, QUATS, _product(rotation, columns(vertices, QUATS)))
+        put(vertices, QUATS, _product(rotation, columns(vertices, QUATS)))
         if names:
             rest = columns(vertices, names).reshape(len(vertices), 3, -1)
             rest[:] = rest @ harmonics.T.astype(np.float32)
@@ -43,11 +43,6 @@ def _turned(turn: bytes, degree: int) -> npt.NDArray[np.float64]:
     """Matrix (B, B) that turns coefficients above degree 0; kept, as files are moved block by block."""
     matrix: npt.NDArray[np.float64] = spherical_harmonics.turned(np.frombuffer(turn).reshape(3, 3), degree)[1:, 1:]
     return matrix
-
-
-def _put(vertices: npt.NDArray[np.void], names: tuple[str, ...], values: npt.NDArray[np.floating]) -> None:
-    for name, column in zip(names, values.T, strict=True):
-        vertices[name] = column
 
 
 def _change_signs(

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.errors import ScenePropertyError, SceneValueError
+from gsseg_core.errors import SceneValueError
 from gsseg_core.scene.ply import read_vertices
-from gsseg_core.scene.vertices import DC, OPACITY, SCALES, ReadScene, columns, dc_of
+from gsseg_core.scene.vertices import DC, OPACITY, SCALES, ReadScene, check_properties, columns, dc_of
 
 _RGB = ("red", "green", "blue")
 _FILTER = "filter_3D"
@@ -46,7 +46,7 @@ def read_mip_splatting(path: Path, within: Path | None = None) -> ReadScene:
         A property of 3DGS is missing.
     """
     vertices = read_vertices(path, within)
-    _expect(path, vertices, (*SCALES, *OPACITY))
+    check_properties(vertices, SCALES + OPACITY, str(path))
     size = vertices[_FILTER].astype(np.float64)[:, None]
     if not (size >= 0).all():
         raise SceneValueError(f"{path}: {_FILTER} holds values that are NaN or negative; expected sizes of at least 0")
@@ -70,7 +70,7 @@ def is_2dgs(head: bytes) -> bool:
 def read_2dgs(path: Path, within: Path | None = None) -> ReadScene:
     """Read a PLY of 2DGS; the third scale, along the normal, is a thousandth of the smaller of the two."""
     vertices = read_vertices(path, within)
-    _expect(path, vertices, SCALES[:2])
+    check_properties(vertices, SCALES[:2], str(path))
     thin = np.minimum(vertices[SCALES[0]], vertices[SCALES[1]]) + _FLATNESS
     return ReadScene(_with(vertices, {SCALES[2]: thin}), "", ("discs, made a thousandth as thick as wide",))
 
@@ -81,12 +81,6 @@ def _properties(head: bytes) -> set[bytes]:
         return set()
     lines = head.partition(b"end_header")[0].splitlines()
     return {line.split()[-1] for line in lines if line.startswith(b"property ")}
-
-
-def _expect(path: Path, vertices: npt.NDArray[np.void], names: tuple[str, ...]) -> None:
-    missing = [name for name in names if name not in (vertices.dtype.names or ())]
-    if missing:
-        raise ScenePropertyError(f"{path}: not a 3DGS scene, lacks the vertex properties {', '.join(missing)}")
 
 
 def _with(

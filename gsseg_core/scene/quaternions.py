@@ -22,12 +22,18 @@ def rotations(quats: npt.NDArray[Number]) -> npt.NDArray[Number]:  # (M, 4) w, x
     return matrices
 
 
-def covariances(
+def half_axes(
     quats: npt.NDArray[Number],  # (M, 4) w, x, y, z, unit
     scales: npt.NDArray[Any],  # (M, 3)
 ) -> npt.NDArray[Number]:
-    """Covariances (M, 3, 3) of Gaussians, R diag(scales^2) R^T, of the higher precision of the two."""
-    half = rotations(quats) * scales[:, None, :]
+    """Half axes (M, 3, 3) of ellipsoids, one in each column, of the higher precision of the two."""
+    axes: npt.NDArray[Number] = rotations(quats) * scales[:, None, :]
+    return axes
+
+
+def covariances(quats: npt.NDArray[Number], scales: npt.NDArray[Any]) -> npt.NDArray[Number]:
+    """Covariances (M, 3, 3) of Gaussians, R diag(scales^2) R^T, of what `half_axes` takes."""
+    half = half_axes(quats, scales)
     product: npt.NDArray[Number] = half @ half.transpose(0, 2, 1)
     return product
 

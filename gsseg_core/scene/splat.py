@@ -10,7 +10,7 @@ from gsseg_core.files.npz_files import UnfitError
 from gsseg_core.scene.scene_file import open_scene
 from gsseg_core.scene.vertices import ReadScene, dc_of, log_scales, logits, pack_vertices
 
-_RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 
 def read_splat(path: Path, within: Path | None = None) -> ReadScene:
@@ -23,11 +23,11 @@ def read_splat(path: Path, within: Path | None = None) -> ReadScene:
     """
     with open_scene(path, within, "a .splat file") as file:
         content = file.read()
-        if len(content) % _RECORD.itemsize:
+        if len(content) % RECORD.itemsize:
             raise UnfitError(
-                f"has {len(content):,} bytes; expected {_RECORD.itemsize} for each Gaussian (truncated, or no .splat)"
+                f"has {len(content):,} bytes; expected {RECORD.itemsize} for each Gaussian (truncated, or no .splat)"
             )
-    records = np.frombuffer(content, _RECORD)
+    records = np.frombuffer(content, RECORD)
     rgba = records["rgba"] / 255
     quats = (records["quat"].astype(np.float32) - 128) / 128
     return ReadScene(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from numpy.lib.recfunctions import structured_to_unstructured
 
+from gsseg_core.errors import ScenePropertyError
 from gsseg_core.scene import spherical_harmonics
 
 MEANS = ("x", "y", "z")
@@ -46,6 +47,18 @@ class ReadScene(NamedTuple):
 def rest_names(count: int) -> tuple[str, ...]:
     """Names of the first `count` properties f_rest_*."""
     return tuple(f"f_rest_{i}" for i in range(count))
+
+
+def rest_of(vertices: npt.NDArray[np.void]) -> tuple[str, ...]:
+    """Names of as many properties f_rest_* as vertices (N,) have."""
+    return rest_names(sum(name.startswith("f_rest_") for name in vertices.dtype.names or ()))
+
+
+def check_properties(vertices: npt.NDArray[np.void], needed: Iterable[str], source: str) -> None:
+    """Raise `ScenePropertyError` if vertices (N,) lack a property."""
+    missing = [name for name in needed if name not in (vertices.dtype.names or ())]
+    if missing:
+        raise ScenePropertyError(f"{source}: not a 3DGS scene, lacks the vertex properties {', '.join(missing)}")
 
 
 def pack_vertices(
@@ -98,6 +111,12 @@ def columns(vertices: npt.NDArray[np.void], names: tuple[str, ...]) -> npt.NDArr
     with np.errstate(over="ignore"):  # doubles beyond float32 become infinite, which validation reports
         side_by_side: npt.NDArray[np.float32] = structured_to_unstructured(vertices[list(names)], dtype=np.float32)
     return side_by_side
+
+
+def put(vertices: npt.NDArray[np.void], names: tuple[str, ...], values: npt.NDArray[np.floating]) -> None:
+    """Set properties of vertices (N,) to the columns of values (N, len(names)), in place."""
+    for name, column in zip(names, values.T, strict=True):
+        vertices[name] = column
 
 
 def logits(opacities: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:

@@ -22,7 +22,7 @@ from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.live.session import LiveSession
 from gsseg_core.objects.occupied_cells import OPAQUE, occupied_cells
 from gsseg_core.refine.settings import RefineSettings
-from gsseg_core.scene.quaternions import rotations
+from gsseg_core.scene.quaternions import half_axes
 from gsseg_ros.conversions import points_cloud
 from gsseg_ros.node.complaints import OBSTACLES, Complaints
 from gsseg_ros.node.parameters import Settings
@@ -119,10 +119,9 @@ class Obstacles:
         scene = session.scene_of(result)
         chosen = self._chosen(settings.obstacle_classes, result.class_names)
         index = np.flatnonzero(np.isin(result.labels, chosen) & (scene.opacities >= OPAQUE))
-        half_axes = rotations(scene.quats[index]) * scene.scales[index, None, :]
         return occupied_cells(
             place.points_to_map(scene.means[index]),
-            place.scale * place.rotation @ half_axes,
+            place.scale * place.rotation @ half_axes(scene.quats[index], scene.scales[index]),
             settings.obstacle_resolution,
             settings.obstacle_min_height,
             settings.obstacle_max_height,

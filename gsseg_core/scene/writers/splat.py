@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from gsseg_core.scene.gaussian_scene import GaussianScene
-
-RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+from gsseg_core.scene.splat import RECORD
 
 
 def write_splat(path: Path, scene: GaussianScene, run: str | None) -> None:
