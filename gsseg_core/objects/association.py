@@ -174,10 +174,10 @@ def _merge(stack: _Stack, settings: AssociationSettings) -> tuple[np.ndarray, fl
     single, sure = _Clusters.single(stack), max(settings.agreement or 0, _MOST)
     clusters, votes = _merged(single, stack.view, settings, sure, surface=0.0)
     doubted = votes.doubted(clusters.touching)
-    split = min(doubted / _SPLIT, 1)
+    split = _in_parts(doubted)
     if split > 0:  # Begun again, so that the surface has its say from the first pair on.
         clusters, votes = _merged(single, stack.view, settings, sure, surface=split)
-    agreement = settings.agreement or votes.told_level(split, doubted)
+    agreement = settings.agreement or votes.told_level(doubted)
     clusters, _ = _merged(clusters, stack.view, settings, agreement, surface=split)
     merged = np.zeros(len(stack.view), np.int64)
     merged[~stack.background] = clusters.of + 1
@@ -285,27 +285,23 @@ class _Votes(NamedTuple):
 
     def doubted(self, touching: sparse.csr_matrix) -> float:
         """Tell which share of the clusters that touch, (C, C), may be parts of one object."""
-        together, see, show = self._compared(*_often(touching))
+        pairs = sparse.triu(touching, 1).tocoo()
+        often = pairs.data >= _OFTEN
+        first, second = pairs.row[often], pairs.col[often]
+        together = np.asarray(self.whole[first].multiply(self.whole[second]).sum(axis=1)).ravel()
+        see, show = self._views_of_both(first, second)
         doubted = self._agreement(together, see, show)[see > _OFTEN] > _DOUBTED
         return float(np.mean(doubted)) if len(doubted) else 0.0
 
-    def told_level(self, split: float, doubted: float) -> float:
-        """Agreement above which clusters are one object, by how often views show them whole.
-
-        Takes whether objects come in parts at all, 0 to 1, and what `doubted` told.
-        """
+    def told_level(self, doubted: float) -> float:
+        """Agreement above which clusters are one object, by how often views show them whole and what `doubted` told."""
         seen = self.counts.sum(axis=1)
         known = seen >= _OFTEN
         if not known.any():
             return _WHOLE
         whole = float(np.mean(self.shown[known].sum(axis=1) / seen[known]))
         level = whole * np.sqrt(_MANY / max(doubted, _MANY))
-        return float(_WHOLE - split * max(_WHOLE - level, 0))
-
-    def _compared(self, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Count, for pairs of clusters, views that show both whole under one id, see both, and show each whole."""
-        together = np.asarray(self.whole[first].multiply(self.whole[second]).sum(axis=1)).ravel()
-        return together, *self._views_of_both(first, second)
+        return float(_WHOLE - _in_parts(doubted) * max(_WHOLE - level, 0))
 
     def _views_of_both(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """Count, for pairs of clusters, the views that see both, and those that show each of them whole, (2, P)."""
@@ -327,11 +323,9 @@ def _goes_on(borders: Borders, first: np.ndarray, second: np.ndarray) -> np.ndar
     return factor
 
 
-def _often(touching: sparse.csr_matrix) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of clusters that touch in several views, the first before the second."""
-    pairs = sparse.triu(touching, 1).tocoo()
-    several = pairs.data >= _OFTEN
-    return pairs.row[several], pairs.col[several]
+def _in_parts(doubted: float) -> float:
+    """Tell by the share of clusters in doubt whether objects come in parts at all, 0 to 1."""
+    return min(doubted / _SPLIT, 1)
 
 
 def _same_view(overlap: sparse.csr_matrix, view: np.ndarray) -> sparse.csr_matrix:
