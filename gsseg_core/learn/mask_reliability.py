@@ -62,17 +62,19 @@ class ViewCheck:
         """List what was most often taken for something else: class predicted, label seen, share of checked pixels."""
         wrong = self.counts.copy()
         wrong[self._right] = 0
-        largest = np.argsort(-wrong, axis=None, kind="stable")[:count]
-        return [
-            (k, int(self.classes[y]), float(wrong[k, y] / self.checked))
-            for k, y in zip(*(index.tolist() for index in np.unravel_index(largest, wrong.shape)), strict=True)
-            if wrong[k, y]
-        ]
+        return [(k, int(self.classes[y]), pixels / self.checked) for k, y, pixels in largest_cells(wrong, count)]
 
     @property
     def _right(self) -> tuple[np.ndarray, np.ndarray]:
         """Where in the counts class and label agree."""
         return (self.evidence or LabelEvidence(self.classes)).correct_words(len(self.counts))
+
+
+def largest_cells(counts: np.ndarray, count: int) -> list[tuple[int, int, int]]:
+    """List rows, columns and values of the largest counts in a table that are not 0, the largest first."""
+    largest = np.argsort(-counts, axis=None, kind="stable")[:count]
+    places = zip(*(index.tolist() for index in np.unravel_index(largest, counts.shape)), strict=True)
+    return [(row, column, int(counts[row, column])) for row, column in places if counts[row, column]]
 
 
 class MaskChecker:

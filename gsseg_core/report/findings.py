@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsseg_core.data.view import View
-from gsseg_core.learn.mask_reliability import ViewCheck, ranked_examples
+from gsseg_core.learn.mask_reliability import ViewCheck, largest_cells
 from gsseg_core.metrics import iou
 from gsseg_core.text import counted
 
@@ -62,10 +62,6 @@ class Evidence:
             views += (shown > 0) & (shown >= SHOWN * check.checked)
         return views
 
-    def examples(self) -> list[tuple[str, ViewCheck]]:
-        """Choose the worst, the median and the best view by reliability; fewer if there are fewer."""
-        return ranked_examples(self.checks)
-
 
 def class_ious(confusion: np.ndarray) -> np.ndarray:
     """IoU of each class between prediction and masks, (K,) of (K, K) pixels; NaN for a class that is in neither."""
@@ -75,11 +71,7 @@ def class_ious(confusion: np.ndarray) -> np.ndarray:
 
 def largest_confusions(confusion: np.ndarray, count: int) -> list[tuple[int, int, int]]:
     """List what was most often taken for something else in (K, K) pixels: class predicted, label of the mask, count."""
-    wrong = confusion.copy()
-    np.fill_diagonal(wrong, 0)
-    largest = np.argsort(-wrong, axis=None, kind="stable")[:count]
-    pairs = zip(*(index.tolist() for index in np.unravel_index(largest, wrong.shape)), strict=True)
-    return [(k, y, int(wrong[k, y])) for k, y in pairs if wrong[k, y]]
+    return largest_cells(confusion - np.diag(confusion.diagonal()), count)
 
 
 def most_confused(confusion: np.ndarray, count: int) -> list[int]:

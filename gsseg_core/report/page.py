@@ -24,6 +24,9 @@ from gsseg_core.two_at_once import two_at_once
 if TYPE_CHECKING:
     from jinja2 import Environment
 
+FIRST = ("preview", "views-shown")
+"""Sections that are made before the others, which choose views by what these have rendered."""
+
 SECTIONS: Mapping[str, tuple[str, Callable[[PageInputs], sections.Content | None]]] = {
     "preview": ("In 3D", sections.preview),
     "views-shown": ("Masks beside predictions", sections.views_shown),
@@ -56,9 +59,7 @@ def write_report_page(path: str | os.PathLike[str], run: PageInputs) -> None:
 def report_page(run: PageInputs) -> str:
     """Put the page together, as HTML."""
     report, labelled = run.report, run.segmentation.labels >= 0
-    contents = [
-        (anchor, title, content) for (anchor, (title, _)), content in zip(SECTIONS.items(), _contents(run), strict=True)
-    ]
+    made = _contents(run)
     style, script = (files("gsseg_core.report").joinpath(f"page.{kind}").read_text("utf-8") for kind in ("css", "js"))
     policy = (
         f"default-src 'none'; img-src data:; style-src {_hash(style)}; script-src {_hash(script)}; "
@@ -72,7 +73,7 @@ def report_page(run: PageInputs) -> str:
             name=os.path.basename(report["scene"]["path"]),
             confidence=float(run.segmentation.confidence[labelled].mean()) if labelled.any() else None,
             warnings=warnings_of(report, run.ious),
-            sections=[entry for entry in contents if entry[2] is not None],
+            sections=[(anchor, title, made[anchor]) for anchor, (title, _) in SECTIONS.items() if anchor in made],
             policy=policy,
             style=style,
             script=script,
@@ -80,12 +81,14 @@ def report_page(run: PageInputs) -> str:
     )
 
 
-def _contents(run: PageInputs) -> list[sections.Content | None]:
-    """Make the contents of the sections, two at once."""
-    makers = [content for _, content in SECTIONS.values()]
-    # The others choose views by what the first two have rendered.
-    parts = (makers[:2], makers[2:])
-    return [made for part in parts for made in two_at_once(lambda make: make(run), part, run.images.device)]
+def _contents(run: PageInputs) -> dict[str, sections.Content]:
+    """Make the contents of the sections that there are, by anchor, two at once."""
+    made: dict[str, sections.Content | None] = {}
+    for anchors in (FIRST, [anchor for anchor in SECTIONS if anchor not in FIRST]):
+        made |= zip(
+            anchors, two_at_once(lambda anchor: SECTIONS[anchor][1](run), anchors, run.images.device), strict=True
+        )
+    return {anchor: content for anchor, content in made.items() if content is not None}
 
 
 @functools.cache  # Compiling the templates takes longer than filling them in.

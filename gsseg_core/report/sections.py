@@ -11,6 +11,7 @@ import numpy as np
 
 from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.export.pictures import overlay, palette, shown_at
+from gsseg_core.learn.mask_reliability import ranked_examples
 from gsseg_core.report.findings import TRUSTED, Evidence, class_ious, largest_confusions, most_confused
 from gsseg_core.report.pictures import PICTURE_PX, THUMBNAIL_PX, ViewImages, draw_triple, jpeg_uri, thumbnails
 from gsseg_core.report.preview import look_from, make_preview, up_of
@@ -146,7 +147,7 @@ def views_shown(run: PageInputs) -> Content | None:
     confusions = {view["name"]: view["confusions"] for view in run.reliability}
     source = "what the other views predict" if run.evidence.held_out else "what was learnt, from this view too"
     views = []
-    for what, check in run.evidence.examples():
+    for what, check in ranked_examples(run.evidence.checks):
         triple = draw_triple(check, run.evidence.views[check.name], run.images, run.colors)
         pictures = [jpeg_uri(image, PICTURE_PX) for image in triple]
         views.append((what, check, pictures, confusions.get(check.name, [])))

@@ -7,7 +7,7 @@ import pytest
 from report_cases import minimal_report
 
 from gsseg_core.data.label_images import UNKNOWN
-from gsseg_core.learn.mask_reliability import ViewCheck
+from gsseg_core.learn.mask_reliability import ViewCheck, ranked_examples
 from gsseg_core.report.findings import (
     Evidence,
     class_ious,
@@ -46,10 +46,10 @@ def test_a_view_shows_what_fills_more_than_a_few_of_its_pixels() -> None:
 def test_examples_are_the_worst_the_median_and_the_best_view() -> None:
     checks = [check(f"v{right}", [0, 1], [[right, 100 - right], [0, 0]]) for right in (70, 95, 20, 80, 99)]
     blank = check("blank", [0], [[0], [0]])
-    chosen = [(what, entry.name) for what, entry in Evidence([*checks, blank], {}, True).examples()]
+    chosen = [(what, entry.name) for what, entry in ranked_examples([*checks, blank])]
     assert chosen == [("worst", "v20"), ("median", "v80"), ("best", "v99")]
-    assert len(Evidence(checks[:2], {}, True).examples()) == 2
-    assert Evidence([blank], {}, True).examples() == Evidence([], {}, True).examples() == []
+    assert len(ranked_examples(checks[:2])) == 2
+    assert ranked_examples([blank]) == ranked_examples([]) == []
 
 
 def test_a_run_without_fault_gets_no_warning() -> None:
