@@ -39,7 +39,8 @@ from gsseg_core.learn.temperature import (
     VIEWS,
     Sample,
     fit_temperature,
-    sample_pixels,
+    grid_of,
+    sample_grid,
     tempered,
 )
 from gsseg_core.metrics import Evaluation
@@ -137,6 +138,12 @@ def _held_out(learner: Learner, name: str, views: Sequence[View]) -> Iterator[Sa
         image, left_over = make_operator(learner.scene, view.camera).blend(codes)
         image[..., 0] += left_over * bool(codes[:, 0].any())
         yield sample_pixels(image, view.read_labels())
+
+
+def sample_pixels(image: np.ndarray, labels: np.ndarray) -> Sample:  # (H, W, K), (H, W)
+    """Take the pixels of a view that the temperature is fitted to."""
+    grid = grid_of(*labels.shape)
+    return sample_grid(grid.of(image), grid.of(labels))
 
 
 def compare_roads(bench: Bench) -> Iterator[list[str]]:

@@ -150,7 +150,7 @@ class State:
         """
         path = Path(path)
         with open_npz(path, "a saved state", FORMAT, None if first else digest, within) as (file, header):
-            living = living_files.read(file, header) if living_files.is_in(file) else None
+            living = living_files.read(file, header)
             if first is not None and header.get("scene") == first.scene.digest:
                 living = living or first
             if first is not None and living is not None:
@@ -163,7 +163,7 @@ class State:
     def load_alone(cls, path: str | os.PathLike[str]) -> tuple[str, State]:
         """Read a state without its scene: the scene's digest, and the state; raises `StateFileError` as `load` does."""
         with open_npz(Path(path), "a saved state", FORMAT, None) as (file, header):
-            living = living_files.read(file, header) if living_files.is_in(file) else None
+            living = living_files.read(file, header)
             n, k = (whole_number(side, "a side of the votes", 1, LIMITS.max_gaussians) for side in header["shape"])
             if 8 * n * k > LIMITS.max_npz_bytes or (living is not None and len(living) != n):
                 raise UnfitError(f"claims votes of {n:,} Gaussians and {k:,} classes; expected as many as its scene "

@@ -75,10 +75,6 @@ class PreparedViews:
                 self._answers.put(name, observation.answered)
         return made
 
-    def remembers(self, name: str) -> bool:
-        """Tell whether the file has what a view was asked last."""
-        return self._answers.holds(name)
-
     def drop(self, name: str) -> None:
         """Keep nothing of a view."""
         self.in_memory.pop(name, None)

@@ -93,17 +93,12 @@ def grid_of(height: int, width: int) -> PixelGrid:
     return PixelGrid(min(step, height, width) // 2, step)
 
 
-def sample_pixels(image: np.ndarray, labels: np.ndarray) -> Sample:
-    """Take the pixels of a view that the temperature is fitted to: a grid, where label and prediction are known.
+def sample_grid(image: np.ndarray, labels: np.ndarray) -> Sample:
+    """Sample a view where label and prediction are known.
 
-    The image, (H, W, K), is blended of codes that have not seen the mask, (H, W) int32 and negative where unknown.
+    The image, (R, C, K), is blended of codes that have not seen the mask, (R, C) int32 and negative where unknown; both
+    are those of `grid_of`.
     """
-    grid = grid_of(*labels.shape)
-    return sample_grid(grid.of(image), grid.of(labels))
-
-
-def sample_grid(image: np.ndarray, labels: np.ndarray) -> Sample:  # (R, C, K), (R, C)
-    """Do the same, with what both are in these pixels."""
     shares, seen = image.reshape(-1, image.shape[2]), labels.ravel()
     total = shares.sum(axis=1)
     known = np.flatnonzero((seen >= 0) & (total > 0.5))

@@ -116,7 +116,7 @@ class ViewRenderer(ABC):
         image, left_over = self.blend_rows(codes, num_classes, of)
         if background:
             image[..., 0] += left_over
-        return Strongest.of(image, grid, None if beside is None or not beside.shape[1] else self.blend_seen(beside))
+        return Strongest.of(image, grid, None if beside is None else self.blend_seen(beside))
 
     def _rows(self, of: np.ndarray | None) -> np.ndarray:
         """Tell which row of such codes each of `ids` has, (M,) int32."""

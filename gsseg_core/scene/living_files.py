@@ -27,13 +27,10 @@ def frame_entries(living: LivingScene) -> list[dict[str, Any]]:
     return [{"group": group, **similarity_entry(frame)} for group, frame in living.frames.items()]
 
 
-def is_in(file: NpzArrays) -> bool:
-    """Whether an npz holds a scene."""
-    return "geometry" in file.names
-
-
-def read(file: NpzArrays, header: dict[str, Any]) -> LivingScene:
-    """Read a scene, colourless; `UnfitError` if what is there is none."""
+def read(file: NpzArrays, header: dict[str, Any]) -> LivingScene | None:
+    """Read a scene, colourless, if an npz holds one; `UnfitError` if what is there is none."""
+    if "geometry" not in file.names:
+        return None
     geometry = file.expect("geometry", np.float32, (None, len(_GEOMETRY)))
     ids, groups = (file.expect(name, np.int64, (len(geometry),)) for name in ("ids", "groups"))
     if ids.min(initial=0) < 0 or len(np.unique(ids)) < len(ids):

@@ -23,7 +23,8 @@ from gsseg_core.learn.temperature import (
     Sample,
     fit_temperature,
     golden_section,
-    sample_pixels,
+    grid_of,
+    sample_grid,
     tempered,
 )
 from gsseg_core.learn.vote_learner import VoteLearner
@@ -98,7 +99,7 @@ def test_names_of_the_classes_and_order_of_the_views_do_not_matter_to_the_temper
 
 def test_nothing_to_go_by_leaves_probabilities_as_they_are() -> None:
     image, unknown = np.full((8, 8, 2), 0.5, np.float32), np.full((8, 8), UNKNOWN, np.int32)
-    assert fit_temperature([]) == 1 and fit_temperature([sample_pixels(image, unknown)]) == 1
+    assert fit_temperature([]) == 1 and fit_temperature([sample_grid(image, unknown)]) == 1
 
 
 @pytest.mark.parametrize("shape", [(5, 7), (300, 400), (1, 100_000), (3_000, 10)])
@@ -107,7 +108,8 @@ def test_pixels_are_sampled_evenly_and_not_too_many(shape: tuple[int, int]) -> N
     labels[0, 0] = UNKNOWN
     image = np.eye(5, dtype=np.float32)[labels]
     image[labels < 0] = 0
-    sample = sample_pixels(image, labels)
+    grid = grid_of(*shape)
+    sample = sample_grid(grid.of(image), grid.of(labels))
     assert min(np.prod(shape) - 1, PIXELS / 16) <= len(sample.seen) <= PIXELS
     assert sample.shares.shape[1] == 3 and (sample.shares.argmax(axis=1) == sample.seen).all()
     assert (np.diff(sample.seen) >= 0).all()

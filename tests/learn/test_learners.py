@@ -113,7 +113,8 @@ def test_nothing_is_asked_twice_of_a_view_that_is_in_the_file(monkeypatch: pytes
         counts.append((after_fit, len(asked)))
     assert counts[0] == counts[1] and counts[0][0] == counts[0][1]
     learner.retract(VIEWS[0].name)
-    assert not learner._prepared.remembers(VIEWS[0].name) and learner._prepared.remembers(VIEWS[1].name)
+    answers = learner._prepared._answers
+    assert not answers.holds(VIEWS[0].name) and answers.holds(VIEWS[1].name)
 
 
 @pytest.mark.parametrize("budget", [0, 1, 1 << 30])

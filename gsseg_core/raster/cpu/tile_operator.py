@@ -82,7 +82,7 @@ class TileOperator(ViewOperator):
         classes, known, some, image, left_over = products.strongest(
             self._tiles, codes, self._rows(of), num_classes, background, first, step, others
         )
-        return Strongest(classes, known, some, Blended(image, left_over) if others.shape[1] else None)
+        return Strongest(classes, known, some, None if beside is None else Blended(image, left_over))
 
     def _adjoint(self, residual: np.ndarray) -> np.ndarray:
         out = np.zeros((self.num_gaussians, residual.shape[2]), np.float32)
