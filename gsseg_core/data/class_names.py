@@ -79,6 +79,12 @@ def listed(names: Iterable[str]) -> str:
     return ", ".join(every[:_LISTED]) + (f" and {more:,} more" if more > 0 else "")
 
 
+def id_of(text: str, class_names: Mapping[int, str]) -> int | None:
+    """Return the id that a text is, if it is one of the classes'."""
+    number = int(text) if text.isascii() and text.isdecimal() and len(text) < 9 else -1
+    return number if number in class_names else None
+
+
 def class_ids(wanted: Iterable[str], class_names: Mapping[int, str]) -> list[int]:
     """Look up classes by id or name: their ids in the order asked for, each once.
 
@@ -91,8 +97,8 @@ def class_ids(wanted: Iterable[str], class_names: Mapping[int, str]) -> list[int
     """
     ids = []
     for name in wanted:
-        number = int(name) if name.isascii() and name.isdigit() and len(name) < 9 else -1
-        meant = [number] if number in class_names else [k for k, known in class_names.items() if known == name]
+        number = id_of(name, class_names)
+        meant = [k for k, known in class_names.items() if known == name] if number is None else [number]
         if not meant:
             known = listed(f"{k} ({clipped(known)})" for k, known in class_names.items())
             raise SettingsError(f"class {quoted(name)} does not exist; expected one of {known}")

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsseg_core.data.class_names import BACKGROUND_NAME, flaw_of_class_name, listed
+from gsseg_core.data.class_names import BACKGROUND_NAME, flaw_of_class_name, id_of, listed
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import LabelMapError
 from gsseg_core.files.json_files import read_json
@@ -87,8 +87,8 @@ def map_labels(given: Mapping[str, str | None], class_names: Mapping[int, str], 
     """
     renamed: dict[int, str | None] = dict.fromkeys(class_names, given[_OTHERS]) if _OTHERS in given else {}
     # Ids after names, since an id says which of several classes of one name is meant.
-    for key in sorted(given, key=lambda key: _id_of(key, class_names) is not None):
-        number = _id_of(key, class_names)
+    for key in sorted(given, key=lambda key: id_of(key, class_names) is not None):
+        number = id_of(key, class_names)
         meant = [k for k, name in class_names.items() if name == key] if number is None else [number]
         if not meant and key != _OTHERS:
             known = listed(f"{k} ({name})" for k, name in class_names.items())
@@ -122,9 +122,3 @@ def _new_name(value: object, key: object, path: Path) -> str | None:
     if flaw := flaw_of_class_name(value):
         raise LabelMapError(f"{path}: gives {quoted(key)} the name {flaw}")
     return str(value)
-
-
-def _id_of(key: str, class_names: Mapping[int, str]) -> int | None:
-    """Return the id that a key is, if it is one of the classes'."""
-    number = int(key) if key.isascii() and key.isdecimal() and len(key) < 9 else -1
-    return number if number in class_names else None

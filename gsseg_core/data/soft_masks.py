@@ -47,6 +47,11 @@ class SeenLabels(NamedTuple):
             return self.evidence.largest
         return int(self.labels.max()) if self.labels.size else UNKNOWN
 
+    @property
+    def concerned(self) -> npt.NDArray[np.int32]:
+        """Classes on which the mask has evidence, any number of times, and `UNKNOWN` maybe."""
+        return self.labels if self.evidence is None else self.evidence.concerned
+
     def named(self) -> npt.NDArray[np.int32]:
         """Reduce the mask to one class per pixel, (H, W) int32; `UNKNOWN` where it leaves the class open."""
         if self.evidence is None:
@@ -79,17 +84,9 @@ class SeenLabels(NamedTuple):
         UnknownLabelError
             A class is not among them.
         """
-        table = np.full(MAX_LABEL + 2, len(ids), np.int32)  # The last one is for unknown pixels.
-        table[ids], table[UNKNOWN] = np.arange(len(ids)), UNKNOWN
-        concerned = self.labels if self.evidence is None else self.evidence.concerned
-        numbers = table[concerned]
-        if (numbers == len(ids)).any():
-            raise UnknownLabelError(
-                f"{source}: mask holds the labels {clipped(np.unique(concerned[numbers == len(ids)]).tolist())}; "
-                f"expected ids of the {len(ids)} classes in use"
-            )
+        table = self._table({k: i for i, k in enumerate(ids.tolist())}, source, f"ids of the {len(ids)} classes in use")
         if self.evidence is None:
-            return SeenLabels(numbers)
+            return SeenLabels(table[self.labels])
         classes, mass, supervised = self.evidence.classes, self.evidence.mass, self.evidence.supervised
         supervised = None if supervised is None else table[supervised]
         return SeenLabels(self.labels, LabelEvidence(table[classes], mass, supervised))
@@ -105,12 +102,7 @@ class SeenLabels(NamedTuple):
         UnknownLabelError
             A class has no new id.
         """
-        table = np.full(MAX_LABEL + 2, UNKNOWN - 1, np.int32)  # The last one is for unknown pixels.
-        table[[*new_ids, UNKNOWN]] = [*new_ids.values(), UNKNOWN]
-        concerned = self.labels if self.evidence is None else self.evidence.concerned
-        if (table[concerned] < UNKNOWN).any():
-            found = np.unique(concerned[table[concerned] < UNKNOWN]).tolist()
-            raise UnknownLabelError(f"{source}: mask holds the labels {clipped(found)}; expected ids of its classes")
+        table = self._table(new_ids, source, "ids of its classes")
         if self.evidence is None:
             return SeenLabels(table[self.labels])
         given, supervised = self.evidence, self.evidence.supervised
@@ -128,6 +120,15 @@ class SeenLabels(NamedTuple):
             supervised = np.setdiff1d(table[supervised], [UNKNOWN]) if whole else None
         unknown = np.append(ignored, False)[self.labels]
         return _tidied(self.labels.copy(), classes, merged[:, : len(classes)], supervised, unknown)
+
+    def _table(self, new_ids: Mapping[int, int], source: str, expected: str) -> npt.NDArray[np.int32]:
+        """Table of new ids by id, `UNKNOWN` included; raise `UnknownLabelError` if a class has none."""
+        table = np.full(MAX_LABEL + 2, UNKNOWN - 1, np.int32)  # The last one is for unknown pixels.
+        table[[*new_ids, UNKNOWN]] = [*new_ids.values(), UNKNOWN]
+        found = np.unique(self.concerned[table[self.concerned] < UNKNOWN]).tolist()
+        if found:
+            raise UnknownLabelError(f"{source}: mask holds the labels {clipped(found)}; expected {expected}")
+        return table
 
 
 class PackedMask:

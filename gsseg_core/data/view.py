@@ -228,9 +228,7 @@ class View:
 
     def class_ids(self) -> set[int]:
         """Classes on which the mask has evidence."""
-        seen = self.read_seen()
-        ids = np.unique(seen.labels) if seen.evidence is None else seen.evidence.concerned
-        return set(ids.tolist()) - {UNKNOWN}
+        return set(np.unique(self.read_seen().concerned).tolist()) - {UNKNOWN}
 
     def read_labels(self) -> npt.NDArray[np.int32]:
         """Read the mask as one class per pixel, (H, W) int32; `UNKNOWN` (-1) where it names none.
@@ -279,7 +277,7 @@ class View:
 
     def _check_seen(self, seen: SeenLabels, source: str) -> None:
         self.camera.check_mask_size(seen.labels.shape[1], seen.labels.shape[0], source)
-        labels = seen.labels if seen.evidence is None else seen.evidence.concerned
+        labels = seen.concerned
         names: Container[int] = range(MAX_LABEL + 1) if self.class_names is None else self.class_names
         low, high = (int(labels.min()), int(labels.max())) if labels.size else (0, -1)
         if low >= UNKNOWN and high <= MAX_LABEL and all(i in names for i in range(max(low, 0), high + 1)):
