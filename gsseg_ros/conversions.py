@@ -199,14 +199,6 @@ def mask_image(
     return plain_image(values, f"mono{bits}", header)
 
 
-def label_image(
-    labels: npt.NDArray[np.integer[Any]],  # (H, W)
-    header: Header,
-) -> Image:
-    """Write labels (H, W) as mono16, `UNKNOWN` (-1) as 65535; raises as `mask_image` does."""
-    return mask_image(labels, header, 16)
-
-
 def rgb_image(
     pixels: npt.NDArray[np.uint8],  # (H, W, 3)
     header: Header,

@@ -44,6 +44,14 @@ def object_message(
     )
 
 
+def color_message(
+    color: npt.NDArray[np.uint8],  # (3,)
+) -> ColorRGBA:
+    """Turn a colour of a palette into an opaque one."""
+    red, green, blue = (float(part) / 255 for part in color)
+    return ColorRGBA(r=red, g=green, b=blue, a=1.0)
+
+
 def point_message(
     values: npt.NDArray[np.floating[Any]],  # (3,)
 ) -> Point:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from gsseg_msgs.msg import Object
 from gsseg_msgs.srv import Pick as PickService
-from std_msgs.msg import ColorRGBA, Header
+from std_msgs.msg import Header
 
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
@@ -26,7 +26,7 @@ from gsseg_ros.node.masks.reader import read_image
 from gsseg_ros.node.parameters import Settings
 from gsseg_ros.node.size_limits import require_size
 from gsseg_ros.node.viewpoints import Lookup, viewpoint_pose
-from gsseg_ros.object_messages import object_message
+from gsseg_ros.object_messages import color_message, object_message
 
 if TYPE_CHECKING:
     from gsseg_core.objects.pick import Pick
@@ -80,10 +80,8 @@ def fill_answer(
     response.cloud = cloud(header, points, rgb, np.full(len(index), OBJECT), confidence)
     response.object = Object(name=name or "object")
     if len(index):
-        red, green, blue = (float(part) / 255 for part in color)
         box = place.box_to_map(class_box(scene, index, confidence))
-        shade = ColorRGBA(r=red, g=green, b=blue, a=1.0)
-        response.object = object_message(OBJECT, name or "object", shade, confidence, box)
+        response.object = object_message(OBJECT, name or "object", color_message(color), confidence, box)
 
 
 def _camera(request: PickService.Request, settings: Settings, lookup: Lookup | None, *, rectified: bool) -> Camera:

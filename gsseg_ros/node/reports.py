@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from gsseg_msgs.msg import ClassSummary, Object, ObjectArray, SegmentationReport, StageTiming
 from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import ColorRGBA, Header
+from std_msgs.msg import Header
 
 from gsseg_core.export.pictures import palette
 from gsseg_core.export.summary import gaussian_counts
@@ -22,7 +22,7 @@ from gsseg_core.segmentation import Segmentation
 from gsseg_ros.conversions import CLOUD_POINT, cloud_of_records, fill_records
 from gsseg_ros.frames import Similarity
 from gsseg_ros.node.workspace import Run
-from gsseg_ros.object_messages import object_message, point_message
+from gsseg_ros.object_messages import color_message, object_message, point_message
 
 _AT_ONCE = 1 << 15  # points of a cloud that are put together at a time
 
@@ -120,11 +120,7 @@ class Selection:
     def _object(self, k: int, index: np.ndarray) -> Object:
         confidence = self._confidence[index]
         box = self.similarity.box_to_map(class_box(self.scene, index, confidence))
-        return object_message(k, self.result.class_names[k], self._color(k), confidence, box)
-
-    def _color(self, k: int) -> ColorRGBA:
-        red, green, blue = (float(part) / 255 for part in self._colors[k])
-        return ColorRGBA(r=red, g=green, b=blue, a=1.0)
+        return object_message(k, self.result.class_names[k], color_message(self._colors[k]), confidence, box)
 
     def class_summary(self, k: int, topic: str) -> ClassSummary:
         """Summarise one class in numbers."""
@@ -133,7 +129,7 @@ class Selection:
             class_id=k,
             name=self.result.class_names[k],
             topic=topic,
-            color=self._color(k),
+            color=color_message(self._colors[k]),
             num_gaussians=len(index),
         )
         if len(index):

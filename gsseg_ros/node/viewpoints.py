@@ -19,7 +19,7 @@ from gsseg_core.scene.camera import Camera
 from gsseg_ros.camera_infos import camera_from_messages
 from gsseg_ros.conversions import (
     confidence_image,
-    label_image,
+    mask_image,
     matrix_from_pose,
     rgb_image,
     stamp_ns,
@@ -93,4 +93,4 @@ def draw(selection: Selection, camera: Camera, header: Header, *, with_overlay: 
     if with_overlay:
         colors = palette(selection.result.num_classes)
         picture = rgb_image(overlay(background_image(selection.scene, operator), seen.labels, colors), header)
-    return Drawing(label_image(labels, header), confidence_image(np.minimum(seen.confidence, 1.0), header), picture)
+    return Drawing(mask_image(labels, header, 16), confidence_image(np.minimum(seen.confidence, 1.0), header), picture)

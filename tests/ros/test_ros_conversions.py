@@ -19,7 +19,6 @@ from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import MaskFormatError
 from gsseg_ros.conversions import (
     confidence_image,
-    label_image,
     labels_from_image,
     mask_image,
     picture_from_image,
@@ -68,7 +67,6 @@ def test_labels_survive_a_mask_image_of_our_own(bits: int, data: st.DataObject, 
     assert (message.encoding, message.step) == (f"mono{bits}", shape[1] * bits // 8)
     assert (message.header, message.height, message.width) == (HEADER, *shape)
     assert np.array_equal(labels_from_image(message, "/some/topic"), labels)
-    assert np.array_equal(labels_from_image(label_image(labels, HEADER), "/some/topic"), labels)
 
 
 def test_a_label_that_does_not_fit_is_not_written() -> None:
