@@ -22,21 +22,11 @@ Quaternion: TypeAlias = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """Where the scene lies in the map: map = scale * rotation @ scene + translation.
+    """Where the scene lies in the map: map = scale * rotation @ scene + translation."""
 
-    Attributes
-    ----------
-    rotation : ndarray (3, 3) float64
-        From the axes of the scene to those of the map.
-    translation : ndarray (3,) float64
-        Place of the scene's origin in the map, in metres.
-    scale : float
-        Metres per scene unit, positive.
-    """
-
-    rotation: Array  # (3, 3)
-    translation: Array  # (3,)
-    scale: float
+    rotation: Array  # (3, 3): from the axes of the scene to those of the map
+    translation: Array  # (3,): place of the scene's origin in the map, in metres
+    scale: float  # metres per scene unit, positive
 
     @classmethod
     def from_parameters(

@@ -52,24 +52,12 @@ class Rendered(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What a view shows, to be compared with a rendering.
+    """What a view shows, to be compared with a rendering."""
 
-    Attributes
-    ----------
-    camera : Camera
-        Of the view, square, of S x S px with the principal point in the middle.
-    seen : (S, S) bool
-        Pixels that lie in the view.
-    edges : (S, S) float32
-        Edges of the photo, or outlines of the mask.
-    labels : (S, S) int32, optional
-        Regions of the mask, negative where unknown; None for a photo.
-    """
-
-    camera: Camera
-    seen: np.ndarray
-    edges: np.ndarray
-    labels: np.ndarray | None = None
+    camera: Camera  # of the view, square, of S x S px with the principal point in the middle
+    seen: np.ndarray  # (S, S) bool: pixels that lie in the view
+    edges: np.ndarray  # (S, S) float32: edges of the photo, or outlines of the mask
+    labels: np.ndarray | None = None  # (S, S) int32: regions of the mask, negative where unknown; not of a photo
 
     def score(self, rendered: Rendered) -> float:
         """Compare with a rendering: 0 to 1."""
@@ -88,27 +76,13 @@ class Shown:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well a scene agrees with some views.
+    """How well a scene agrees with some views."""
 
-    Attributes
-    ----------
-    compared : str
-        With their 'photos' or their 'masks'.
-    views : int
-        How many.
-    score : float
-        Of the views, 0 to 1.
-    chance : float
-        Of pictures that do not belong together.
-    agrees : bool or None
-        Whether cameras and scene belong together; None where nobody can tell.
-    """
-
-    compared: str
-    views: int
-    score: float
-    chance: float
-    agrees: bool | None
+    compared: str  # with their 'photos' or their 'masks'
+    views: int  # how many
+    score: float  # of the views, 0 to 1
+    chance: float  # of pictures that do not belong together
+    agrees: bool | None  # whether cameras and scene belong together; None where nobody can tell
 
     def __str__(self) -> str:
         """Describe it for people."""

@@ -15,18 +15,10 @@ from gsseg_core.scene.similarity import Similarity
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Poses of a dataset's cameras in a scene: how they are to be understood, and then where their frame lies.
+    """Poses of a dataset's cameras in a scene: how they are to be understood, and then where their frame lies."""
 
-    Attributes
-    ----------
-    convention : Convention
-        How poses are to be understood.
-    similarity : Similarity
-        From the frame that they are in then to that of the scene.
-    """
-
-    convention: Convention = field(default_factory=Convention)
-    similarity: Similarity = field(default_factory=Similarity)
+    convention: Convention = field(default_factory=Convention)  # how poses are to be understood
+    similarity: Similarity = field(default_factory=Similarity)  # from the frame that they are then in to the scene's
 
     def camera(self, camera: Camera) -> Camera:
         """Pose a camera of the dataset in the scene."""

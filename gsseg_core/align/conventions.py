@@ -53,19 +53,13 @@ _LOOKING = [
 class Convention:
     """How poses are to be understood; by default, as they were read.
 
-    Attributes
-    ----------
-    inverted : bool
-        Whether what was read as camera-to-world leads from the world to the camera.
-    world_axes : (3, 3)
-        A: its columns are the cameras' world axes in the scene.
-    camera_axes : (3, 3)
-        B: its columns are axes x right, y down, z forward in those of the cameras as they were read.
+    Columns of A are the cameras' world axes in the scene; those of B are axes x right, y down, z forward in those of
+    the cameras as they were read.
     """
 
-    inverted: bool = False
-    world_axes: np.ndarray = field(default_factory=lambda: np.eye(3))  # (3, 3)
-    camera_axes: np.ndarray = field(default_factory=lambda: np.eye(3))  # (3, 3)
+    inverted: bool = False  # whether what was read as camera-to-world leads from the world to the camera
+    world_axes: np.ndarray = field(default_factory=lambda: np.eye(3))  # (3, 3): A
+    camera_axes: np.ndarray = field(default_factory=lambda: np.eye(3))  # (3, 3): B
 
     def camera(self, camera: Camera) -> Camera:
         """Pose a camera as it was meant."""

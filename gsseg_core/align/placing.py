@@ -31,25 +31,12 @@ _CLOSE_PX = 1.0  # photos and renderings that are nearer than this are as they s
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """An alignment, and how well the scene agrees with the views through it.
+    """An alignment, and how well the scene agrees with the views through it."""
 
-    Attributes
-    ----------
-    alignment : Alignment
-        Where the cameras are.
-    agreement : Agreement
-        Of the scene, with what the cameras show there.
-    before : Agreement
-        With the cameras where they were.
-    offset_px : float, optional
-        Median distance of features of the photos from those of renderings, px of the photos at 480 px or less; None
-        without photos.
-    """
-
-    alignment: Alignment
-    agreement: Agreement
-    before: Agreement
-    offset_px: float | None = None
+    alignment: Alignment  # where the cameras are
+    agreement: Agreement  # of the scene, with what the cameras show there
+    before: Agreement  # with the cameras where they were
+    offset_px: float | None = None  # median from features of photos to those of renderings, px at 480 px; None without
 
     def as_dict(self) -> dict[str, Any]:
         """Give it as `report.json` does."""
@@ -58,24 +45,12 @@ class Found:
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """A dataset whose cameras are in the frame of a scene, as far as it is known.
+    """A dataset whose cameras are in the frame of a scene, as far as it is known."""
 
-    Attributes
-    ----------
-    dataset : Dataset
-        Its cameras moved.
-    dataparser : pathlib.Path or None
-        The file of nerfstudio that said where to, if there was one.
-    found : Found or None
-        What was found, if that was asked for.
-    agreement : Agreement or None
-        Of scene and views, where it was looked at and views show anything.
-    """
-
-    dataset: Dataset
-    dataparser: Path | None = None
-    found: Found | None = None
-    agreement: Agreement | None = None
+    dataset: Dataset  # its cameras moved
+    dataparser: Path | None = None  # the file of nerfstudio that said where to, if there was one
+    found: Found | None = None  # what was found, if that was asked for
+    agreement: Agreement | None = None  # of scene and views, where it was looked at and views show anything
 
     @property
     def fits(self) -> bool:

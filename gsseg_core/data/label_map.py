@@ -33,18 +33,10 @@ _EXPECTED = 'an object such as {"armchair": "chair", "17": "wall", "person": nul
 
 @dataclass(frozen=True)
 class LabelMap:
-    """What becomes of the ids of masks.
+    """What becomes of the ids of masks."""
 
-    Attributes
-    ----------
-    new_ids : mapping from id to id
-        `UNKNOWN` where it is ignored.
-    class_names : mapping from new id to name
-        Ascending, the background included.
-    """
-
-    new_ids: Mapping[int, int]
-    class_names: Mapping[int, str]
+    new_ids: Mapping[int, int]  # `UNKNOWN` where it is ignored
+    class_names: Mapping[int, str]  # ascending, the background included
 
 
 def read_label_map(

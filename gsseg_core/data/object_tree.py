@@ -26,27 +26,13 @@ PART, OBJECT, WHOLE = "part", "object", "whole"
 
 @dataclass(frozen=True, eq=False)
 class ObjectTree:
-    """Which parts the objects of a scene have, and which wholes they make.
+    """Which parts the objects of a scene have, and which wholes they make."""
 
-    Attributes
-    ----------
-    parents : (M,) int32
-        Node that each node is a part of; -1 for those that are of none.
-    agreement : (M,) float32
-        Share of the views' say, in [0, 1], by which all that a node holds has one id; 1 for leaves.
-    leaves : (N,) int32
-        Leaf of each Gaussian; -1 where it is of no class.
-    num_classes : int
-        K; the first nodes are the classes, the background among them.
-    level : float
-        Granularity of the classes, in (0, 1).
-    """
-
-    parents: np.ndarray
-    agreement: np.ndarray
-    leaves: np.ndarray
-    num_classes: int
-    level: float
+    parents: np.ndarray  # (M,) int32: node that each node is a part of; -1 for those that are of none
+    agreement: np.ndarray  # (M,) float32: share of the views' say by which all that it holds has one id; 1 for leaves
+    leaves: np.ndarray  # (N,) int32: leaf of each Gaussian; -1 where it is of no class
+    num_classes: int  # K; the first nodes are the classes, the background among them
+    level: float  # granularity of the classes, in (0, 1)
 
     def __post_init__(self) -> None:
         """Raise `UnfitError` unless it is a tree whose nodes are nested as the docstring of the module says."""

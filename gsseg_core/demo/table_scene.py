@@ -43,28 +43,14 @@ _NUM_FLOATERS = 500
 
 @dataclass(frozen=True)
 class DemoScene:
-    """A demo scene on disk and its truth.
+    """A demo scene on disk and its truth."""
 
-    Attributes
-    ----------
-    root : pathlib.Path
-        The dataset folder: scene.ply, cameras.json, classes.json, split.json, labels/, labels_true/ and truth.npz.
-    scene : GaussianScene
-        The N Gaussians in scene.ply.
-    truth : ndarray (N,) int32
-        True label of each Gaussian, `FLOATER` for those that belong to nothing; also `labels` in truth.npz.
-    class_names : dict from id to name
-        Background included.
-    train, test : list of str
-        Names of the views; labels/ has the train views only, labels_true/ all.
-    """
-
-    root: Path
-    scene: GaussianScene
-    truth: np.ndarray
-    class_names: dict[int, str]
-    train: list[str]
-    test: list[str]
+    root: Path  # the dataset folder, with the truth in labels_true/ and truth.npz
+    scene: GaussianScene  # N Gaussians
+    truth: np.ndarray  # (N,) int32: true label of each Gaussian, `FLOATER` for those that belong to nothing
+    class_names: dict[int, str]  # background included
+    train: list[str]  # names of the views, which labels/ has
+    test: list[str]  # names of the views that labels_true/ alone has
 
 
 def build_demo(folder: str | os.PathLike[str], seed: int = 0) -> DemoScene:

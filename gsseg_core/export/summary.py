@@ -31,17 +31,7 @@ PACKAGES = ("gsseg", "numpy", "scipy", "numba")
 class RunSettings:
     """All that determines a run; its fields are `settings` in `report.json`.
 
-    Attributes
-    ----------
-    learner, labels, views, device, memory_budget, seed, scheduler, ids, granularity, scene_format, collision,
-    label_map, quality
-        As `gsseg_core.pipeline.segment` takes them; `ids` is None until the masks were opened, if they are to tell.
-    refine : RefineSettings
-        The refinement.
-    graph : GraphSettings, optional
-        Of the graph along which probabilities spread; None where they do not.
-    learner_settings : dataclass, optional
-        Those of the learner, if it has any.
+    Others are what `gsseg_core.pipeline.segment` takes.
     """
 
     learner: str
@@ -51,15 +41,15 @@ class RunSettings:
     memory_budget: int
     seed: int
     scheduler: str | None
-    ids: str | None
+    ids: str | None  # None until the masks were opened, if they are to tell
     refine: RefineSettings
-    graph: GraphSettings | None
+    graph: GraphSettings | None  # None where probabilities do not spread along one
     granularity: float | None = None
     scene_format: str = DEFAULT
     collision: str | None = None
     label_map: str | None = None
     quality: str = "full"
-    learner_settings: Any = None
+    learner_settings: Any = None  # those of the learner, if it has any
 
     def check(self) -> None:
         """Raise `SettingsError` where they do not go together."""
@@ -89,53 +79,24 @@ class RunSettings:
 
 @dataclass(frozen=True, eq=False)
 class RunReport:
-    """What a run found, from what, with which settings, and how long it took; its fields are those of `report.json`.
+    """What a run found, from what, with which settings, and how long it took; its fields are those of `report.json`."""
 
-    Attributes
-    ----------
-    scene : mapping
-        Path, size and digest of what was segmented.
-    views : mapping
-        How many were used, and why others were not.
-    settings : mapping
-        All that determined the result.
-    objective : sequence of float
-        The learner's objective after each step.
-    gaussians : mapping from what became of them to int
-        How many.
-    classes : sequence of mappings
-        Id, name, size, mean confidence, file and box of each.
-    pictures : sequence of str
-        Files.
-    seconds, versions : mappings
-        Seconds of each stage, and what it ran on: version of each package.
-    prepared_views : mapping, optional
-        Bytes of prepared views in memory and in a temporary file, and the budget of those in memory.
-    frame : mapping, optional
-        How well the cameras fit the scene, and what was done to have them fit.
-    run, page : str, optional
-        Id of the run, and file of the report page.
-    calibration, ids, masks : mappings, optional
-        The temperature and what it was fitted to; objects that ids which are a view's own were found to be; masks that
-        another program wrote, or that were scaled.
-    """
-
-    scene: Mapping[str, Any]
-    views: Mapping[str, Any]
-    settings: Mapping[str, Any]
-    objective: Sequence[float]
-    gaussians: Mapping[str, int]
-    classes: Sequence[Mapping[str, Any]]
-    pictures: Sequence[str]
-    seconds: Mapping[str, float]
-    versions: Mapping[str, str]
-    run: str | None = None
-    calibration: Mapping[str, Any] | None = None
-    ids: Mapping[str, Any] | None = None
-    prepared_views: Mapping[str, int] | None = None
-    masks: Mapping[str, Any] | None = None
-    page: str | None = None
-    frame: Mapping[str, Any] | None = None
+    scene: Mapping[str, Any]  # path, size and digest of what was segmented
+    views: Mapping[str, Any]  # how many were used, and why others were not
+    settings: Mapping[str, Any]  # all that determined the result
+    objective: Sequence[float]  # the learner's objective after each step
+    gaussians: Mapping[str, int]  # how many, by what became of them
+    classes: Sequence[Mapping[str, Any]]  # id, name, size, mean confidence, file and box of each
+    pictures: Sequence[str]  # files
+    seconds: Mapping[str, float]  # of each stage
+    versions: Mapping[str, str]  # of each package that it ran on
+    run: str | None = None  # id of the run
+    calibration: Mapping[str, Any] | None = None  # the temperature and what it was fitted to
+    ids: Mapping[str, Any] | None = None  # objects that ids which are a view's own were found to be
+    prepared_views: Mapping[str, int] | None = None  # bytes in memory and in a temporary file, and the budget
+    masks: Mapping[str, Any] | None = None  # those that another program wrote, or that were scaled
+    page: str | None = None  # file of the report page
+    frame: Mapping[str, Any] | None = None  # how well the cameras fit the scene, and what was done to that end
 
     @classmethod
     def of(

@@ -53,22 +53,12 @@ def as_pixels(image: np.ndarray) -> np.ndarray:  # (H, W, 3) in [0, 1]
 
 
 class Drawn(NamedTuple):
-    """A view of a segmentation, for people.
+    """A view of a segmentation, for people."""
 
-    Attributes
-    ----------
-    view : View
-        Where from.
-    labels : (H, W) int32
-        Class of each pixel.
-    overlay, image : (H, W, 3) uint8
-        The scene tinted by class, and in its own colours.
-    """
-
-    view: View
-    labels: np.ndarray
-    overlay: np.ndarray
-    image: np.ndarray
+    view: View  # where from
+    labels: np.ndarray  # (H, W) int32: class of each pixel
+    overlay: np.ndarray  # (H, W, 3) uint8: the scene tinted by class
+    image: np.ndarray  # (H, W, 3) uint8: the scene in its own colours
 
     @classmethod
     def of(cls, view: View, labels: np.ndarray, image: np.ndarray, num_classes: int) -> Drawn:

@@ -12,21 +12,11 @@ from gsseg_core.scene.living_scene import LivingScene
 
 
 class Matching(NamedTuple):
-    """How a scene goes over into another one.
+    """How a scene goes over into another one."""
 
-    Attributes
-    ----------
-    after : LivingScene
-        N' Gaussians; those that match keep their ids.
-    origin : (N',) int64
-        Where each was before; -1 for those that match none.
-    by : str
-        "id" or "position".
-    """
-
-    after: LivingScene
-    origin: np.ndarray
-    by: str
+    after: LivingScene  # N' Gaussians; those that match keep their ids
+    origin: np.ndarray  # (N',) int64: where each was before; -1 for those that match none
+    by: str  # "id" or "position"
 
 
 def match_scenes(before: LivingScene, scene: GaussianScene, tolerance: float = 0.0) -> Matching:

@@ -30,18 +30,10 @@ _REASONS: dict[type[GssegError], str] = {
 
 @dataclass(frozen=True)
 class Rejection:
-    """Reason for which a view was rejected.
+    """Reason for which a view was rejected."""
 
-    Attributes
-    ----------
-    reason : str
-        A short name, to count by.
-    message : str
-        What was found and what was expected.
-    """
-
-    reason: str
-    message: str
+    reason: str  # a short name, to count by
+    message: str  # what was found and what was expected
 
     @classmethod
     def of(cls, error: GssegError) -> Rejection:

@@ -55,21 +55,11 @@ GRAPH = GraphSettings(strength=4.0)
 
 @dataclass(frozen=True, eq=False)
 class Pick:
-    """An object of a scene.
+    """An object of a scene."""
 
-    Attributes
-    ----------
-    membership : (N,) float32
-        How sure it is that each Gaussian belongs to the object, in [0, 1]; 0 where nothing is known.
-    evidence : (N,) float32
-        Labelled pixels that the membership of each stands on, in px.
-    scene_digest : str
-        Which scene it belongs to.
-    """
-
-    membership: np.ndarray
-    evidence: np.ndarray
-    scene_digest: str
+    membership: np.ndarray  # (N,) float32: how sure each is of the object, in [0, 1]; 0 where nothing is known
+    evidence: np.ndarray  # (N,) float32: labelled pixels that the membership stands on, in px
+    scene_digest: str  # which scene it belongs to
 
     @property
     def ids(self) -> np.ndarray:

@@ -27,21 +27,11 @@ NOTED = 5
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Masks beside predictions of them.
+    """Masks beside predictions of them."""
 
-    Attributes
-    ----------
-    checks : list of ViewCheck
-        With what was predicted; of all views that were learnt from, or of some.
-    views : mapping from name to View
-        At least those.
-    held_out : bool
-        Whether a prediction comes from the other views alone; else the view itself has been learnt from, too.
-    """
-
-    checks: Sequence[ViewCheck]
-    views: Mapping[str, View]
-    held_out: bool
+    checks: Sequence[ViewCheck]  # with what was predicted; of all views that were learnt from, or of some
+    views: Mapping[str, View]  # at least those
+    held_out: bool  # whether a prediction comes from the other views alone; else also from the view itself
 
     def confusion(self, num_classes: int) -> np.ndarray:
         """Count pixels by class predicted (row) and label of the mask (column), over all views: (K, K) int64.

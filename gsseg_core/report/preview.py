@@ -35,27 +35,16 @@ RECORD = np.dtype(
 class Preview:
     """Gaussians to look at.
 
-    Attributes
-    ----------
-    records : (M,) RECORD
-        Positions within `low` to `high`, scales as logarithms within `log_scales`, quaternions w, x, y, z; labels as
-        in the segmentation, `first` where unobserved, and where removed `first` + 1 more than the most probable class.
-    low, high : (3,) float64
-        The box that holds them, in scene units.
-    core : (2, 3) float64
-        Corners of the box that holds all but those around the scene; what is looked at from outside.
-    log_scales : (2,) float64
-        Natural logarithms of the smallest and the largest scale.
-    left_out : int
-        Gaussians of the scene that are not among them.
+    Positions are within `low` to `high`, scales as logarithms within `log_scales`, quaternions w, x, y, z. Labels are
+    as in the segmentation, `first` where unobserved, and where removed `first` + 1 more than the most probable class.
     """
 
-    records: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    core: np.ndarray
-    log_scales: np.ndarray
-    left_out: int
+    records: np.ndarray  # (M,) RECORD
+    low: np.ndarray  # (3,) float64: the box that holds them, in scene units
+    high: np.ndarray  # (3,) float64
+    core: np.ndarray  # (2, 3) float64: corners of the box that holds all but those around the scene, to be looked at
+    log_scales: np.ndarray  # (2,) float64: natural logarithms of the smallest and the largest scale
+    left_out: int  # Gaussians of the scene that are not among them
 
     def header(self) -> dict[str, Any]:
         """Give what is needed to read the records, for JSON."""

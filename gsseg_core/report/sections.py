@@ -39,25 +39,13 @@ Content = Mapping[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class PageInputs:
-    """What the report page is made from.
+    """What the report page is made from."""
 
-    Attributes
-    ----------
-    report : mapping
-        What `report.json` holds.
-    scene, segmentation
-        What was segmented, and what came out.
-    evidence : Evidence
-        Masks beside predictions of them.
-    images : ViewImages
-        What was seen from the views.
-    """
-
-    report: Mapping[str, Any]
-    scene: GaussianScene
-    segmentation: Segmentation
-    evidence: Evidence
-    images: ViewImages
+    report: Mapping[str, Any]  # what `report.json` holds
+    scene: GaussianScene  # what was segmented
+    segmentation: Segmentation  # what came out
+    evidence: Evidence  # masks beside predictions of them
+    images: ViewImages  # what was seen from the views
 
     @cached_property
     def colors(self) -> np.ndarray:

@@ -20,27 +20,15 @@ if TYPE_CHECKING:
 class SceneWriter(NamedTuple):
     """A format that scenes are written in.
 
-    Attributes
-    ----------
-    name : str
-        What messages call it.
-    suffixes : tuple of str
-        Of its files; the first is what gsseg gives them.
-    write : str
-        The function that writes a file, as "module:function", imported when it is used. It takes the path of an empty
-        file, a `GaussianScene`, and the id of a run or None. "" is `GaussianScene.save`.
-    extra : str
-        The extra of gsseg with the library that this needs, if it needs one.
-    together : bool
-        Whether a file holds several objects and keeps them apart: then the function takes a sequence of `SceneObject`
-        in place of the scene.
+    What writes takes the path of an empty file, a `GaussianScene` (a sequence of `SceneObject`, where these are kept
+    apart) and the id of a run or None.
     """
 
-    name: str
-    suffixes: tuple[str, ...]
-    write: str = ""
-    extra: str = ""
-    together: bool = False
+    name: str  # what messages call it
+    suffixes: tuple[str, ...]  # of its files; the first is what gsseg gives them
+    write: str = ""  # as "module:function", imported when it is used; "" is `GaussianScene.save`
+    extra: str = ""  # the extra of gsseg with the library that this needs, if it needs one
+    together: bool = False  # whether a file holds several objects and keeps them apart
 
 
 class SceneObject(NamedTuple):

@@ -12,21 +12,11 @@ from gsseg_core.files.atomic import write_atomically
 
 
 class TriangleMesh(NamedTuple):
-    """A mesh whose triangles are counter-clockwise, seen from outside.
+    """A mesh whose triangles are counter-clockwise, seen from outside."""
 
-    Attributes
-    ----------
-    points : (V, 3) float32
-        In scene units and axes.
-    triangles : (T, 3) int32
-        Indices of points.
-    convex : bool
-        Whether it is its own convex hull.
-    """
-
-    points: npt.NDArray[np.float32]
-    triangles: npt.NDArray[np.int32]
-    convex: bool = False
+    points: npt.NDArray[np.float32]  # (V, 3) float32: in scene units and axes
+    triangles: npt.NDArray[np.int32]  # (T, 3) int32: indices of points
+    convex: bool = False  # whether it is its own convex hull
 
     def save(self, path: str | os.PathLike[str], run: str | None = None) -> None:
         """Write an OBJ, atomically (`WriteError`); `run` is the id of the run that it belongs to, for a comment."""

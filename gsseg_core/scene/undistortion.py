@@ -36,29 +36,15 @@ _BLOCK_PX = 2**18
 
 @dataclass(frozen=True)
 class Undistortion:
-    """A pinhole view of an image that a lens bent.
+    """A pinhole view of an image that a lens bent."""
 
-    Attributes
-    ----------
-    lens : Lens
-        What took the image.
-    width, height : int
-        Size of the view in pixels.
-    focal, principal : (float, float)
-        Focal lengths and principal point of the view along x and y, in pixels.
-    rotation : tuple of 9 floats
-        (3, 3), row by row: from the axes of the view to those of the lens.
-    face : str
-        Which of several views of the image it is; "" if there is one only.
-    """
-
-    lens: Lens
-    width: int
-    height: int
-    focal: tuple[float, float]
-    principal: tuple[float, float]
-    rotation: tuple[float, ...] = _AS_IT_IS
-    face: str = ""
+    lens: Lens  # what took the image
+    width: int  # of the view, in pixels
+    height: int  # of the view, in pixels
+    focal: tuple[float, float]  # focal lengths along x and y, in pixels
+    principal: tuple[float, float]  # principal point, x and y in pixels
+    rotation: tuple[float, ...] = _AS_IT_IS  # (3, 3) row by row: from the axes of the view to those of the lens
+    face: str = ""  # which of several views of the image it is; "" if there is one only
 
     @property
     def K(self) -> npt.NDArray[np.float64]:

@@ -27,21 +27,11 @@ _LEAST_SCALE = float(np.exp(-40))  # What half floats and bytes round to nothing
 
 
 class ReadScene(NamedTuple):
-    """What the reader of a scene format returns.
+    """What the reader of a scene format returns."""
 
-    Attributes
-    ----------
-    vertices : ndarray (N,) structured
-        One Gaussian per record of the file, in the order of the file, with the properties of a 3DGS PLY.
-    version : str
-        Version of the format, empty if it has none.
-    remarks : tuple of str
-        What was left out or converted while reading this file, for `gsseg doctor`; beyond what its format loses.
-    """
-
-    vertices: npt.NDArray[np.void]  # (N,)
-    version: str = ""
-    remarks: tuple[str, ...] = ()
+    vertices: npt.NDArray[np.void]  # (N,): those of a 3DGS PLY, in the order of the file
+    version: str = ""  # of the format, empty if it has none
+    remarks: tuple[str, ...] = ()  # what was left out or converted of this file, beyond what its format loses
 
 
 def rest_names(count: int) -> tuple[str, ...]:

@@ -36,18 +36,10 @@ _SMALL = (48, 64)
 
 @dataclass
 class ClientRenderer:
-    """Renders for one browser, which draws by itself, gets images, or both.
+    """Renders for one browser, which draws by itself, gets images, or both."""
 
-    Attributes
-    ----------
-    nodes : SplatNodes or None
-        What it draws by itself.
-    frames : Frames or None
-        The images that it gets.
-    """
-
-    nodes: SplatNodes | None
-    frames: Frames | None
+    nodes: SplatNodes | None  # what it draws by itself
+    frames: Frames | None  # the images that it gets
 
     def show(self, picture: Picture) -> None:
         """Show a picture from now on."""

@@ -34,24 +34,12 @@ _RAMP = np.array([(122, 1, 30), (230, 120, 40), (250, 230, 140), (90, 180, 140),
 
 
 class Labelling(NamedTuple):
-    """Label and class probabilities of each Gaussian, from a segmentation, a live source or corrections.
+    """Label and class probabilities of each Gaussian, from a segmentation, a live source or corrections."""
 
-    Attributes
-    ----------
-    labels : (N,) int32
-        Class, or `UNOBSERVED` (-1), or `REMOVED` (-2).
-    probabilities : (N, K) float32
-        By class; zeros where nothing is known. Rows sum to at most 1: a source may know the largest one only.
-    class_names : dict of int to str
-        Names by id, for all K.
-    nodes : tuple of int, optional
-        Ids of the classes where they are nodes of a tree, by which they have their colours.
-    """
-
-    labels: np.ndarray
-    probabilities: np.ndarray
-    class_names: dict[int, str]
-    nodes: tuple[int, ...] | None = None
+    labels: np.ndarray  # (N,) int32: class, or `UNOBSERVED` (-1), or `REMOVED` (-2)
+    probabilities: np.ndarray  # (N, K) float32: by class; zeros where nothing is known, and rows may sum to less than 1
+    class_names: dict[int, str]  # names by id, for all K
+    nodes: tuple[int, ...] | None = None  # ids of the classes that are nodes of a tree, and coloured by it
 
     @classmethod
     def of(cls, segmentation: Segmentation) -> Labelling:
@@ -79,40 +67,18 @@ class ClassRow(NamedTuple):
 
 @dataclass(eq=False)
 class ViewModel:
-    """The state of a viewer. Change it with its methods; `shown` and `colors` say what follows from it.
+    """The state of a viewer. Change it with its methods; `shown` and `colors` say what follows from it."""
 
-    Attributes
-    ----------
-    scene : GaussianScene
-        N Gaussians.
-    labelling : Labelling
-        What is known of them; replaced as a whole by `relabel`.
-    reliability : (N,) float32 or None
-        Mean reliability of the views that saw each Gaussian, in [0, 1], NaN where none did; None while unknown.
-    mode : str
-        One of `MODES`.
-    min_confidence : float
-        Gaussians that are less sure of their own class are not shown.
-    min_probability : float
-        If above 0, a Gaussian is shown not for its label, but for having at least this probability of a shown class.
-    hidden, removed : set of int
-        Labels that are switched off; and those that are off the list, too.
-    class_ids : tuple of int
-        Ids by label, for as many labels as ids were given: labels are numbers without gaps, ids need not be.
-    tree : ObjectTree or None
-        Parts and wholes of the classes.
-    """
-
-    scene: GaussianScene
-    labelling: Labelling
-    reliability: np.ndarray | None = None
-    mode: str = BY_CLASS
-    min_confidence: float = 0.0
-    min_probability: float = 0.0
-    hidden: set[int] = field(default_factory=set)
-    removed: set[int] = field(default_factory=set)
-    class_ids: tuple[int, ...] = ()
-    tree: ObjectTree | None = None
+    scene: GaussianScene  # N Gaussians
+    labelling: Labelling  # what is known of them; replaced as a whole by `relabel`
+    reliability: np.ndarray | None = None  # (N,) float32: mean over the views that saw each, or NaN; None if unknown
+    mode: str = BY_CLASS  # one of `MODES`
+    min_confidence: float = 0.0  # Gaussians that are less sure of their own class are not shown
+    min_probability: float = 0.0  # if above 0, what is shown has at least this probability of a shown class
+    hidden: set[int] = field(default_factory=set)  # labels that are switched off
+    removed: set[int] = field(default_factory=set)  # labels that are off the list, too
+    class_ids: tuple[int, ...] = ()  # ids by label, as many as were given: labels are numbers without gaps
+    tree: ObjectTree | None = None  # parts and wholes of the classes
 
     def ids(self) -> list[int]:
         """Ids of all classes, by label; those that were added in the viewer have the smallest free ones."""

@@ -29,21 +29,11 @@ Key = tuple[int, int]
 
 
 class Node(NamedTuple):
-    """Some Gaussians of the scene with their colours and visibility.
+    """Some Gaussians of the scene with their colours and visibility."""
 
-    Attributes
-    ----------
-    members : (M,) int64
-        Indices in the scene, M at least 1.
-    rgba : (M, 4) uint8
-        Colours, and opacities: 0 for those that are not shown.
-    visible : bool
-        Whether any is.
-    """
-
-    members: np.ndarray
-    rgba: np.ndarray
-    visible: bool
+    members: np.ndarray  # (M,) int64: indices in the scene, M at least 1
+    rgba: np.ndarray  # (M, 4) uint8: colours, and opacities: 0 for those that are not shown
+    visible: bool  # whether any is
 
 
 def cut(labels: np.ndarray, confidence: np.ndarray, max_nodes: int = MAX_NODES) -> dict[Key, np.ndarray]:
@@ -74,24 +64,12 @@ def cut(labels: np.ndarray, confidence: np.ndarray, max_nodes: int = MAX_NODES) 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A scene with the visibility and the colour of every Gaussian.
+    """A scene with the visibility and the colour of every Gaussian."""
 
-    Attributes
-    ----------
-    scene : GaussianScene
-        N Gaussians.
-    parts : mapping of Key to (M,) int64
-        How the scene is cut into nodes, as `cut` does.
-    shown : (N,) bool
-        Which of them are to be seen.
-    colors : (N, 3) uint8
-        In which colours.
-    """
-
-    scene: GaussianScene
-    parts: Mapping[Key, np.ndarray]
-    shown: np.ndarray
-    colors: np.ndarray
+    scene: GaussianScene  # N Gaussians
+    parts: Mapping[Key, np.ndarray]  # how the scene is cut into nodes, as `cut` does: (M,) int64 each
+    shown: np.ndarray  # (N,) bool: which of them are to be seen
+    colors: np.ndarray  # (N, 3) uint8: in which colours
 
     @cached_property
     def nodes(self) -> dict[Key, Node]:

@@ -22,34 +22,16 @@ POSE_SOURCES = ("topic", "odometry", "tf", "auto")
 
 @dataclass(frozen=True)
 class Declaration:
-    """One parameter.
-
-    Attributes
-    ----------
-    name : str
-        Its name.
-    default : object
-        Its default; its type is the parameter's.
-    description : str
-        What it is, with its unit.
-    low, high : float, optional
-        Least and largest value.
-    at_once : bool
-        Whether a change takes effect at once; others are accepted only while the node is unconfigured.
-    at_start : bool
-        Whether it is given at the start of the process, once for all: it bounds what peers may reach.
-    any_type : bool
-        Whether a value may be of another type than the default: true and false are no strings in YAML.
-    """
+    """One parameter."""
 
     name: str
-    default: Any
-    description: str
-    low: float | None = None
+    default: Any  # its type is the parameter's
+    description: str  # what it is, with its unit
+    low: float | None = None  # least and largest value
     high: float | None = None
-    at_once: bool = False
-    at_start: bool = False
-    any_type: bool = False
+    at_once: bool = False  # whether a change takes effect at once; else it is accepted only while unconfigured
+    at_start: bool = False  # whether it is given at the start of the process for good: it bounds what peers reach
+    any_type: bool = False  # whether a value may be of another type: true and false are no strings in YAML
 
 
 MAX_PIXELS, OBJECTS = 1 << 24, -1.0

@@ -49,21 +49,14 @@ class Paired(NamedTuple):
 class PairingSettings:
     """Limits on how long and how many masks wait.
 
-    Attributes
-    ----------
-    wait_s : float
-        Seconds that a mask waits for what belongs to it while that stream is silent. What was lost on the way, a
-        reliable publisher sends again only when the middleware next asks for it, three seconds later or more.
-    max_waiting, max_bytes : int
-        Masks that wait at the same time, and bytes of theirs; one more, and the oldest has to go.
-    with_depth : bool
-        Whether a mask waits for the depth image of exactly its stamp, too.
+    What was lost on the way, a reliable publisher sends again only when the middleware next asks for it, three seconds
+    later or more.
     """
 
-    wait_s: float = 10.0
-    max_waiting: int = 300
-    max_bytes: int = MOST_BYTES
-    with_depth: bool = False
+    wait_s: float = 10.0  # seconds that a mask waits for what belongs to it while that stream is silent
+    max_waiting: int = 300  # masks that wait at the same time; one more, and the oldest has to go
+    max_bytes: int = MOST_BYTES  # the same, in bytes of theirs
+    with_depth: bool = False  # whether a mask waits for the depth image of exactly its stamp, too
 
 
 class Pairing:

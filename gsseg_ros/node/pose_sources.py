@@ -23,21 +23,11 @@ _POSES_KEPT = 2000  # At 200 Hz, those of ten seconds.
 
 @dataclass(frozen=True, eq=False)
 class GivenPose:
-    """A pose as a message gives it.
+    """A pose as a message gives it."""
 
-    Attributes
-    ----------
-    matrix : ndarray (4, 4)
-        From the child frame to the frame, in metres.
-    frame_id : str
-        Frame that it is in; "" for the map.
-    child_frame_id : str
-        Frame whose pose it is; "" for one that is not named.
-    """
-
-    matrix: Pose
-    frame_id: str = ""
-    child_frame_id: str = ""
+    matrix: Pose  # (4, 4): from the child frame to the frame, in metres
+    frame_id: str = ""  # frame that it is in; "" for the map
+    child_frame_id: str = ""  # frame whose pose it is; "" for one that is not named
 
 
 class Frames(Protocol):

@@ -29,27 +29,13 @@ _AT_ONCE = 1 << 15  # points of a cloud that are put together at a time
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Those classes and Gaussians of a segmentation that a request asked for.
+    """Those classes and Gaussians of a segmentation that a request asked for."""
 
-    Attributes
-    ----------
-    session : LiveSession
-        What it comes from.
-    result : Segmentation
-        Of all classes.
-    chosen : sequence of int
-        Ids of the classes that were asked for, ascending.
-    min_confidence : float
-        Gaussians less sure than this are left out.
-    similarity : Similarity
-        From the scene to the map.
-    """
-
-    session: LiveSession
-    result: Segmentation
-    chosen: Sequence[int]
-    min_confidence: float
-    similarity: Similarity
+    session: LiveSession  # what it comes from
+    result: Segmentation  # of all classes
+    chosen: Sequence[int]  # ids of the classes that were asked for, ascending
+    min_confidence: float  # Gaussians less sure than this are left out
+    similarity: Similarity  # from the scene to the map
 
     @property
     def scene(self) -> GaussianScene:

@@ -38,30 +38,14 @@ _PATHS = {"scene_path": "a scene", "label_map": "a label map"}
 
 @dataclass
 class Run:
-    """One piece of work for a request; all its outputs carry its stamp and number.
+    """One piece of work for a request; all its outputs carry its stamp and number."""
 
-    Attributes
-    ----------
-    job : str
-        What runs.
-    stamp : Time
-        When it was given its number.
-    revision : int
-        Its number, counted from 1; 0 until it has one.
-    dropped : Counter of str
-        As that of the workspace, when it was given its number.
-    era : object
-        As that of the workspace, when it began.
-    watch : Stopwatch
-        Seconds of its stages.
-    """
-
-    job: str
-    era: object
-    stamp: Time = field(default_factory=Time)
-    revision: int = 0
-    dropped: Counter[str] = field(default_factory=Counter)
-    watch: Stopwatch = field(default_factory=Stopwatch)
+    job: str  # what runs
+    era: object  # as that of the workspace, when it began
+    stamp: Time = field(default_factory=Time)  # when it was given its number
+    revision: int = 0  # its number, counted from 1; 0 until it has one
+    dropped: Counter[str] = field(default_factory=Counter)  # as that of the workspace, when it was given its number
+    watch: Stopwatch = field(default_factory=Stopwatch)  # seconds of its stages
     _started: float = field(default_factory=time.perf_counter)
 
     @property

@@ -47,17 +47,12 @@ class PhotoFileError(GssegError):
 class Group(NamedTuple):
     """Messages that are published together.
 
-    Attributes
-    ----------
-    due : float
-        When, in masks since the start of the pass.
-    messages : tuple of (topic, message)
-        `topic` is a key of `TYPES`. A message that is bytes was recorded and goes out as it is; a message object gets
-        the stamp of its publication, the same for the whole group.
+    A message that is bytes was recorded and goes out as it is; a message object gets the stamp of its publication, the
+    same for the whole group.
     """
 
-    due: float
-    messages: tuple[tuple[str, Any], ...]
+    due: float  # when, in masks since the start of the pass
+    messages: tuple[tuple[str, Any], ...]  # each with its topic, a key of `TYPES`
 
 
 class Source(Protocol):

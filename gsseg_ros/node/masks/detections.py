@@ -25,24 +25,12 @@ class NamedMask(NamedTuple):
 
 
 class Beside(NamedTuple):
-    """What there is beside detections to make a mask of.
+    """What there is beside detections to make a mask of."""
 
-    Attributes
-    ----------
-    size : (int, int)
-        Width and height of the camera's images.
-    max_pixels : int
-        No image may have more.
-    labels : (H, W) of int, or None
-        Of the mask that belongs to them, where the adapter takes one.
-    heard : mapping from label to name
-        What `label_info` told.
-    """
-
-    size: tuple[int, int]
-    max_pixels: int
-    labels: npt.NDArray[np.int32] | None = None
-    heard: Mapping[int, str] = {}
+    size: tuple[int, int]  # width and height of the camera's images
+    max_pixels: int  # no image may have more
+    labels: npt.NDArray[np.int32] | None = None  # (H, W): of the mask that belongs to them, if the adapter takes one
+    heard: Mapping[int, str] = {}  # what `label_info` told
 
 
 class Detected(NamedTuple):
@@ -56,22 +44,12 @@ class Detected(NamedTuple):
 
 @dataclass(frozen=True)
 class Adapter:
-    """How messages of one type become masks.
+    """How messages of one type become masks."""
 
-    Attributes
-    ----------
-    package, name : str
-        Of the message.
-    takes_mask : bool
-        Whether the pixels of its detections are those of a mask, which comes beside it.
-    module : str
-        Where `named_mask` is, which makes a `NamedMask` of a message, the name of its topic and `Beside`.
-    """
-
-    package: str
-    name: str
-    takes_mask: bool
-    module: str
+    package: str  # of the message
+    name: str  # of the message
+    takes_mask: bool  # whether the pixels of its detections are those of a mask, which comes beside it
+    module: str  # where `named_mask` is, which makes a `NamedMask` of a message, the name of its topic and `Beside`
 
     @property
     def type(self) -> str:
