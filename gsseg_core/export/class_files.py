@@ -75,11 +75,11 @@ def write_classes(
     segmentation: Segmentation,
     folder: Path,
     run: str,
-    scene_format: str = DEFAULT,
-    meshes: Mapping[int, TriangleMesh] | None = None,
+    scene_format: str,
+    meshes: Mapping[int, TriangleMesh],
 ) -> dict[int, Path]:
     """Write the files of `export_classes` into a folder of a run with this id, with these meshes to collide with."""
-    confidence, meshes, names = segmentation.confidence, meshes or {}, segmentation.class_names
+    confidence, names = segmentation.confidence, segmentation.class_names
     paths = class_paths(segmentation, folder, scene_format)
     for k, mesh in meshes.items():
         mesh.save(folder / mesh_file_name(k, names[k]), run)
@@ -104,7 +104,7 @@ def write_selection(
     class_names: Mapping[int, str],
     path: str | os.PathLike[str],
     scene_format: str,
-    meshes: Mapping[int, TriangleMesh] | None = None,
+    meshes: Mapping[int, TriangleMesh],
 ) -> None:
     """Write some Gaussians of a scene as one file, in which USD keeps the classes of these labels apart.
 
@@ -119,7 +119,7 @@ def write_selection(
     """
     part = scene.subset(chosen)
     if not SCENE_WRITERS[scene_format].together:
-        for k, mesh in (meshes or {}).items():
+        for k, mesh in meshes.items():
             mesh.save(Path(path).with_name(f"{stem_of(path, scene_format)}_{mesh_file_name(k, class_names[k])}"))
         write_scene(part, path, scene_format)
         return
@@ -134,11 +134,11 @@ def _objects(
     scene: GaussianScene,
     labels: np.ndarray,  # (N,) int
     class_names: Mapping[int, str],
-    meshes: Mapping[int, TriangleMesh] | None = None,
+    meshes: Mapping[int, TriangleMesh],
 ) -> list[SceneObject]:
     """All classes that have Gaussians, as objects of one file."""
     present = np.unique(labels[labels >= 0]).tolist()
-    return [SceneObject(scene.subset(labels == k), k, class_names[k], (meshes or {}).get(k)) for k in present]
+    return [SceneObject(scene.subset(labels == k), k, class_names[k], meshes.get(k)) for k in present]
 
 
 def class_paths(segmentation: Segmentation, folder: Path, scene_format: str) -> dict[int, Path]:

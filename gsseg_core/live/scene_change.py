@@ -6,7 +6,7 @@ stay what they are, bit for bit, unless one that changed in this frame reaches t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 import numpy as np
 
@@ -80,24 +80,24 @@ class SceneChange:
         return bool(in_scene < in_group)
 
     def _changed(self, group: int | None) -> tuple[np.ndarray, np.ndarray]:
-        """Places of the Gaussians that changed in the frame of a group, before (M,) and after (M',)."""
+        """Places of the Gaussians that changed in the frame of a group, before (M,) and after (M',).
+
+        Those of another group did if it lies otherwise in that frame than before.
+        """
         if group not in self._parts:
-            apart = [other for other, is_kept in self._relations(group).items() if not is_kept]
+            before, after = self.before, self.after
+            apart = [
+                other
+                for other, frame in before.frames.items()
+                if other not in after.frames
+                or not is_same(relation(before.frame(group), frame), relation(after.frame(group), after.frame(other)))
+            ]
             gone, new = self._gone, self._new
             self._parts[group] = (
-                np.flatnonzero(gone | np.isin(self.before.groups, apart)),
-                np.flatnonzero(new | np.isin(self.after.groups, apart)),
+                np.flatnonzero(gone | np.isin(before.groups, apart)),
+                np.flatnonzero(new | np.isin(after.groups, apart)),
             )
         return self._parts[group]
-
-    def _relations(self, group: int | None) -> Mapping[int, bool]:
-        """Tell of each group that was there before whether it lies in the frame of another one as it did."""
-        before, after = self.before, self.after
-        return {
-            other: other in after.frames
-            and is_same(relation(before.frame(group), frame), relation(after.frame(group), after.frame(other)))
-            for other, frame in before.frames.items()
-        }
 
 
 def carried(rows: np.ndarray, origin: np.ndarray) -> np.ndarray:  # (N, ...), (N',)

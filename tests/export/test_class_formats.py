@@ -226,13 +226,13 @@ def test_an_object_of_one_gaussian_has_a_mesh_and_one_that_is_not_opaque_has_non
 
 def test_a_selection_in_usd_keeps_its_classes_apart(tmp_path: Path) -> None:
     labels = np.where(TRUTH == 3, -2, TRUTH)
-    write_selection(SCENE, TRUTH != 0, labels, NAMES, tmp_path / "selection.usda", "usd")
+    write_selection(SCENE, TRUTH != 0, labels, NAMES, tmp_path / "selection.usda", "usd", {})
     stage = Usd.Stage.Open(str(tmp_path / "selection.usda"))
     assert [prim.GetName() for prim in stage.GetDefaultPrim().GetChildren()] == [
         "class_1_red_ball", "class_2_cup_mug", "scene",
     ]  # fmt: skip
     with pytest.raises(EmptySceneError):
-        write_selection(SCENE, TRUTH > 9, labels, NAMES, tmp_path / "none.usda", "usd")
+        write_selection(SCENE, TRUTH > 9, labels, NAMES, tmp_path / "none.usda", "usd", {})
     assert not (tmp_path / "none.usda").exists()
 
 
