@@ -5,13 +5,7 @@ from __future__ import annotations
 from geometry_msgs.msg import PoseWithCovariance
 from gsseg_msgs.msg import Object, ObjectArray
 from std_msgs.msg import Header
-from vision_msgs.msg import (
-    BoundingBox3D,
-    Detection3D,
-    Detection3DArray,
-    ObjectHypothesis,
-    ObjectHypothesisWithPose,
-)
+from vision_msgs.msg import BoundingBox3D, Detection3D, Detection3DArray, ObjectHypothesis, ObjectHypothesisWithPose
 
 __all__ = ["Detection3DArray", "detections_of"]
 

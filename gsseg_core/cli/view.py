@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import os
 import threading
-import warnings
 import webbrowser
 from contextlib import closing, suppress
 from pathlib import Path
@@ -95,7 +94,6 @@ def _show(options: argparse.Namespace, listener: Listener, viewer_module: Module
     viewer = viewer_module.Viewer(
         model, views, reliability, source, listener=listener, draw=options.draw, device=options.device
     )
-    warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # A browser may leave at any moment.
     with closing(viewer), suppress(KeyboardInterrupt):  # How it is meant to end.
         tell(f"gsseg: {len(scene):,} Gaussians at {viewer.url} (Ctrl-C ends it)")
         if listener.everywhere:

@@ -149,10 +149,7 @@ def write_overview(
 
 
 def draw_worst_views(
-    images_of: Callable[[View], np.ndarray],
-    views: Mapping[str, View],
-    checks: Sequence[ViewCheck],
-    count: int = WORST,
+    images_of: Callable[[View], np.ndarray], views: Mapping[str, View], checks: Sequence[ViewCheck], count: int = WORST
 ) -> np.ndarray:
     """Draw the worst views: the mask, what the other views predict, and in red where the two differ; (H, W, 3) uint8.
 

@@ -34,34 +34,15 @@ class Observation(ABC):
     some pixel of that label. Most Gaussians are seen under one label only, so there are about as many pairs as
     Gaussians that are seen, however many labels the mask has. Votes, the paper's loss and its gradient, and every step
     of EM need one number per pair.
-
-    Attributes
-    ----------
-    name : str
-        Of the view.
-    ids : (M,) int32
-        Gaussians that some labelled pixel sees, as indices in the scene, ascending: whoever goes through them goes
-        through memory once.
-    start : (M + 1,) int64
-        Pairs of ids[m] are start[m] to start[m + 1].
-    labels : (P,) int32
-        Label of each pair, as its position in `classes`.
-    classes : (L,) int32
-        Labels that occur in the mask, ascending.
-    areas : (L,) int64
-        Pixels of each label.
-    evidence : LabelEvidence
-        What the labels say of the classes; of a plain mask, that they are classes.
-    answered : tuple or None
-        What `shares` was asked last, and what it answered; it is not asked twice.
     """
 
-    name: str
-    ids: np.ndarray
-    start: np.ndarray
-    labels: np.ndarray
-    classes: np.ndarray
-    areas: np.ndarray
+    name: str  # of the view
+    ids: np.ndarray  # (M,) int32: Gaussians that some labelled pixel sees, as indices in the scene, ascending
+    start: np.ndarray  # (M + 1,) int64: pairs of ids[m] are start[m] to start[m + 1]
+    labels: np.ndarray  # (P,) int32: label of each pair, as its position in `classes`
+    classes: np.ndarray  # (L,) int32: labels that occur in the mask, ascending
+    areas: np.ndarray  # (L,) int64: pixels of each label
+    # What `shares` was asked last, and what it answered; it is not asked twice.
     answered: tuple[np.ndarray, np.ndarray, VoteShares] | None = None
 
     @property

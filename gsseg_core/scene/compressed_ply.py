@@ -43,8 +43,7 @@ def read_compressed_ply(path: Path, within: Path | None = None) -> ReadScene:
         raise SceneFileError(f"{path}: has SH of {len(sh):,} Gaussians for {n:,} vertices; expected as many")
     try:
         packed = pack_in_blocks(
-            n,
-            lambda block: _pack(chunks[block.start // _BLOCK :], vertices[block], None if sh is None else sh[block]),
+            n, lambda block: _pack(chunks[block.start // _BLOCK :], vertices[block], None if sh is None else sh[block])
         )
     except (ValueError, TypeError) as error:
         raise SceneFileError(f"{path}: not a compressed PLY ({error}); expected one of PlayCanvas") from error

@@ -45,11 +45,7 @@ class Spinner:
         if self._own:
             self._context.init(args=[], domain_id=domain_id)
         self.node = Node(
-            name,
-            context=self._context,
-            use_global_arguments=False,
-            enable_rosout=False,
-            start_parameter_services=False,
+            name, context=self._context, use_global_arguments=False, enable_rosout=False, start_parameter_services=False
         )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)

@@ -130,11 +130,7 @@ class Selection:
 
 
 def report_message(
-    run: Run,
-    selection: Selection,
-    settings: RefineSettings,
-    map_frame: str,
-    topics: Mapping[int, str] | None = None,
+    run: Run, selection: Selection, settings: RefineSettings, map_frame: str, topics: Mapping[int, str] | None = None
 ) -> SegmentationReport:
     """Report a run; the stages so far and the total are filled in by `finish`."""
     session, result = selection.session, selection.result

@@ -45,10 +45,7 @@ class SceneChanges:
     """
 
     def __init__(
-        self,
-        services: Services,
-        complain: Callable[[str], None],
-        await_fused: Callable[[set[str]], None],
+        self, services: Services, complain: Callable[[str], None], await_fused: Callable[[set[str]], None]
     ) -> None:
         self.node, self.workspace, self.turns = services.node, services.workspace, services.turns
         self._complain, self._show, self._await_fused = complain, services.show, await_fused

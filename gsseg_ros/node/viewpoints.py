@@ -17,13 +17,7 @@ from gsseg_core.export.view_pictures import background_image
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_ros.camera_infos import camera_from_messages
-from gsseg_ros.conversions import (
-    confidence_image,
-    mask_image,
-    matrix_from_pose,
-    rgb_image,
-    stamp_ns,
-)
+from gsseg_ros.conversions import confidence_image, mask_image, matrix_from_pose, rgb_image, stamp_ns
 from gsseg_ros.errors import NoTransformError, TooManyPixelsError, ViewpointError
 from gsseg_ros.node.parameters import Settings
 from gsseg_ros.node.reports import Selection

@@ -22,12 +22,7 @@ from gsseg_core.live.session import LiveSession
 from gsseg_core.progress import Stopwatch
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_ros.errors import (
-    InvalidRequestError,
-    MissingFileError,
-    NoSceneError,
-    NotActiveError,
-)
+from gsseg_ros.errors import InvalidRequestError, MissingFileError, NoSceneError, NotActiveError
 from gsseg_ros.node.jobs import JobSlot, Requests
 from gsseg_ros.node.masks.label_space import LabelSpace, NewNames
 from gsseg_ros.node.parameters import Settings

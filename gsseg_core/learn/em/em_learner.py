@@ -286,11 +286,7 @@ class EMLearner(Learner):
         return -remaining, rejected
 
     def _initial_error_models(
-        self,
-        votes: CSRRows,
-        rejected: Mapping[str, np.ndarray],
-        tick: Tick,
-        names: Iterable[str] | None = None,
+        self, votes: CSRRows, rejected: Mapping[str, np.ndarray], tick: Tick, names: Iterable[str] | None = None
     ) -> dict[str, ErrorModel]:
         """Estimate an error model for each view, or for some, from the votes of all other views.
 
