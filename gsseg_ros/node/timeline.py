@@ -10,6 +10,7 @@ BEHIND_NS = SECOND
 """How much older than the newest of its stream a message is that is not merely out of order."""
 
 _IN_A_ROW = 10
+_WAIT_S = 1.0  # in which nothing goes on; after two, a message is late
 MASK = "mask"
 """The stream whose messages are counted where they are lost."""
 
@@ -44,8 +45,6 @@ class Timeline:
     ----------
     capacity : int
         So many messages are held at most, and no more of one stream are taken for stragglers.
-    wait_s : float
-        The second in which nothing goes on, and half of the two after which a message is late.
 
     Attributes
     ----------
@@ -57,11 +56,11 @@ class Timeline:
         Masks from before time was set back that came after it.
     """
 
-    def __init__(self, capacity: int, wait_s: float = 1.0) -> None:
+    def __init__(self, capacity: int) -> None:
         self.epoch = 0
         self.last_jump = (0, 0)
         self.lost_masks = 0
-        self._capacity, self._wait_s = capacity, wait_s
+        self._capacity = capacity
         self._newest: dict[str, int] = {}  # Of each stream, in this time.
         self._before: dict[str, int] = {}  # Of the streams that have sent nothing in this time, in the one before.
         self._began = 0  # This time, ns.
@@ -131,9 +130,9 @@ class Timeline:
             return []
         self._held_since = now_s if self._held_since is None else self._held_since
         self._quiet_since = now_s if self._quiet_since is None else self._quiet_since
-        if now_s - self._quiet_since >= self._wait_s:
+        if now_s - self._quiet_since >= _WAIT_S:
             return self._start_afresh()
-        return self._all_late() if now_s - self._held_since >= 2 * self._wait_s else []
+        return self._all_late() if now_s - self._held_since >= 2 * _WAIT_S else []
 
     def forget_masks(self) -> int:
         """Forget the masks that are held; return how many they were."""
