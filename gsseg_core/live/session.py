@@ -359,10 +359,8 @@ class LiveSession:
         return dropped
 
     def _forget(self) -> None:
-        num_classes = max(self._names) + 1 if self._declared else 1
-        self._live = self._no_votes(num_classes)
-        self._learnt, self._segmented, self.num_fused = None, None, 0
-        self._cameras = []
+        self._live = self._no_votes(max(self._names) + 1 if self._declared else 1)
+        self._learnt, self._segmented, self.num_fused, self._cameras = None, None, 0, []
         self._version += 1
         self.retire()
 
