@@ -163,11 +163,8 @@ splats of objects that touch, stand on and hide each other, and were trained ane
 another id in every view, and edges off by up to 3 px. Scores are of the test views against the true masks; no learner
 saw either.
 
-The settings of `em` were chosen on train views that were held out from learning, but not all: `least_agreement`,
-`majority` and `tolerance` on the test views of the apartment and of an earlier demo, with masks drawn wrong in many
-ways ([robustness.md](robustness.md)), and so were `SHARPNESS`, `SHORTEST` and `TELLING` of
-`gsseg_core/learn/em/boundary_alignment.py` and `COVERED` of `gsseg_core/learn/em/rejected_regions.py`. None was chosen
-on test views of the other three.
+The settings of `em` were chosen on train views that were held out from learning, or compared there with other values,
+of all development scenes together ([em_settings.md](em_settings.md)); none stands on test views.
 
 Other tables: which step of `em` helps where, [regret.md](regret.md); objects cut out, with every kind of refinement,
 [clean_objects.md](clean_objects.md); masks without common ids, [ids.md](ids.md).
