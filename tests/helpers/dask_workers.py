@@ -8,6 +8,8 @@ its tests take:
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -32,7 +34,7 @@ SETTINGS = EMSettings(max_steps=6, tolerance=0.0)
 
 @contextmanager
 def workers(count: int) -> Iterator[str]:
-    """The address of a scheduler with some workers, each a process of one thread, which come back when killed."""
+    """The address of a scheduler with some workers, each a process of one thread."""
     patient = {f"distributed.comm.timeouts.{name}": f"{PATIENCE:g}s" for name in ("connect", "tcp")}
     with (
         dask.config.set(patient),
@@ -41,6 +43,17 @@ def workers(count: int) -> Iterator[str]:
         ) as cluster,
     ):
         yield cluster.scheduler_address
+
+
+@contextmanager
+def newcomer(client: Any) -> Iterator[None]:
+    """One more worker. Killed ones mostly come back, but on a busy machine what watches over them may give up."""
+    command = [sys.executable, "-m", "dask", "worker", client.scheduler.address, "--nthreads", "1", "--no-dashboard"]
+    with subprocess.Popen([*command, "--no-nanny"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        try:
+            yield
+        finally:
+            process.kill()
 
 
 @pytest.fixture(name="address", scope="module")

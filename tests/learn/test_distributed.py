@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from dask_workers import (  # noqa: F401
     changed,
     client_fixture,
     client_of_victims_fixture,
+    newcomer,
 )
 from patience import PATIENCE
 from small_scenes import NUM_CLASSES, taught
@@ -107,6 +109,7 @@ def test_the_views_of_killed_workers_are_done_again_elsewhere(
 
     lull = changed(client, victims, "gsseg_core.learn.em.em_kernels", "pair_likelihood", mix)
     steps: list[int] = []
+    others = ExitStack()
 
     def kill_at_work(stage: str, done: int, total: int) -> None:
         if done == 2 and 2 not in steps:
@@ -117,13 +120,14 @@ def test_the_views_of_killed_workers_are_done_again_elsewhere(
             killed.extend(victims.values())
             for process in killed:
                 os.kill(process, signal.SIGKILL)
+            others.enter_context(newcomer(client))
 
-    there.fit(kill_at_work)
-    assert len(killed) == many and steps[-1] == SETTINGS.max_steps
-    np.testing.assert_array_equal(there.codes_, here.codes_)
-    assert there.history_ == here.history_
-    client.wait_for_workers(1, timeout=PATIENCE)
-    assert_same(there, here)  # Where all were killed, by workers that came back.
+    with others:
+        there.fit(kill_at_work)
+        assert len(killed) == many and steps[-1] == SETTINGS.max_steps
+        np.testing.assert_array_equal(there.codes_, here.codes_)
+        assert there.history_ == here.history_
+        assert_same(there, here)  # Where all were killed, by others.
 
 
 def test_a_worker_killed_while_views_are_observed_changes_nothing(client_of_victims: Any) -> None:
