@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -29,6 +30,9 @@ _TRIAL, _TRIAL_SIZE = 2500, 0.1
 
 _FAINT = 2
 """Opacity of the trial, of 255: it is drawn like all others, and hardly seen."""
+
+NOTICE: float | None = 8.0
+"""Seconds for which a browser is told why it gets images; None leaves that to whoever reads it."""
 
 _PATIENCE = 60.0
 _SMALL = (48, 64)
@@ -98,7 +102,7 @@ class ClientRenderers:
         if self._drawn_by == AUTO:
             try:
                 self._decide(client, renderer)
-            except (RuntimeError, TimeoutError, OSError, ValueError):  # It has left, or cannot even draw the trial.
+            except (RuntimeError, OSError, ValueError):  # It has left.
                 return
 
     def _leave(self, client: viser.ClientHandle) -> None:
@@ -111,40 +115,43 @@ class ClientRenderers:
         """Try how fast a browser draws, first a few splats and then all, and have it draw or tell it why not."""
         alone = time_of_picture(client)
         with trial(client):
-            slow = time_of_picture(client) - alone > SLOW
-        if not slow:
+            fast = time_of_picture(client) - alone <= SLOW
+        if fast:
             with self._lock:
                 renderer.nodes = nodes = SplatNodes(client, self._splats)
                 if self._picture:
                     nodes.show(self._picture.nodes)
-            slow = time_of_picture(client) - alone > SLOW
-            if slow:
-                with self._lock:
-                    nodes.show({})
-                    renderer.nodes = None
-            else:
+            fast = time_of_picture(client) - alone <= SLOW
+            if fast:
                 renderer.close()
                 client.scene.set_background_image(None)
                 client.flush()
-        if slow:
+            else:
+                with self._lock:
+                    nodes.show({})
+                    renderer.nodes = None
+        if not fast:
             client.add_notification(
                 "The server draws",
                 "This browser draws slowly, as without a GPU, so it gets images. `--draw browser` leaves it to itself.",
-                auto_close_seconds=8.0,
+                auto_close_seconds=NOTICE,
             )
 
 
 def time_of_picture(client: viser.ClientHandle) -> float:
-    """Seconds that a browser takes to draw what it has now, and to send a small image of that.
+    """Seconds that a browser takes to draw what it has now, and to send a small image of that; NaN if it gives none.
 
     Raises
     ------
-    RuntimeError, TimeoutError
-        The browser has left, or does not answer.
+    RuntimeError
+        The browser has left.
     """
     for _ in range(2):  # The first may be without what has just been sent: splats are sorted beside the drawing.
         start = time.monotonic()
-        client.get_render(*_SMALL, timeout=_PATIENCE)
+        try:
+            client.get_render(*_SMALL, timeout=_PATIENCE)
+        except TimeoutError:
+            return math.nan
     return time.monotonic() - start
 
 

@@ -14,7 +14,7 @@ import pytest
 from ros_checks import limited
 from ros_fixtures import parameters_fixture, root_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros
-from ros_robot import SERVICES, Goal, Learn, Robot, core_session, viewpoint
+from ros_robot import CLASSES, SERVICES, Goal, Learn, Robot, core_session, viewpoint
 from small_scenes import build, clean_views
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
@@ -213,7 +213,7 @@ def starved(shared: Ros, root: Path) -> Robot:
     scene = build(np.zeros(250_000, np.int64), rng.uniform(-1, 1, (250_000, 3)), np.full((250_000, 3), 0.004))
     scene.save(root / "large.ply")
     core_session(scene, clean_views(1)).save(root / "narrow_state.npz")
-    names = [f"class {k}" for k in range(150)]
+    names = [*CLASSES, *(f"class {k}" for k in range(len(CLASSES), 150))]
     robot = Robot(shared, "/starved")
     robot.started({"scene_path": root / "large.ply", "data_root": root, "class_names": names})
     robot.drive(clean_views(1))

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -283,6 +284,8 @@ def test_a_browser_gets_images_until_it_has_shown_that_it_draws_fast(
     chromium: Browser, monkeypatch: pytest.MonkeyPatch, limit: float, draws: bool
 ) -> None:
     monkeypatch.setattr(clients, "SLOW", limit)
+    monkeypatch.setattr(clients, "NOTICE", None)  # Where it closed by itself, a busy machine might look too late.
+    monkeypatch.setattr(clients, "_PATIENCE", PATIENCE)
     viewer = Viewer(ViewModel(SCENE, LEARNT), clean_views(1), listener=listen(port=18080), draw=AUTO)
     with on_a_page(viewer, chromium) as shown:
         (renderer,) = viewer.renderers.by_client.values()
@@ -293,6 +296,17 @@ def test_a_browser_gets_images_until_it_has_shown_that_it_draws_fast(
         assert (renderer.nodes is not None) == draws
         viewer.state.change(lambda model: model.isolate(2))
         shown.wait(lambda: shown.looks_like(2) and not shown.looks_like(1), "the mug alone")
+
+
+def test_a_browser_that_gives_no_picture_in_time_is_told_that_it_gets_images() -> None:
+    client = MagicMock(camera=MagicMock(fov=1.0, aspect=1.0, position=np.zeros(3), wxyz=np.eye(4)[0]))
+    client.get_render.side_effect = TimeoutError
+    renderers = clients.ClientRenderers(MagicMock(), SCENE, AUTO, "cpu")
+    renderers._join(client)
+    assert "draws slowly" in client.add_notification.call_args.args[1]
+    (renderer,) = renderers.by_client.values()
+    assert renderer.nodes is None and renderer.frames is not None
+    renderers.close()
 
 
 def test_the_command_serves_the_page_until_it_is_interrupted(tmp_path: Path) -> None:
