@@ -84,9 +84,10 @@ class SeenLabels(NamedTuple):
         UnknownLabelError
             A class is not among them.
         """
-        table = self._table({k: i for i, k in enumerate(ids.tolist())}, source, f"ids of the {len(ids)} classes in use")
+        expected = f"ids of the {len(ids)} classes in use"
+        table, concerned = self._new_ids(ids, np.arange(len(ids)), source, expected)
         if self.evidence is None:
-            return SeenLabels(table[self.labels])
+            return SeenLabels(concerned)
         classes, mass, supervised = self.evidence.classes, self.evidence.mass, self.evidence.supervised
         supervised = None if supervised is None else table[supervised]
         return SeenLabels(self.labels, LabelEvidence(table[classes], mass, supervised))
@@ -102,9 +103,9 @@ class SeenLabels(NamedTuple):
         UnknownLabelError
             A class has no new id.
         """
-        table = self._table(new_ids, source, "ids of its classes")
+        table, concerned = self._new_ids([*new_ids], [*new_ids.values()], source, "ids of its classes")
         if self.evidence is None:
-            return SeenLabels(table[self.labels])
+            return SeenLabels(concerned)
         given, supervised = self.evidence, self.evidence.supervised
         mass = np.eye(len(given.classes), dtype=np.float32) if given.mass is None else given.mass
         targets = table[given.classes]
@@ -121,14 +122,23 @@ class SeenLabels(NamedTuple):
         unknown = np.append(ignored, False)[self.labels]
         return _tidied(self.labels.copy(), classes, merged[:, : len(classes)], supervised, unknown)
 
-    def _table(self, new_ids: Mapping[int, int], source: str, expected: str) -> npt.NDArray[np.int32]:
-        """Table of new ids by id, `UNKNOWN` included; raise `UnknownLabelError` if a class has none."""
+    def _new_ids(
+        self, ids: npt.ArrayLike, new: npt.ArrayLike, source: str, expected: str  # (K,), (K,)
+    ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:  # fmt: skip
+        """Give classes new ids: a table of these by id, `UNKNOWN` included, and what `concerned` becomes by it.
+
+        Raises
+        ------
+        UnknownLabelError
+            A class has no new id.
+        """
         table = np.full(MAX_LABEL + 2, UNKNOWN - 1, np.int32)  # The last one is for unknown pixels.
-        table[[*new_ids, UNKNOWN]] = [*new_ids.values(), UNKNOWN]
-        found = np.unique(self.concerned[table[self.concerned] < UNKNOWN]).tolist()
-        if found:
+        table[np.asarray(ids, np.int64)], table[UNKNOWN] = new, UNKNOWN
+        concerned = table[self.concerned]
+        if (concerned < UNKNOWN).any():
+            found = np.unique(self.concerned[concerned < UNKNOWN]).tolist()
             raise UnknownLabelError(f"{source}: mask holds the labels {clipped(found)}; expected {expected}")
-        return table
+        return table, concerned
 
 
 class PackedMask:
