@@ -14,7 +14,7 @@ from rclpy.action import ActionClient
 from gsseg_ros.client.spinner import Spinner
 from gsseg_ros.errors import NodeUnavailableError, SegmentationError, error_name
 
-GRACE_SECONDS = 1.0
+GRACE_SECONDS = 3.0
 """For an answer on its way from a node that has just ended."""
 
 CANCEL_SECONDS = 5.0

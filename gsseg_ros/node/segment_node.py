@@ -50,8 +50,12 @@ STOP_SECONDS = 3.0
 
 SUCCESS = TransitionCallbackReturn.SUCCESS
 
-ANSWER_SECONDS, CANCEL_SECONDS = 0.3, 2.0
-"""At the end of the node, for answers under way, and for that to a job that it has canceled."""
+LATE_SECONDS = 3.0
+"""What a job gets beyond that at the end of the node, where it would have nobody left to answer."""
+
+ANSWER_TURNS, CANCEL_TURNS = 6, 40
+"""At the end of the node, turns of the executor for answers under way, and for that to a job that it has canceled;
+counted, not timed, so that they are enough on a busy machine, too. One that finds nothing to do takes 0.05 s."""
 
 
 class SegmentNode(LifecycleNode):
@@ -295,12 +299,24 @@ class SegmentNode(LifecycleNode):
         diagnostics.complain(self._complaints, inputs, clock_problem)
 
 
-def _spin_once(executor: MultiThreadedExecutor, node: SegmentNode) -> None:
+def _spin_once(executor: MultiThreadedExecutor, node: SegmentNode, seconds: float) -> None:
     try:
-        executor.spin_once(timeout_sec=0.2)
+        executor.spin_once(timeout_sec=seconds)
     except Exception as error:
         # An error in one callback is raised here, where it would end all the others.
         node.get_logger().error(describe(error))
+
+
+def _stop_answering(executor: MultiThreadedExecutor, node: SegmentNode) -> None:
+    """Stop the node; a canceled job is still answered, which rclpy sends from the executor."""
+    slot = node.workspace.slot
+    turns = CANCEL_TURNS if slot.busy else ANSWER_TURNS
+    node.stop()
+    latest = time.monotonic() + LATE_SECONDS
+    while slot.busy and time.monotonic() < latest:
+        _spin_once(executor, node, 0.05)
+    for _ in range(turns):
+        _spin_once(executor, node, 0.05)
 
 
 def main(args: list[str] | None = None) -> int:
@@ -324,19 +340,14 @@ def main(args: list[str] | None = None) -> int:
     starting.start()
     try:
         while not stop.is_set():
-            _spin_once(executor, node)
+            _spin_once(executor, node, 0.2)
     finally:
         if node.configuring:
             # There is nothing yet that could be lost, and no way to stop a compiler.
             node.destroy_node()
             os._exit(0)
         starting.join(STOP_SECONDS)
-        # A canceled job is still answered: rclpy sends that from the executor.
-        seconds = CANCEL_SECONDS if node.workspace.slot.busy else ANSWER_SECONDS
-        node.stop()
-        answered = time.monotonic() + seconds
-        while time.monotonic() < answered:
-            executor.spin_once(timeout_sec=0.05)
+        _stop_answering(executor, node)
         node.close()
         executor.shutdown(timeout_sec=STOP_SECONDS)
         rclpy.shutdown()

@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import pytest
 from patience import PATIENCE
@@ -22,6 +22,8 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
 from gsseg_ros.client import NodeUnavailableError, SegmentationClient, SegmentationError
+
+T = TypeVar("T")
 
 FOREVER: dict[str, Any] = {"learner": "gradient", "max_steps": 1_000_000}
 """A goal that does not come to its end while a test waits."""
@@ -67,7 +69,7 @@ def shared_fixture(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
 @pytest.fixture(name="place")
 def place_fixture(shared: Place) -> Place:
     """The node without views and codes."""
-    shared.client.load_scene("data/scene.ply")
+    once_free(lambda: shared.client.load_scene("data/scene.ply"))
     return shared
 
 
@@ -91,6 +93,10 @@ class Background:
         self._thread.join(PATIENCE)
         assert not self._thread.is_alive(), "the call does not return"
 
+    @property
+    def ended(self) -> bool:
+        return not self._thread.is_alive()
+
     def _run(self) -> None:
         try:
             self.result = self._function()
@@ -99,11 +105,33 @@ class Background:
 
 
 def learning_forever(client: SegmentationClient) -> Background:
-    """A `learn` that is under way."""
+    """A `learn` that is in its steps: before, kernels are loaded, which nothing can stop."""
     began = threading.Event()
-    running = Background(lambda: client.learn("data", **FOREVER, on_feedback=lambda *_: began.set()))
-    assert began.wait(PATIENCE), running.error
+
+    def told(stage: str, done: int, *_: float) -> None:
+        if stage == "gradient" and done > 1:
+            began.set()
+
+    running = Background(lambda: client.learn("data", **FOREVER, on_feedback=told))
+    wait_until(lambda: began.wait(0.1) or running.ended, "steps of learning")
+    assert began.is_set(), running.error
     return running
+
+
+def once_free(call: Callable[[], T]) -> T:
+    """Call again while the node is busy: a job that was given up may take its time to stop."""
+    answers: list[T] = []
+
+    def answered() -> bool:
+        try:
+            answers.append(call())
+        except SegmentationError as error:
+            if error.name != "BUSY":
+                raise
+        return bool(answers)
+
+    wait_until(answered, "the node to be free")
+    return answers[0]
 
 
 def failure(call: Callable[[], Any]) -> SegmentationError:

@@ -19,6 +19,7 @@ from ros_client_cases import (  # noqa: F401
     failure,
     learning_forever,
     learnt_fixture,
+    once_free,
     place_fixture,
     says_in_the_end,
     shared_fixture,
@@ -62,13 +63,13 @@ def test_an_error_in_the_feedback_cancels_and_comes_out(place: Place) -> None:
 
     with pytest.raises(LookupError, match="enough"):
         place.client.learn("data", **FOREVER, on_feedback=complain)
-    assert place.client.learn("data").report.num_views == 4
+    assert once_free(lambda: place.client.learn("data")).report.num_views == 4
 
 
 def test_learning_that_takes_too_long_is_canceled(place: Place) -> None:
     with pytest.raises(NodeUnavailableError, match="did not answer in time during learn"):
         place.client.learn("data", **FOREVER, timeout=1.0)
-    assert place.client.learn("data").report.num_views == 4
+    assert once_free(lambda: place.client.learn("data")).report.num_views == 4
 
 
 def run_script(ros: Ros, text: str) -> subprocess.Popen[str]:
@@ -95,7 +96,7 @@ def test_ctrl_c_in_a_plain_script_cancels_learning(place: Place) -> None:
     script.send_signal(signal.SIGINT)
     output, _ = script.communicate(timeout=PATIENCE)
     assert script.returncode == 0 and output.endswith("interrupted\n"), output
-    assert place.client.learn("data").report.num_views == 4
+    assert once_free(lambda: place.client.learn("data")).report.num_views == 4
 
 
 def test_a_script_that_forgets_to_close_ends_cleanly(place: Place) -> None:
@@ -168,8 +169,8 @@ def test_a_node_that_is_asked_to_end_cancels_learning_and_says_so(ros: Ros, tmp_
         running = learning_forever(client)
         node.send(signal.SIGTERM)
         running.join()
-        assert isinstance(running.error, SegmentationError) and running.error.name == "CANCELED"
-        assert node.wait() == 0
+        assert isinstance(running.error, SegmentationError), (running.error, node.output)
+        assert running.error.name == "CANCELED" and node.wait() == 0
 
 
 def test_a_service_that_goes_away_unanswered_ends_the_wait(ros: Ros) -> None:
