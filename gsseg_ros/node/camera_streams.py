@@ -84,14 +84,14 @@ class CameraStreams:
         self.pairing = Pairing(self.poses(), PairingSettings(with_depth=settings.depth_gating), prefix, name)
         self._pairings = [self.pairing]
         topics: list[tuple[Any, str, Callable[[str, Any], None]]] = [(CameraInfo, "camera_info", self.on_camera_info)]
-        if not settings.detections_topic:
-            topics.insert(0, (mask_class(settings), "mask", self.on_mask))
         if settings.depth_gating:
             topics.append((Image, "depth", self.on_depth))
         if source == "odometry":
             topics.append((Odometry, "odometry", self.on_odometry))
         elif source != "tf":
             topics.append((PoseStamped, "pose", self.on_pose))
+        if not settings.detections_topic:  # Last: who has found it, and begins to publish, has found the others, too.
+            topics.append((mask_class(settings), "mask", self.on_mask))
         for kind, role, callback in topics:
             # What TF knows may be all that there is.
             listen(kind, role, self.topic(role), callback, required=not (role == "pose" and source == "auto"))

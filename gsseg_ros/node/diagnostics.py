@@ -42,7 +42,7 @@ def missing_inputs(inputs: Inputs) -> dict[str, str]:
     """Explain what to check for each input that was silent for five seconds; by its role, such as "mask"."""
     now = time.monotonic()
     complaints: dict[str, str] = {}
-    for topic, role in inputs.roles.items():
+    for topic, role in sorted(inputs.roles.items(), key=lambda item: item[1] != "mask"):  # The mask first.
         count, last = inputs.arrivals[topic]
         silence = now - last
         if silence < PERIOD:

@@ -67,7 +67,8 @@ def photo() -> np.ndarray:
 
 
 def listen(ros: Ros) -> dict[str, list[Any]]:
-    return {topic: ros.collect(kind, topic) for topic, kind in KINDS.items()}
+    # The mask last: it is found last, and the replay begins once it is.
+    return {topic: ros.collect(kind, topic) for topic, kind in reversed(KINDS.items())}
 
 
 def stamps(messages: list[Any]) -> list[int]:
@@ -133,13 +134,13 @@ def finished(process: Process) -> str:
 
 
 def test_a_folder_gives_the_views_of_the_split_in_order_with_equal_stamps(ros: Ros, folder: Path) -> None:
-    heard = listen(ros)
+    heard, begun = listen(ros), time.time_ns()
     output = finished(ros.start("replay_node", {"data": folder, "rate": 40.0, "map_frame": "world"}))
     views = Dataset(folder).views("train")
     ros.wait_until(lambda: len(heard["mask"]) == len(views) and len(heard["pose"]) == len(views), "all views")
     assert stamps(heard["mask"]) == stamps(heard["camera_info"]) == stamps(heard["pose"])
     assert stamps(heard["mask"]) == sorted(set(stamps(heard["mask"])))
-    assert abs(stamps(heard["mask"])[0] - time.time_ns()) < 60e9
+    assert begun < stamps(heard["mask"])[0] < time.time_ns()
     for view, mask, info, pose in zip(views, heard["mask"], heard["camera_info"], heard["pose"], strict=True):
         assert mask.encoding == "mono8" and mask.header.frame_id == info.header.frame_id == "camera"
         np.testing.assert_array_equal(labels_from_image(mask, "mask"), view.read_labels())
@@ -347,10 +348,10 @@ def test_a_signal_stops_it_and_it_says_what_it_published(
     number: signal.Signals,
 ) -> None:
     heard = listen(ros)
-    process = ros.start("replay_node", {"data": folder, "rate": 0.02, "loop": 0})
+    process = ros.start("replay_node", {"data": folder, "rate": 0.001, "loop": 0})
     ros.wait_until(lambda: heard["mask"], "a mask")
     process.send(number)
-    assert process.wait() == 0, process.output  # Long before the next mask, which is due after 50 s.
+    assert process.wait() == 0, process.output  # Long before the next mask, which is due after 1000 s.
     assert "stopped: published 1 mask, 1 camera_info, 1 pose, 0 image in " in process.output
     assert "Traceback" not in process.output
 
