@@ -44,6 +44,11 @@ def requests() -> QoSProfile:
     return QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
 
 
+def feedback() -> QoSProfile:
+    """Make a profile for the feedback of an action: of a client that stands still for a while, too, none is lost."""
+    return QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
+
+
 @contextmanager
 def clear_overrides(topic: str) -> Iterator[None]:
     """Make what rclpy raises in the body for a parameter qos_overrides that cannot be used one clear error.

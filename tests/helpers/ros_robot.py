@@ -99,7 +99,7 @@ class Robot:
         }
         # The question for the state comes last: a node that answers it has heard of all the others (see `_greet`).
         self.goals: list[Goal] = []
-        self._learner = ActionClient(ros.node, Learn, f"{self.name}/learn")
+        self._learner = ActionClient(ros.node, Learn, f"{self.name}/learn", feedback_sub_qos_profile=RELIABLE)
         self._clients = {
             service: ros.node.create_client(kind, f"{self.name}/{service}") for service, kind in SERVICES.items()
         }

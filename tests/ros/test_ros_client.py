@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from patience import PATIENCE
 from ros_client_cases import (  # noqa: F401
+    FOREVER,
     Background,
     Place,
     failure,
@@ -18,12 +19,14 @@ from ros_client_cases import (  # noqa: F401
     says_in_the_end,
     shared_fixture,
 )
+from ros_helpers import wait_until
 from scene_files import write_glb, write_gsplat, write_ksplat
 from small_scenes import NAMES, balls_on_a_table, ring
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 import rclpy
+from gsseg_msgs.action import Learn
 from rclpy.signals import SignalHandlerOptions
 
 from gsseg_core.errors import IntrinsicsError, PoseError
@@ -31,7 +34,7 @@ from gsseg_core.export.pictures import palette
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.scene_delta import SceneDelta
 from gsseg_core.segmentation import Segmentation
-from gsseg_ros.client import SegmentationClient, Viewpoint
+from gsseg_ros.client import SegmentationClient, SegmentationError, Viewpoint
 
 
 def test_learning_tells_its_progress_in_the_callers_thread_and_what_it_came_to(place: Place) -> None:
@@ -48,6 +51,24 @@ def test_learning_tells_its_progress_in_the_callers_thread_and_what_it_came_to(p
     assert result.report.num_views == 4 and result.num_steps > 0
     assert np.isfinite(result.loss)
     assert {"observe", "learn"} <= result.seconds.keys() and min(result.seconds.values()) >= 0
+
+
+def test_of_feedback_nothing_is_lost_while_the_client_stands_still(place: Place) -> None:
+    told: list[int] = []
+    go_on = threading.Event()
+    heard = place.ros.collect(Learn.Impl.FeedbackMessage, "/gsseg/learn/_action/feedback", 1000)
+    learning = Background(lambda: place.client.learn("data", **FOREVER, on_feedback=lambda *of: told.append(of[1])))
+    wait_until(lambda: len(told) > 10 and heard, "feedback")
+    place.client._spinner._executor.create_task(lambda: go_on.wait(PATIENCE))
+    before = len(heard)
+    wait_until(lambda: len(heard) > before + 30, "more feedback than is kept by default")
+    go_on.set()
+    sent = [message.feedback.done for message in heard[before : before + 30]]
+    wait_until(lambda: told[-1] > sent[-1], "the client to catch up")
+    assert set(sent) <= set(told)
+    assert place.client.cancel()
+    learning.join()
+    assert isinstance(learning.error, SegmentationError) and learning.error.name == "CANCELED"
 
 
 def test_fewer_views_and_steps_are_as_asked_for(place: Place) -> None:
@@ -220,7 +241,7 @@ def test_an_export_says_which_files_it_wrote(learnt: Place) -> None:
 def test_views_are_awaited_and_counted_and_forgotten(place: Place) -> None:
     counts: list[int] = []
     replay = place.ros.start("replay_node", {"data": place.folder / "data", "rate": 50.0})
-    assert place.client.wait_for_views(4, on_views=counts.append) == 4
+    assert place.client.wait_for_views(4, PATIENCE, counts.append) == 4
     assert counts[-1] == 4 and counts == sorted(counts)
     assert replay.wait() == 0
     assert place.client.segment().report.learner == "votes"
