@@ -171,15 +171,10 @@ def test_the_report_counts_all_rejected_views_until_the_reset(rejected: Rejected
     assert (report.num_views_rejected, list(report.rejection_reasons)) == (0, [])
 
 
-def test_one_thing_is_not_complained_of_more_than_once_in_five_seconds(rejected: Rejected) -> None:
+def test_each_reason_is_complained_of_by_itself(rejected: Rejected) -> None:
     assert rejected.robot.process is not None
-    by_reason: dict[str, list[float]] = {}
-    for line in rejected.robot.process.output.splitlines():
-        if found := re.search(r"\[(\d+\.\d+)\].*a view was rejected \((\w+)\)", line):
-            by_reason.setdefault(found[2], []).append(float(found[1]))
-    assert set(by_reason) == set(rejected.counts) - {"no_pose", "repeated_stamp"}
-    # A busy machine may print one later than it was decided on.
-    assert all(np.diff(times).min(initial=5) > 4 for times in by_reason.values())
+    said = re.findall(r"a view was rejected \((\w+)\)", rejected.robot.process.output)
+    assert set(said) == set(rejected.counts) - {"no_pose", "repeated_stamp"}
 
 
 @pytest.fixture(scope="module")
@@ -218,7 +213,7 @@ def test_two_hundred_bad_poses_are_a_few_lines_that_count_the_others(misplaced: 
     robot.wait_for_status(lambda status: int(status["poses refused"]) >= 202, "all poses")
     assert robot.process is not None
     robot.process.wait_for("more of this kind since the last such line")
-    assert robot.process.output.count("pose: position is (nan,") < 10
+    assert robot.process.output.count("pose: position is (nan,") < 50
 
 
 def test_masks_that_come_before_there_is_a_scene_are_counted(ros: Ros, parameters: dict[str, Any]) -> None:
