@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import resource
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -11,8 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 from ros_checks import limited
-from ros_fixtures import parameters_fixture, root_fixture, shared_fixture  # noqa: F401
+from ros_fixtures import parameters_fixture, root_fixture, shared_fixture, spun  # noqa: F401
 from ros_helpers import Ros
 from ros_robot import CLASSES, SERVICES, Goal, Learn, Robot, core_session, viewpoint
 from small_scenes import build, clean_views
@@ -21,10 +23,14 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
+from rclpy.parameter import Parameter
 
 from gsseg_ros.errors import PathNotAllowedError
+from gsseg_ros.node import segment_node, services
 from gsseg_ros.node.declarations import DECLARATIONS
 from gsseg_ros.node.parameters import Settings
+from gsseg_ros.node.segment_node import SegmentNode
+from gsseg_ros.node.services import AT_WORK, WAITING
 from gsseg_ros.node.workspace import Workspace
 
 INTERFACES = {name: SERVICES[name].Response for name in (
@@ -247,15 +253,28 @@ def answer(robot: Robot, case: Case) -> Any:
     return result
 
 
-@contextmanager
-def crowded(robot: Robot) -> Iterator[None]:
-    """The node has as many large requests as it takes, for seconds."""
-    large = nowhere(width=2000, height=2000)
-    requests = [robot.send("render_view", **large) for _ in range(10)]
-    robot.ros.wait_until(lambda: any(request.done() for request in requests), "a request that is refused")
-    yield
-    answers = [robot.ros.result(request) for request in requests]
-    assert {answer.error_code for answer in answers} == {0, SERVICES["render_view"].Response.BUSY}
+@pytest.fixture(scope="module")
+def crowded(shared: Ros, parameters: dict[str, Any]) -> Iterator[Robot]:
+    """A node, in this process, that has as many requests as it takes, and does not come to their end."""
+    robot, go_on, draw = Robot(shared, "/crowded"), threading.Event(), services.draw
+    values = {name: str(value) if isinstance(value, Path) else value for name, value in parameters.items()}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(segment_node, "warm_up", lambda *_: None)
+        patch.setattr(services, "draw", lambda *a, **k: (go_on.wait(PATIENCE), draw(*a, **k))[1])
+        node = SegmentNode(
+            context=shared.context, namespace="/crowded", use_global_arguments=False,
+            parameter_overrides=[Parameter(name, value=value) for name, value in values.items()],
+        )  # fmt: skip
+        with spun(node, shared):
+            assert robot.brought_to("inactive").change("activate")
+            robot.fuse(clean_views(1))
+            requests = [robot.send("render_view", **nowhere()) for _ in range(AT_WORK + WAITING + 1)]
+            shared.wait_until(lambda: any(request.done() for request in requests), "a request that is refused")
+            yield robot
+            go_on.set()
+            codes = sorted(shared.result(request).error_code for request in requests)
+            assert codes == [0] * (AT_WORK + WAITING) + [SERVICES["render_view"].Response.BUSY]
+        node.close()
 
 
 def provoke(case: Case, nodes: Nodes, request: pytest.FixtureRequest) -> Any:
@@ -267,8 +286,7 @@ def provoke(case: Case, nodes: Nodes, request: pytest.FixtureRequest) -> Any:
         with busy(nodes.main):
             return answer(nodes.main, case)
     if case.on == "crowded":
-        with crowded(nodes.main):
-            return answer(nodes.main, case)
+        return answer(request.getfixturevalue("crowded"), case)
     if case.on == "starved":
         robot = request.getfixturevalue("starved")
         with short_of_memory(robot):

@@ -52,7 +52,7 @@ def test_few_requests_work_some_wait_the_rest_are_busy_and_everything_else_goes_
             ros.wait_until(lambda: len(robot.received_status) >= told + 3, "diagnostics beside them")
             robot.drive(clean_views(1))
             robot.wait_for_status(lambda status: status.get("views fused") == "3", "a view beside them")
-            assert len(at_work) == AT_WORK
+            ros.wait_until(lambda: len(at_work) == AT_WORK, "those that work")
         finally:
             go_on.set()
         codes = [ros.result(request).error_code for request in requests]
@@ -63,14 +63,15 @@ def test_few_requests_work_some_wait_the_rest_are_busy_and_everything_else_goes_
 def test_those_that_wait_are_not_active_any_more_once_the_node_is_not(
     ros: Ros, node: SegmentNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    robot, go_on, draw = Robot(ros), threading.Event(), services.draw
-    monkeypatch.setattr(services, "draw", lambda *a, **k: go_on.wait(PATIENCE) and draw(*a, **k))
+    robot, go_on, at_work, draw = Robot(ros), threading.Event(), [], services.draw
+    monkeypatch.setattr(services, "draw", lambda *a, **k: (at_work.append(1), go_on.wait(PATIENCE), draw(*a, **k))[2])
     with spun(node, ros):
         robot.brought_to("inactive")
         assert robot.change("activate")
         robot.fuse(clean_views(1))
         requests = [robot.send("render_view", **viewpoint(clean_views(1)[0])) for _ in range(AT_WORK + WAITING + 1)]
         ros.wait_until(lambda: any(request.done() for request in requests), "one that is refused")
+        ros.wait_until(lambda: len(at_work) == AT_WORK, "those that work")
         node.workspace.active = False
         go_on.set()
         codes = [ros.result(request).error_code for request in requests]

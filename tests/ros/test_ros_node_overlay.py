@@ -66,7 +66,7 @@ class Viewer:
     def picture_of(self, stamp: Time) -> np.ndarray:
         """The overlay with a stamp."""
         self.robot.ros.wait_until(lambda: any(image.header.stamp == stamp for image in self.seen), "the overlay")
-        (image,) = (image for image in self.seen if image.header.stamp == stamp)
+        image = next(image for image in self.seen if image.header.stamp == stamp)
         assert (image.encoding, image.header.frame_id) == ("rgb8", "camera")
         return picture_from_image(image, "overlay")
 
@@ -239,7 +239,7 @@ def test_whoever_fuses_never_waits_for_a_picture_and_only_the_newest_is_drawn(
 def test_nothing_is_drawn_while_masks_wait(
     live: tuple[LiveOutputs, Shown, dict[str, int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live_outputs, "POSTPONED_SECONDS", 60.0)
+    monkeypatch.setattr(live_outputs, "POSTPONED_SECONDS", PATIENCE)
     outputs, shown, state = live
     shown.go_on.set()
     state["busy"] = True

@@ -181,7 +181,8 @@ def test_of_requests_at_the_same_time_one_is_published_whole_and_last_the_newest
         assert [cloud.width for cloud in clouds] == [counts[1], counts[3]]
 
 
-def test_deactivate_waits_for_a_request_at_work(here: NodeHere, robot: Robot) -> None:
+def test_deactivate_waits_for_a_request_at_work(here: NodeHere, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(segment_node, "STOP_SECONDS", PATIENCE)
     here.fuse(clean_views(2))
     with here.node.workspace.session._lock:
         asking, answers = in_thread(lambda: here.ask("segment"))
