@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -38,6 +39,7 @@ def workers(count: int) -> Iterator[str]:
     patient = {f"distributed.comm.timeouts.{name}": f"{PATIENCE:g}s" for name in ("connect", "tcp")}
     with (
         dask.config.set(patient),
+        mock.patch.object(scheduler, "PATIENCE", PATIENCE),
         distributed.LocalCluster(
             processes=True, n_workers=count, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=50
         ) as cluster,

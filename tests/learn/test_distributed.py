@@ -22,11 +22,9 @@ from dask_workers import (  # noqa: F401
     client_of_victims_fixture,
     newcomer,
 )
-from patience import PATIENCE
 from small_scenes import NUM_CLASSES, taught
 
 from gsseg_core.data.view import View
-from gsseg_core.learn.distributed import dask_cluster as scheduler
 from gsseg_core.learn.distributed.dask_learners import DistributedEM, DistributedVotes
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.vote_learner import VoteLearner
@@ -89,10 +87,9 @@ def test_fewer_views_than_workers_are_enough(client: Any) -> None:
 
 @pytest.mark.parametrize("many", [1, 2], ids=["one", "all"])
 def test_the_views_of_killed_workers_are_done_again_elsewhere(
-    client_of_victims: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, many: int
+    client_of_victims: Any, tmp_path: Path, many: int
 ) -> None:
     client = client_of_victims
-    monkeypatch.setattr(scheduler, "PATIENCE", PATIENCE)
     here = taught(EMLearner(SCENE, NUM_CLASSES, SETTINGS), VIEWS).fit()
     there = DistributedEM(client, SCENE, NUM_CLASSES, SETTINGS)
     there.observe_all(VIEWS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
@@ -150,6 +151,7 @@ def test_a_port_where_no_scheduler_answers_is_one_clear_line_in_time(
         thread.start()
         address = f"127.0.0.1:{server.getsockname()[1]}"
         assert main(segment(data, "out", "--scheduler", address)) == 2
+        server.shutdown(socket.SHUT_RDWR)  # On a busy machine nobody may have come so far as to connect.
         thread.join(PATIENCE)
     stderr = capfd.readouterr().err
     assert stderr.startswith(f"gsseg: error: scheduler {address}: {says}") and stderr.count("\n") == 1
@@ -162,17 +164,32 @@ def test_an_address_of_a_worker_is_said_to_be_none_of_a_scheduler(client: Any) -
         pass
 
 
-def test_ctrl_c_while_workers_learn_ends_with_130_and_not_a_word(address: str, data: Path) -> None:
+def test_ctrl_c_while_workers_learn_ends_with_130_and_not_a_word(client: Any, address: str, data: Path) -> None:
     arguments = [option for option in segment(data, "out", "--scheduler", address) if option != "--quiet"]
-    with subprocess.Popen(
-        [sys.executable, "-m", "gsseg_core.cli", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as process:
-        assert process.stderr is not None
-        stderr = b""
-        while b"observe:" not in stderr and process.poll() is None:
-            stderr += os.read(process.stderr.fileno(), 4096)
-        process.send_signal(signal.SIGINT)
-        out, rest = process.communicate(timeout=PATIENCE)
+    ended = str(data / "ended")
+
+    def work(*_: object) -> None:  # Until the signal has had its effect, however late it comes.
+        import time
+        from pathlib import Path
+
+        while not Path(ended).exists():
+            time.sleep(0.01)
+
+    with (
+        changed(client, client.nthreads(), "gsseg_core.learn.distributed.dask_worker", "sum_votes", work),
+        subprocess.Popen(
+            [sys.executable, "-m", "gsseg_core.cli", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        ) as process,
+    ):
+        try:
+            assert process.stderr is not None
+            stderr = b""
+            while b"observe:" not in stderr and process.poll() is None:
+                stderr += os.read(process.stderr.fileno(), 4096)
+            process.send_signal(signal.SIGINT)
+            out, rest = process.communicate(timeout=PATIENCE)
+        finally:
+            Path(ended).touch()
     assert (process.returncode, out) == (130, b""), stderr + rest
     assert not re.search(rb"Traceback|Exception|Error|distributed", stderr + rest), stderr + rest
 
@@ -210,20 +227,29 @@ def test_the_documented_commands_make_a_cluster_and_its_loss_is_one_clear_error(
             with pytest.raises(SchedulerError, match="has no workers"), scheduler.connected(address):
                 pass
             with subprocess.Popen([*run, "worker", address, "--no-dashboard", "--nthreads", "1"], **quiet) as worker:
-                with distributed.Client(address, set_as_default=False) as client:
+                with distributed.Client(address, timeout=PATIENCE, set_as_default=False) as client:
                     client.wait_for_workers(1, timeout=PATIENCE)
                 with scheduler.connected(address) as client:
                     there = DistributedEM(client, SCENE, NUM_CLASSES, SETTINGS)
                     there.observe_all(VIEWS)
                     assert_same(there, taught(EMLearner(SCENE, NUM_CLASSES, SETTINGS), VIEWS))
                     worker.terminate()
+                    wait_until(lambda client=client: not client.nthreads(), "the worker to leave")  # type: ignore[misc]
                     with pytest.raises(SchedulerError, match="has no workers"):
                         there.fit()
                     first.kill()
+                    client.rpc.timeout = 1  # Else it is looked for as long as a busy machine needs.
                     with pytest.raises(SchedulerError, match="does not answer any more"):
                         there.fit()
         finally:
             first.kill()
+
+
+def test_a_worker_that_is_there_is_found_however_late_one_comes_to_look(monkeypatch: pytest.MonkeyPatch) -> None:
+    hours = itertools.count(0, 3600)
+    monkeypatch.setattr(scheduler, "time", SimpleNamespace(monotonic=lambda: next(hours)))
+    client: Any = SimpleNamespace(nthreads=lambda: {"tcp://here:1": 2})
+    assert scheduler.find_workers(client) == {"tcp://here:1": 2}
 
 
 def written(path: Path) -> str:

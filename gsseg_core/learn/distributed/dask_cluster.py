@@ -17,7 +17,7 @@ from gsseg_core.errors import SchedulerError, SettingsError
 if TYPE_CHECKING:
     from distributed import Client
 
-PATIENCE = 10.0  # seconds to wait for a scheduler to answer, and for a worker when there is none
+PATIENCE = 30.0  # seconds to wait for a scheduler to answer, and for a worker when there is none
 UNREACHABLE = (OSError, TimeoutError, asyncio.TimeoutError)  # what Dask raises when nobody answers
 
 
@@ -109,14 +109,17 @@ def find_workers(client: Client) -> dict[str, int]:
     SchedulerError
         None comes, or the scheduler is lost.
     """
-    start = time.monotonic()
-    while time.monotonic() - start <= PATIENCE:
+    deadline = time.monotonic() + PATIENCE
+    while True:
+        late = time.monotonic() > deadline  # However long this process stood still, it looks once more.
         try:
             workers = client.nthreads()
         except UNREACHABLE as error:
             raise SchedulerError(f"{name_of(client)}: does not answer any more; expected one that stays") from error
         if workers:
             return dict(sorted(workers.items()))
+        if late:
+            break
         time.sleep(0.1)
     raise SchedulerError(f"{name_of(client)}: has no workers; expected at least one, started by `dask worker ADDRESS`")
 
