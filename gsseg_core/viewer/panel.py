@@ -35,6 +35,9 @@ MOST_CLASSES, MOST_VIEWS = 5, 8
 LONGEST_NAME = 80
 """Characters of a name; of a longer one, the first."""
 
+NOTICE: float | None = 10.0
+"""Seconds for which a browser is told of an error beside the answer; None leaves that to whoever reads it."""
+
 SWITCH, ONLY, REMOVE = "switch it on or off", "only this", "remove"
 REGION, DISC, ALIKE = "the whole region", "a disc", "all that looks alike there"
 _OFF = (73, 80, 87)
@@ -295,7 +298,7 @@ class Panel:
             self._answer.content = _paragraph(f" {error}", title="That did not work.")
             if client is not None:
                 text = printable(str(error))
-                client.add_notification("That did not work", text, color="red", auto_close_seconds=10.0)
+                client.add_notification("That did not work", text, color="red", auto_close_seconds=NOTICE)
 
     # Corrections, as they are set up in the panel.
 

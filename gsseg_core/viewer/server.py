@@ -33,6 +33,9 @@ MOST_BYTES = 2**20
 LARGEST_WINDOW = 2**14
 """Most pixels of a browser's picture, each way."""
 
+PATIENCE = 60.0
+"""Seconds for a browser to say what it wants, once it is connected, and to show that it is still there."""
+
 _LARGEST_NUMBER, _LONGEST_TEXT = 1e9, 1000
 
 _HEARD = ("ViewerCameraMessage", "ScenePointerMessage", "GuiUpdateMessage", "GetRenderResponseMessage")
@@ -80,6 +83,7 @@ def _guarding(listener: Listener) -> Iterator[threading.Event]:
 
         guarded.set()
         ours = {"sock": listener.socket, "create_connection": _Connection, "max_size": MOST_BYTES}
+        ours |= {"open_timeout": PATIENCE, "ping_timeout": PATIENCE}
         return real(handler, process_request=process, **{**options, **ours})
 
     websockets.asyncio.server.serve = serve  # type: ignore[assignment, misc]

@@ -10,7 +10,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from patience import PATIENCE
@@ -71,13 +71,15 @@ def started_chromium() -> Iterator[Browser]:
 
 
 @contextmanager
-def opened_page(browser: Browser, width: int = 960, height: int = 720, tolerated: str = "") -> Iterator[Page]:
+def opened_page(
+    browser: Browser, width: int = 960, height: int = 720, tolerated: str = "", **options: Any
+) -> Iterator[Page]:
     """Open an empty page; at the end, what it threw or logged as an error is one, as a warning is for Python.
 
-    What holds the text `tolerated`, if that is given, is let pass.
+    What holds the text `tolerated`, if that is given, is let pass. `options` are further ones of Playwright's contexts.
     """
     complaints: list[str] = []
-    context = browser.new_context(viewport={"width": width, "height": height}, accept_downloads=True)
+    context = browser.new_context(viewport={"width": width, "height": height}, accept_downloads=True, **options)
     context.set_default_timeout(1000 * PATIENCE)  # Of pictures, too, which a busy machine takes half a minute to take.
     page = context.new_page()
     page.on("pageerror", lambda error: complaints.append(str(error)))

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from browser import opened_page
 from parts_of_balls import SCENE, TRUTH, halved, seen_as
-from patience import PATIENCE
 from PIL import Image
 from report_cases import run_with_nasty_names
 from small_scenes import NAMES, ring, write_dataset
@@ -50,7 +50,8 @@ def after(page: Page, change: Callable[[], object]) -> np.ndarray:
     frames = int(page.locator(CANVAS).get_attribute("data-frames") or 0)
     change()
     # Not by wait_for_function, which needs eval, and that the page's policy forbids.
-    page.locator(f"{CANVAS}:not([data-frames='{frames}'])").wait_for(timeout=1000 * PATIENCE)
+    page.locator(f"{CANVAS}:not([data-frames='{frames}'])").wait_for()
+    page.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")  # It may be older.
     return shot(page.locator(CANVAS))
 
 
@@ -122,9 +123,7 @@ def test_nasty_names_do_nothing(opened: Page) -> None:
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_a_phone_shows_all_of_it_without_scrolling_sideways(chromium: Browser, report: str, scheme: str) -> None:
-    context = chromium.new_context(viewport={"width": 360, "height": 740}, color_scheme=scheme)
-    try:
-        page = context.new_page()
+    with opened_page(chromium, 360, 740, color_scheme=scheme) as page:
         page.goto(report)
         page.wait_for_selector(f"{CANVAS}[data-frames]")
         assert page.evaluate("document.documentElement.scrollWidth") <= 360
@@ -133,22 +132,16 @@ def test_a_phone_shows_all_of_it_without_scrolling_sideways(chromium: Browser, r
         ]
         assert (sum(paper) < 150) == (scheme == "dark")
         assert shot(page.locator(CANVAS)).std() > 5
-    finally:
-        context.close()
 
 
 def test_everything_but_the_preview_works_without_javascript(chromium: Browser, report: str) -> None:
-    context = chromium.new_context(java_script_enabled=False)
-    try:
-        page = context.new_page()
+    with opened_page(chromium, java_script_enabled=False) as page:
         page.goto(report)
         assert page.locator(".poster").is_visible() and not page.locator(CANVAS).is_visible()
         assert not page.locator(".controls").is_visible() and page.locator("noscript p").is_visible()
         assert page.locator(".classes tbody tr").count() == 4 and page.locator(".legend li").first.is_visible()
         assert shot(page.locator(".poster")).std() > 5
         assert page.locator(".triple img").count() == 9
-    finally:
-        context.close()
 
 
 def test_levels_recolour_the_preview_and_parts_stand_under_their_object(

@@ -85,8 +85,10 @@ def test_a_window_that_is_too_small_for_a_picture_gets_one_once_it_is_larger(mon
     client.image_height = 0
 
     def ask(client: Client, rows: int) -> Camera:
-        asked.append(rows)
-        return camera_of(client, rows)  # type: ignore[arg-type]
+        try:
+            return camera_of(client, rows)  # type: ignore[arg-type]
+        finally:
+            asked.append(rows)
 
     monkeypatch.setattr(server_frames, "camera_of", ask)
     with closing(Frames(client)) as frames:  # type: ignore[arg-type]

@@ -23,11 +23,13 @@ pytest.importorskip("viser")
 
 import msgspec
 import viser
+import websockets.asyncio.server
 import zstandard
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from gsseg_core.errors import SettingsError
+from gsseg_core.viewer import panel
 from gsseg_core.viewer import server as view_server
 from gsseg_core.viewer.access import listen
 from gsseg_core.viewer.clients import SERVER
@@ -295,6 +297,14 @@ def test_a_viser_that_cannot_be_guarded_does_not_stay_open(monkeypatch: pytest.M
     assert stopped == [True]
 
 
+def test_a_browser_on_a_busy_machine_is_given_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: dict[str, Any] = {}
+    monkeypatch.setattr(websockets.asyncio.server, "serve", lambda _, **options: given.update(options))
+    with listen(port=PORT) as listener, view_server._guarding(listener):
+        websockets.asyncio.server.serve(None, open_timeout=1)  # type: ignore[arg-type]
+    assert given["open_timeout"] == given["ping_timeout"] == view_server.PATIENCE
+
+
 class Asked(ThreadingHTTPServer):
     """A server of somebody else, which counts what it is asked for."""
 
@@ -317,7 +327,10 @@ class Asked(ThreadingHTTPServer):
         self.server_close()
 
 
-def test_markup_in_names_and_errors_runs_nothing_and_fetches_nothing(chromium: Browser) -> None:
+def test_markup_in_names_and_errors_runs_nothing_and_fetches_nothing(
+    chromium: Browser, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(panel, "NOTICE", None)  # Where it closed by itself, a busy machine might look too late.
     with ExitStack() as stack:
         other = stack.enter_context(closing(Asked()))
         fetched = f"http://127.0.0.1:{other.server_address[1]}/fetched"
@@ -360,6 +373,7 @@ def test_a_browser_with_the_printed_address_gets_the_page_and_one_without_the_to
 
 def test_an_address_that_makes_the_page_connect_elsewhere_does_not(chromium: Browser, viewer: Viewer) -> None:
     with closing(Asked()) as other, closing(chromium.new_page()) as page:  # It complains, and should.
+        page.set_default_timeout(1000 * PATIENCE)
         said: list[str] = []
         page.on("console", lambda message: said.append(message.text))
         port = other.server_address[1]
