@@ -7,11 +7,10 @@ import threading
 import numba as nb
 import numpy as np
 import pytest
+from patience import PATIENCE
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.two_at_once import two_at_once
-
-PATIENCE = 60  # s, after which a thread that does not come is a failure
 
 
 @pytest.fixture(autouse=True)

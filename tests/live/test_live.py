@@ -320,13 +320,13 @@ def test_names_of_classes_are_told_while_a_view_is_being_fused(monkeypatch: pyte
 
     def observe(learner: object, view: object) -> bool:
         begun.set()
-        in_time.append(told.wait(30))
+        in_time.append(told.wait(PATIENCE))
         return True
 
     monkeypatch.setattr(VoteLearner, "observe", observe)
     fusing = threading.Thread(target=session.fuse, args=(clean_views(1)[0],))
     fusing.start()
-    assert begun.wait(30)
+    assert begun.wait(PATIENCE)
     assert session.class_names == NAMES
     told.set()
     fusing.join()
