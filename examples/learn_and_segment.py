@@ -9,6 +9,7 @@ While `segment_node` runs and masks have come (see examples/README.md):
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
 
 import numpy as np
@@ -23,6 +24,8 @@ options = parser.parse_args()
 try:
     with SegmentationClient(options.node) as client:
         client.wait_until_active()
+        with contextlib.suppress(NodeUnavailableError):  # It says itself that there is none to learn from.
+            client.wait_for_views(1, timeout=10)  # masks may still be on their way
         learnt = client.learn(on_feedback=lambda stage, done, total, loss: print(f"{stage} {done}/{total}"))
         result = client.segment()
 except (SegmentationError, NodeUnavailableError) as error:

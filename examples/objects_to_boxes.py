@@ -31,6 +31,7 @@ if not options.opening > 0:
 
 try:
     with SegmentationClient(options.node) as client:
+        client.wait_until_active()
         result = client.segment(options.classes, min_confidence=options.min_confidence)
 except (SegmentationError, NodeUnavailableError) as error:
     sys.exit(f"objects_to_boxes: {error}")

@@ -113,7 +113,7 @@ def main() -> None:
         while not node.done:
             rclpy.spin_once(node)
         for topic in (node.masks, node.camera_infos, node.poses):
-            topic.wait_for_all_acked(Duration(seconds=1))
+            topic.wait_for_all_acked(Duration(seconds=30))
         print(f"published {len(views)} masks")
     except (KeyboardInterrupt, ExternalShutdownException):
         print("stopped")

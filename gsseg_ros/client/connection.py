@@ -50,7 +50,7 @@ class Connection:
         *,
         context: Context | None = None,
         domain_id: int | None = None,
-        find_timeout: float = 10.0,
+        find_timeout: float = 30.0,
     ) -> None:
         self._name = "/" + node_name.strip("/")
         self._spinner = Spinner("gsseg_client", context, domain_id)

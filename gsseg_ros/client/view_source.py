@@ -63,7 +63,7 @@ class RosSource:
         node_name: str = "gsseg",
         *,
         domain_id: int | None = None,
-        find_timeout: float = 10.0,
+        find_timeout: float = 30.0,
     ) -> None:
         self._scene, self._name = scene, "/" + node_name.strip("/")
         self._said: tuple[str, ...] | None = None

@@ -55,7 +55,7 @@ _PARAMETERS: tuple[tuple[str, str | int | float, float | None, float | None, str
 _SETTLE_S = 0.5
 # For messages on their way: what a busy receiver has lost, it asks for again seconds later. One that hangs may not hold
 # up the others for longer.
-_PATIENCE_S = 10.0
+_PATIENCE_S = 30.0
 
 # A signal is noticed when a wait ends, so no wait is longer.
 _SLICE_S = 0.05

@@ -97,7 +97,7 @@ def assert_listed(ros: Ros, node: str, unused_allowed: set[str]) -> None:
 def test_the_policy_lists_exactly_what_replay_client_and_viewer_have(ros: Ros, tmp_path: Path) -> None:
     data = write_dataset(tmp_path / "data")
     ros.start("segment_node", {"scene_path": data / "scene.ply"}).wait_for("active: listening")
-    ros.start("replay_node", {"data": data, "rate": 0.1})
+    ros.start("replay_node", {"data": data, "rate": 0.1, "loop": 0})
     assert_listed(ros, "replay", {"/clock"})
     with SegmentationClient(domain_id=ros.domain, find_timeout=PATIENCE) as client:
         says_in_the_end(lambda: client.wait_for_views(1000, timeout=1.0), "of 1000 views")

@@ -36,7 +36,7 @@ from gsseg_core.scene.similarity import Similarity
 from gsseg_ros.conversions import stamp_message
 from gsseg_ros.delta_messages import delta_from_message, message_from_delta
 from gsseg_ros.errors import InvalidRequestError
-from gsseg_ros.node import diagnostics
+from gsseg_ros.node import diagnostics, inputs
 from gsseg_ros.node.scene_changes import _with_names
 from gsseg_ros.replay.growing import GrowingSource
 
@@ -111,6 +111,7 @@ def test_a_keyframe_whose_mask_still_waits_for_its_pose_is_fused_before_the_chan
     here: NodeHere, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     session, asked, under_way = here.node.workspace.living_session, threading.Event(), here.inputs._stamps_under_way
+    monkeypatch.setattr(inputs, "AWAITED_SECONDS", PATIENCE)
     monkeypatch.setattr(here.inputs, "_stamps_under_way", lambda: (under_way(), asked.set())[0])
     (late,) = clean_views(1)
     (stamp,) = here.send([late], ["camera_info", "mask"])

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from patience import PATIENCE
-from ros_helpers import Ros, ros_fixture  # noqa: F401
+from ros_helpers import Ros, ros_fixture, wait_until  # noqa: F401
 from small_scenes import NAMES, many_classes, write_dataset
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
@@ -29,11 +29,10 @@ MOVED = {"scene_to_map.scale": 2.0, "scene_to_map.translation": [1.0, -2.0, 0.5]
 
 
 def next_update(source: RosSource) -> LiveUpdate:
-    for _ in range(100):
-        update = source.wait(0.5)
-        if update is not None:
-            return update
-    pytest.fail("no codes came")
+    updates: list[LiveUpdate | None] = [None]
+    wait_until(lambda: updates.append(source.wait(0.5)) or updates[-1], "codes")  # type: ignore[func-returns-value]
+    assert updates[-1] is not None
+    return updates[-1]
 
 
 def test_live_codes_are_those_of_the_node_wherever_the_scene_lies_in_the_map(ros: Ros, tmp_path: Path) -> None:
@@ -57,7 +56,7 @@ def test_live_codes_are_those_of_the_node_wherever_the_scene_lies_in_the_map(ros
         assert np.allclose(probabilities.max(axis=1)[known], truth.confidence[known], atol=1e-6)
         assert not probabilities[~known].any()
         other, _ = many_classes(30)
-        wrong = RosSource(other, domain_id=ros.domain)
+        wrong = RosSource(other, domain_id=ros.domain, find_timeout=PATIENCE)
         with pytest.raises(StateMismatchError, match=r"has the scene .*scene.ply, which is not this one"):
             next_update(wrong)
         wrong.close()
