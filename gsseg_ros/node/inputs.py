@@ -219,10 +219,10 @@ class Inputs:
             callback(name, message)
             self._hand_over()
 
-        subscription = MatchedSubscription(self._node, kind, topic, arrived, self._group)
-        self.arrivals[name] = (0, self.started)
+        self.arrivals[name] = (0, self.started)  # Before: messages may come at once, in another thread.
         if required:
             self.roles[name] = role
+        subscription = MatchedSubscription(self._node, kind, topic, arrived, self._group)
         self._subscriptions.append(subscription)
         if built is not None:
             built.callback(subscription.close)
@@ -258,7 +258,7 @@ class Inputs:
 
     def _hand_over(self) -> None:
         with self._handing:  # Whoever asks finds a mask here or there.
-            for camera in self.cameras.values():
+            for camera in list(self.cameras.values()):  # Another thread may still be making some.
                 for paired in camera.pairing.take():
                     self.worker.submit(paired)
             dropped = self.dropped
@@ -268,7 +268,7 @@ class Inputs:
     @property
     def dropped(self) -> Counter[str]:
         """Masks that were dropped before they came to be fused, or did not arrive, by reason."""
-        dropped = sum((camera.pairing.dropped for camera in self.cameras.values()), Counter[str]())
+        dropped = sum((camera.pairing.dropped for camera in list(self.cameras.values())), Counter[str]())
         if self.worker.dropped:
             dropped["queue_full"] = self.worker.dropped
         if lost := sum(count for topic, count in self.lost.items() if self.roles.get(topic) in _MASKS):

@@ -97,7 +97,8 @@ def test_views_of_another_process_are_fused_with_the_default_quality_of_service(
     replay = ros.start("replay_node", {"data": root / "data", "rate": 30.0, "loop": 5})
     status = robot.wait_for_status(lambda status: status.get("views accepted") == str(5 * len(views)), "all views")
     assert replay.wait() == 0, replay.output
-    assert (status["message"], status["queue drops"], status["time jumps"]) == ("fusing", "0", "0")
+    assert (status["queue drops"], status["time jumps"]) == ("0", "0")
+    assert "fusing" in {said.message for array in robot.received_status for said in array.status}
     assert {key for key in status if key.startswith("rejected")} == set()
     found, wanted = learnt(robot, "replayed"), expected(scene, views)
     assert (found.labels == wanted.labels).mean() > 0.99

@@ -12,12 +12,13 @@ from patience import PATIENCE
 from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros, wait_until
 from ros_node_here import NodeHere, node_here
-from ros_robot import LATCHED, SERVICES, Robot, core_session, renamed, viewpoint
+from ros_robot import LATCHED, SECOND, SERVICES, Robot, core_session, messages, renamed, viewpoint
 from small_scenes import clean_views
 
 from gsseg_core.data.view import View
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_ros.node import segment_node
+from gsseg_ros.node import inputs, segment_node
+from gsseg_ros.node.matched_subscription import MatchedSubscription
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
@@ -69,6 +70,23 @@ def test_views_of_a_saved_state_stay_when_the_stamps_of_a_new_run_repeat(
         assert after.done("save_state", path="restart.npz").num_views == 10
         expected = core_session(scene, renamed(views)).codes()
         np.testing.assert_allclose(session.codes(), expected, atol=1e-4)
+
+
+def test_messages_that_come_while_it_still_subscribes_are_taken_in(
+    shared: Ros, parameters: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent = messages(clean_views(1)[0], 1000 * SECOND)
+
+    class Early(MatchedSubscription):
+        def __init__(self, node: Any, kind: Any, topic: str, callback: Any, group: Any) -> None:
+            super().__init__(node, kind, topic, callback, group)
+            callback(sent[topic])
+
+    monkeypatch.setattr(inputs, "MatchedSubscription", Early)
+    with node_here(shared, parameters) as here:
+        here.inputs._hand_over()
+        wait_until(lambda: here.inputs.accepted == 1, "the view")
+        assert [count for count, _ in here.inputs.arrivals.values()] == [1, 1, 1]
 
 
 def test_views_stay_when_the_stamps_repeat_after_an_activation(here: NodeHere) -> None:
