@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -20,8 +21,10 @@ from ament_index_python import get_package_prefix, get_package_share_directory
 from lifecycle_msgs.msg import State
 from lifecycle_msgs.srv import GetState
 
-START_SECONDS = 300.0  # The first start after installing compiles the kernels of gsseg_core.
-STOP_SECONDS = 20.0
+from gsseg_ros.child_nodes import claimed_domain
+
+START_SECONDS = 1200.0  # The first start after installing compiles the kernels of gsseg_core.
+STOP_SECONDS = 300.0  # Far more than it takes, since tests run beside this.
 SHARED_FILES = ("config/segment_node.yaml", "launch/segment.launch.py", "launch/replay.launch.py", "package.xml")
 
 
@@ -33,7 +36,8 @@ def main() -> None:
 
     node = find_node(below)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    os.environ["ROS_DOMAIN_ID"] = "101"  # The tests, which may run beside this, have those up to 100.
+    domain, claim = claimed_domain(random.sample(range(1, 101), 100))  # The tests of any checkout may run beside this.
+    os.environ["ROS_DOMAIN_ID"] = str(domain)
     os.environ["ROS_PYTHON_CHECK_FIELDS"] = "1"
     process = subprocess.Popen([node])
     try:
@@ -42,6 +46,7 @@ def main() -> None:
     finally:
         process.kill()
         process.wait()
+        claim.close()
     print(f"{node} was active after {seconds:.1f} s and stopped when asked to")
 
 

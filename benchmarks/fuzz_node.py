@@ -20,7 +20,7 @@ from fuzz import LONGEST_LINE, MOST_MEMORY, Ended, Tally, judge
 from mutations import any_bytes
 from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
-from ros_helpers import Ros, own_domain
+from ros_helpers import Ros
 from ros_robot import CLASSES, KINDS, SERVICES, Learn, Robot, core_session, messages, viewpoint
 from sensor_msgs.msg import Image
 from small_scenes import balls_on_a_table, clean_views, write_dataset
@@ -45,7 +45,7 @@ class FuzzedNode:
             os.environ.pop(name, None)
         self.root, self._backup, self._patience = folder / "root", folder / "backup", patience
         self._make_root(folder)
-        self._ros = Ros(folder, own_domain())
+        self._ros = Ros(folder)
         self.robot = Robot(self._ros)
         self._parameters = {
             "scene_path": self.root / "data" / "scene.ply", "data_root": self.root, "class_names": CLASSES,

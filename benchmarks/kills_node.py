@@ -13,7 +13,7 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 from forked import THREADS
 from kills import state_faults
-from ros_helpers import Ros, own_domain
+from ros_helpers import Ros
 from ros_robot import CLASSES, Robot, core_session, renamed
 from small_scenes import balls_on_a_table, clean_views
 from whole_outputs import Fault, faults_of, hash_of, leftovers, listing, read_folder
@@ -41,7 +41,7 @@ class NodeVictim:
             session.save(self.root / f"{name}.npz")
         for name in THREADS:  # A node has threads of its own.
             os.environ.pop(name, None)
-        self._ros = Ros(folder, own_domain())
+        self._ros = Ros(folder)
         self._robot = Robot(self._ros)
         self._parameters = {"scene_path": folder / "scene.ply", "data_root": self.root, "class_names": CLASSES}
         self.prepare()

@@ -31,7 +31,7 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from report import table
-from ros_helpers import Process, Ros, own_domain
+from ros_helpers import Process, Ros
 from ros_robot import CLASSES, Robot
 from rosgraph_msgs.msg import Clock
 from small_scenes import NAMES, balls_on_a_table, ring, true_labels, write_dataset
@@ -110,7 +110,7 @@ class Day:
         self.found = Findings()
         for name in SCENES:
             write_noisy_dataset(self._root / name, SCENES.index(name), seed)
-        self._ros = Ros(folder, own_domain())
+        self._ros = Ros(folder)
         self.robot = Robot(self._ros)
         self._clock = SimulatedClock(self._ros)
         parameters = {"data_root": self._root, "class_names": CLASSES, "max_views": MAX_VIEWS, "use_sim_time": True}
@@ -239,6 +239,7 @@ class Day:
         if self._replay is not None:
             self._replay.wait_for("replaying", PATIENCE)
         self._wait((1.5 if learn else 0.5) * MAX_VIEWS / self._rate)
+        self._client.wait_for_views(1, PATIENCE)
         self.stop_playing()
         if learn:
             self._client.learn(num_views=TAUGHT, timeout=PATIENCE)

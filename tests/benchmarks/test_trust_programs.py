@@ -38,7 +38,8 @@ def test_kills_are_counted_and_drawn_again_by_their_number(tmp_path: Path) -> No
 
 def test_broken_files_requests_and_messages_are_judged_and_shown_again(tmp_path: Path) -> None:
     pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-    done = ran("fuzz.py", "--what", "split.json,state,mask,save_state", "--count", 2, "--out", tmp_path)
+    wanted = ("--what", "split.json,state,mask,save_state", "--count", 2, "--patience", PATIENCE)
+    done = ran("fuzz.py", *wanted, "--out", tmp_path)
     assert done.returncode in (0, 1), done.stderr
     for what in ("split.json", "state", "mask", "save_state"):
         assert f"| {what} | 2 |" in done.stdout

@@ -25,7 +25,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -75,11 +75,6 @@ def private_context(*args: str) -> Iterator[Context]:
             yield context
         finally:
             context.shutdown()
-
-
-def own_domain() -> int:
-    """A ROS domain for a program that runs for long: 215 to 232, where no tests are."""
-    return os.getpid() % 18 + 215
 
 
 class Process:
@@ -154,8 +149,8 @@ class Process:
 class Ros:
     """A ROS context of its own in a domain of its own, with a node that a thread spins."""
 
-    def __init__(self, folder: Path, domain: int | None = None) -> None:
-        self.domain, claim = next_domain() if domain is None else (domain, nullcontext())
+    def __init__(self, folder: Path) -> None:
+        self.domain, claim = next_domain()
         self.environment = {
             **os.environ,
             "ROS_DOMAIN_ID": str(self.domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
