@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +20,7 @@ from gsseg_core.scene.ply import write_vertices
 from gsseg_core.scene.scene_formats import read_scene
 from gsseg_core.scene.scene_ids import read_ids
 from gsseg_core.scene.vertices import (
+    BLOCK,
     DC,
     MEANS,
     OPACITY,
@@ -149,28 +151,19 @@ class GaussianScene:
         sh_names = _sh_names(vertices, source)
         if len(vertices) == 0:
             raise EmptySceneError(f"{source}: holds no Gaussian (0 vertices); expected at least one")
-        means, opacities, log_scales, quats = (columns(vertices, names) for names in (MEANS, OPACITY, SCALES, QUATS))
         if not _all_within(vertices, min(_ANY, LIMITS.max_value)):
-            for values, what in ((opacities, "opacities"), (log_scales, "scales"), (quats, "rotations")):
-                _check_finite(values, what, source, _ANY)
-            for values, what in ((means, "positions"), (columns(vertices, sh_names), "SH coefficients")):
-                _check_finite(values, what, source, LIMITS.max_value)
-
-        lengths = _lengths(quats)
-        zero = np.flatnonzero(lengths == 0)
+            asked = [(OPACITY, "opacities", _ANY), (SCALES, "scales", _ANY), (QUATS, "rotations", _ANY)]
+            asked += [(MEANS, "positions", LIMITS.max_value), (sh_names, "SH coefficients", LIMITS.max_value)]
+            for names, what, most in asked:
+                _check_finite(columns(vertices, names), what, source, most)
+        means, quats, scales, opacities = _activated(vertices)
+        zero = np.flatnonzero(np.isnan(quats[:, 0]))
         if zero.size:
             raise SceneValueError(
                 f"{source}: {zero.size} of {len(vertices)} Gaussians have a rotation quaternion of zero "
                 f"(first at index {zero[0]}); expected quaternions of non-zero length"
             )
-        return cls(
-            means=np.ascontiguousarray(means),
-            quats=(quats / lengths).astype(np.float32),
-            scales=np.exp(np.clip(log_scales, -_MAX_LOG_SCALE, _MAX_LOG_SCALE)),
-            opacities=np.reciprocal(1 + np.exp(-np.clip(opacities[:, 0], -_MAX_LOGIT, _MAX_LOGIT))),
-            vertices=vertices,
-            path=path,
-        )
+        return cls(means, quats, scales, opacities, vertices, path)
 
     def __len__(self) -> int:
         """Count the Gaussians."""
@@ -278,11 +271,25 @@ def _all_within(vertices: npt.NDArray[np.void], most: float) -> bool:  # (N,)
     return all(block.min() >= -most and block.max() <= most for block in blocks)
 
 
-def _lengths(quats: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:  # (N, 4)
-    """Lengths (N, 1) of quaternions."""
-    w, x, y, z = quats.T.astype(np.float64)
-    lengths: npt.NDArray[np.float64] = np.sqrt(w * w + x * x + y * y + z * z)[:, None]
-    return lengths
+def _activated(vertices: npt.NDArray[np.void]) -> tuple[npt.NDArray[np.float32], ...]:  # (N,)
+    """Means (N, 3), unit quaternions (N, 4), NaN where they are zero, scales (N, 3) and opacities (N,) of vertices."""
+    means, quats, scales, opacities = (np.empty((len(vertices), size), np.float32) for size in (3, 4, 3, 1))
+
+    def activate(start: int) -> None:
+        part = slice(start, start + BLOCK)
+        some = vertices[part]
+        means[part] = columns(some, MEANS)
+        stored = columns(some, QUATS).astype(np.float64)
+        w, x, y, z = stored.T
+        with np.errstate(invalid="ignore"):
+            quats[part] = stored / np.sqrt(w * w + x * x + y * y + z * z)[:, None]
+        scales[part] = np.exp(np.clip(columns(some, SCALES), -_MAX_LOG_SCALE, _MAX_LOG_SCALE))
+        opacities[part] = np.reciprocal(1 + np.exp(-np.clip(columns(some, OPACITY), -_MAX_LOGIT, _MAX_LOGIT)))
+
+    # Two cores wait for memory less than one does; a block's values stay in the cache.
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(activate, range(0, len(vertices), BLOCK)))
+    return means, quats, scales, opacities[:, 0]
 
 
 def _check_finite(values: npt.NDArray[np.float32], what: str, source: str, most: float) -> None:  # (N, C)

@@ -18,11 +18,13 @@ DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 OPACITY = ("opacity",)
 SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
+BLOCK = 1 << 15
+"""Gaussians that are packed or unpacked at a time."""
+
 REST_COUNTS = tuple(3 * (d + 1) ** 2 - 3 for d in range(spherical_harmonics.MAX_DEGREE + 1))
 """How many properties f_rest_* a scene of SH degree 0, 1, 2, 3 has."""
 
 _MARGIN = 1e-7  # Opacities are kept so far from 0 and 1, where the logit is infinite.
-_BLOCK = 1 << 15  # Gaussians that are packed at a time
 _LEAST_SCALE = float(np.exp(-40))  # What half floats and bytes round to nothing is no more than this.
 
 
@@ -84,14 +86,14 @@ def pack_vertices(
 
 def pack_in_blocks(count: int, pack: Callable[[slice], npt.NDArray[np.void]]) -> npt.NDArray[np.void]:
     """Pack (N,) Gaussians by `pack` of one slice after the other: what lies between fits into the processor's cache."""
-    first = pack(slice(0, _BLOCK))
-    if count <= _BLOCK:
+    first = pack(slice(0, BLOCK))
+    if count <= BLOCK:
         return first
     # As plain numbers: NumPy copies records field after field.
     table = np.empty((count, first.dtype.itemsize // 4), np.float32)
-    for start in range(0, count, _BLOCK):
-        part = pack(slice(start, start + _BLOCK)) if start else first
-        table[start : start + _BLOCK] = part.view(np.float32).reshape(len(part), -1)
+    for start in range(0, count, BLOCK):
+        part = pack(slice(start, start + BLOCK)) if start else first
+        table[start : start + BLOCK] = part.view(np.float32).reshape(len(part), -1)
     vertices: npt.NDArray[np.void] = table.view(first.dtype)[:, 0]
     return vertices
 
