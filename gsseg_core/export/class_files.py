@@ -16,6 +16,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.ply import write_vertices
 from gsseg_core.scene.scene_writers import DEFAULT, SCENE_WRITERS, SceneObject, check_format, write_objects, write_scene
 from gsseg_core.scene.triangle_mesh import TriangleMesh
+from gsseg_core.scene.vertices import chosen
 from gsseg_core.segmentation import Segmentation
 
 TOGETHER = "objects"
@@ -184,8 +185,8 @@ def _with_confidence(vertices: np.ndarray, ids: np.ndarray, label: int, confiden
     rows = out.view(np.uint8).reshape(len(out), -1)[:, : kept.itemsize]
     out["label"], out["confidence"] = label, confidence[ids]
     if kept.itemsize < vertices.itemsize:
-        vertices, ids = repack_fields(vertices[ids][names]), np.arange(len(ids))
-    source = np.ascontiguousarray(vertices).view(np.uint8).reshape(len(vertices), -1)
+        vertices, ids = repack_fields(chosen(vertices, ids)[names]), np.arange(len(ids))
     for first in range(0, len(ids), _PART):
-        rows[first : first + _PART] = source[ids[first : first + _PART]]
+        part = chosen(vertices, ids[first : first + _PART])
+        rows[first : first + _PART] = part.view(np.uint8).reshape(len(part), -1)
     return out

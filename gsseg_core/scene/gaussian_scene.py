@@ -28,6 +28,7 @@ from gsseg_core.scene.vertices import (
     REST_COUNTS,
     SCALES,
     check_properties,
+    chosen,
     columns,
     logits,
     pack_vertices,
@@ -187,8 +188,10 @@ class GaussianScene:
         picked = np.arange(len(self))[index].reshape(-1)
         if picked.size == 0:
             raise EmptySceneError(f"{self.path or 'scene'}: none of its {len(self)} Gaussians is in the subset")
-        arrays = ("means", "quats", "scales", "opacities", "vertices")
-        return replace(self, **{name: getattr(self, name)[picked] for name in arrays})
+        arrays = ("means", "quats", "scales", "opacities")
+        return replace(
+            self, vertices=chosen(self.vertices, picked), **{name: getattr(self, name)[picked] for name in arrays}
+        )
 
     @property
     def sh_degree(self) -> int:

@@ -16,7 +16,7 @@ from gsseg_core.scene import spherical_harmonics
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_ids import with_ids
 from gsseg_core.scene.similarity import Similarity
-from gsseg_core.scene.vertices import MEANS, QUATS, SCALES, columns, put, rest_of
+from gsseg_core.scene.vertices import MEANS, QUATS, SCALES, chosen, columns, put, rest_of
 
 IDENTITY = Similarity()
 """The frame of the scene, and of a group that has not moved."""
@@ -88,7 +88,7 @@ def joined(
     if added is not None:
         for name in names:
             parts[name].append(getattr(added, name))
-    vertices = with_ids(scene.vertices[stays], None if added is None else added.vertices, ids)
+    vertices = with_ids(chosen(scene.vertices, np.flatnonzero(stays)), None if added is None else added.vertices, ids)
     arrays: dict[str, Any] = {name: np.concatenate(part) for name, part in parts.items()}
     return replace(scene, **arrays, vertices=vertices)
 

@@ -105,6 +105,12 @@ def columns(vertices: npt.NDArray[np.void], names: tuple[str, ...]) -> npt.NDArr
     return side_by_side
 
 
+def chosen(vertices: npt.NDArray[np.void], index: npt.NDArray[np.integer]) -> npt.NDArray[np.void]:  # (N,), (M,)
+    """Take vertices, (M,), as plain bytes: NumPy takes records field after field, in ten times the time."""
+    taken: npt.NDArray[np.void] = np.take(vertices.view(f"V{vertices.itemsize}"), index).view(vertices.dtype)
+    return taken
+
+
 def put(vertices: npt.NDArray[np.void], names: tuple[str, ...], values: npt.NDArray[np.floating]) -> None:
     """Set properties of vertices (N,) to the columns of values (N, len(names)), in place."""
     for name, column in zip(names, values.T, strict=True):
