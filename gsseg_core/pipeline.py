@@ -34,7 +34,7 @@ from gsseg_core.files.run_folder import StagedRun, staged_run
 from gsseg_core.files.write_behind import WriteBehind, writing_behind
 from gsseg_core.learn.calibrate import Calibration, calibrate
 from gsseg_core.learn.learner import NO_MASK, Learner
-from gsseg_core.learn.mask_reliability import MaskChecker, ViewCheck, compare_mask, reliability_report
+from gsseg_core.learn.mask_reliability import MaskChecker, ViewCheck, compare_mask, reliability_report, shown_views
 from gsseg_core.learn.prepared_views import default_budget
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.objects.object_table import ObjectTable, find_objects
@@ -203,7 +203,9 @@ def segment(
         drawn: dict[str, Drawn] = {}
         if settings.refine.carve:
             with watch.stage("carve"):
-                seen = look_at(inputs.scene, result, inputs.looked_at, inputs.pictured, drawn, device=device)
+                asked = {view.name for view in inputs.pictured}
+                asked |= {check.name for check in shown_views(assessment.checks or ())}
+                seen = look_at(inputs.scene, result, inputs.looked_at, asked, drawn, device)
                 result = result.carved_by(inputs.scene, seen)
         with watch.stage("pictures"):
             left = [view for view in inputs.pictured if view.name not in drawn]
@@ -318,8 +320,11 @@ def _write(
         files = class_paths(exported, folder / "classes", settings.scene_format)
         behind(write_classes, scene, exported, folder / "classes", run.id, settings.scene_format, meshes)
     with watch.stage("pictures"):
+        images = ViewImages(scene, settings.device)
+        for one in drawn.values():
+            images.keep(one.view, one.image)
         shown = [drawn[view.name] for view in inputs.pictured]
-        images, evidence, pictures = _picture(run, inputs, assessment, result, level, shown, settings.device, behind)
+        evidence, pictures = _picture(run, inputs, assessment, result, level, shown, images, behind)
     report = RunReport.of(
         scene, exported, run=run.id, views=assessment.report, settings=settings.as_dict(), seconds=watch.seconds,
         objective=assessment.objective, calibration=assessment.calibration.as_dict(), prepared_views=assessment.memory,
@@ -336,25 +341,24 @@ def _write(
 
 def _picture(
     run: StagedRun, inputs: Inputs, assessment: Assessment, result: Segmentation, level: Segmentation,
-    shown: Iterable[Drawn], device: str, behind: WriteBehind[...],
-) -> tuple[ViewImages, Evidence, list[Path]]:  # fmt: skip
-    """Write the pictures; what the report page can use of them is kept."""
-    views, folder, images = assessment.views, run.folder / "pictures", ViewImages(inputs.scene, device)
+    shown: Iterable[Drawn], images: ViewImages, behind: WriteBehind[...],
+) -> tuple[Evidence, list[Path]]:  # fmt: skip
+    """Write the pictures; images of views that are rendered for them are kept for the report page."""
+    views, folder = assessment.views, run.folder / "pictures"
     checks = list(assessment.checks or ())
     if assessment.checks is None:  # What is compared then is drawn in full size.
         views = {view.name: view for view in inputs.train if view.name in views}
     for drawn in shown:
-        images.keep(drawn.view, drawn.image)
         if assessment.checks is None and drawn.view.name in views:
             checks.append(compare_mask(views[drawn.view.name], drawn.labels, result.num_classes))
     save = partial(behind, save_png)
     if level is not result:  # What is compared with the masks are objects, as they are.
-        shown = draw_views(inputs.scene, level, inputs.pictured, device=device)
+        shown = draw_views(inputs.scene, level, inputs.pictured, device=images.device)
     pictures = write_pictures(level, shown, folder, run.id, save)
     if assessment.checks:
         pictures.append(folder / "worst_views.png")
-        save(pictures[-1], draw_worst_views(images.rendered, views, assessment.checks), run.id)
-    return images, Evidence(checks, views, assessment.checks is not None), pictures
+        save(pictures[-1], draw_worst_views(images.rendered, views, assessment.checks, device=images.device), run.id)
+    return Evidence(checks, views, assessment.checks is not None), pictures
 
 
 def render(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -83,16 +83,14 @@ def look_at(
     scene: GaussianScene,
     segmentation: Segmentation,
     views: Iterable[View],
-    pictured: Iterable[View],
+    asked: Collection[str],
     drawn: dict[str, Drawn],
-    *,
     device: str = "cpu",
 ) -> Iterator[Silhouette]:
-    """Tell what views show, to carve objects by, and draw those in `pictured` on the way, into `drawn`."""
-    names = {view.name for view in pictured}
+    """Tell what views show, to carve objects by, and draw those of the `asked` names on the way, into `drawn`."""
 
     def look(view: View) -> Silhouette:
-        operator, pictured = make_operator(scene, view.camera, device), view.name in names
+        operator, pictured = make_operator(scene, view.camera, device), view.name in asked
         nothing = np.empty((len(operator.ids), 0), np.float32)
         colors = scene.colors(view.camera.center, operator.ids) if pictured else nothing
         labels, (image, left_over) = segmentation.label_map_beside(operator, with_depths(scene, operator, colors))
@@ -149,8 +147,9 @@ def write_overview(
 
 
 def draw_worst_views(
-    images_of: Callable[[View], np.ndarray], views: Mapping[str, View], checks: Sequence[ViewCheck], count: int = WORST
-) -> np.ndarray:
+    images_of: Callable[[View], np.ndarray], views: Mapping[str, View], checks: Sequence[ViewCheck], count: int = WORST,
+    device: str = "cpu",
+) -> np.ndarray:  # fmt: skip
     """Draw the worst views: the mask, what the other views predict, and in red where the two differ; (H, W, 3) uint8.
 
     Parameters
@@ -163,15 +162,20 @@ def draw_worst_views(
         Of all views, or of some, with what was predicted; at least one.
     count : int
         Views at most, one a row.
+    device : str
+        Where images are made: on the CPU, two at once.
     """
-    images, captions = [], []
     colors = palette(len(checks[0].counts))
-    for check in worst_views(checks, count):
+
+    def draw(check: ViewCheck) -> list[np.ndarray]:
         view = views[check.name]
         image, mask, predicted = shown_at(CELL_PX, images_of(view), view.read_labels(), check.prediction())
         different = ((mask != predicted) & (mask != UNKNOWN) & (predicted != UNKNOWN)).astype(np.int32)
-        images += [overlay(image, mask, colors), overlay(image, predicted, colors)]
-        images.append(overlay(image, different, _DIFFERENT))
+        return [overlay(image, mask, colors), overlay(image, predicted, colors), overlay(image, different, _DIFFERENT)]
+
+    captions, worst = [], worst_views(checks, count)
+    for check in worst:
         trusted = f"{100 * check.reliability:.0f} % reliable" if check.checked else "unchecked"
         captions += [f"{check.name}: {trusted}", "what the other views say", "where they differ"]
+    images = [image for row in two_at_once(draw, worst, device) for image in row]
     return contact_sheet(images, captions, 3)
