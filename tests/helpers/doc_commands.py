@@ -77,7 +77,7 @@ class Started:
 
     def end(self) -> None:
         """End everything, with what it started."""
-        for number, patience in ((signal.SIGINT, 3), (signal.SIGKILL, 3)):
+        for number, patience in ((signal.SIGINT, 3), (signal.SIGKILL, TIMEOUT)):
             for process in self._processes:
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(process.pid, number)
