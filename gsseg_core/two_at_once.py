@@ -33,7 +33,7 @@ def two_at_once(work: Callable[[T], R], items: Iterable[T], device: str = "cpu")
         try:
             for item in items:
                 begun.append(pool.submit(work, item))
-                if len(begun) == 2:
+                if len(begun) > 2:
                     yield begun.popleft().result()
             while begun:
                 yield begun.popleft().result()
