@@ -16,6 +16,7 @@ from gsseg_core.errors import EmptySceneError, SceneFileError, ScenePropertyErro
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.ply import read_vertices
 from gsseg_core.scene.spherical_harmonics import C0
+from gsseg_core.scene.vertices import BLOCK
 
 GEOMETRY = ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
 
@@ -279,6 +280,19 @@ def test_zero_quaternions_are_refused_with_count_and_place(tmp_path: Path) -> No
         vertices[name][[1, 5]] = 0
     with pytest.raises(SceneValueError, match=r"2 of 6 .* have a rotation quaternion of zero \(first at index 1\)"):
         GaussianScene.load(write_ply(tmp_path / "in.ply", vertices))
+
+
+def test_a_scene_of_several_blocks_is_that_of_its_parts() -> None:
+    vertices = random_vertices(2 * BLOCK + 3, 0)
+    whole = GaussianScene.from_vertices(vertices, None)
+    for part in (slice(0, 5), slice(BLOCK - 2, BLOCK + 2), slice(2 * BLOCK - 1, None)):
+        alone = GaussianScene.from_vertices(vertices[part], None)
+        for name in ("means", "quats", "scales", "opacities"):
+            np.testing.assert_array_equal(getattr(whole, name)[part], getattr(alone, name))
+    for name in GEOMETRY[4:]:
+        vertices[name][-1] = 0
+    with pytest.raises(SceneValueError, match=rf"1 of {len(vertices)} .* \(first at index {len(vertices) - 1}\)"):
+        GaussianScene.from_vertices(vertices, None)
 
 
 def test_extreme_but_finite_values_are_activated_within_range(tmp_path: Path) -> None:
