@@ -21,6 +21,7 @@ from gsseg_core.kernels import kernel_cache
 from gsseg_core.learn.em.boundary_alignment import align_boundaries
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.vote_learner import VoteLearner
+from gsseg_core.objects.clicks import merge_tree
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.label_propagation import spread_if_scarce
 from gsseg_core.refine.settings import PAPER
@@ -142,8 +143,10 @@ def _learn_something(device: str) -> None:
 def refine_something(device: str = "cpu") -> None:
     """Do all with a small scene that needs nothing learnt: align boundaries, spread labels, refine, carve, render."""
     scene, camera, labels = _square()
-    edges = labels != np.roll(labels, 1, axis=1)  # strong enough along boundaries for these to be looked into
-    align_boundaries(labels, edges.astype(np.float32), EMSettings.edge_px)
+    wide, true = (np.pad(np.ones((32 - 2 * margin, 32 - 2 * margin), np.int32), margin) for margin in (10, 12))
+    edges = sum(np.abs(np.diff(true, axis=axis, prepend=0)) for axis in (0, 1))
+    align_boundaries(wide, 3 * np.asarray(edges, np.float32), EMSettings.edge_px)  # The region's outline moves.
+    merge_tree(labels[..., None])  # as for points in a view
     share = np.clip(0.5 + scene.means[:, 0], 0.05, 0.95)  # Unsure in the middle, where neighbours decide.
     codes = np.stack([1 - share, share], axis=1).astype(np.float32)
     spread_if_scarce(scene, codes, np.zeros(len(codes)))

@@ -86,7 +86,7 @@ def test_warm_up_says_nothing_where_the_kernels_are_there() -> None:
     assert told == ""
 
 
-@pytest.mark.parametrize("what", ["segment", "fuse"])
+@pytest.mark.parametrize("what", ["segment", "fuse", "click", "move outlines"])
 def test_after_warm_up_nothing_is_compiled_any_more(tmp_path: Path, what: str) -> None:
     data, out = str(write_dataset(tmp_path / "data")), str(tmp_path / "out")
     scene = str(Path(data) / "scene.ply")
@@ -102,6 +102,20 @@ def test_after_warm_up_nothing_is_compiled_any_more(tmp_path: Path, what: str) -
     session, data = LiveSession(GaussianScene.load({scene!r})), Dataset({data!r})
     assert not any(map(session.fuse, data.views("train")))
     session.segmentation()""",
+        "click": f"""
+    from gsseg_core.data.dataset import Dataset
+    from gsseg_core.objects.pick import pick_clicks
+    from gsseg_core.scene.gaussian_scene import GaussianScene
+    camera = Dataset({data!r}).views("train")[0].camera
+    pick_clicks(GaussianScene.load({scene!r}), camera, [(camera.height // 2, camera.width // 2)], [])""",
+        "move outlines": """
+    import numpy as np
+    from gsseg_core.learn.em.boundary_alignment import align_boundaries
+    labels, edges = np.zeros((64, 64), np.int32), np.zeros((64, 64), np.float32)
+    labels[20:42, 20:42] = 1
+    for line in (edges[22, 22:40], edges[39, 22:40], edges[22:40, 22], edges[22:40, 39]):
+        line[:] = 3
+    assert (align_boundaries(labels, edges, 3) != labels).any()""",
     }
     run = subprocess.run(
         [sys.executable, "-c", COUNTED.format(work=work[what])], capture_output=True, text=True, check=False

@@ -19,7 +19,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage
 
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import NoUsableViewsError, SettingsError
@@ -97,6 +96,8 @@ def click_labels(
             f"clicks: {len(inside)} inside, {len(set(inside) & set(outside))} of them outside too; expected at least "
             "one inside, and none that is both"
         )
+    from scipy import ndimage  # Loaded here: whoever only warms up does without.
+
     features, covered = _features(scene, camera, device)
     for row, column in inside:
         if covered[row, column] <= 0:
@@ -151,11 +152,24 @@ def _price(means: np.ndarray, size: np.ndarray, a: int, b: int, border: int) -> 
 
 
 @kernel
+def _twice_as_long(values: np.ndarray) -> np.ndarray:  # (E,) int64
+    longer = np.empty(2 * values.shape[0], np.int64)
+    for e in range(values.shape[0]):
+        longer[e] = values[e]
+    return longer
+
+
+@kernel
 def _merge(cells: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Merge; a region's neighbours are listed by the names that they had when it came into being."""
+    """Merge; a region's neighbours are listed by the names that they had when it came into being.
+
+    Loops stand where NumPy would append and assign: with the texts of its errors, that takes twice as long to compile.
+    """
     n = height * width
     means, size = np.empty((2 * n - 1, cells.shape[1])), np.ones(2 * n - 1, np.int64)
-    means[:n] = cells
+    for i in range(n):
+        for d in range(cells.shape[1]):
+            means[i, d] = cells[i, d]
     parent, price = np.arange(2 * n - 1), np.zeros(2 * n - 1)
     current = np.arange(2 * n - 1)  # the region of today that holds each one, up to shortcuts
     start, stop = np.zeros(2 * n - 1, np.int64), np.zeros(2 * n - 1, np.int64)
@@ -172,7 +186,7 @@ def _merge(cells: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.n
                 near[used], borders[used] = j, 1
                 used += 1
                 if j > i:
-                    heapq.heappush(waiting, (_price(means, size, i, j, 1), i, j))
+                    heapq.heappush(waiting, (_price(means, size, i, j, borders[used - 1]), i, j))
         stop[i] = used
     highest = 0.0
     for new in range(n, 2 * n - 1):
@@ -181,11 +195,12 @@ def _merge(cells: np.ndarray, height: int, width: int) -> tuple[np.ndarray, np.n
             least, a, b = heapq.heappop(waiting)
         highest = max(highest, least)
         price[new], size[new] = highest, size[a] + size[b]
-        means[new] = (size[a] * means[a] + size[b] * means[b]) / size[new]
+        for d in range(means.shape[1]):
+            means[new, d] = (size[a] * means[a, d] + size[b] * means[b, d]) / size[new]
         parent[a] = parent[b] = current[a] = current[b] = new
         most = stop[a] - start[a] + stop[b] - start[b]
         if used + most > near.shape[0]:
-            near, borders = np.append(near, np.empty_like(near)), np.append(borders, np.empty_like(borders))
+            near, borders = _twice_as_long(near), _twice_as_long(borders)
         start[new] = used
         for old in (a, b):
             for e in range(start[old], stop[old]):
