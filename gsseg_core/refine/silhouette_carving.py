@@ -95,15 +95,9 @@ def kept_shares(
     """
     views = _ObjectViews(scene, np.ascontiguousarray(labels, np.int32))
     go, kept, stay = np.zeros(len(scene)), np.ones(len(scene)), np.zeros(len(scene))
-
-    def object_to(shown: Silhouette) -> tuple[Silhouette, ObjectsAlone, np.ndarray]:
-        alone, behind = views.project(shown), shown.depth * np.float32(BEHIND)
-        reasons = alone.reasons_to_go(depths(scene, shown.camera, alone.ids), shown.labels, behind)
-        return shown._replace(operator=None), alone, reasons
-
-    for shown, alone, reasons in two_at_once(object_to, silhouettes):
-        go[alone.ids] += reasons
-        views.add(shown, alone)
+    for shown in silhouettes:
+        alone, behind = views.add(shown), shown.depth * np.float32(BEHIND)
+        go[alone.ids] += alone.reasons_to_go(depths(scene, shown.camera, alone.ids), shown.labels, behind)
     asked = go > 0
     for step in range(steps):
         stay[asked] = 0
@@ -135,20 +129,21 @@ class _ObjectViews:
         self._shown: list[Silhouette] = []
         self._kept: dict[int, ObjectsAlone] = {}
 
-    def add(self, shown: Silhouette, alone: ObjectsAlone) -> None:
-        """Add a view and what was projected of it, without its operator."""
+    def add(self, shown: Silhouette) -> ObjectsAlone:
+        """Project a view, unless it comes with its operator."""
+        alone = self._project(shown)
         if alone.nbytes + sum(kept.nbytes for kept in self._kept.values()) <= _MEMORY:
             self._kept[len(self._shown)] = alone
-        self._shown.append(shown)
+        self._shown.append(shown._replace(operator=None))
+        return alone
 
     def __len__(self) -> int:
         return len(self._shown)
 
     def __getitem__(self, number: int) -> tuple[Silhouette, ObjectsAlone]:
-        return self._shown[number], self._kept.get(number) or self.project(self._shown[number])
+        return self._shown[number], self._kept.get(number) or self._project(self._shown[number])
 
-    def project(self, shown: Silhouette) -> ObjectsAlone:
-        """Find the objects of a view, which is projected unless it comes with its operator."""
+    def _project(self, shown: Silhouette) -> ObjectsAlone:
         operator = shown.operator or TileOperator.of(self._scene, shown.camera)  # on the CPU, which alone tells reasons
         return operator.objects_alone(self._labels)
 
