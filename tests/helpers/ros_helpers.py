@@ -14,8 +14,8 @@ fixture and its tests take `ros`:
 
 from __future__ import annotations
 
-import itertools
 import gc
+import itertools
 import json
 import os
 import signal
