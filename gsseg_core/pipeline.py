@@ -320,9 +320,7 @@ def _write(
         files = class_paths(exported, folder / "classes", settings.scene_format)
         behind(write_classes, scene, exported, folder / "classes", run.id, settings.scene_format, meshes)
     with watch.stage("pictures"):
-        images = ViewImages(scene, settings.device)
-        for one in drawn.values():
-            images.keep(one.view, one.image)
+        images = ViewImages(scene, settings.device, drawn.values())
         shown = [drawn[view.name] for view in inputs.pictured]
         evidence, pictures = _picture(run, inputs, assessment, result, level, shown, images, behind)
     report = RunReport.of(
@@ -344,13 +342,11 @@ def _picture(
     shown: Iterable[Drawn], images: ViewImages, behind: WriteBehind[...],
 ) -> tuple[Evidence, list[Path]]:  # fmt: skip
     """Write the pictures; images of views that are rendered for them are kept for the report page."""
-    views, folder = assessment.views, run.folder / "pictures"
-    checks = list(assessment.checks or ())
+    views, folder, checks = assessment.views, run.folder / "pictures", list(assessment.checks or ())
     if assessment.checks is None:  # What is compared then is drawn in full size.
         views = {view.name: view for view in inputs.train if view.name in views}
-    for drawn in shown:
-        if assessment.checks is None and drawn.view.name in views:
-            checks.append(compare_mask(views[drawn.view.name], drawn.labels, result.num_classes))
+        compared = [drawn for drawn in shown if drawn.view.name in views]
+        checks = [compare_mask(views[drawn.view.name], drawn.labels, result.num_classes) for drawn in compared]
     save = partial(behind, save_png)
     if level is not result:  # What is compared with the masks are objects, as they are.
         shown = draw_views(inputs.scene, level, inputs.pictured, device=images.device)

@@ -14,7 +14,7 @@ from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.photos import read_photo
 from gsseg_core.data.view import View
 from gsseg_core.export.pictures import outline, overlay, shown_at
-from gsseg_core.export.view_pictures import background_image
+from gsseg_core.export.view_pictures import Drawn, background_image
 from gsseg_core.learn.mask_reliability import ViewCheck
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.report.findings import Evidence
@@ -43,11 +43,13 @@ class Triple(NamedTuple):
 
 
 class ViewImages:
-    """What was seen from a view: its photo, else the colours of the scene, rendered on a device."""
+    """What was seen from a view: its photo, else the colours of the scene, rendered on a device unless drawn before."""
 
-    def __init__(self, scene: GaussianScene, device: str = "cpu") -> None:
+    def __init__(self, scene: GaussianScene, device: str = "cpu", drawn: Iterable[Drawn] = ()) -> None:
         self.scene, self.device = scene, device
         self._images: dict[tuple[str, int], np.ndarray] = {}
+        for one in drawn:
+            self.keep(one.view, one.image)
 
     def keep(self, view: View, rendered: np.ndarray) -> None:
         """Keep a rendering (H, W, 3) uint8 that has been made anyway, unless there is a photo."""
