@@ -5,7 +5,9 @@ Only `main` imports what takes time, so that Ctrl-C is heard from the start.
 
 from __future__ import annotations
 
+import os
 import sys
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from gsseg_core.cli import interrupts
@@ -54,6 +56,7 @@ def _run(arguments: Sequence[str] | None) -> int:
 
     from gsseg_core.freed_memory import keep_freed_memory
 
+    _check_threads()
     keep_freed_memory()
     try:
         if arguments is None:
@@ -63,3 +66,17 @@ def _run(arguments: Sequence[str] | None) -> int:
     finally:
         if arguments is None:
             interrupts.leave_at_once()
+
+
+def _check_threads() -> None:
+    """Raise `SettingsError` for what numba takes for no number of threads: in a traceback, or a warning with one."""
+    from gsseg_core.errors import SettingsError
+    from gsseg_core.text import quoted
+
+    found = os.environ.get("NUMBA_NUM_THREADS", "1")
+    with suppress(ValueError):
+        if int(found) > 0:
+            return
+    raise SettingsError(
+        f"environment variable NUMBA_NUM_THREADS: is {quoted(found)}; expected a number of threads from 1, or none set"
+    )

@@ -208,3 +208,12 @@ def test_an_error_is_on_a_line_of_its_own_below_the_progress_bar(
     stderr = capsys.readouterr().err
     assert "observe" in stderr
     assert re.search(r"^gsseg: error: .*view1\.png", stderr, re.MULTILINE)
+
+
+@pytest.mark.parametrize("found", ["0", "-2", "abc", ""])
+def test_a_number_of_threads_that_numba_cannot_take_is_one_clear_line(
+    found: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("NUMBA_NUM_THREADS", found)
+    assert main(["doctor"]) == 2
+    assert_one_line(capsys.readouterr().err, f"variable NUMBA_NUM_THREADS: is '{found}'; expected a number of threads")
