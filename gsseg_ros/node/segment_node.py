@@ -17,7 +17,6 @@ from lifecycle_msgs.srv import ChangeState, GetAvailableStates, GetAvailableTran
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
-from rclpy.executors import MultiThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
@@ -29,21 +28,17 @@ from gsseg_ros.node import declarations, diagnostics, parameters
 from gsseg_ros.node.complaints import SCENE_DELTA, Complaints
 from gsseg_ros.node.inputs import Inputs
 from gsseg_ros.node.learn_action import LearnAction
+from gsseg_ros.node.node_executor import NodeExecutor
 from gsseg_ros.node.obstacles import Obstacles
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.parameters import Settings
 from gsseg_ros.node.scene_changes import SceneChanges
 from gsseg_ros.node.scene_frame import SceneFrame
-from gsseg_ros.node.services import AT_WORK, WAITING, Services, describe
+from gsseg_ros.node.services import Services, describe
 from gsseg_ros.node.sim_time import SimTime
 from gsseg_ros.node.viewpoints import Lookup
 from gsseg_ros.node.workspace import Workspace
 from gsseg_ros.shared_memory import make_room
-
-THREADS = AT_WORK + WAITING + 7
-"""Of the executor: those that requests hold that take long, one for a learn job, one for a transition, one for
-obstacles, and always some for messages, parameters, diagnostics, the lifecycle state, and requests that are refused at
-once."""
 
 STOP_SECONDS = 3.0
 """How long a job gets to stop when the node is deactivated or shut down."""
@@ -299,24 +294,18 @@ class SegmentNode(LifecycleNode):
         diagnostics.complain(self._complaints, inputs, clock_problem)
 
 
-def _spin_once(executor: MultiThreadedExecutor, node: SegmentNode, seconds: float) -> None:
-    try:
-        executor.spin_once(timeout_sec=seconds)
-    except Exception as error:
-        # An error in one callback is raised here, where it would end all the others.
-        node.get_logger().error(describe(error))
-
-
-def _stop_answering(executor: MultiThreadedExecutor, node: SegmentNode) -> None:
-    """Stop the node; a canceled job is still answered, which rclpy sends from the executor."""
+def _end(executor: NodeExecutor, node: SegmentNode) -> None:
+    """Stop the node, and take it away; a canceled job is still answered, which rclpy sends from the executor."""
     slot = node.workspace.slot
     turns = CANCEL_TURNS if slot.busy else ANSWER_TURNS
     node.stop()
     latest = time.monotonic() + LATE_SECONDS
     while slot.busy and time.monotonic() < latest:
-        _spin_once(executor, node, 0.05)
+        executor.spin_once(0.05)
     for _ in range(turns):
-        _spin_once(executor, node, 0.05)
+        executor.spin_once(0.05)
+    executor.shutdown()  # Before the node goes, which callbacks may be using.
+    node.close()
 
 
 def main(args: list[str] | None = None) -> int:
@@ -333,23 +322,20 @@ def main(args: list[str] | None = None) -> int:
     except Exception as error:  # What ROS raises for arguments and parameters that it cannot take is not public.
         print(f"segment_node: error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
-    executor = MultiThreadedExecutor(THREADS)
-    executor.add_node(node)
+    executor = NodeExecutor(node)
     # Not here: signals are heard in this thread, and to compile kernels takes half a minute and more.
     starting = threading.Thread(target=node.autostart, name="autostart", daemon=True)
     starting.start()
     try:
         while not stop.is_set():
-            _spin_once(executor, node, 0.2)
+            executor.spin_once(0.2)
     finally:
         if node.configuring:
             # There is nothing yet that could be lost, and no way to stop a compiler.
             node.destroy_node()
             os._exit(0)
         starting.join(STOP_SECONDS)
-        _stop_answering(executor, node)
-        node.close()
-        executor.shutdown(timeout_sec=STOP_SECONDS)
+        _end(executor, node)
         rclpy.shutdown()
     return 0
 

@@ -23,11 +23,11 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
-from rclpy.executors import MultiThreadedExecutor
 from rclpy.parameter import Parameter
 
 from gsseg_ros.node import segment_node
-from gsseg_ros.node.segment_node import THREADS, SegmentNode
+from gsseg_ros.node.node_executor import NodeExecutor
+from gsseg_ros.node.segment_node import SegmentNode
 
 
 @pytest.fixture(name="root", scope="module")
@@ -108,14 +108,13 @@ def node_fixture(ros: Ros, parameters: dict[str, Any], monkeypatch: pytest.Monke
 
 
 @contextmanager
-def spun(node: SegmentNode, ros: Ros) -> Iterator[None]:
+def spun(node: SegmentNode) -> Iterator[None]:
     """Spin a node of this process as its program does."""
-    executor, stop = MultiThreadedExecutor(THREADS, context=ros.context), threading.Event()
-    executor.add_node(node)
+    executor, stop = NodeExecutor(node), threading.Event()
 
     def spin() -> None:
         while not stop.is_set():
-            segment_node._spin_once(executor, node, 0.1)
+            executor.spin_once(0.1)
 
     spinning = threading.Thread(target=spin)
     spinning.start()
@@ -124,8 +123,4 @@ def spun(node: SegmentNode, ros: Ros) -> Iterator[None]:
     finally:
         stop.set()
         spinning.join(PATIENCE)
-        # rclpy's own shutdown waits for no callback: one would meet a node that is gone, and say so in a later test.
-        executor._executor.shutdown()
-        for task in executor._futures:
-            task.exception()
-        executor.shutdown(PATIENCE)
+        executor.shutdown()

@@ -6,12 +6,14 @@ import contextlib
 import functools
 import os
 import signal
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from ros_fixtures import parameters_fixture, root_fixture  # noqa: F401
+from ros_fixtures import node_fixture, parameters_fixture, root_fixture  # noqa: F401
 from ros_helpers import Ros, ros_fixture  # noqa: F401
 from ros_robot import Goal, Robot, core_session, renamed
 from small_scenes import clean_views
@@ -21,6 +23,10 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
+
+from gsseg_ros.node import segment_node
+from gsseg_ros.node.node_executor import NodeExecutor
+from gsseg_ros.node.segment_node import SegmentNode
 
 
 @pytest.mark.parametrize("doing", ["idle", "learning"])
@@ -47,6 +53,24 @@ def test_a_signal_ends_it_while_it_is_not_configured(
     process.wait_for("autostart is false")
     process.send(number)
     assert process.wait() == 0, process.output
+
+
+def test_the_last_callback_has_ended_before_the_node_goes(node: SegmentNode) -> None:
+    executor, begun = NodeExecutor(node), threading.Event()
+    order: list[str] = []
+
+    def callback() -> None:
+        begun.set()
+        time.sleep(1)
+        order.append("callback")
+
+    executor.create_task(callback)
+    while not begun.is_set():
+        executor.spin_once(0.1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(node, "close", lambda: order.append("node"))
+        segment_node._end(executor, node)
+    assert order == ["callback", "node"]
 
 
 @pytest.fixture(scope="module")

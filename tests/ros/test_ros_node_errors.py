@@ -265,7 +265,7 @@ def crowded(shared: Ros, parameters: dict[str, Any]) -> Iterator[Robot]:
             context=shared.context, namespace="/crowded", use_global_arguments=False,
             parameter_overrides=[Parameter(name, value=value) for name, value in values.items()],
         )  # fmt: skip
-        with spun(node, shared):
+        with spun(node):
             assert robot.brought_to("inactive").change("activate")
             robot.fuse(clean_views(1))
             requests = [robot.send("render_view", **nowhere()) for _ in range(AT_WORK + WAITING + 1)]

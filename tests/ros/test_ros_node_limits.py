@@ -37,7 +37,7 @@ def test_few_requests_work_some_wait_the_rest_are_busy_and_everything_else_goes_
         return draw(*arguments, **settings)
 
     monkeypatch.setattr(services, "draw", wait_and_draw)
-    with spun(node, ros):
+    with spun(node):
         robot.brought_to("inactive")
         assert robot.change("activate")
         robot.fuse(clean_views(2))
@@ -65,7 +65,7 @@ def test_those_that_wait_are_not_active_any_more_once_the_node_is_not(
 ) -> None:
     robot, go_on, at_work, draw = Robot(ros), threading.Event(), [], services.draw
     monkeypatch.setattr(services, "draw", lambda *a, **k: (at_work.append(1), go_on.wait(PATIENCE), draw(*a, **k))[2])
-    with spun(node, ros):
+    with spun(node):
         robot.brought_to("inactive")
         assert robot.change("activate")
         robot.fuse(clean_views(1))
@@ -100,7 +100,7 @@ def test_masks_and_viewpoints_of_too_many_pixels_are_refused(ros: Ros, parameter
 
 def test_what_peers_may_reach_is_fixed_at_the_start_in_every_state(ros: Ros, node: SegmentNode, root: Path) -> None:
     robot = Robot(ros)
-    with spun(node, ros):
+    with spun(node):
         for state in ("unconfigured", "inactive", "active"):
             while robot.state != state:
                 assert robot.change({"unconfigured": "configure", "inactive": "activate"}[robot.state])
@@ -115,7 +115,7 @@ def test_a_scene_that_a_peer_names_by_the_parameter_lies_below_data_root(
 ) -> None:
     robot, at_start = Robot(ros), str(root / "data" / "scene.ply")
     outside = root.parent / "outside.ply"
-    with spun(node, ros):
+    with spun(node):
         for path in (outside, root / "link" / "outside.ply", root / ".." / "outside.ply", "~/scene.ply"):
             taken, reason = robot.set("scene_path", str(path))
             assert not taken and "parameter scene_path, set after the start: path" in reason, path

@@ -161,7 +161,7 @@ def test_the_state_is_told_and_changed_while_the_session_is_locked(
         return make(*arguments)
 
     monkeypatch.setattr(diagnostics, "diagnostic_array", make_and_tell)
-    with spun(node, ros):
+    with spun(node):
         robot.brought_to("inactive")
         assert robot.change("activate")
         with node.workspace.session._lock:
