@@ -22,7 +22,7 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     An earlier file at `path` stays whole until the new one is complete and on the disk. If the body raises, whatever
     it raises, the temporary file is removed and the earlier file remains; after a kill the next write into the same
-    folder removes it. A link to a file stays, and what it points to is replaced.
+    folder, or run of it, removes it. A link to a file stays, and what it points to is replaced.
 
     Parent folders are created. What is yielded is the name of an empty file, which the body must write; it has the
     suffix of `path`, for writers that go by it.
@@ -44,7 +44,7 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         target = _replaceable(path)
         target.parent.mkdir(parents=True, exist_ok=True)
-        _remove_leftovers(target.parent)
+        remove_leftovers(target.parent)
         temporary, lock = _locked_file(target.parent, path.suffix)
         yield temporary
         with open(temporary, "rb+") as file:
@@ -107,6 +107,16 @@ def sync_folder(folder: Path) -> None:
             os.close(file)
 
 
+def remove_leftovers(folder: Path) -> None:
+    """Remove temporary files in a folder whose writers are dead."""
+    with os.scandir(folder) as entries:
+        names = [entry.path for entry in entries if _TEMPORARY.fullmatch(entry.name)]
+    for name in names:
+        with contextlib.suppress(OSError), open(name, "rb") as file:
+            if try_lock(file.fileno()):
+                os.unlink(name)
+
+
 def _replaceable(path: Path) -> Path:
     """Follow a link, and refuse what is neither a file nor missing; raises `OSError`, too."""
     target = Path(os.path.realpath(path)) if path.is_symlink() else path
@@ -121,7 +131,7 @@ def _replaceable(path: Path) -> Path:
 
 
 def _locked_file(folder: Path, suffix: str) -> tuple[Path, int]:
-    """Make an empty file that `_remove_leftovers` leaves alone while this process lives; its name and descriptor."""
+    """Make an empty file that `remove_leftovers` leaves alone while this process lives; its name and descriptor."""
     while True:
         path = folder / f".gsseg-{secrets.token_hex(6)}{suffix}"
         file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
@@ -129,13 +139,3 @@ def _locked_file(folder: Path, suffix: str) -> tuple[Path, int]:
         if try_lock(file) is not False and path.exists():
             return path, file
         os.close(file)
-
-
-def _remove_leftovers(folder: Path) -> None:
-    """Remove temporary files in a folder whose writers are dead."""
-    with os.scandir(folder) as entries:
-        names = [entry.path for entry in entries if _TEMPORARY.fullmatch(entry.name)]
-    for name in names:
-        with contextlib.suppress(OSError), open(name, "rb") as file:
-            if try_lock(file.fileno()):
-                os.unlink(name)

@@ -32,7 +32,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
 from gsseg_core.errors import GssegError, PathTakenError, WriteError
-from gsseg_core.files.atomic import sync_folder, try_lock
+from gsseg_core.files.atomic import remove_leftovers, sync_folder, try_lock
 from gsseg_core.files.run_manifest import FileRecord, Manifest, RunRecord
 
 RUN_FILE, COMMIT_FILE = ".gsseg-run.json", ".gsseg-commit.json"
@@ -285,7 +285,8 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _remove_dead(out: Path) -> None:
-    """Remove what was staged by runs whose processes have ended; `out` is locked."""
+    """Remove what was staged by runs whose processes have ended, and files they were writing; `out` is locked."""
+    remove_leftovers(out)
     for path in [path for path in out.iterdir() if STAGING.fullmatch(path.name) and _is_folder(path)]:
         with contextlib.suppress(OSError):
             lock = _open_folder(path)

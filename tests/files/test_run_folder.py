@@ -17,6 +17,7 @@ from test_atomic import small_files_only
 
 from gsseg_core.errors import PathTakenError, SettingsError, WriteError
 from gsseg_core.files import run_folder
+from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.run_folder import COMMIT_FILE, RUN_FILE, settle, staged_run
 
 FIRST = ["a.npz", "classes/1_cup.ply", "classes/2_box.ply", "old/gone.png", "report.json"]
@@ -95,6 +96,21 @@ def test_after_a_kill_at_any_step_all_files_are_of_one_run_and_the_next_run_clea
             last = write(out, FIRST)
             assert contents(out) == dict.fromkeys(FIRST, last) | mine and hidden(out) == [RUN_FILE]
     assert before > 10 and after > 10 and not was_killed
+
+
+@in_clean_process
+def test_a_run_removes_what_a_killed_save_left_in_its_folder_and_nothing_that_is_being_saved(tmp_path: Path) -> None:
+    child = os.fork()
+    if not child:
+        with write_atomically(tmp_path / "state.npz"):
+            os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
+    with write_atomically(tmp_path / "nested" / "state.npz") as living:
+        living = living.rename(tmp_path / living.name)  # Where a save would have removed what the dead one left.
+        assert len(hidden(tmp_path)) == 2
+        write(tmp_path, FIRST)
+        assert hidden(tmp_path) == sorted([living.name, RUN_FILE])
+        living.rename(tmp_path / "nested" / living.name)
 
 
 @in_clean_process
