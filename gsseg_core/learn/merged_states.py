@@ -35,13 +35,14 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
     StateMismatchError
         They are of different scenes.
     StateFileError
-        They have different names for one class, or ids that each session gave to the objects that it found.
+        They have different names for one class, or ids that each session gave to the objects that it found; or two are
+        the same, whose votes would count twice.
     """
     first = saved[0]
     names: dict[int, str] = {}
     views: dict[str, View] = {}
     votes = np.zeros((len(first.state.votes), max(one.state.votes.shape[1] for one in saved)), np.int64)
-    for one in saved:
+    for number, one in enumerate(saved):
         if one.scene != first.scene or not _is_same_map(one.state.living, first.state.living):
             raise StateMismatchError(
                 f"{one.source}: belongs to the scene {one.scene[:12]}; expected {first.scene[:12]}, that of "
@@ -53,6 +54,12 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
                 "whose ids mean the same in all states"
             )
         _add_names(names, one)
+        for other in saved[:number]:
+            if _is_same_state(one.state, other.state):
+                raise StateFileError(
+                    f"{one.source}: holds the votes and views of {other.source}, which would count twice; expected "
+                    "each state once"
+                )
         votes[:, : one.state.votes.shape[1]] += one.state.votes
         for view in one.state.views:
             name = _free_name(view.name, views)
@@ -84,4 +91,23 @@ def _is_same_map(one: LivingScene | None, other: LivingScene | None) -> bool:
         and np.array_equal(one.groups, other.groups)
         and one.frames.keys() == other.frames.keys()
         and all(is_same(frame, other.frames[group]) for group, frame in one.frames.items())
+    )
+
+
+def _is_same_state(one: State, other: State) -> bool:
+    """Whether two states are of the same views, with the same poses and masks, and so have the same votes, not none."""
+    return (
+        (one.num_fused, len(one.views)) == (other.num_fused, len(other.views))
+        and all(_is_same_view(*views) for views in zip(one.views, other.views, strict=True))
+        and np.array_equal(one.votes, other.votes)
+        and bool(one.votes.any())
+    )
+
+
+def _is_same_view(one: View, other: View) -> bool:
+    return (
+        (one.name, one.group) == (other.name, other.group)
+        and np.array_equal(one.camera.K, other.camera.K)
+        and np.array_equal(one.camera.world_to_camera, other.camera.world_to_camera)
+        and np.array_equal(one.read_labels(), other.read_labels())
     )

@@ -77,11 +77,25 @@ def test_states_that_do_not_belong_together_are_refused_with_one_error_and_nothi
         assert main(["merge", one, other, "-o", str(out)]) == 2
         told = capsys.readouterr().err
         assert message in told and told.count("\n") == 1 and not out.exists()
-        session = load(one)
+        session = load(robot(tmp_path / "b.npz", VIEWS[2:]))
         before = session._live._votes.copy()
         with pytest.raises(Exception, match=Path(other).name):
             session.merge([one, other])
         np.testing.assert_array_equal(session._live._votes, before)
+
+
+def test_a_state_that_is_given_twice_or_is_known_already_is_refused_and_a_later_one_of_the_same_robot_is_not(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one, later, out = robot(tmp_path / "a.npz", VIEWS[:2]), robot(tmp_path / "b.npz", VIEWS[:3]), tmp_path / "c.npz"
+    again = robot(tmp_path / "again.npz", VIEWS[:2])
+    for same in (one, again):
+        assert main(["merge", one, later, same, "-o", str(out)]) == 2
+        assert f"{same}: holds the votes and views of {one}, which would count twice" in capsys.readouterr().err
+    session = load(one)
+    with pytest.raises(StateFileError, match=r"again\.npz: holds the votes and views of what is known here"):
+        session.merge([later, again])
+    assert session.num_fused == 2 and not out.exists()
 
 
 def test_objects_that_robots_have_numbered_themselves_are_not_added_up(
