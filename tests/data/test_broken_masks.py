@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,7 @@ from mask_writers import AMG_HEADER, PER_VIEW_WRITERS, WRITERS, compressed, runs
 from test_mask_formats import HEIGHT, WIDTH, make_cameras, written
 
 from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.mask_formats import shapes
 from gsseg_core.data.mask_formats.rle import run_lengths, runs_to_mask
 from gsseg_core.data.mask_formats.shapes import Polygons, Shape, paint
 from gsseg_core.errors import GssegError, MaskFormatError
@@ -293,6 +295,44 @@ def test_a_polygon_of_coco_covers_what_pycocotools_says_but_for_its_outline() ->
     theirs = runs_to_mask(run_lengths(drawn["counts"].decode(), ""), 120, 100, "")
     ours = paint([Shape(1, Polygons([ring], ""))], 120, 100) > 0
     assert (ours != theirs).sum() < 0.02 * theirs.sum()
+
+
+def polygons(seed: int, count: int, size: int) -> list[np.ndarray]:
+    """Some that cross themselves, stick out of the image, have no point, or corners at centres and edges of pixels."""
+    rng = np.random.default_rng(seed)
+    return [np.round(rng.uniform(-size / 5, size * 1.2, (rng.integers(12), 2)) * 2) / 2 for _ in range(count)]
+
+
+def inside(ring: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Say, edge by edge, which pixels have an odd number of crossings with edges on their left or at their centre."""
+    found, (row, column), points = np.zeros((height, width), bool), np.mgrid[:height, :width], (ring - 0.5).tolist()
+    for (x, y), (next_x, next_y) in zip(points, points[1:] + points[:1], strict=True):
+        if y != next_y:
+            crosses = (min(y, next_y) <= row) & (row < max(y, next_y))
+            found ^= crosses & (x + (row - y) * ((next_x - x) / (next_y - y)) <= column)
+    return found
+
+
+@pytest.mark.parametrize("at_once", [7, 2**18])
+@pytest.mark.parametrize("seed", range(20))
+def test_polygons_of_one_shape_cover_what_each_covers(monkeypatch: pytest.MonkeyPatch, seed: int, at_once: int) -> None:
+    rings = polygons(seed, 8, 50)
+    expected = np.any([inside(ring, 50, 40) for ring in rings], axis=0)
+    monkeypatch.setattr(shapes, "_AT_ONCE", at_once)
+    for most in (0, 2**16):  # One after the other, and together.
+        monkeypatch.setattr(shapes, "_RING_PIXELS", most)
+        np.testing.assert_array_equal(paint([Shape(1, Polygons(rings, ""))], 50, 40) > 0, expected)
+
+
+def test_polygons_as_large_as_the_image_take_the_time_of_their_outlines() -> None:
+    def seconds(count: int) -> float:
+        shape = Shape(1, Polygons(polygons(1, count, 1000), ""))
+        start = time.process_time()
+        paint([shape], 1000, 1000)
+        return time.process_time() - start
+
+    seconds(10)
+    assert seconds(1000) < 20 * seconds(10)
 
 
 def test_a_polygon_of_millions_of_points_is_filled_or_refused_in_bounded_memory() -> None:

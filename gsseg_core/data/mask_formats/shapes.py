@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -26,6 +27,7 @@ T = TypeVar("T", bound=np.generic)
 
 _AT_ONCE = 2**18  # crossings of rows and edges that are worked on at a time
 _FEW = 2**16  # crossings that a polygon may have in any image
+_RING_PIXELS = 2**16  # that are filled in the time that a polygon takes by itself, however small
 
 
 class Part(NamedTuple):
@@ -74,37 +76,78 @@ class Polygons:
 
     def parts(self, width: int, height: int) -> Iterator[Part]:
         """See `Region`."""
-        for ring in self.rings:
-            part = self._filled(ring, width, height)
-            if part is not None:
-                yield part
+        rings = [ring for ring in self.rings if len(ring)]
+        together = rings and len(rings) * _RING_PIXELS >= width * height
+        for some in [rings] if together else [[ring] for ring in rings]:
+            yield from self._filled(_Edges.of(some, width, height), width, height)
 
-    def _filled(self, ring: npt.NDArray[np.float64], width: int, height: int) -> Part | None:
-        """Fill one polygon: rows cross its edges, and between the first and second crossing a row is inside."""
-        if not len(ring):
-            return None
-        x, y = (ring - 0.5).T  # Centres of pixels are whole numbers then.
-        left, top = (int(np.clip(np.ceil(low.min()), 0, size)) for low, size in ((x, width), (y, height)))
-        right, bottom = (int(np.clip(np.ceil(high.max()), 0, size)) for high, size in ((x, width), (y, height)))
-        if right <= left or bottom <= top:
-            return None
-        first = np.clip(np.ceil(np.minimum(y, np.roll(y, -1))), top, bottom).astype(np.int64)
-        rows = np.clip(np.ceil(np.maximum(y, np.roll(y, -1))), top, bottom).astype(np.int64) - first  # (P,)
-        if rows.sum() > max(4 * width * height, _FEW):
+    def _filled(self, edges: _Edges, width: int, height: int) -> Iterator[Part]:
+        """Fill polygons: a row is inside of each from every odd crossing with its edges to the next crossing."""
+        count = np.bincount(edges.ring, edges.end - edges.first)
+        if count.max() > max(4 * width * height, _FEW):
             raise MaskFormatError(
-                f"{self.where}: a polygon of {len(ring):,} points crosses the rows of the image {rows.sum():,} times; "
-                f"expected an outline of something in {width} x {height} pixels"
+                f"{self.where}: a polygon of {(edges.ring == count.argmax()).sum():,} points crosses the rows of the "
+                f"image {count.max():,.0f} times; expected an outline of something in {width} x {height} pixels"
             )
-        crossings = np.zeros((bottom - top, right - left + 1), np.uint8)
-        slope = (np.roll(x, -1) - x) / np.where(rows > 0, np.roll(y, -1) - y, 1)
-        for edges in _batches(rows):
-            count = rows[edges]
-            edge = np.repeat(edges, count)
-            row = first[edge] + np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count)
-            column = np.clip(np.ceil(x[edge] + (row - y[edge]) * slope[edge]), left, right).astype(np.int64)
-            np.add.at(crossings, (row - top, column - left), np.uint8(1))
-        inside = np.cumsum(crossings, axis=1, dtype=np.uint8)[:, :-1] & 1
-        return Part(top, left, inside.astype(bool))
+        (left, top), (right, bottom) = edges.low.min(axis=1).tolist(), edges.high.max(axis=1).tolist()
+        if right <= left or bottom <= top:
+            return
+        fits = np.min_scalar_type(-2 * len(count))
+        depth = np.zeros((bottom - top) * (right - left) + 1, fits)  # polygons that a pixel is in, first the changes
+        for ring, row, column in edges.crossings():
+            row, column = np.divmod(np.sort((ring * height + row) * (width + 1) + column), width + 1)
+            pixel = (row % height - top) * (right - left) + column - left
+            np.add.at(depth, pixel[::2], fits.type(1))
+            np.subtract.at(depth, pixel[1::2], fits.type(1))
+        np.cumsum(depth, dtype=fits, out=depth)
+        yield Part(top, left, depth[:-1].reshape(bottom - top, right - left) > 0)
+
+
+class _Edges(NamedTuple):
+    """Edges of polygons, each from a point to the next, and the rows of an image that they cross."""
+
+    ring: npt.NDArray[np.int64]  # (E,): the polygon
+    x: npt.NDArray[np.float64]  # (E,), as all of the point; centres of pixels are whole numbers
+    y: npt.NDArray[np.float64]
+    after: npt.NDArray[np.int64]  # the next point
+    first: npt.NDArray[np.int64]  # row that is crossed
+    end: npt.NDArray[np.int64]  # row behind the last one
+    low: npt.NDArray[np.int64]  # (2, R): first column and row of each polygon within the image
+    high: npt.NDArray[np.int64]  # (2, R): those behind the last ones
+
+    @classmethod
+    def of(cls, rings: list[npt.NDArray[np.float64]], width: int, height: int) -> _Edges:
+        """Collect the edges of polygons, each of which has a point at least."""
+        ends = np.cumsum([len(ring) for ring in rings])
+        starts = np.concatenate([[0], ends[:-1]])
+        points = np.concatenate(rings).T - 0.5
+        ring, after = np.repeat(np.arange(len(rings)), ends - starts), np.arange(1, points.shape[1] + 1)
+        after[ends - 1] = starts
+        low, high = (
+            np.clip(np.ceil(limit.reduceat(points, starts, axis=1)), 0, [[width], [height]]).astype(np.int64)
+            for limit in (np.minimum, np.maximum)
+        )
+        high[1] = np.where(high[0] > low[0], high[1], low[1])  # One beside the image crosses none of its rows.
+        x, y = points
+        first, end = (
+            np.clip(np.ceil(limit(y, y[after])), low[1, ring], high[1, ring]).astype(np.int64)
+            for limit in (np.minimum, np.maximum)
+        )
+        return cls(ring, x, y, after, first, end, low, high)
+
+    def crossings(self) -> Iterator[tuple[npt.NDArray[np.int64], ...]]:
+        """Give all crossings of some rows at a time, each (C,): polygon, row, and column of the first pixel behind."""
+        count = np.cumsum(np.bincount(self.first, minlength=self.end.max() + 1) - np.bincount(self.end))
+        blocks = np.flatnonzero(np.diff(np.cumsum(count) // _AT_ONCE)) + 1
+        for begin, end in pairwise([0, *blocks.tolist(), len(count)]):
+            first = np.clip(self.first, begin, end)
+            rows = np.clip(self.end, begin, end) - first
+            edge = np.repeat(np.arange(len(rows)), rows)
+            row = first[edge] + np.arange(len(edge)) - np.repeat(np.cumsum(rows) - rows, rows)
+            after, ring = self.after[edge], self.ring[edge]
+            slope = (self.x[after] - self.x[edge]) / (self.y[after] - self.y[edge])
+            column = np.ceil(self.x[edge] + (row - self.y[edge]) * slope)
+            yield ring, row, np.clip(column, self.low[0, ring], self.high[0, ring]).astype(np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,13 +243,6 @@ def scaled(labels: npt.NDArray[T], camera: Camera) -> npt.NDArray[T]:
     rows, columns = (((np.arange(n) + 0.5) * m / n).astype(np.int64) for n, m in zip(size, labels.shape, strict=True))
     near: npt.NDArray[T] = labels[rows[:, None], columns]
     return near
-
-
-def _batches(rows: npt.NDArray[np.int64]) -> Iterator[npt.NDArray[np.int64]]:
-    """Split the edges that cross a row into batches, each with few crossings."""
-    edges = np.flatnonzero(rows)
-    batch = np.cumsum(rows[edges]) // _AT_ONCE
-    yield from np.split(edges, np.flatnonzero(np.diff(batch)) + 1)
 
 
 def _odd(ring: npt.NDArray[np.float64]) -> str:
