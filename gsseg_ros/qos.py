@@ -10,6 +10,9 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 
 from gsseg_core.errors import SettingsError
 
+FEEDBACK_DEPTH = 1000
+"""Of the feedback of an action: of a client that stands still for a while, too, none is lost."""
+
 
 def input_data(depth: int) -> QoSProfile:
     """Make a profile for an input, so many messages deep, for a burst while the interpreter is busy.
@@ -39,14 +42,9 @@ def latched() -> QoSProfile:
     return QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-def requests() -> QoSProfile:
-    """Make a profile for services: as is usual, but deep enough that in a burst, too, every request gets an answer."""
-    return QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
-
-
-def feedback() -> QoSProfile:
-    """Make a profile for the feedback of an action: of a client that stands still for a while, too, none is lost."""
-    return QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
+def reliable(depth: int = 100) -> QoSProfile:
+    """Make a profile as is usual, but so deep that in a burst, too, every request gets an answer."""
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
 
 
 @contextmanager

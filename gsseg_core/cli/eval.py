@@ -34,13 +34,15 @@ def run(options: argparse.Namespace) -> int:
     from gsseg_core.data.class_names import read_classes
     from gsseg_core.data.mask_formats.table import open_masks
     from gsseg_core.errors import ClassesFileError, SettingsError
+    from gsseg_core.files.atomic import check_replaceable, check_writable
     from gsseg_core.files.input_files import is_there
     from gsseg_core.files.json_files import write_json
     from gsseg_core.metrics import evaluate_folders, evaluate_masks, predicted_maps
     from gsseg_core.text import evaluation_summary
 
     if options.json:
-        _check_replaceable(Path(options.json))
+        check_writable(options.json)
+        check_replaceable(Path(options.json), "file of scores", _holds_scores(Path(options.json)))
     root = Path(options.truth).parent
     classes = root / "classes.json"
     names = read_classes(classes) if is_there(classes, ClassesFileError) else None
@@ -62,16 +64,11 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _check_replaceable(path: Path) -> None:
-    """Raise `PathTakenError` if something else than scores is there, or, as `check_writable` does, `WriteError`."""
-    from gsseg_core.errors import PathTakenError
-    from gsseg_core.files.atomic import check_writable
+def _holds_scores(path: Path) -> bool:
+    """Whether scores, or nothing, are in a file that is there, or would be there behind a link."""
+    from gsseg_core.errors import GssegError
     from gsseg_core.files.json_files import read_object
 
-    check_writable(path)
-    if not path.exists() or not path.stat().st_size:
-        return
-    with suppress(PathTakenError):
-        if "mean_iou" in read_object(path, PathTakenError, "scores"):
-            return
-    raise PathTakenError(f"{path}: is there and holds no scores; expected a new file, or scores to replace")
+    with suppress(GssegError):
+        return not (path.exists() and path.stat().st_size) or "mean_iou" in read_object(path, GssegError, "scores")
+    return False

@@ -83,6 +83,12 @@ def check_writable(path: str | os.PathLike[str]) -> None:
         raise WriteError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
+def check_replaceable(path: Path, what: str, is_one: bool) -> None:
+    """Raise `PathTakenError` if something is at `path` that is not what will be written there."""
+    if os.path.lexists(path) and not is_one:
+        raise PathTakenError(f"{path}: is there and is no {what}; expected a new file, or a {what} to replace")
+
+
 def try_lock(file: int) -> bool | None:
     """Lock an open file for this process if nobody has; None where the file system has no locks.
 

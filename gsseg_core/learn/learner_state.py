@@ -21,8 +21,8 @@ from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import PER_VIEW, UNKNOWN
 from gsseg_core.data.soft_masks import TOLERANCE, SeenLabels
 from gsseg_core.data.view import View
-from gsseg_core.errors import GssegError, PathTakenError, StateFileError
-from gsseg_core.files.atomic import write_atomically
+from gsseg_core.errors import GssegError, StateFileError
+from gsseg_core.files.atomic import check_replaceable, write_atomically
 from gsseg_core.files.limits import LIMITS, MAX_LABEL
 from gsseg_core.files.npz_files import (
     NpzArrays,
@@ -98,7 +98,7 @@ class State:
             The file cannot be written; an earlier one is unchanged.
         """
         path = Path(path)
-        _require_replaceable(path)
+        check_replaceable(path, "saved state", npz_format(path) == FORMAT)
         seen = np.flatnonzero(self.votes.any(axis=1))
         header: dict[str, Any] = {
             "format": FORMAT,
@@ -127,7 +127,7 @@ class State:
         with write_atomically(path) as temporary, open(temporary, "wb") as file:
             # Without allow_pickle=False, which NumPy 1.26 would take for one more array.
             np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
-            _require_replaceable(path)  # To save takes long.
+            check_replaceable(path, "saved state", npz_format(path) == FORMAT)  # To save takes long.
 
     @classmethod
     def load(
@@ -201,11 +201,6 @@ class State:
 def _entry(view: View) -> dict[str, Any]:
     entry: dict[str, Any] = {"name": view.name, "size": [view.camera.width, view.camera.height]}
     return entry if view.group is None else {**entry, "group": view.group}
-
-
-def _require_replaceable(path: Path) -> None:
-    if os.path.lexists(path) and npz_format(path) != FORMAT:
-        raise PathTakenError(f"{path}: is there and is no saved state; expected a new file, or a state to replace")
 
 
 def _read_votes(file: NpzArrays, shape: tuple[int, int], num_kept: int, num_fused: int) -> np.ndarray:

@@ -27,7 +27,7 @@ from gsseg_ros.client.results import LearnResult, PickedObject, RenderedView, Se
 from gsseg_ros.client.run_clouds import RunClouds
 from gsseg_ros.client.scene_requests import SceneRequests
 from gsseg_ros.conversions import arrays_from_cloud, mask_image, viewpoint_messages
-from gsseg_ros.qos import feedback
+from gsseg_ros.qos import FEEDBACK_DEPTH, reliable
 
 
 class SegmentationClient(SceneRequests):
@@ -50,7 +50,9 @@ class SegmentationClient(SceneRequests):
     """
 
     def _reach(self, node: Any) -> None:
-        self._learn: Any = ActionClient(node, Learn, f"{self._name}/learn", feedback_sub_qos_profile=feedback())
+        self._learn: Any = ActionClient(
+            node, Learn, f"{self._name}/learn", feedback_sub_qos_profile=reliable(FEEDBACK_DEPTH)
+        )
         self._learning: set[LearnGoal] = set()
         self._clouds = RunClouds(self._spinner, f"{self._name}/cloud")
 

@@ -24,7 +24,7 @@ from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.reports import Selection, finish, report_message
 from gsseg_ros.node.services import explain
 from gsseg_ros.node.workspace import Run, Workspace
-from gsseg_ros.qos import feedback
+from gsseg_ros.qos import FEEDBACK_DEPTH, reliable
 
 FEEDBACK_PERIOD = 0.1
 """Seconds between two messages of feedback, at least; a new stage is always told."""
@@ -51,7 +51,7 @@ class LearnAction:
             goal_callback=self._welcome,
             cancel_callback=lambda goal: CancelResponse.ACCEPT,
             callback_group=ReentrantCallbackGroup(),
-            feedback_pub_qos_profile=feedback(),
+            feedback_pub_qos_profile=reliable(FEEDBACK_DEPTH),
         )
 
     def close(self) -> None:

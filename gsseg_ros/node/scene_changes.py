@@ -20,7 +20,7 @@ from gsseg_ros.delta_messages import delta_from_message
 from gsseg_ros.errors import InvalidRequestError
 from gsseg_ros.node.pairing import CAMERAS_KEPT
 from gsseg_ros.node.services import Services, answered, explain, in_turn
-from gsseg_ros.qos import requests
+from gsseg_ros.qos import reliable
 
 _STAMP = re.compile(r"[0-9]+")
 _CAMERA_NUMBERS = frozenset(map(str, range(2, CAMERAS_KEPT + 1)))
@@ -54,10 +54,10 @@ class SceneChanges:
             (UpdateScene, "update_scene", self.update_scene),
             (MergeStates, "merge_states", self.merge_states),
         ):
-            self.node.create_service(interface, f"~/{name}", handler, qos_profile=requests(), callback_group=group)
+            self.node.create_service(interface, f"~/{name}", handler, qos_profile=reliable(), callback_group=group)
         # Reliable and one after the other: each change goes by the one before it.
         self.node.create_subscription(
-            SceneDeltaMessage, "scene_delta", self.on_scene_delta, requests(),
+            SceneDeltaMessage, "scene_delta", self.on_scene_delta, reliable(),
             callback_group=MutuallyExclusiveCallbackGroup(),
         )  # fmt: skip
 

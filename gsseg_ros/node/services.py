@@ -39,7 +39,7 @@ from gsseg_ros.node.scene_frame import placed, placed_by
 from gsseg_ros.node.viewpoints import Lookup, draw, viewpoint
 from gsseg_ros.node.workspace import Run, Workspace
 from gsseg_ros.object_messages import point_message
-from gsseg_ros.qos import requests
+from gsseg_ros.qos import reliable
 
 STATE_FILE, EXPORT_FOLDER = "gsseg_state.npz", "gsseg_export"
 
@@ -139,7 +139,7 @@ class Services:
             (Export, "export", self.export),
             (Reset, "reset", self.reset),
         ):
-            node.create_service(interface, f"~/{name}", handler, qos_profile=requests(), callback_group=group)
+            node.create_service(interface, f"~/{name}", handler, qos_profile=reliable(), callback_group=group)
 
     @answered
     @in_turn

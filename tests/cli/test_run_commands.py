@@ -214,7 +214,7 @@ def test_scores_replace_nothing_but_scores(place: Path, capsys: pytest.CaptureFi
     for other in ("classes.json", "split.json", "cameras.json", "scene.ply"):
         before = (data / other).read_bytes()
         assert main([*given, f"{data}/{other}"]) == 2
-        assert_one_line(capsys.readouterr().err, f"{other}: is there and holds no scores; expected a new file")
+        assert_one_line(capsys.readouterr().err, f"{other}: is there and is no file of scores; expected a new file")
         assert (data / other).read_bytes() == before
     scores.touch()  # As mktemp leaves it.
     for _ in range(2):
