@@ -23,9 +23,11 @@ from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View, spread
 from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.learn.temperature import VIEWS, Sample, grid_of, sample_grid
+from gsseg_core.scene.camera import Camera
 from gsseg_core.two_at_once import two_at_once
 
 WORST = 4  # views that are trusted least, as pictures show them
+_ALL = 1 << 17  # px of the largest views of which all are compared; of others, every second tile of 16 x 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +103,7 @@ class MaskChecker:
         """Compare all masks with their predictions, in the order of the views.
 
         A prediction is unknown where most of a ray ends on Gaussians that only this view has seen; and, but for the
-        `shown_views`, where the mask says nothing.
+        `shown_views`, where the mask says nothing, and in every second tile of 16 x 16 pixels of a large view.
         """
         views = self.learner.views
         checks = {}
@@ -109,28 +111,49 @@ class MaskChecker:
             for done, name in enumerate(views):
                 progress("check views", done, len(views))
                 checks[name] = next(checked)
-        for check in shown_views(list(checks.values())):
-            if check.num_pixels < views[check.name].camera.width * views[check.name].camera.height:
-                everywhere = PackedLabels(self.learner.classes_without(views[check.name]))
-                checks[check.name] = replace(check, predicted=everywhere)
+        shown = shown_views(list(checks.values()))
+        again = [views[check.name] for check in shown if not _is_of_all(check, views[check.name].camera)]
+        with closing(two_at_once(self._everywhere, again, self.learner.device)) as predicted:
+            for view, everywhere in zip(again, predicted, strict=True):
+                checks[view.name] = replace(checks[view.name], predicted=everywhere)
         progress("check views", len(views), len(views))
         return list(checks.values())
 
     def _check(self, view: View) -> ViewCheck:
         """Compare a view's mask with what is predicted where it says something."""
         learner, seen = self.learner, view.read_seen()
+        wanted = _compared(seen.labels)
         sampled = view.name in self._sampled
-        predicted = self._predict(view, seen) if sampled else learner.classes_without(view, only_labelled=True)
-        predicted[seen.labels < 0] = UNKNOWN
+        predicted = self._predict(view, seen) if sampled else learner.classes_without(view, wanted)
+        predicted[~wanted] = UNKNOWN
         check = compare_mask(view, predicted, learner.num_classes, seen)
         return replace(check, rejected=learner.rejected_share(view))
 
+    def _everywhere(self, view: View) -> PackedLabels:
+        """Tell the class of each pixel of a view that is shown, also where nothing is compared."""
+        labelled = view.read_seen().labels >= 0
+        return PackedLabels(self.learner.classes_without(view, labelled if labelled.all() else None))
+
     def _predict(self, view: View, seen: SeenLabels) -> np.ndarray:
-        """Tell the class of each pixel, (H, W) int32, and keep the probabilities of some."""
-        grid = grid_of(view.camera.height, view.camera.width)
-        found = self.learner.strongest_without(view, only_labelled=True, grid=grid)
-        self._samples[view.name] = sample_grid(found.some, grid.of(seen.named()))
+        """Tell the class of each pixel that is compared, (H, W) int32, and keep the probabilities of some."""
+        grid, wanted = grid_of(view.camera.height, view.camera.width), _compared(seen.labels)
+        found = self.learner.strongest_without(view, wanted, grid)
+        self._samples[view.name] = sample_grid(found.some, grid.of(np.where(wanted, seen.named(), UNKNOWN)))
         return found.labels()
+
+
+def _is_of_all(check: ViewCheck, camera: Camera) -> bool:
+    """Tell whether all pixels of a view were compared."""
+    return check.num_pixels == camera.width * camera.height <= _ALL
+
+
+def _compared(labels: np.ndarray) -> np.ndarray:  # (H, W)
+    """Choose the pixels of a mask that are compared, (H, W) bool: large masks tell enough by half of them."""
+    wanted: np.ndarray = labels >= 0
+    if wanted.size > _ALL:
+        rows, columns = (np.arange(size) // 16 for size in wanted.shape)
+        wanted &= np.add.outer(rows, columns) % 2 == 0
+    return wanted
 
 
 def check_views(learner: Learner, progress: Progress = silent) -> list[ViewCheck]:

@@ -106,12 +106,13 @@ class ViewRenderer(ABC):
 
     def strongest(
         self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid | None = None,
-        of: np.ndarray | None = None, beside: np.ndarray | None = None,
+        of: np.ndarray | None = None, beside: np.ndarray | None = None, wanted: np.ndarray | None = None,
     ) -> Strongest:  # fmt: skip
         """Find the class of each pixel, from codes in [0, 1] as `blend_rows` takes them.
 
         What a ray has left over is `background`, class 0, or else nothing. Codes `beside` these, (M, C) of `ids`, as
-        colours, are blended in the same pass, as `blend_seen` does.
+        colours, are blended in the same pass, as `blend_seen` does. If only some pixels are `wanted`, (H, W) bool,
+        others may have any value.
         """
         image, left_over = self.blend_rows(codes, num_classes, of)
         if background:

@@ -15,6 +15,7 @@ from wrong_masks import WrongMasks
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.export.view_pictures import draw_worst_views
+from gsseg_core.learn import mask_reliability
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.mask_reliability import ViewCheck, check_views, reliability_report, worst_views
 from gsseg_core.report.pictures import ViewImages
@@ -98,6 +99,18 @@ def test_unknown_pixels_do_not_count() -> None:
     taught(learner, [View.from_arrays(CLEAN[0].camera, labels), *CLEAN[1:]]).fit()
     check = check_views(learner)[0]
     assert check.num_pixels == check.checked == (labels >= 0).sum()
+
+
+def test_of_large_views_half_is_compared_which_tells_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mask_reliability, "_ALL", 100)
+    for half in check_views(learner_with_bad_frames()):
+        whole = checks()[half.name]
+        assert half.num_pixels == whole.num_pixels and half.checked == pytest.approx(whole.checked / 2, rel=0.1)
+        assert half.reliability == pytest.approx(whole.reliability, abs=0.03)  # Of views of 3,072 px.
+        shown = half.prediction()
+        np.testing.assert_array_equal(shown[shown != UNKNOWN], whole.prediction()[shown != UNKNOWN])
+        if half.name in BAD:  # They are shown to people, in full.
+            np.testing.assert_array_equal(shown, whole.prediction())
 
 
 def test_views_of_which_nothing_is_known_come_last_and_have_no_figure() -> None:

@@ -63,3 +63,13 @@ def test_what_is_blended_beside_the_strongest_class_is_what_is_blended_alone(bac
     without = operator.strongest(codes, 5, True)
     assert without.beside is None
     np.testing.assert_array_equal(found.classes, without.classes)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.5, 0])
+def test_pixels_that_are_wanted_are_the_same_as_without_the_others(backend, share):
+    scene, camera = random_view(5, 400, 37, 21)
+    operator, rng = backend.make(scene, camera), np.random.default_rng(5)
+    codes = CSRRows.from_dense(rng.dirichlet(np.full(6, 0.2), len(scene)).astype(np.float32))
+    wanted = rng.random((camera.height, camera.width)) < share
+    found, full = operator.strongest(codes, 6, True, wanted=wanted), operator.strongest(codes, 6, True)
+    np.testing.assert_array_equal(found.labels()[wanted], full.labels()[wanted])

@@ -223,10 +223,12 @@ class EMLearner(Learner):
             image[..., 0] += left_over
         return image
 
-    def strongest_without(self, view: View, only_labelled: bool = False, grid: PixelGrid | None = None) -> Strongest:
+    def strongest_without(
+        self, view: View, wanted: np.ndarray | None = None, grid: PixelGrid | None = None
+    ) -> Strongest:  # fmt: skip
         """Tell the class of each pixel by `predict_without`, without an image of all classes."""
-        codes, of, background, operator = self._without(view, only_labelled)
-        return operator.strongest(codes, self.num_classes, background, grid, of)
+        codes, of, background, operator = self._without(view, wanted is not None)
+        return operator.strongest(codes, self.num_classes, background, grid, of, wanted=wanted)
 
     def _without(
         self, view: View, only_labelled: bool

@@ -68,7 +68,7 @@ def render(tiles: Tiles, codes: CSRRows, rows: np.ndarray, channels: int) -> tup
         tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
         values, rays = np.zeros((TILE, channels, TILE), np.float32), np.empty((TILE, TILE), np.float32)
         others = np.empty((TILE, 0, TILE), np.float32)
-        _blend_codes(tiles, tile, codes, rows, nothing_else, 0, values, others, rays)
+        _blend_codes(tiles, tile, codes, rows, nothing_else, OPEN, 0, values, others, rays)
         _put(tiles, tile, values, rays, out, left_over)
     return out, left_over
 
@@ -76,13 +76,14 @@ def render(tiles: Tiles, codes: CSRRows, rows: np.ndarray, channels: int) -> tup
 @kernel(parallel=True)
 def strongest(
     tiles: Tiles, codes: CSRRows, rows: np.ndarray, channels: int, background: bool, first: int, step: int,
-    beside: np.ndarray,  # (M, C) float32
+    beside: np.ndarray, wanted: np.ndarray,  # (M, C) float32; (H, W) bool, or (0, 0) for all pixels
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Find the column of the largest blended code in each pixel, (H, W) int32, the first of equal ones.
 
     Second is told whether the sum of all is more than a half, (H, W) bool. What a ray has left over is added to column
     0, if that is the background. No image of all columns is written, but for each step-th pixel of rows and columns,
     from the first on: (R, C, K). Then comes what `render_few` makes of the codes `beside` these, if there are any.
+    Blocks of 4 x 4 pixels none of which is `wanted` are not looked at: what is told of them has no meaning.
 
     Codes are at most 1. So once one column leads by more than a ray has left, nothing farther changes that, and a block
     in which all rays are so far takes no more codes.
@@ -98,7 +99,8 @@ def strongest(
         best, known = np.zeros((TILE, TILE), np.int32), np.empty((TILE, TILE), np.float32)
         left, top = corner_of(tiles, tile)
         ending = OPEN & ~_blocks_of_grid(first, step, left, top)
-        _blend_codes(tiles, tile, codes, rows, beside, ending, values, others, rays)
+        looked_at = _blocks_with(wanted, left, top) if wanted.size else OPEN
+        _blend_codes(tiles, tile, codes, rows, beside, looked_at, ending, values, others, rays)
         _compare(values, rays, background, best, known)
         _put(tiles, tile, others, rays, image, left_over)
         for r in range(min(TILE, tiles.height - top)):
@@ -113,6 +115,16 @@ def strongest(
                         some[(top + r) // step, (left + c) // step, k] = values[b, k, lane]
                     some[(top + r) // step, (left + c) // step, 0] += rays[b, lane] if background else np.float32(0)
     return out, half, some, image, left_over
+
+
+@called_by_kernels
+def _blocks_with(wanted: np.ndarray, left: int, top: int) -> int:  # (H, W) bool
+    """Which blocks of a tile have pixels that are wanted, as bits."""
+    blocks = 0
+    for r in range(top, min(top + TILE, wanted.shape[0])):
+        for c in range(left, min(left + TILE, wanted.shape[1])):
+            blocks |= wanted[r, c] << ((r - top) // SIDE * SIDE + (c - left) // SIDE)
+    return blocks
 
 
 @called_by_kernels
@@ -166,7 +178,7 @@ def _compare(
 @called_by_kernels(fastmath={"contract"}, error_model="numpy")
 def _blend_codes(
     tiles: Tiles, tile: int, codes: CSRRows, rows: np.ndarray, beside: np.ndarray,  # as `strongest` takes them
-    ending: int,  # bits of blocks of which only the largest column is wanted
+    looked_at: int, ending: int,  # bits of blocks: of all that count; of those whose largest column alone is wanted
     values: np.ndarray, others: np.ndarray, rays: np.ndarray,  # (16, K, 16), (16, C, 16) in: zeros; (16, 16) out
 ) -> None:  # fmt: skip
     """Blend the codes of a tile, and others beside them; weights are used where they are made.
@@ -176,7 +188,8 @@ def _blend_codes(
     last, channels, (indptr, indices, data) = tiles.start[tile + 1], values.shape[1], codes
     lines = np.empty((2, 2, TILE), np.float32)
     turns, patience = np.zeros(TILE, np.int64), 6 + channels // 4  # the more there is to look through, the less often
-    left, top, live = open_rays(tiles, tile, rays)
+    left, top, inside = open_rays(tiles, tile, rays)
+    live = inside & looked_at
     wanted, ahead = live, aim_next(tiles, tiles.start[tile] - 1, last, left, top, lines)
     for e in range(tiles.start[tile], last):
         g = tiles.entries[e]

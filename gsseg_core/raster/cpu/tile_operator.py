@@ -74,14 +74,15 @@ class TileOperator(ViewOperator):
 
     def strongest(
         self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid | None = None,
-        of: np.ndarray | None = None, beside: np.ndarray | None = None,
+        of: np.ndarray | None = None, beside: np.ndarray | None = None, wanted: np.ndarray | None = None,
     ) -> Strongest:  # fmt: skip
         """Find the class of each pixel, tile by tile, without an image of all classes."""
         first, step = grid or (1 << 30, 1 << 30)  # of which no image has a pixel
         others = np.ascontiguousarray(np.empty((len(self.ids), 0)) if beside is None else beside, np.float32)
         classes, known, some, image, left_over = products.strongest(
-            self._tiles, codes, self._rows(of), num_classes, background, first, step, others
-        )
+            self._tiles, codes, self._rows(of), num_classes, background, first, step, others,
+            np.empty((0, 0), np.bool_) if wanted is None else wanted,
+        )  # fmt: skip
         return Strongest(classes, known, some, None if beside is None else Blended(image, left_over))
 
     def _adjoint(self, residual: np.ndarray) -> np.ndarray:
