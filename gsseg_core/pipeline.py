@@ -10,13 +10,15 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from gsseg_core.align.placing import Placed, place
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.hints import mask_hint
 from gsseg_core.data.label_images import GLOBAL, PER_VIEW, write_mask
 from gsseg_core.data.view import QUALITIES, View, spread
 from gsseg_core.errors import NoUsableViewsError, SettingsError
-from gsseg_core.export.class_files import class_paths, class_places, mesh_file_name, write_classes
+from gsseg_core.export.class_files import class_paths, mesh_file_name, write_classes
 from gsseg_core.export.collision import collision_meshes
 from gsseg_core.export.pictures import save_png
 from gsseg_core.export.summary import RunReport, RunSettings, class_table
@@ -48,6 +50,7 @@ from gsseg_core.report.sections import PageInputs
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_writers import DEFAULT as DEFAULT_FORMAT
 from gsseg_core.segmentation import Segmentation
+from gsseg_core.spatial.row_order import curve_order, reordered
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -81,17 +84,6 @@ class Assessment:
     objective: list[float]  # of the learner, after each step
     report: Mapping[str, Any]  # `views` in `report.json`
     memory: Mapping[str, int]  # `prepared_views` there
-
-
-def segment_places(class_names: Mapping[int, str], views: Iterable[View], settings: RunSettings) -> list[str]:
-    """Files that `gsseg segment` writes, as far as they are known before it learns; relative to its folder."""
-    pictures = ["contact_sheet.png", "legend.png", "worst_views.png"]
-    pictures += [view_file_name(view.name, "overlay_") for view in views]
-    classes = class_places(class_names, settings.scene_format, settings.collision)
-    return [
-        "segmentation.npz", "report.json", "report.html",
-        *(f"classes/{name}" for name in classes), *(f"pictures/{name}" for name in pictures),
-    ]  # fmt: skip
 
 
 def segment(
@@ -172,7 +164,7 @@ def segment(
     )  # fmt: skip
     watch = Stopwatch()
     settings.check()
-    with staged_run(out, "segment", places=segment_places({}, [], settings)) as run:
+    with staged_run(out, "segment", places=settings.places({}, [])) as run:
         with ExitStack() as workers:
             with watch.stage("load"):
                 client = _connect(scheduler, workers)
@@ -184,11 +176,14 @@ def segment(
                     scene, dataset, align=align, check=True, dataparser=dataparser, device=device, progress=progress
                 )
             with watch.stage("load"):
-                inputs = _inputs(scene, placed, settings)
+                # Workers find the scene in files of their own, in the order that it has there.
+                order = curve_order(scene.means) if client is None else np.arange(len(scene))
+                inputs = _inputs(reordered(scene, order), placed, settings)
+                del scene
             if settings.ids == PER_VIEW:
                 with watch.stage("associate"):
                     inputs = _associate(inputs, device, progress)
-            run.claim(segment_places(inputs.class_names, inputs.pictured, settings))
+            run.claim(settings.places(inputs.class_names, inputs.pictured))
             fitted = _learn(inputs, settings, client, watch, progress)
             assessment = _assess(fitted, inputs.class_names, watch, progress)
         codes, evidence = fitted.codes_, fitted.evidence()
@@ -213,6 +208,10 @@ def segment(
         with watch.stage("refine"):
             result = result.calibrated(assessment.calibration.temperature)
             result = inputs.objects.with_tree(result) if inputs.objects else result
+            places = np.empty_like(order)
+            places[order] = np.arange(len(order))
+            inputs = replace(inputs, scene=reordered(inputs.scene, places))
+            result = result.in_order_of(inputs.scene, places)
         with ExitStack() as writing:
             behind = writing.enter_context(writing_behind())
             report = _write(run, inputs, assessment, result, drawn, settings, watch, behind)
@@ -314,7 +313,7 @@ def _write(
     with watch.stage("export"):
         behind(load_templates)
         if level is not result:
-            run.claim(segment_places(level.class_names, inputs.pictured, settings))
+            run.claim(settings.places(level.class_names, inputs.pictured))
         behind(named.save, folder / "segmentation.npz", run.id)
         meshes = collision_meshes(scene, exported, settings.collision) if settings.collision else {}
         files = class_paths(exported, folder / "classes", settings.scene_format)

@@ -36,6 +36,7 @@ from gsseg_core.refine.silhouette_carving import Silhouette, carve
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import neighbours_of
+from gsseg_core.spatial.row_order import take_rows
 from gsseg_core.text import clipped, quoted
 
 UNOBSERVED, REMOVED = -1, -2
@@ -226,6 +227,17 @@ class Segmentation:
         if order == list(range(len(ids))):
             return result
         return replace(result, probabilities=self.probabilities[:, order], learnt=self.learnt[:, order])
+
+    def in_order_of(self, scene: GaussianScene, places: np.ndarray) -> Segmentation:
+        """Give the result for the same Gaussians in the order of another scene: places (N,) of these in this one."""
+        learnt = np.cumsum(self.clustered)[places] - 1  # rows, of those that were clustered
+        clustered = self.clustered[places]
+        tree = self.tree and replace(self.tree, leaves=self.tree.leaves[places])
+        probabilities = take_rows(np.ascontiguousarray(self.probabilities), places)
+        return replace(
+            self, labels=self.labels[places], probabilities=probabilities, clustered=clustered,
+            learnt=self.learnt[learnt[clustered]], scene_digest=scene.digest, ids=scene.ids, tree=tree,
+        )  # fmt: skip
 
     @cached_property
     def confidence(self) -> np.ndarray:

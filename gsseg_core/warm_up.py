@@ -15,6 +15,9 @@ from typing import Any
 import numpy as np
 from numba.core import event
 
+from gsseg_core.csr_rows import CSRRows
+from gsseg_core.data.label_evidence import resolved_votes
+from gsseg_core.data.soft_masks import quantise
 from gsseg_core.data.view import View
 from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.kernels import kernel_cache
@@ -23,11 +26,15 @@ from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.objects.clicks import merge_tree
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.cpu.occlusion import ray_ends
 from gsseg_core.refine.label_propagation import spread_if_scarce
 from gsseg_core.refine.settings import PAPER
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.harmonics_kernel import seen_colors
+from gsseg_core.scene.spherical_harmonics import basis
 from gsseg_core.segmentation import Segmentation
+from gsseg_core.spatial.row_order import curve_order, reordered
 
 FIRST_RUN = "compiling kernels, about a minute on two cores; only the first run after installing does this"
 EVERY_RUN = (
@@ -155,3 +162,17 @@ def refine_something(device: str = "cpu") -> None:
     result.render(operator)
     operator.render(scene.colors(camera.center))
     overlay(np.zeros((*labels.shape, 3), np.uint8), labels, palette(2))
+    reordered(scene, curve_order(scene.means))
+    _do_what_is_rare(scene, camera, labels)
+
+
+def _do_what_is_rare(scene: GaussianScene, camera: Camera, labels: np.ndarray) -> None:  # (32, 32)
+    """Do what only some inputs need, as soft masks and maps that change, or only programs that use the library."""
+    quantise(np.stack([labels == 0, labels == 1]).astype(np.float32))
+    resolved_votes(CSRRows.from_dense(np.array([[-1, 1]])), np.ones(2, bool))
+    ray_ends(scene, camera, labels)
+    harmonics = basis(np.eye(3), 3)
+    seen_colors(harmonics, scene.means, np.arange(3, dtype=np.int32), np.zeros(3, np.float32), 0)  # not of a PLY
+    operator = make_operator(scene, camera)
+    operator.adjoint(np.ones((*labels.shape, 1), np.float32))
+    operator.weights()

@@ -137,6 +137,26 @@ def with_parts() -> Segmentation:
     return replace(Segmentation.from_codes(SCENE, CODES, NAMES, UNREFINED), tree=tree_of_balls())
 
 
+def test_a_result_in_the_order_of_another_scene_says_the_same_of_each_gaussian() -> None:
+    codes = CODES.copy()
+    codes[::7] = 0
+    result = Segmentation.from_codes(SCENE, codes, NAMES)
+    tree = replace(tree_of_balls(), leaves=np.where(result.labels >= 0, result.labels, -1).astype(np.int32))
+    result = replace(result, tree=tree)
+    places = np.random.default_rng(0).permutation(len(SCENE))
+    other = SCENE.subset(places)
+    moved = result.in_order_of(other, places)
+    assert result.clustered.any() and moved.scene_digest == other.digest
+    for name in ("labels", "probabilities", "clustered", "confidence"):
+        np.testing.assert_array_equal(getattr(moved, name), getattr(result, name)[places])
+    operators = [make_operator(scene, clean_views()[0].camera) for scene in (SCENE, other)]
+    np.testing.assert_array_equal(result.blend(operators[0]), moved.blend(operators[1]))
+    assert moved.tree is not None
+    np.testing.assert_array_equal(moved.tree.leaves, tree.leaves[places])
+    back = moved.in_order_of(SCENE, np.argsort(places))
+    np.testing.assert_array_equal(back.learnt, result.learnt)
+
+
 def test_levels_are_segmentations_whose_classes_are_the_nodes_there() -> None:
     objects = with_parts()
     assert objects.at(None) is objects

@@ -3,6 +3,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
@@ -19,9 +20,68 @@ from numba.core import event
 from gsseg_core.warm_up import warm_up
 warm_up()
 with event.install_recorder("numba:compile") as compiled:
-    {work}
+{work}
 assert not compiled.buffer, [begun.data["dispatcher"] for _, begun in compiled.buffer]
 """
+
+WORK = {
+    "segment": """
+from gsseg_core.cli.main import main
+assert main(["segment", {scene!r}, "--data", {data!r}, "--out", {out!r}, "--quiet"]) == 0""",
+    "fuse": """
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.live.session import LiveSession
+from gsseg_core.scene.gaussian_scene import GaussianScene
+session, data = LiveSession(GaussianScene.load({scene!r})), Dataset({data!r})
+assert not any(map(session.fuse, data.views("train")))
+session.segmentation()""",
+    "click": """
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.objects.pick import pick_clicks
+from gsseg_core.scene.gaussian_scene import GaussianScene
+camera = Dataset({data!r}).views("train")[0].camera
+pick_clicks(GaussianScene.load({scene!r}), camera, [(camera.height // 2, camera.width // 2)], [])""",
+    "soft and partial masks": """
+import numpy as np
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.soft_masks import quantise, restrict
+from gsseg_core.data.view import View
+from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.scene.gaussian_scene import GaussianScene
+learner = EMLearner(GaussianScene.load({scene!r}), 4)
+for number, view in enumerate(Dataset({data!r}).views("train")):
+    labels = view.read_labels()
+    soft = quantise(0.9 * np.stack([labels == k for k in range(4)])), restrict((labels == 1).astype(int), [1])
+    learner.observe(View.from_seen(view.camera, soft[number % 2]))
+learner.fit()""",
+    "change the map": """
+import numpy as np
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.live.living_session import LivingSession
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.scene_delta import SceneDelta
+session, data = LivingSession(GaussianScene.load({scene!r})), Dataset({data!r})
+assert not any(map(session.fuse, data.views("train")))
+session.update(SceneDelta(removed=np.arange(5)))
+session.segmentation()""",
+    "weights": """
+import numpy as np
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.raster.backends import make_operator
+from gsseg_core.scene.gaussian_scene import GaussianScene
+camera = Dataset({data!r}).views("train")[0].camera
+operator = make_operator(GaussianScene.load({scene!r}), camera)
+operator.weights()
+operator.adjoint(np.ones((camera.height, camera.width, 2)))""",
+    "move outlines": """
+import numpy as np
+from gsseg_core.learn.em.boundary_alignment import align_boundaries
+labels, edges = np.zeros((64, 64), np.int32), np.zeros((64, 64), np.float32)
+labels[20:42, 20:42] = 1
+for line in (edges[22, 22:40], edges[39, 22:40], edges[22:40, 22], edges[22:40, 39]):
+    line[:] = 3
+assert (align_boundaries(labels, edges, 3) != labels).any()""",
+}
 
 
 def test_a_device_that_is_not_there_is_refused() -> None:
@@ -86,38 +146,13 @@ def test_warm_up_says_nothing_where_the_kernels_are_there() -> None:
     assert told == ""
 
 
-@pytest.mark.parametrize("what", ["segment", "fuse", "click", "move outlines"])
+@pytest.mark.parametrize("what", WORK)
 def test_after_warm_up_nothing_is_compiled_any_more(tmp_path: Path, what: str) -> None:
     data, out = str(write_dataset(tmp_path / "data")), str(tmp_path / "out")
-    scene = str(Path(data) / "scene.ply")
     shutil.copy(f"{data}/labels/view1.png", f"{data}/labels/view0.png")  # It is wrong there.
-    work = {
-        "segment": f"""
-    from gsseg_core.cli.main import main
-    assert main(["segment", {scene!r}, "--data", {data!r}, "--out", {out!r}, "--quiet"]) == 0""",
-        "fuse": f"""
-    from gsseg_core.data.dataset import Dataset
-    from gsseg_core.live.session import LiveSession
-    from gsseg_core.scene.gaussian_scene import GaussianScene
-    session, data = LiveSession(GaussianScene.load({scene!r})), Dataset({data!r})
-    assert not any(map(session.fuse, data.views("train")))
-    session.segmentation()""",
-        "click": f"""
-    from gsseg_core.data.dataset import Dataset
-    from gsseg_core.objects.pick import pick_clicks
-    from gsseg_core.scene.gaussian_scene import GaussianScene
-    camera = Dataset({data!r}).views("train")[0].camera
-    pick_clicks(GaussianScene.load({scene!r}), camera, [(camera.height // 2, camera.width // 2)], [])""",
-        "move outlines": """
-    import numpy as np
-    from gsseg_core.learn.em.boundary_alignment import align_boundaries
-    labels, edges = np.zeros((64, 64), np.int32), np.zeros((64, 64), np.float32)
-    labels[20:42, 20:42] = 1
-    for line in (edges[22, 22:40], edges[39, 22:40], edges[22:40, 22], edges[22:40, 39]):
-        line[:] = 3
-    assert (align_boundaries(labels, edges, 3) != labels).any()""",
-    }
+    work = WORK[what].format(data=data, scene=str(Path(data) / "scene.ply"), out=out)
     run = subprocess.run(
-        [sys.executable, "-c", COUNTED.format(work=work[what])], capture_output=True, text=True, check=False
-    )
+        [sys.executable, "-c", COUNTED.format(work=textwrap.indent(work, "    "))],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
     assert run.returncode == 0, run.stderr

@@ -86,7 +86,7 @@ def overlay(image: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.nda
     tints = FILL * colors.astype(np.float32)
     tints[:1] = 0.65 * 30
     lines = np.minimum(1.12 * colors, 255).astype(np.float32)
-    picture: np.ndarray = _tinted(np.array(image), np.array(labels, np.int32), tints, lines)
+    picture: np.ndarray = _tinted(np.array(image, order="C"), np.array(labels, np.int32, order="C"), tints, lines)
     return picture
 
 

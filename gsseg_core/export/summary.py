@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from typing import Any
@@ -12,9 +12,11 @@ import numpy as np
 
 from gsseg_core.data.label_images import IDS, PER_VIEW
 from gsseg_core.data.object_tree import check_granularity
-from gsseg_core.data.view import QUALITIES
+from gsseg_core.data.view import QUALITIES, View
 from gsseg_core.errors import SettingsError
+from gsseg_core.export.class_files import class_places
 from gsseg_core.export.collision import check_collision
+from gsseg_core.export.view_pictures import view_file_name
 from gsseg_core.learn.registry import check_learner, check_seed
 from gsseg_core.objects.oriented_boxes import object_boxes
 from gsseg_core.refine.label_propagation import GraphSettings
@@ -50,6 +52,16 @@ class RunSettings:
     label_map: str | None = None
     quality: str = "full"
     learner_settings: Any = None  # those of the learner, if it has any
+
+    def places(self, class_names: Mapping[int, str], views: Iterable[View]) -> list[str]:
+        """Files that `gsseg segment` writes, as far as they are known before it learns; relative to its folder."""
+        pictures = ["contact_sheet.png", "legend.png", "worst_views.png"]
+        pictures += [view_file_name(view.name, "overlay_") for view in views]
+        classes = class_places(class_names, self.scene_format, self.collision)
+        return [
+            "segmentation.npz", "report.json", "report.html",
+            *(f"classes/{name}" for name in classes), *(f"pictures/{name}" for name in pictures),
+        ]  # fmt: skip
 
     def check(self) -> None:
         """Raise `SettingsError` where they do not go together."""

@@ -1,0 +1,77 @@
+"""Rows of arrays in another order: Gaussians that are near each other in space are to be so in memory."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numba as nb
+import numpy as np
+
+from gsseg_core.kernels.compiler import kernel
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.simd import prefetch
+
+_CELLS = 1 << 10  # along each axis: three numbers of ten bits make one of thirty
+_SAMPLE = 1 << 16  # Gaussians by which the box of the curve is found
+_LINE = 16  # numbers of 32 bits in a cache line
+_AHEAD = 12  # rows between the one that is copied and the one that is fetched from memory
+_TAIL = 1.0  # percent of them on each side that may lie outside, so that a far floater makes no cell large
+
+
+def curve_order(means: np.ndarray) -> np.ndarray:
+    """Order Gaussians along the Z-order curve of Morton (1966); those in one cell stay in their order.
+
+    Trainers leave them in nearly random order, so that each look at a neighbour waits for memory.
+
+    Parameters
+    ----------
+    means : (N, 3) float32
+        Centres, in any unit.
+
+    Returns
+    -------
+    (N,) int64
+        Index of each, first to last along the curve.
+    """
+    low, high = np.percentile(means[:: len(means) // _SAMPLE + 1], (_TAIL, 100 - _TAIL), axis=0)
+    cells = (means - low.astype(np.float32)) * np.float32(_CELLS / max(float((high - low).max()), 1e-30))
+    key = np.zeros(len(means), np.uint32)
+    for axis, place in enumerate(np.clip(cells, 0, _CELLS - 1).astype(np.uint32).T):
+        key |= _spread(place) << np.uint32(axis)
+    # One number for the cell and the index sorts in a quarter of the time that argsort takes.
+    both = np.sort(key.astype(np.uint64) << np.uint64(32) | np.arange(len(means), dtype=np.uint64))
+    return (both & np.uint64(0xFFFFFFFF)).astype(np.int64)
+
+
+def _spread(number: np.ndarray) -> np.ndarray:
+    """Put two zeros before each of the ten bits of numbers, (N,) uint32."""
+    for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):
+        number = (number | number << np.uint32(shift)) & np.uint32(mask)
+    return number
+
+
+def reordered(scene: GaussianScene, order: np.ndarray) -> GaussianScene:
+    """Give a scene whose Gaussian i is Gaussian order[i], (N,) int64, of this one, as `GaussianScene.subset` does."""
+    names, records = ("means", "quats", "scales", "opacities"), scene.vertices
+    arrays: dict[str, Any] = {name: take_rows(getattr(scene, name).reshape(len(scene), -1), order) for name in names}
+    arrays["opacities"] = arrays["opacities"][:, 0]
+    if records.itemsize % 4 or not records.flags.c_contiguous:
+        return replace(scene.subset(order), **arrays)
+    # As numbers that they need not be: they are only copied.
+    vertices = take_rows(records.view(np.float32).reshape(len(scene), -1), order).reshape(-1).view(records.dtype)
+    return replace(scene, vertices=vertices, **arrays)
+
+
+@kernel(parallel=True)
+def take_rows(table: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Copy some rows, (M',), of a table (M, K) of 32 bits; many times as fast as NumPy where they lie anywhere."""
+    out, last = np.empty((chosen.shape[0], table.shape[1]), table.dtype), chosen.shape[0] - 1
+    for m in nb.prange(chosen.shape[0]):
+        later = table[chosen[min(m + _AHEAD, last)]]
+        for j in range(0, table.shape[1], _LINE):
+            prefetch(later, j)
+        row, copy = table[chosen[m]], out[m]
+        for j in range(row.shape[0]):
+            copy[j] = row[j]
+    return out
