@@ -35,11 +35,12 @@ def curve_order(means: np.ndarray) -> np.ndarray:
         Index of each, first to last along the curve.
     """
     low, high = np.percentile(means[:: len(means) // _SAMPLE + 1], (_TAIL, 100 - _TAIL), axis=0)
-    cells = (means - low.astype(np.float32)) * np.float32(_CELLS / max(float((high - low).max()), 1e-30))
+    with np.errstate(over="ignore"):  # What is so far away is in the last cell.
+        cells = (means - low.astype(np.float32)) * np.float32(_CELLS / max(float((high - low).max()), 1e-30))
     key = np.zeros(len(means), np.uint32)
     for axis, place in enumerate(np.clip(cells, 0, _CELLS - 1).astype(np.uint32).T):
         key |= _spread(place) << np.uint32(axis)
-    # One number for the cell and the index sorts in a quarter of the time that argsort takes.
+    # One number for the cell and the index sorts in a fifth of the time that argsort takes.
     both = np.sort(key.astype(np.uint64) << np.uint64(32) | np.arange(len(means), dtype=np.uint64))
     return (both & np.uint64(0xFFFFFFFF)).astype(np.int64)
 
@@ -65,7 +66,7 @@ def reordered(scene: GaussianScene, order: np.ndarray) -> GaussianScene:
 
 @kernel(parallel=True)
 def take_rows(table: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """Copy some rows, (M',), of a table (M, K) of 32 bits; many times as fast as NumPy where they lie anywhere."""
+    """Copy some rows, (M',), of a table (M, K) of 32 bits; several times as fast as NumPy where they lie anywhere."""
     out, last = np.empty((chosen.shape[0], table.shape[1]), table.dtype), chosen.shape[0] - 1
     for m in nb.prange(chosen.shape[0]):
         later = table[chosen[min(m + _AHEAD, last)]]

@@ -32,8 +32,12 @@ def test_each_gaussian_comes_once(count: int, seed: int) -> None:
     assert np.array_equal(np.sort(curve_order(means)), np.arange(count))
 
 
-def test_those_at_one_place_stay_in_their_order() -> None:
-    assert np.array_equal(curve_order(np.ones((50, 3), np.float32)), np.arange(50))
+@pytest.mark.parametrize("far", [1.0, 1e30])
+def test_those_at_one_place_stay_in_their_order_also_with_one_far_away(far: float) -> None:
+    means = np.ones((500, 3), np.float32)
+    means[3] = far
+    expected = np.arange(500) if far == 1 else np.append(np.delete(np.arange(500), 3), 3)
+    assert np.array_equal(curve_order(means), expected)
 
 
 def test_neighbours_are_near_each_other_also_with_a_floater_far_away() -> None:
