@@ -139,16 +139,6 @@ def put_in_order(
     return numbers, new_labels, new_votes
 
 
-@kernel(parallel=True)
-def take(table: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """Copy some rows (M',) of a table (M, K); several times as fast as numpy."""
-    out = np.empty((chosen.shape[0], table.shape[1]), table.dtype)
-    for m in nb.prange(chosen.shape[0]):
-        for j in range(table.shape[1]):
-            out[m, j] = table[chosen[m], j]
-    return out
-
-
 @kernel(parallel=True, fastmath=simd.FAST, error_model="numpy")
 def share(
     tiles: Tiles, labels: Labels, blocks: np.ndarray,  # (E,) of each entry

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsseg_core.raster.cpu import silhouette_kernels
-from gsseg_core.raster.cpu.label_pairs import take
 from gsseg_core.raster.cpu.tiling import Tiles
+from gsseg_core.spatial.row_order import take_rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class ObjectsAlone:
         start, entries, rows = silhouette_kernels.choose(tiles.start, tiles.entries, labels[ids])
         ids, none = ids[rows], np.empty(0, np.int32)
         return cls(ids, labels[ids], tiles._replace(
-            table=take(tiles.table, rows), start=start, entries=entries,
+            table=take_rows(tiles.table, rows), start=start, entries=entries,
             gaussian_start=none.astype(np.int64), gaussian_entries=none,
         ))  # fmt: skip
 

@@ -22,6 +22,7 @@ from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import Blended, PixelGrid, Strongest
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.spatial.row_order import take_rows
 
 
 class TileOperator(ViewOperator):
@@ -163,7 +164,7 @@ class TileObservation(Observation):
         self._number, self.labels, self._votes = label_pairs.put_in_order(
             order, first, self.start, pair_numbers, labels, votes
         )
-        table, none = label_pairs.take(tiles.table, by_row), np.empty(0, np.int64)
+        table, none = take_rows(tiles.table, by_row), np.empty(0, np.int64)
         self._tiles = tiles._replace(
             table=table, start=start, entries=entries, gaussian_start=none, gaussian_entries=none.astype(np.int32)
         )
