@@ -26,6 +26,7 @@ class NodeExecutor(Executor):
         super().__init__(context=node.context)
         self._log = node.get_logger()
         self._pool = ThreadPoolExecutor(THREADS, "callback")
+        self._heard = True
         self.add_node(node)
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
@@ -42,9 +43,14 @@ class NodeExecutor(Executor):
         self._pool.shutdown()
         return super().shutdown(timeout_sec)
 
+    def silence(self) -> None:
+        """Log nothing any more: the node is taken away from callbacks that cannot be waited for."""
+        self._heard = False
+
     def _run(self, task: Task) -> None:
         try:
             task()
             task.result()
         except Exception as error:
-            self._log.error(describe(error))
+            if self._heard:
+                self._log.error(describe(error))

@@ -332,6 +332,7 @@ def main(args: list[str] | None = None) -> int:
     finally:
         if node.configuring:
             # There is nothing yet that could be lost, and no way to stop a compiler.
+            executor.silence()
             node.destroy_node()
             os._exit(0)
         starting.join(STOP_SECONDS)

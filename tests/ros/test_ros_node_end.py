@@ -9,10 +9,12 @@ import signal
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from patience import PATIENCE
 from ros_fixtures import node_fixture, parameters_fixture, root_fixture  # noqa: F401
 from ros_helpers import Ros, ros_fixture  # noqa: F401
 from ros_robot import Goal, Robot, core_session, renamed
@@ -71,6 +73,29 @@ def test_the_last_callback_has_ended_before_the_node_goes(node: SegmentNode) -> 
         patch.setattr(node, "close", lambda: order.append("node"))
         segment_node._end(executor, node)
     assert order == ["callback", "node"]
+
+
+@pytest.mark.parametrize("silent", [False, True])
+def test_what_a_callback_meets_that_the_node_leaves_behind_is_not_complained_of(
+    node: SegmentNode, monkeypatch: pytest.MonkeyPatch, silent: bool
+) -> None:
+    said: list[str] = []
+    executor, begun, gone = NodeExecutor(node), threading.Event(), threading.Event()
+    monkeypatch.setattr(executor, "_log", SimpleNamespace(error=said.append))
+
+    def callback() -> None:
+        begun.set()
+        assert gone.wait(PATIENCE)
+        raise ValueError("the node is gone")
+
+    executor.create_task(callback)
+    while not begun.is_set():
+        executor.spin_once(0.1)
+    if silent:
+        executor.silence()
+    gone.set()
+    executor.shutdown()
+    assert len(said) == (not silent)
 
 
 @pytest.fixture(scope="module")
