@@ -96,7 +96,8 @@ class MaskChecker:
     def sample(self, view: View) -> Sample:
         """Take pixels of a view's mask with their predicted probabilities, to fit the temperature to."""
         if view.name not in self._samples:
-            self._predict(view, view.read_seen())
+            seen = view.read_seen()
+            self._predict(view, seen, _compared(seen.labels))
         return self._samples[view.name]
 
     def check_all(self, progress: Progress = silent) -> list[ViewCheck]:
@@ -124,7 +125,7 @@ class MaskChecker:
         learner, seen = self.learner, view.read_seen()
         wanted = _compared(seen.labels)
         sampled = view.name in self._sampled
-        predicted = self._predict(view, seen) if sampled else learner.classes_without(view, wanted)
+        predicted = self._predict(view, seen, wanted) if sampled else learner.classes_without(view, wanted)
         predicted[~wanted] = UNKNOWN
         check = compare_mask(view, predicted, learner.num_classes, seen)
         return replace(check, rejected=learner.rejected_share(view))
@@ -134,9 +135,9 @@ class MaskChecker:
         labelled = view.read_seen().labels >= 0
         return PackedLabels(self.learner.classes_without(view, labelled if labelled.all() else None))
 
-    def _predict(self, view: View, seen: SeenLabels) -> np.ndarray:
+    def _predict(self, view: View, seen: SeenLabels, wanted: np.ndarray) -> np.ndarray:  # (H, W) bool
         """Tell the class of each pixel that is compared, (H, W) int32, and keep the probabilities of some."""
-        grid, wanted = grid_of(view.camera.height, view.camera.width), _compared(seen.labels)
+        grid = grid_of(view.camera.height, view.camera.width)
         found = self.learner.strongest_without(view, wanted, grid)
         self._samples[view.name] = sample_grid(found.some, grid.of(np.where(wanted, seen.named(), UNKNOWN)))
         return found.labels()
