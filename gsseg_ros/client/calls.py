@@ -17,6 +17,9 @@ from gsseg_ros.errors import NodeUnavailableError, SegmentationError, error_name
 GRACE_SECONDS = 3.0
 """For an answer on its way from a node that has just ended."""
 
+ASK_SECONDS = 2.0
+"""Until a question is asked again."""
+
 CANCEL_SECONDS = 5.0
 """How long a goal that is given up may take to end."""
 
@@ -56,6 +59,24 @@ class Calls:
         finally:
             client.remove_pending_request(answer)
 
+    def ask(self, client: Any, question: Any, deadline: float) -> Any:
+        """Ask what changes nothing, again and again; None if there is no answer by the deadline, or the service goes.
+
+        An answer to someone the node has not heard of yet is lost, and the node may have been started anew meanwhile.
+        """
+        while time.monotonic() < deadline and client.service_is_ready():
+            answer = self._asked(client, question, min(ASK_SECONDS, deadline - time.monotonic()))
+            if answer.done():
+                return answer.result()
+        return None
+
+    def _asked(self, client: Any, question: Any, seconds: float) -> Any:
+        """Ask once, and wait so long; returns the future of the answer."""
+        answer = self.spinner.run(lambda: client.call_async(question))
+        self.spinner.wait_for(lambda: answer.done() or not client.service_is_ready(), seconds)
+        client.remove_pending_request(answer)
+        return answer
+
     def find(self, ready: Callable[[], bool], what: str, timeout: float) -> None:
         """Wait until a service or action of the node is there; raises `NodeUnavailableError`."""
         timeout = min(timeout, self.find_timeout)
@@ -86,10 +107,12 @@ class Calls:
         """
         in_time = self.spinner.wait_for(lambda: settled() or not ready(), deadline - time.monotonic())
         if not settled() and not self.spinner.wait_for(settled, GRACE_SECONDS if in_time else 0.0):
-            why = "went away" if in_time else "did not answer in time"
-            raise NodeUnavailableError(
-                f"{self.node_name} {why} during {what}; check its log, and whether it still runs"
-            )
+            raise self.unanswered(what, gone=in_time)
+
+    def unanswered(self, what: str, gone: bool) -> NodeUnavailableError:
+        """Make the error for a request that the node did not answer, as it is gone or in time."""
+        why = "went away" if gone else "did not answer in time"
+        return NodeUnavailableError(f"{self.node_name} {why} during {what}; check its log, and whether it still runs")
 
 
 class LearnGoal:

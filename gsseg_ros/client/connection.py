@@ -34,8 +34,8 @@ _SERVICES = {
     MergeStates: "merge_states", GetState: "get_state",
 }  # fmt: skip
 
-ASK_SECONDS, POLL_SECONDS = 2.0, 0.2
-"""Until a question for the node's state is asked again, unanswered and answered."""
+POLL_SECONDS = 0.2
+"""Until the node's state is asked for again."""
 
 
 Self = TypeVar("Self", bound="Connection")
@@ -91,14 +91,12 @@ class Connection:
         if not self._spinner.wait_for(client.service_is_ready, timeout):
             raise self._calls.absent(f"service {client.srv_name}", timeout)
         while time.monotonic() < deadline:
-            # Asked again and again, for the node may have been started anew meanwhile.
-            asked = self._spinner.run(lambda: client.call_async(GetState.Request()))
-            if self._spinner.wait_for(asked.done, min(ASK_SECONDS, deadline - time.monotonic())):
-                state = asked.result().current_state.label
-                if asked.result().current_state.id == State.PRIMARY_STATE_ACTIVE:
+            told = self._calls.ask(client, GetState.Request(), deadline)
+            if told is not None:
+                state = told.current_state.label
+                if told.current_state.id == State.PRIMARY_STATE_ACTIVE:
                     return
-                self._spinner.wait_for(lambda: False, min(POLL_SECONDS, deadline - time.monotonic()))
-            client.remove_pending_request(asked)
+            self._spinner.wait_for(lambda: False, min(POLL_SECONDS, deadline - time.monotonic()))
         raise NodeUnavailableError(
             f"{self._name} is {state} after {timeout:g} s; expected active: its log says why it could not be "
             "configured, or it waits for a lifecycle manager (parameter autostart)"

@@ -155,10 +155,11 @@ class RosSource:
     def _similarity(self) -> Similarity:
         client = self._spinner.node.create_client(GetParameters, f"{self._name}/get_parameters")
         self._calls.find(client.service_is_ready, f"service {client.srv_name}", ANSWER_SECONDS)
-        deadline = time.monotonic() + ANSWER_SECONDS  # Not of what it took to find it.
-        asked = self._spinner.run(lambda: client.call_async(GetParameters.Request(names=list(_PARAMETERS))))
-        self._calls.settle(asked.done, client.service_is_ready, client.srv_name, deadline)
-        scale, translation, rotation = (_value(value) for value in asked.result().values)
+        question = GetParameters.Request(names=list(_PARAMETERS))
+        told = self._calls.ask(client, question, time.monotonic() + ANSWER_SECONDS)
+        if told is None:
+            raise self._calls.unanswered(client.srv_name, gone=not client.service_is_ready())
+        scale, translation, rotation = (_value(value) for value in told.values)
         return Similarity.from_parameters(scale, translation, rotation)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:

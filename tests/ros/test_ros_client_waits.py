@@ -7,7 +7,11 @@ import subprocess
 import sys
 import textwrap
 import threading
+import time
+from concurrent.futures import Future
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,6 +38,29 @@ import rclpy
 from gsseg_msgs.srv import Reset
 
 from gsseg_ros.client import NodeUnavailableError, SegmentationClient, SegmentationError
+from gsseg_ros.client.calls import Calls
+
+
+def test_a_question_whose_answer_is_lost_is_asked_again_for_as_long_as_the_node_is_there() -> None:
+    asked: list[Future] = []
+
+    def call_async(question: str) -> Future:
+        assert question == "well?"
+        asked.append(Future())
+        if len(asked) == 3:
+            asked[-1].set_result("yes")
+        return asked[-1]
+
+    ready = iter([True] * 99)
+    client = SimpleNamespace(
+        service_is_ready=lambda: next(ready, False), call_async=call_async, remove_pending_request=lambda _: None
+    )
+    spinner: Any = SimpleNamespace(run=lambda call: call(), wait_for=lambda settled, seconds: settled())
+    calls = Calls(spinner, "/gsseg", 1.0)
+    assert calls.ask(client, "well?", time.monotonic() + PATIENCE) == "yes" and len(asked) == 3
+    ready = iter([True] * 4)
+    assert calls.ask(client, "well?", time.monotonic() + PATIENCE) is None
+    assert calls.ask(client, "well?", time.monotonic()) is None
 
 
 def test_cancel_from_another_thread_ends_learning_and_changes_nothing(learnt: Place) -> None:
