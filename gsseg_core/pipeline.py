@@ -10,8 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from gsseg_core.align.placing import Placed, place
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.hints import mask_hint
@@ -50,7 +48,7 @@ from gsseg_core.report.sections import PageInputs
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_writers import DEFAULT as DEFAULT_FORMAT
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.spatial.row_order import curve_order, reordered
+from gsseg_core.spatial.row_order import curve_order, inverse, reordered
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -177,8 +175,8 @@ def segment(
                 )
             with watch.stage("load"):
                 # Workers find the scene in files of their own, in the order that it has there.
-                order = curve_order(scene.means) if client is None else np.arange(len(scene))
-                inputs = _inputs(reordered(scene, order), placed, settings)
+                order = curve_order(scene.means) if client is None else None
+                inputs = _inputs(scene if order is None else reordered(scene, order), placed, settings)
                 del scene
             if settings.ids == PER_VIEW:
                 with watch.stage("associate"):
@@ -208,10 +206,10 @@ def segment(
         with watch.stage("refine"):
             result = result.calibrated(assessment.calibration.temperature)
             result = inputs.objects.with_tree(result) if inputs.objects else result
-            places = np.empty_like(order)
-            places[order] = np.arange(len(order))
-            inputs = replace(inputs, scene=reordered(inputs.scene, places))
-            result = result.in_order_of(inputs.scene, places)
+            if order is not None:
+                places = inverse(order)
+                inputs = replace(inputs, scene=reordered(inputs.scene, places))
+                result = result.in_order_of(inputs.scene, places)
         with ExitStack() as writing:
             behind = writing.enter_context(writing_behind())
             report = _write(run, inputs, assessment, result, drawn, settings, watch, behind)

@@ -194,8 +194,8 @@ def save_png(path: str | Path, image: np.ndarray, run: str | None = None) -> Non
         The file cannot be written.
     """
     with write_atomically(path) as temporary:
-        # Two fifths of the time of Pillow's own level, and files 7 % larger.
-        Image.fromarray(image).save(temporary, format="PNG", compress_level=4, pnginfo=run_text(run))
+        # Two fifths of the time of Pillow's own level, and files 10 to 20 % larger.
+        Image.fromarray(image).save(temporary, format="PNG", compress_level=2, pnginfo=run_text(run))
 
 
 def outline(labels: np.ndarray) -> np.ndarray:

@@ -52,6 +52,13 @@ def _spread(number: np.ndarray) -> np.ndarray:
     return number
 
 
+def inverse(order: np.ndarray) -> np.ndarray:  # (N,) int64
+    """Tell which place each index has in an order, (N,) int64."""
+    places = np.empty_like(order)
+    places[order] = np.arange(len(order))
+    return places
+
+
 def reordered(scene: GaussianScene, order: np.ndarray) -> GaussianScene:
     """Give a scene whose Gaussian i is Gaussian order[i], (N,) int64, of this one, as `GaussianScene.subset` does."""
     names, records = ("means", "quats", "scales", "opacities"), scene.vertices
