@@ -36,7 +36,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.two_at_once import two_at_once
 
 STEPS = 2  # of the shares: all move at once and so overshoot; on held-out views five were no better
-KEPT = 0.5  # least share with which a Gaussian stays with its object, of the largest share in that object
+KEPT = 0.4  # least share with which a Gaussian stays with its object, of the largest share in that object
 _LEAST = np.float32(0.01)  # of a share, so that a Gaussian may come back
 _MEMORY = 2 << 30  # bytes of projected views that are kept between the steps; others are projected anew
 
