@@ -51,10 +51,10 @@ A mask passes through the files of `gsseg_core` that one small run enters, from 
 back to where a call enters it from a room that lies below its own. The time of `gsseg --help` is the best of five,
 without the start of Python itself; heavy are numba, scipy and torch.
 
-Stages are those of the last committed BENCHMARK.json against the one before it; the five worst are named. Times mean
-two idle cores; what processors worked stands beside them, and two cores need half of that at least. Labels of the demo
-cannot be those of before the rooms any more, since its scene, the learner and the refinement are others;
-docs/results.md has what they score.
+Stages are those of the last committed BENCHMARK.json against the last before it on such a processor; the five worst are
+named. Times mean two idle cores; what processors worked stands beside them, and two cores need half of that at least.
+Labels of the demo cannot be those of before the rooms any more, since its scene, the learner and the refinement are
+others; docs/results.md has what they score.
 """
 
 
@@ -87,7 +87,7 @@ def measured() -> dict[str, str]:
                 _listed(climbed),
                 f"{seconds:.2f}",
                 _listed(heavy),
-                _listed(slower_stages(), 5),
+                _slower_stages(),
             ),
             strict=True,
         )
@@ -202,19 +202,24 @@ def help_start() -> tuple[float, list[str]]:
     return seconds, loaded.stdout.split()
 
 
-def slower_stages() -> list[str]:
-    """List what took longer in the last committed BENCHMARK.json than in the one before it, the worst first."""
+def _slower_stages() -> str:
+    """Tell what took longer in the last committed BENCHMARK.json than before on such a processor, the worst first."""
 
     def git(*command: str) -> str:
         return subprocess.run(["git", *command], cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout
 
+    commits = git("log", "--format=%H", "--", "BENCHMARK.json").split()
+    runs = (json.loads(git("show", f"{commit}:BENCHMARK.json")) for commit in commits)
+    last = next(runs)
+    earlier = next((run for run in runs if run["machine"]["processor"] == last["machine"]["processor"]), None)
+    if earlier is None:
+        return f"no earlier run on {last['machine']['processor']}"
     now, before = (
-        {(row["section"], row["name"]): row["value"] for row in json.loads(file)["rows"] if row["unit"] == "s"}
-        for file in (git("show", f"{commit}:BENCHMARK.json")
-                     for commit in git("log", "-2", "--format=%H", "--", "BENCHMARK.json").split())
-    )  # fmt: skip
+        {(row["section"], row["name"]): row["value"] for row in run["rows"] if row["unit"] == "s"}
+        for run in (last, earlier)
+    )
     ratios = sorted(((now[key] / before[key], key) for key in now.keys() & before.keys() if before[key]), reverse=True)
-    return [f"{name} ({section}) {ratio:.2f}" for ratio, (section, name) in ratios if ratio > SLOWER]
+    return _listed([f"{name} ({section}) {ratio:.2f}" for ratio, (section, name) in ratios if ratio > SLOWER], 5)
 
 
 def times_of_tests(run: bool) -> dict[str, str]:
