@@ -215,8 +215,8 @@ which others hid a part, show in full, and so do those just under a neighbour's 
 
 Carving takes two steps ([method.md](method.md#refinement)). All shares move at once and overshoot, so that five, as
 there were, are no better on held-out views, and take two and a half times the CPU time: 0.93 s against 0.39 s on the
-demo, 1.41 s against 0.55 s in the apartment. Visible IoU from wrong masks, five steps and two, both with the share of 0.5 that Gaussians
-had to keep then.
+demo, 1.41 s against 0.55 s in the apartment. Visible IoU from wrong masks, five steps and two, when a Gaussian had to
+keep 0.5 of the largest share, not 0.4 as now:
 
 | views | demo | apartment | shelf | kitchen_table | workbench |
 | --- | --- | --- | --- | --- | --- |
