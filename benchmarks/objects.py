@@ -20,7 +20,6 @@ from machine import DATA, REPOSITORY
 from object_ceiling import best_selection
 from object_scores import ObjectScores, objects_of
 from results import machine, markdown, points
-from straddlers import split, straddlers
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View, spread
@@ -31,7 +30,7 @@ from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.depth import surface
 from gsseg_core.refine.settings import PAPER, UNREFINED, RefineSettings
-from gsseg_core.refine.silhouette_carving import Silhouette, kept_shares, sticking_out
+from gsseg_core.refine.silhouette_carving import Silhouette, carve
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
@@ -41,12 +40,11 @@ WITHOUT_VIEWS = {
     "KNN + filter (paper)": PAPER,
 }
 SCENES = ("replica_apartment", "shelf", "kitchen_table", "workbench")
-CARVED, SPLIT = "KNN + carving", "KNN + straddlers split + carving"
-CEILINGS = {"KNN": "KNN + chosen by the truth", SPLIT: "KNN + straddlers split + chosen by the truth"}
+CARVED, CEILING = "KNN + carving", "KNN + chosen by the truth"
 HELD_OUT = slice(3, None, 7)
 
-Parts = dict[str, tuple[GaussianScene, np.ndarray]]
-"""By way of refinement: a scene, and the label of each of its Gaussians."""
+Labels = dict[str, np.ndarray]
+"""By way of refinement: the label of each Gaussian, (N,) int32."""
 
 
 def main() -> int:
@@ -102,52 +100,35 @@ def measure(
             scored = [view for view in truth.views("train") if view.name in names]
         learner = EMLearner(scene, data.num_classes)
         learner.observe_all(train)
-        parts, halves = refined(scene, learner.fit().codes_, data.class_names, train)
-        scores = score(parts | ceilings(parts, scene, halves, scored), scene, data.num_classes, scored)
+        labels = refined(scene, learner.fit().codes_, data.class_names, train)
+        labels[CEILING] = best_selection(scene, labels["KNN"], scored, scene)
+        scores = score(labels, scene, data.num_classes, scored)
         for way, both in scores.items():
             values = [(each.iou, each.boundary_iou) for each in (both.visible, both.whole)]
             figures = [points(float(np.nanmean(value))) for pair in values for value in pair]
             rows.append([name, kind, way, *figures])
             print(*rows[-1], sep=", ", flush=True)
         shown = pictures if (name, kind) == ("demo", "wrong") else REPOSITORY / "results_out"
-        draw(parts, truth.class_names, scores, scored, shown / f"objects_{name}_{kind}.png")
+        draw(labels, scene, truth.class_names, scores, scored, shown / f"objects_{name}_{kind}.png")
     return rows
 
 
-def refined(
-    scene: GaussianScene, codes: np.ndarray, names: dict[int, str], train: Sequence[View]
-) -> tuple[Parts, np.ndarray]:
-    """Make every kind of refinement from the same codes; and the labels of the halves before they were carved."""
-    parts: Parts = {}
-    for way, settings in WITHOUT_VIEWS.items():
-        parts[way] = scene, Segmentation.from_codes(scene, codes, names, settings).labels
-    clustered = Segmentation.from_codes(scene, codes, names, WITHOUT_VIEWS["KNN"])
+def refined(scene: GaussianScene, codes: np.ndarray, names: dict[int, str], train: Sequence[View]) -> Labels:
+    """Make every kind of refinement from the same codes."""
+    made = {way: Segmentation.from_codes(scene, codes, names, settings) for way, settings in WITHOUT_VIEWS.items()}
+    labels, clustered = {way: each.labels for way, each in made.items()}, made["KNN"]
     silhouettes = []
     for view in spread(train, RefineSettings.carve_views):
         operator = make_operator(scene, view.camera)
         silhouettes.append(Silhouette.of(scene, operator, clustered.label_map(operator)))
-    found = kept_shares(scene, clustered.labels, silhouettes)
-    parts[CARVED] = scene, np.where(sticking_out(found.kept, clustered.labels), -2, clustered.labels)
-    halves, parents = split(scene, straddlers(found))
-    labels = clustered.labels[parents]
-    kept = kept_shares(halves, labels, silhouettes).kept
-    parts[SPLIT] = halves, np.where(sticking_out(kept, labels), -2, labels)
-    return parts, labels
+    labels[CARVED] = np.where(carve(scene, clustered.labels, silhouettes), -2, clustered.labels)
+    return labels
 
 
-def ceilings(parts: Parts, scene: GaussianScene, halves: np.ndarray, views: Sequence[View]) -> Parts:
-    """Choose Gaussians, and halves, by the truth of the very views that score them."""
-    labels = {"KNN": parts["KNN"][1], SPLIT: halves}
-    return {
-        name: (parts[way][0], best_selection(parts[way][0], labels[way], views, scene))
-        for way, name in CEILINGS.items()
-    }
-
-
-def score(parts: Parts, scene: GaussianScene, num_classes: int, views: Sequence[View]) -> dict[str, ObjectScores]:
+def score(labels: Labels, scene: GaussianScene, num_classes: int, views: Sequence[View]) -> dict[str, ObjectScores]:
     """Score the objects of each way in some views."""
-    objects = {way: objects_of(*part) for way, part in parts.items()}
-    scores = {way: ObjectScores(num_classes) for way in parts}
+    objects = {way: objects_of(scene, each) for way, each in labels.items()}
+    scores = {way: ObjectScores(num_classes) for way in labels}
     for view in views:
         depth, truth = surface(scene, make_operator(scene, view.camera)).depth, view.read_labels()
         for way, each in objects.items():
@@ -156,8 +137,9 @@ def score(parts: Parts, scene: GaussianScene, num_classes: int, views: Sequence[
 
 
 def draw(
-    parts: Parts, names: dict[int, str], scores: dict[str, ObjectScores], views: Sequence[View], path: Path
-) -> None:
+    labels: Labels, scene: GaussianScene, names: dict[int, str], scores: dict[str, ObjectScores],
+    views: Sequence[View], path: Path,
+) -> None:  # fmt: skip
     """Draw the objects that carving changes most, alone: without, with the paper's steps, carved."""
     ways = ("no refinement", "KNN + filter (paper)", CARVED)
     gain = np.nan_to_num(np.abs(scores[CARVED].visible.iou - scores[ways[0]].visible.iou))
@@ -165,8 +147,7 @@ def draw(
     for label in np.argsort(-gain, kind="stable")[:3].tolist():
         view = max(views, key=lambda one: int((one.read_labels() == label).sum()))
         for way in ways:
-            scene, labels = parts[way]
-            chosen = scene.subset(labels == label)
+            chosen = scene.subset(labels[way] == label)
             images.append(background_image(chosen, make_operator(chosen, view.camera)))
             captions.append(f"{names[label]}: {way}")
     save_png(path, contact_sheet(images, captions, len(ways)))
@@ -209,9 +190,6 @@ which others hid a part, show in full, and so do those just under a neighbour's 
   maps that the segmentation itself renders, so errors of single masks carve nothing away; no retraining. What no view
   reaches stays, and no object goes as a whole. Where objects touch, it may take a little of the object itself: see the
   foot of the can.
-- **Splitting straddlers** (`benchmarks/straddlers.py`) puts two halves in place of each Gaussian that both fills its
-  object and sticks out, and has each carved by itself. It changes the Gaussians of the scene, so it is no part of
-  the command.
 
 Carving takes two steps ([method.md](method.md#refinement)). All shares move at once and overshoot, so that five, as
 there were, are no better on held-out views, and take two and a half times the CPU time: 0.93 s against 0.39 s on the
@@ -235,10 +213,10 @@ apartment's. No way of weighing views, ends and axes that was tried gained visib
 
 ## How much there is to gain
 
-The rows **chosen by the truth** are no refinement. There each object keeps those of its own Gaussians, or of their
-halves, whose silhouettes fit the true masks of the scored views best: the headroom of any choice among them, with no
-retraining. `benchmarks/object_ceiling.py` goes through the Gaussians one after the other and stops at a local optimum,
-so a better choice may exist; and it fits the visible score only.
+The rows **chosen by the truth** are no refinement. There each object keeps those of its own Gaussians whose silhouettes
+fit the true masks of the scored views best: the headroom of any choice among them, with no retraining.
+`benchmarks/object_ceiling.py` goes through the Gaussians one after the other and stops at a local optimum, so a better
+choice may exist; and it fits the visible score only.
 
 What is lost in the demo is a rim less than a pixel wide around each object, since discs on a curved surface stick out
 at its outline, and from wrong masks some of the table at an object's foot. Carving cannot see the rim: the label maps

@@ -69,17 +69,9 @@ class Silhouette(NamedTuple):
         return cls(camera, labels.astype(np.int32), depth, operator if isinstance(operator, TileOperator) else None)
 
 
-class KeptShares(NamedTuple):
-    """Share of each Gaussian that its object keeps, and the reasons for it at the last step, in px: (N,) float64."""
-
-    kept: np.ndarray  # 0.01 to 1; 1 where it has no object or no view says anything
-    stay: np.ndarray  # as when the share was last in question; 0 where there is no reason to go
-    go: np.ndarray
-
-
 def kept_shares(
     scene: GaussianScene, labels: np.ndarray, silhouettes: Iterable[Silhouette], steps: int = STEPS
-) -> KeptShares:
+) -> np.ndarray:
     """Find how much of each Gaussian its object should keep.
 
     Parameters
@@ -92,6 +84,11 @@ def kept_shares(
         Views.
     steps : int
         How often to go through them, at least 1.
+
+    Returns
+    -------
+    (N,) float64
+        0.01 to 1; 1 where it has no object or no view says anything.
     """
     views = _ObjectViews(scene, np.ascontiguousarray(labels, np.int32))
     go, kept, stay = np.zeros(len(scene)), np.ones(len(scene)), np.zeros(len(scene))
@@ -108,7 +105,7 @@ def kept_shares(
         if step == 0:
             # The less is kept, the more reason there is to stay: who stays beside all others stays beside fewer.
             asked &= kept < 1
-    return KeptShares(kept, stay, go)
+    return kept
 
 
 def _reasons_to_stay(
@@ -153,7 +150,7 @@ def carve(scene: GaussianScene, labels: np.ndarray, silhouettes: Iterable[Silhou
 
     Results depend neither on the order of the Gaussians nor on the number of threads.
     """
-    return sticking_out(kept_shares(scene, labels, silhouettes).kept, labels)
+    return sticking_out(kept_shares(scene, labels, silhouettes), labels)
 
 
 def sticking_out(kept: np.ndarray, labels: np.ndarray) -> np.ndarray:  # (N,), (N,) int32

@@ -1,4 +1,4 @@
-"""Extracted objects: their silhouettes, what is carved away, halves of straddlers, and the scene without them."""
+"""Extracted objects: their silhouettes, what is carved away, and the scene without them."""
 
 from __future__ import annotations
 
@@ -25,12 +25,11 @@ from small_scenes import (
     true_labels,
     write_dataset,
 )
-from straddlers import DISTANCE, half_opacity, split, straddlers
 
 from gsseg_core.cli.main import main
 from gsseg_core.data.class_names import class_ids
 from gsseg_core.data.view import View
-from gsseg_core.errors import EmptySceneError, MaskSizeError, SceneValueError, SettingsError
+from gsseg_core.errors import EmptySceneError, MaskSizeError, SettingsError
 from gsseg_core.export.class_files import export_classes
 from gsseg_core.objects.removal import without_objects
 from gsseg_core.raster.backends import make_operator
@@ -105,8 +104,8 @@ def test_shares_agree_with_their_slow_twin() -> None:
         shown[:10] = -1
         views.append(Silhouette.of(scene, make_operator(scene, camera), shown))
     result = kept_shares(scene, labels, views, steps=3)
-    np.testing.assert_allclose(result.kept, slow_shares(scene, labels, views, 3), atol=2e-3)
-    assert (result.kept < 0.5).any() and (result.kept == 1).any()
+    np.testing.assert_allclose(result, slow_shares(scene, labels, views, 3), atol=2e-3)
+    assert (result < 0.5).any() and (result == 1).any()
 
 
 def test_carving_takes_the_fringe_away_and_leaves_the_objects() -> None:
@@ -145,7 +144,7 @@ def test_an_object_of_one_gaussian_that_sticks_out_stays() -> None:
     camera = look_at("above", np.array([0.1, 0.1, 3.5]), 120, 90, 125.0)
     shown = true_labels(scene, truth, camera)
     shares = kept_shares(scene, truth, [Silhouette.of(scene, make_operator(scene, camera), shown)], steps=5)
-    assert (shares.kept[1:] < 0.5).any() and not sticking_out(shares.kept, truth).any()
+    assert (shares[1:] < 0.5).any() and not sticking_out(shares, truth).any()
 
 
 def test_background_and_what_no_view_sees_is_never_carved() -> None:
@@ -202,62 +201,6 @@ def test_a_label_map_of_another_size_is_refused() -> None:
     camera = ring(1)[0]
     with pytest.raises(MaskSizeError, match=rf"view0.*shape \(3, 4\); expected \({HEIGHT}, {WIDTH}\)"):
         Silhouette.of(SCENE, make_operator(SCENE, camera), np.zeros((3, 4), np.int32))
-
-
-def test_halves_cover_what_the_whole_did_at_every_opacity() -> None:
-    o = np.linspace(0.001, 0.99, 400)[:, None]
-    x = np.linspace(-8, 8, 1601)
-    whole, variance = o * np.exp(-(x**2) / 2), 1 - DISTANCE**2
-    ahead, back = (half_opacity(o) * np.exp(-((x - sign * DISTANCE) ** 2) / (2 * variance)) for sign in (-1, 1))
-    halves = 1 - (1 - ahead) * (1 - back)
-    np.testing.assert_allclose(halves.sum(axis=1), whole.sum(axis=1), rtol=1e-6)
-    error = np.abs(halves - whole).max(axis=1)
-    assert error[o[:, 0] <= 0.5].max() < 0.04 and error.max() < 0.17
-    assert (half_opacity(o) < 0.7).all() and (half_opacity(o) > 0).all()
-
-
-@settings(max_examples=10)
-@given(seed=st.integers(0, 10**6))
-def test_a_picture_of_split_gaussians_is_that_of_whole_ones(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    scene = GaussianScene.from_arrays(
-        np.zeros((1, 3)), rng.normal(size=(1, 4)), rng.uniform(0.1, 0.5, (1, 3)), rng.uniform(0.1, 0.99, 1),
-        np.zeros((1, 1, 3)),
-    )  # fmt: skip
-    camera = look_at("near", np.array([0.0, -3.0, 1.0]))
-    halves, parents = split(scene, np.array([True]))
-    assert parents.tolist() == [0, 0] and len(halves) == 2
-    pictures = [make_operator(each, camera).transmittance() for each in (scene, halves)]
-    np.testing.assert_allclose(*pictures, atol=0.18)
-    # Mass and variance along the axis stay where they were.
-    np.testing.assert_allclose(halves.means.mean(axis=0), scene.means[0], atol=1e-6)
-    longest = scene.scales.max()
-    offset = np.linalg.norm(halves.means[0] - halves.means[1]) / 2
-    np.testing.assert_allclose(
-        halves.scales[0].astype(float)[scene.scales[0].argmax()] ** 2 + offset**2, longest**2, rtol=1e-5
-    )
-
-
-def test_a_split_scene_is_a_valid_ply_and_the_others_are_untouched(tmp_path: Path) -> None:
-    which = LABELS == 2
-    halves, parents = split(SCENE, which)
-    halves.save(tmp_path / "split.ply")
-    read = GaussianScene.load(tmp_path / "split.ply")
-    for name in ("means", "scales", "opacities", "quats"):
-        np.testing.assert_allclose(getattr(read, name), getattr(halves, name), rtol=1e-5, atol=1e-7)
-    np.testing.assert_array_equal(halves.vertices[: len(SCENE)][~which], SCENE.vertices[~which])
-    np.testing.assert_array_equal(parents, np.concatenate([np.arange(len(SCENE)), np.flatnonzero(which)]))
-    assert len(split(SCENE, np.zeros(len(SCENE), bool)).scene) == len(SCENE)
-    with pytest.raises(SceneValueError, match=r"shape \(3,\).*expected \(\d+,\), bool"):
-        split(SCENE, np.ones(3, bool))
-
-
-def test_straddlers_have_reasons_for_both() -> None:
-    scene, labels, fringe = with_fringe()
-    result = kept_shares(scene, labels, silhouettes())
-    found = straddlers(result)
-    assert found.any() and not found[labels <= 0].any()
-    assert (np.minimum(result.stay, result.go)[found] >= 2).all() and found[~fringe].mean() < 0.2
 
 
 def segmentation() -> Segmentation:
