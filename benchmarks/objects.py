@@ -155,10 +155,11 @@ def draw(
 
 TEXT = """# Objects cut out of the scene
 
-Made by `python benchmarks/objects.py`, which measures everything here again. Machine: {machine}.
+Made by `python benchmarks/objects.py`, which measures everything here again.
+Machine: {machine}.
 
-Learnt by `em` from the train views, with true masks and with wrong ones (the demo's own, and `labels_noisy`
-of the others); scored in the {views} against the true masks. Settings were chosen on train views that were held out
+Learnt by `em` from the train views, with true masks and with wrong ones (the demo's own, and `labels_noisy` of the
+others); scored in the {views} against the true masks. Settings were chosen on train views that were held out
 from learning, as `--held-out` does it.
 
 {table}
@@ -188,8 +189,7 @@ which others hid a part, show in full, and so do those just under a neighbour's 
 - **Carving** (the default, `gsseg_core.refine.silhouette_carving`) drops the Gaussians that stick out of the
   silhouettes in 24 train views, unless the object would have holes without them. The silhouettes are those of the label
   maps that the segmentation itself renders, so errors of single masks carve nothing away; no retraining. What no view
-  reaches stays, and no object goes as a whole. Where objects touch, it may take a little of the object itself: see the
-  foot of the can.
+  reaches stays, and no object goes as a whole. Where objects touch, it may take a little of the object itself.
 
 Carving takes two steps ([method.md](method.md#refinement)). All shares move at once and overshoot, so that five, as
 there were, are no better on held-out views, and take two and a half times the CPU time: 0.93 s against 0.39 s on the
@@ -228,8 +228,9 @@ that it goes by have the same one.
 gsseg remove scene.ply --segmentation out/segmentation.npz --class chair --out without_chair.ply
 ```
 
-Writes a valid 3DGS PLY; in Python it is `gsseg_core.objects.removal.without_objects`. The objects' PLYs and what is
-left make up the scene, Gaussian for Gaussian. What an object hid, no camera has seen: holes are left as they are.
+Writes a valid 3DGS PLY, or another [format](formats.md) by the suffix of `--out` or by `--format`; in Python it is
+`gsseg_core.objects.removal.without_objects`. The objects' PLYs and what is left make up the scene, Gaussian for
+Gaussian. What an object hid, no camera has seen: holes are left as they are.
 Gaussians that refinement took out of an object stay in the scene.
 """
 
