@@ -22,7 +22,7 @@ from object_scores import ObjectScores, objects_of
 from results import machine, markdown, points
 
 from gsseg_core.data.dataset import Dataset
-from gsseg_core.data.view import View, spread
+from gsseg_core.data.view import View
 from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.export.pictures import contact_sheet, save_png
 from gsseg_core.export.view_pictures import background_image
@@ -30,7 +30,6 @@ from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.depth import surface
 from gsseg_core.refine.settings import PAPER, UNREFINED, RefineSettings
-from gsseg_core.refine.silhouette_carving import Silhouette, carve
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
@@ -116,13 +115,8 @@ def measure(
 def refined(scene: GaussianScene, codes: np.ndarray, names: dict[int, str], train: Sequence[View]) -> Labels:
     """Make every kind of refinement from the same codes."""
     made = {way: Segmentation.from_codes(scene, codes, names, settings) for way, settings in WITHOUT_VIEWS.items()}
-    labels, clustered = {way: each.labels for way, each in made.items()}, made["KNN"]
-    silhouettes = []
-    for view in spread(train, RefineSettings.carve_views):
-        operator = make_operator(scene, view.camera)
-        silhouettes.append(Silhouette.of(scene, operator, clustered.label_map(operator)))
-    labels[CARVED] = np.where(carve(scene, clustered.labels, silhouettes), -2, clustered.labels)
-    return labels
+    made[CARVED] = made["KNN"].carved(scene, [view.camera for view in train])
+    return {way: each.labels for way, each in made.items()}
 
 
 def score(labels: Labels, scene: GaussianScene, num_classes: int, views: Sequence[View]) -> dict[str, ObjectScores]:
