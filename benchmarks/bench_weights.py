@@ -25,6 +25,7 @@ from workloads import REAL, RoomSize, make_room, true_labels
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View, spread
+from gsseg_core.learn.em.block_weights import block_weights
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu import label_pairs
@@ -92,13 +93,13 @@ def compare(name: str, scene: GaussianScene, views: list[View], num_classes: int
 class StoredWeights(TileObservation):
     """An observation that keeps the weights of all its records."""
 
-    def __init__(self, operator: ViewOperator, labels: np.ndarray) -> None:
-        lifted = Lifted.of(operator._tiles, labels)
+    def __init__(self, operator: ViewOperator, labels: np.ndarray, weights: np.ndarray | None = None) -> None:
+        lifted = Lifted.of(operator._tiles, labels, weights)
         super().__init__(operator.camera.name, operator.ids, operator._tiles, lifted)
         self._first = np.concatenate([[0], np.cumsum(self._records)])
         self._kept = np.empty((self._first[-1], LANES), np.uint16)
         self._left_over = np.empty((len(self._records), TILE, TILE), np.float32)
-        store(self._tiles, self._blocks, self._first, self._kept, self._left_over)
+        store(self._shared, self._blocks, self._first, self._kept, self._left_over)
 
     @property
     def nbytes(self) -> int:
@@ -109,14 +110,15 @@ class StoredWeights(TileObservation):
         """Share out as ever, with stored weights."""
         mask = self._mask
         logs, left_over = np.zeros(len(self._records)), np.zeros(len(mask.present))
-        sums = np.empty(self._slot_start[-1], np.float32)
+        sums, numbered = np.empty(self._slot_start[-1], np.float32), np.empty_like(likelihood)
+        numbered[self._number] = likelihood
         share_stored(
-            self._tiles.start, self._blocks, self._first, self._kept, self._left_over, mask, self._slot_start,
-            self._pair, likelihood, rest, logs, left_over, sums,
+            self._shared.start, self._blocks, self._first, self._kept, self._left_over, mask, self._slot_start,
+            self._pair, numbered, rest, logs, left_over, sums,
         )  # fmt: skip
         parts = label_pairs.add_up(self._slot_start, self._pair, sums, len(likelihood))
         total = np.bincount(mask.present, weights=left_over, minlength=len(rest))
-        return VoteShares(parts.sum(axis=0), total, float(logs.sum()))
+        return VoteShares(parts.sum(axis=0)[self._number], total, float(logs.sum()))
 
 
 class StoringLearner(EMLearner):
@@ -125,7 +127,7 @@ class StoringLearner(EMLearner):
     def _prepare(self, view: View, seen: SeenLabels) -> StoredWeights:
         operator = make_operator(self.scene, view.camera)
         labels, evidence = self._used_labels(seen, operator)
-        observation = StoredWeights(operator, labels)
+        observation = StoredWeights(operator, labels, block_weights(labels, view.name))
         if evidence is not None:
             observation.evidence = evidence
         return observation
@@ -207,7 +209,7 @@ def share_stored(  # type: ignore[no-untyped-def]
                         total = add_scaled_where(total, weight, said[s] * np.float32(1 / STEPS), np.int64(lanes[span]))
                 store_row(value, b, total)
         spare = left_over[label_start[tile] : label_start[tile + 1]]
-        logs[tile] = label_pairs.invert(spans, mask, rest[labels], final[tile], value, spare)
+        logs[tile] = label_pairs.invert(spans, mask, mask.weights[tile], rest[labels], final[tile], value, spare)
         mine = sums[slot_start[tile] : slot_start[tile + 1]]
         label_pairs.sum_shares(blocks[start[tile] : start[tile + 1]], many, spans, mask, value, weights, mine)
         mine *= np.float32(1 / STEPS)

@@ -22,7 +22,7 @@ import torch
 
 from gsseg_core.csr_rows import starts
 from gsseg_core.errors import SettingsError
-from gsseg_core.raster.constants import ALPHA_MAX, ALPHA_MIN, CHANNELS, DILATION, NEAR, T_MIN, TINY
+from gsseg_core.raster.constants import ALPHA_MAX, ALPHA_MIN, BLOCK, CHANNELS, DILATION, NEAR, T_MIN, TINY
 from gsseg_core.raster.observation import Observation, VoteShares
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import Blended
@@ -240,8 +240,8 @@ class GsplatOperator(ViewOperator):
         before = torch.cat([torch.ones_like(behind[:, :1]), behind], dim=1)[:, :-1]
         return alpha * before * (behind > T_MIN)
 
-    def _observe(self, labels: np.ndarray) -> Observation:
-        return GsplatObservation(self, labels)
+    def _observe(self, labels: np.ndarray, weights: np.ndarray | None) -> Observation:
+        return GsplatObservation(self, labels, weights)
 
 
 def view_operator(scene: GaussianScene, camera: Camera, device: str) -> GsplatOperator:
@@ -252,7 +252,7 @@ def view_operator(scene: GaussianScene, camera: Camera, device: str) -> GsplatOp
 class GsplatObservation(Observation):
     """A view and its mask on a GPU."""
 
-    def __init__(self, operator: GsplatOperator, labels: np.ndarray) -> None:  # (H, W)
+    def __init__(self, operator: GsplatOperator, labels: np.ndarray, weights: np.ndarray | None) -> None:  # (H, W)
         self.name, self._operator = operator.camera.name, operator
         known = labels >= 0
         classes, self.areas = np.unique(labels[known], return_counts=True)
@@ -269,12 +269,18 @@ class GsplatObservation(Observation):
         self.start = starts(seen.sum(axis=1))
         self.labels = seen.nonzero()[1].astype(np.int32)
         self._votes = votes[self._visible][seen]
+        of_pixels = np.ones(labels.shape, np.float32)
+        if weights is not None:
+            of_pixels[:] = weights.repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)[: labels.shape[0], : labels.shape[1]]
+        self._weights = _tensor(of_pixels, operator.device)
+        self.weighted_areas = np.bincount(local[known], of_pixels[known], len(classes))
 
     @property
     def nbytes(self) -> int:
         """Memory that it holds, in bytes, the operator's included; most of it on the GPU."""
         held = (self._visible, self.ids, self.start, self.labels, self._votes)
-        return self._operator.nbytes + self._labels.nbytes + sum(array.nbytes for array in held)
+        on_gpu = self._labels.nbytes + self._weights.nbytes
+        return self._operator.nbytes + on_gpu + sum(array.nbytes for array in held)
 
     def operator(self, camera: Camera, num_gaussians: int) -> GsplatOperator:
         """Give the operator that it was observed with."""
@@ -309,8 +315,8 @@ class GsplatObservation(Observation):
             labelled = one_hot.any(dim=2)
             likelihood = ((image + left_over[..., None] * _tensor(rest, device)) * one_hot).sum(dim=2)
             # A pixel that nothing explains has no share to give, at any codes; its term is held at a floor.
-            inverse = torch.where(labelled & (likelihood > TINY), 1 / likelihood, 0)
-            logs = likelihood[labelled].clamp_min(TINY).double().log().sum()
+            inverse = torch.where(labelled & (likelihood > TINY), self._weights / likelihood, 0)
+            logs = (self._weights * likelihood.clamp_min(TINY).double().log())[labelled].sum()
             residual = one_hot * inverse[..., None]
             spare = (residual * left_over[..., None]).double().sum(dim=(0, 1))
         return gradient(image, carried, residual), spare, logs

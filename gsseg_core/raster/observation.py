@@ -42,6 +42,7 @@ class Observation(ABC):
     labels: np.ndarray  # (P,) int32: label of each pair, as its position in `classes`
     classes: np.ndarray  # (L,) int32: labels that occur in the mask, ascending
     areas: np.ndarray  # (L,) int64: pixels of each label
+    weighted_areas: np.ndarray  # (L,) float64: the same, each pixel by its weight in `shares`
     # What `shares` was asked last, and what it answered; it is not asked twice.
     answered: tuple[np.ndarray, np.ndarray, VoteShares] | None = None
 
@@ -88,7 +89,7 @@ class Observation(ABC):
         add_votes(total, self.ids, self.start, self.labels, self.evidence.votes, self.votes(), units, sign)
 
     def shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares:
-        """Share one vote per labelled pixel among the Gaussians that made it.
+        """Share one vote per labelled pixel, times its weight, among the Gaussians that made it.
 
         With p(y_p) = (W likelihood)[p, y_p] + T_end[p] rest[y_p], the share of a pair is the sum over the pixels of its
         label of w[p, i] / p(y_p). It is the gradient of the log likelihood with respect to that of the pairs.

@@ -51,7 +51,9 @@ class ViewOperator(ViewRenderer):
         self._check_size(residual, 3)
         return self._adjoint(residual)
 
-    def observe(self, labels: np.ndarray, evidence: LabelEvidence | None = None) -> Observation:
+    def observe(
+        self, labels: np.ndarray, evidence: LabelEvidence | None = None, weights: np.ndarray | None = None
+    ) -> Observation:
         """Tie the view to its mask.
 
         Parameters
@@ -60,6 +62,9 @@ class ViewOperator(ViewRenderer):
             Classes, negative where nothing is known; or prototypes 0 to L - 1, each of which occurs.
         evidence : LabelEvidence, optional
             What prototypes mean.
+        weights : (ceil(H / 4), ceil(W / 4)) float32, optional
+            By how much the pixels of each block of 4 x 4 count in `Observation.shares`, 1 by default; those of 0 are
+            not gone through. In `votes` each counts once.
 
         Raises
         ------
@@ -67,7 +72,7 @@ class ViewOperator(ViewRenderer):
             The labels are not of the camera's size.
         """
         self._check_size(labels, 2)
-        observation = self._observe(labels)
+        observation = self._observe(labels, weights)
         if evidence is not None:
             observation.evidence = evidence
         return observation
@@ -158,7 +163,7 @@ class ViewOperator(ViewRenderer):
         """List pixels and places in `ids`, both (P,) int32, and weights, (P,) float32, nearest first in each pixel."""
 
     @abstractmethod
-    def _observe(self, labels: np.ndarray) -> Observation: ...
+    def _observe(self, labels: np.ndarray, weights: np.ndarray | None) -> Observation: ...
 
     def _vote(
         self, labels: np.ndarray, evidence: LabelEvidence | None, total: np.ndarray, units: float, sign: int

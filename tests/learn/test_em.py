@@ -27,12 +27,14 @@ from threadpoolctl import threadpool_limits
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
+from gsseg_core.learn.em.block_weights import block_weights
 from gsseg_core.learn.em.confusion_model import PART_PRIOR
 from gsseg_core.learn.em.em_kernels import GRADIENT_UNIT, ViewPairs, accumulate, m_step, predicted_gain
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings, codes_without
 from gsseg_core.learn.em.rejected_regions import SMALLEST
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.constants import BLOCK
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 SCENE, TRUTH = balls_on_a_table()
@@ -43,7 +45,7 @@ def slow_em(
 ) -> tuple[np.ndarray, list[float], dict[str, np.ndarray]]:
     """Readable twin of `EMLearner.fit`, with W as dense matrices in float64: codes, objectives, confusions R."""
     n, K, o = len(scene), NUM_CLASSES, settings.outliers
-    seen, formers = [], []
+    seen, formers, each, whole = [], [], [], []
     words = rejected_regions(scene, views, settings) if settings.errors else [view.read_labels() for view in views]
     for view, word in zip(views, words, strict=True):
         operator, y = make_operator(scene, view.camera), word.ravel()
@@ -54,8 +56,13 @@ def slow_em(
         classes = np.unique(view.read_labels()[view.read_labels() >= 0])
         parts = np.unique(y[y >= K])  # rejected regions, each a word of its own
         onehot = (y[:, None] == np.append(classes, parts)).astype(np.float64)
-        known = y >= 0
+        known, weights = y >= 0, pixel_weights(view)
         seen.append((W[known], rest[known], onehot[known], classes))
+        each.append(weights[known, None])
+        # Counts of the error models speak for whole regions, by what was gone through of them.
+        regions = slow_regions(view.read_labels())[0] if settings.rejects_regions else view.read_labels()
+        area, weighed = (np.bincount(regions.ravel()[known], w) for w in (None, weights[known]))
+        whole.append(each[-1] * (area / np.maximum(weighed, 1))[regions.ravel()[known], None])
         formers.append([view.read_labels().ravel()[(y == part).argmax()] for part in parts])
 
     votes = np.zeros((n, K))
@@ -103,14 +110,15 @@ def slow_em(
     for r, steps in enumerate(rounds):
         for step in range(steps):
             shares = [one_over_p(v, q) for v in range(len(seen))]
-            objective = (prior[counted] * np.log(q[counted])).sum() - sum(np.log(s.max(axis=1)).sum() for s in shares)
+            logs = sum((w[:, 0] * np.log(s.max(axis=1))).sum() for w, s in zip(each, shares, strict=True))
+            objective = (prior[counted] * np.log(q[counted])).sum() - logs
             objectives.append(objective / sum(len(onehot) for _, _, onehot, _ in seen))
-            gradient = [W.T @ s @ ((1 - o) * R + o / R.shape[1]).T
-                     for (W, _, _, _), s, R in zip(seen, shares, confusions, strict=True)]  # fmt: skip
+            gradient = [W.T @ (w * s) @ ((1 - o) * R + o / R.shape[1]).T
+                     for (W, _, _, _), w, s, R in zip(seen, each, shares, confusions, strict=True)]  # fmt: skip
             if step == steps - 1 and r < len(rounds) - 1:
                 for v, (W, rest, _, _) in enumerate(seen):
                     without = scaled(q * (sum(gradient) - gradient[v]) + prior)
-                    share = one_over_p(v, without)
+                    share = whole[v] * one_over_p(v, without)
                     counts = without.T @ (W.T @ share)
                     counts[0] += rest @ share
                     confusions[v] = estimated(v, (1 - o) * confusions[v] * counts, confusions[v])
@@ -142,6 +150,13 @@ def rejected_regions(scene: GaussianScene, views: list[View], settings: EMSettin
                 word[of_pixel == region] = NUM_CLASSES + region
         words.append(word)
     return words
+
+
+def pixel_weights(view: View) -> np.ndarray:
+    """By how much each pixel of a mask counts in the steps, (H W,)."""
+    labels = view.read_labels()
+    blocks = block_weights(labels, view.name).astype(np.float64)
+    return np.kron(blocks, np.ones((BLOCK, BLOCK)))[: labels.shape[0], : labels.shape[1]].ravel()
 
 
 def slow_regions(

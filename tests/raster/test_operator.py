@@ -156,6 +156,32 @@ def test_votes_and_shares_agree_with_the_naive_rasteriser(backend, seed, n, widt
     np.testing.assert_allclose(share.log_likelihood, log_likelihood, rtol=near, atol=near)
 
 
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_pixels_share_their_votes_by_their_weights_and_vote_without(backend, width, height):
+    scene, camera = random_view(5, 120, width, height)
+    mask, operator = random_mask(5, width, height), backend.make(scene, camera)
+    rng = np.random.default_rng(5)
+    blocks = rng.choice(np.float32([0, 0, 1, 4]), (-(-height // 4), -(-width // 4)))
+    of_pixels = np.kron(blocks, np.ones((4, 4)))[:height, :width]
+    seen, plain = operator.observe(mask, None, blocks), operator.observe(mask)
+    np.testing.assert_array_equal(seen.votes(), plain.votes())
+    np.testing.assert_array_equal(seen.labels, plain.labels)
+    np.testing.assert_array_equal(seen.areas, plain.areas)
+    np.testing.assert_allclose(seen.weighted_areas, [of_pixels[mask == label].sum() for label in seen.classes])
+    codes, rest = rng.uniform(0.1, 1, (len(seen.ids), len(seen.classes))), rng.uniform(0.1, 1, len(seen.classes))
+    share, weights = seen.shares(codes[seen.rows, seen.labels], rest), dense(operator)
+    left_over = operator.transmittance().ravel()
+    likelihood = weights[:, seen.ids] @ codes + np.outer(left_over, rest)
+    near, log_likelihood, shares = 30 * backend.sum, 0.0, seen.dense(share.pairs)
+    for j, label in enumerate(seen.classes):
+        pixels = np.flatnonzero(mask == label)
+        each = of_pixels.ravel()[pixels] / likelihood[pixels, j]
+        np.testing.assert_allclose(shares[:, j], each @ weights[pixels][:, seen.ids], rtol=near, atol=4 * near)
+        np.testing.assert_allclose(share.rest[j], each @ left_over[pixels], rtol=near, atol=4 * near)
+        log_likelihood += of_pixels.ravel()[pixels] @ np.log(likelihood[pixels, j])
+    np.testing.assert_allclose(share.log_likelihood, log_likelihood, rtol=near, atol=near)
+
+
 # By hand
 
 

@@ -6,7 +6,8 @@ reasons; here is what the names below stand for, with q (N, K) the class probabi
 label y in view v given class k:
 
 - `_e_step` sums over the views gradient[i, k] = dlogL / dq_i[k] = sum_v sum_y C_v[k, y] B_v[i, y], with B_v[i, y] the
-  sum of w_v[p, i] / p_v(y | p) over the pixels p of label y. q * gradient are the expected counts, in px.
+  sum of w_v[p, i] / p_v(y | p) over the pixels p of label y. q * gradient are the expected counts, in px. Not all
+  pixels are gone through, and some count for others (`block_weights`).
 - `m_step` sets q_i to normalise(q_i gradient_i + prior_i), the exact maximiser of the usual lower bound, so J never
   falls. prior_i is `prior_weight` times the mean of the votes' probabilities over the nearest Gaussians.
 - `predicted_gain` is the slope of J along the step. J is concave, so no step gains more; fitting ends with the first
@@ -32,6 +33,7 @@ from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn.em import em_kernels as kernels
+from gsseg_core.learn.em.block_weights import block_weights
 from gsseg_core.learn.em.boundary_alignment import align_boundaries
 from gsseg_core.learn.em.confusion_model import ErrorModel
 from gsseg_core.learn.em.em_kernels import ViewPairs
@@ -252,6 +254,11 @@ class EMLearner(Learner):
         evidence, areas = self.error_models_[view.name].evidence, self.observation(view.name).areas
         return 0.0 if evidence.nameless is None else float(areas[evidence.nameless].sum() / areas.sum())
 
+    def _prepare(self, view: View, seen: SeenLabels) -> Observation:
+        operator = self._operator_of(view)
+        used = self._used_labels(seen, operator)
+        return operator.observe(*used, block_weights(used.labels, view.name))
+
     def _used_labels(self, seen: SeenLabels, operator: ViewOperator) -> SeenLabels:
         """Align boundaries of a plain mask with edges, and give each region a label if regions may be rejected."""
         settings = self.settings
@@ -345,6 +352,8 @@ class EMLearner(Learner):
             shares = observation.shares(said, likelihood[:, 0])
             counts = kernels.confusion_counts(without, pairs, shares.pairs, self.num_classes, len(likelihood))
             counts[0] += shares.rest
+            # What was gone through of each label speaks for all of it.
+            counts *= observation.areas / np.maximum(observation.weighted_areas, 1)
             model.m_step(model.expected_counts(counts))
 
         for _ in self._of_each(refit, models, tick):

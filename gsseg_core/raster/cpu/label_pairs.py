@@ -15,7 +15,7 @@ from gsseg_core import simd
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.raster.constants import AHEAD, CHUNKS, TINY
 from gsseg_core.raster.cpu.blending import open_rays, stride_of, tile_of_turn
-from gsseg_core.raster.cpu.lifting import Labels
+from gsseg_core.raster.cpu.lifting import Labels, weighted_blocks
 from gsseg_core.raster.cpu.splat import WIDTH, aim, blend_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
 
@@ -29,31 +29,38 @@ PARTS = 4  # parts of the image whose sums are added up beside each other
 
 
 @kernel(parallel=True)
-def keep_entries(start: np.ndarray, reached: np.ndarray, kept_start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give a number to every entry that reaches a labelled pixel, from where those of its tile begin, (T + 1,).
+def keep_entries(
+    start: np.ndarray, reached: np.ndarray, kept_start: np.ndarray, shared_start: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Give a number to every entry that reaches a labelled pixel, and another where such a pixel has a weight.
 
-    Returns where each entry goes, -1 if nowhere, and its tile, (E, 2) int32; and blocks of those kept, (E',) uint16.
+    Those of a tile begin where the two starts say, (T + 1,). Returns both numbers of each entry, -1 for none, and its
+    tile, (E, 3) int32; of those with a weight the first number, int32, and the blocks with a weight, uint16, (E',).
     """
-    kept, blocks = np.empty((len(reached), 2), np.int32), np.empty(kept_start[-1], np.uint16)
+    kept = np.empty((len(reached), 3), np.int32)
+    shared, blocks = np.empty(shared_start[-1], np.int32), np.empty(shared_start[-1], np.uint16)
     for tile in nb.prange(start.shape[0] - 1):
-        n = kept_start[tile]
+        n, s, weighted = kept_start[tile], shared_start[tile], weighted_blocks(weights[tile])
         for e in range(start[tile], start[tile + 1]):
-            kept[e, 0], kept[e, 1] = -1, tile
+            kept[e, 0], kept[e, 1], kept[e, 2] = -1, -1, tile
             if reached[e]:
-                kept[e, 0], blocks[n] = n, reached[e]
+                kept[e, 0] = n
+                if reached[e] & weighted:
+                    kept[e, 1], shared[s], blocks[s] = s, n, reached[e] & weighted
+                    s += 1
                 n += 1
-    return kept, blocks
+    return kept, shared, blocks
 
 
 @kernel(parallel=True)
 def number_pairs(
-    tiles: Tiles, kept: np.ndarray,  # (E, 2)
-    facts: np.ndarray,  # (T, 6) int64: first of all entries, of all slots, of the entries kept, of their slots, of the
-    # labels, and how many labels; together, since each look at another tile waits for memory
+    tiles: Tiles, kept: np.ndarray,  # (E, 3)
+    facts: np.ndarray,  # (T, 6) int64: first of all entries, of all slots, of the entries with a weight, of their
+    # slots, of the labels, and how many labels; together, since each look at another tile waits for memory
     sums: np.ndarray, present: np.ndarray, num_labels: int,  # (slots,) sum of weights by entry and label
     capacity: np.ndarray,  # (CHUNKS + 1,) where each chunk's pairs begin; there is more than needed
     entries: np.ndarray,  # (E',) int32 out: Gaussian of each kept entry
-    pair: np.ndarray,  # (slots kept,) int32 out: of each kept entry and label of its tile, -1 where none
+    pair: np.ndarray,  # (slots,) int32 out: of each entry with a weight and label of its tile, -1 where none
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Give a number to every Gaussian that is seen, and to each of its labels, and tell the entries.
 
@@ -73,22 +80,22 @@ def number_pairs(
             for i in range(tiles.gaussian_start[g], tiles.gaussian_start[g + 1]):
                 simd.prefetch(kept, tiles.gaussian_entries[min(i + 2 * AHEAD, last)])
                 later = tiles.gaussian_entries[min(i + AHEAD, last)]
-                of_tile = facts[kept[later, 1]]
+                of_tile = facts[kept[later, 2]]
                 simd.prefetch(sums, of_tile[1] + (later - of_tile[0]) * of_tile[5])
                 e = tiles.gaussian_entries[i]
-                target = kept[e, 0]
-                if target < 0:
+                if kept[e, 0] < 0:
                     continue
-                is_seen = True
-                entries[target] = tag | (place - first)
-                of_tile = facts[kept[e, 1]]
+                is_seen, shared = True, kept[e, 1]
+                entries[kept[e, 0]] = tag | (place - first)
+                of_tile = facts[kept[e, 2]]
                 slots = of_tile[5]
                 base = of_tile[1] + (e - of_tile[0]) * slots
-                position = of_tile[3] + (target - of_tile[2]) * slots
+                position = of_tile[3] + (shared - of_tile[2]) * slots
                 for j in range(slots):
                     weight = sums[base + j]
                     if not weight > 0:
-                        pair[position + j] = -1
+                        if shared >= 0:
+                            pair[position + j] = -1
                         continue
                     label = present[of_tile[4] + j]
                     if seen[label] != g:
@@ -96,7 +103,8 @@ def number_pairs(
                         labels[n], votes[n] = label, 0.0
                         n += 1
                     votes[number[label]] += weight
-                    pair[position + j] = tag | (number[label] - capacity[chunk])
+                    if shared >= 0:
+                        pair[position + j] = tag | (number[label] - capacity[chunk])
             if is_seen:
                 gaussians[place], counts[place] = g, n - begin
                 place += 1
@@ -108,9 +116,9 @@ def number_pairs(
 def renumber(numbers: np.ndarray, before: np.ndarray, count: int) -> np.ndarray:
     """Give numbers of int32, which begin anew in every chunk, others in the order in which they occur; -1 stays.
 
-    That is done in place. Of `count` numbers each occurs, and `before`, (CHUNKS,), are in the chunks before. Returns
-    the new number of each, (count,) int32. What one tile meets comes to lie close together: to fetch that from anywhere
-    in memory is a quarter of the time of `share`.
+    That is done in place. Those of the `count` numbers that occur nowhere come last, and `before`, (CHUNKS,), are in
+    the chunks before. Returns the new number of each, (count,) int32. What one tile meets comes to lie close together:
+    to fetch that from anywhere in memory is a quarter of the time of `share`.
     """
     new, n = np.full(count, -1, np.int32), np.int32(0)
     for i in range(numbers.shape[0]):
@@ -121,6 +129,10 @@ def renumber(numbers: np.ndarray, before: np.ndarray, count: int) -> np.ndarray:
             known = new[number]
             numbers[i] = new[number] = n if known < 0 else known  # without a branch, which nobody could predict
             n += np.int32(known < 0)
+    for i in range(count if n < count else 0):
+        if new[i] < 0:
+            new[i] = n
+            n += np.int32(1)
     return new
 
 
@@ -141,15 +153,16 @@ def put_in_order(
 
 @kernel(parallel=True, fastmath=simd.FAST, error_model="numpy")
 def share(
-    tiles: Tiles, labels: Labels, blocks: np.ndarray,  # (E,) of each entry
+    tiles: Tiles, labels: Labels, blocks: np.ndarray,  # (E,) uint16: of each entry
     records: np.ndarray,  # (T,) blocks of all the tile's entries
     slot_start: np.ndarray, pair: np.ndarray,  # (T + 1,), (slot_start[-1],)
     likelihood: np.ndarray, rest: np.ndarray,  # (P,), (L,) float32, as `Observation.shares` takes them
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Share one vote per labelled pixel among the pairs that made it.
+    """Share one vote per labelled pixel, times its weight, among the pairs that made it.
 
     With p(y_p) as in `Observation.shares`, returns sums of log p(y_p) by tile, (T,) float64; of T_end / p(y_p) by label
-    of each tile, float64 as `labels.present`; and of w / p(y_p) by entry and label, (slot_start[-1],) float32.
+    of each tile, float64 as `labels.present`; and of w / p(y_p) by entry and label, (slot_start[-1],) float32. Each
+    term counts by the weight of its pixel.
     """
     logs, left_over = np.zeros(len(records)), np.zeros(len(labels.present))
     sums = np.empty(slot_start[-1], np.float32)
@@ -170,7 +183,7 @@ def share(
             rays, value, weights,
         )  # fmt: skip
         of_label = rest[labels.present[here]]
-        logs[tile] = invert(spans, labels, of_label, rays, value, left_over[here])
+        logs[tile] = invert(spans, labels, labels.weights[tile], of_label, rays, value, left_over[here])
         sum_shares(blocks[own], count, spans, labels, value, weights, sums[of_entry])
     return logs, left_over, sums
 
@@ -187,10 +200,9 @@ def _blend_likelihood(
     n = 0
     for e in range(entries.shape[0]):
         simd.prefetch(table, entries[min(e + AHEAD, entries.shape[0] - 1)])
-        g = entries[e]
+        g, todo = entries[e], np.int64(blocks[e])
         aim(table, g, left, top, lines)
         only = likelihood[pair[e * label_count]] if label_count == 1 else np.float32(0.0)
-        todo = np.int64(blocks[e])
         while todo:
             b = simd.first_bit(todo)
             todo &= todo - 1
@@ -210,15 +222,16 @@ def _blend_likelihood(
 
 @called_by_kernels(error_model="numpy")
 def invert(
-    spans: np.ndarray, labels: Labels, rest: np.ndarray, rays: np.ndarray,  # (17,), (L_t,), (16, 16)
-    value: np.ndarray,  # (16, 16) in: W likelihood; out: 1 / likelihood, 0 where there is no label
+    spans: np.ndarray, labels: Labels, weights: np.ndarray,  # (17,); (16,) of blocks
+    rest: np.ndarray, rays: np.ndarray,  # (L_t,), (16, 16)
+    value: np.ndarray,  # (16, 16) in: W likelihood; out: weight / likelihood, 0 where there is no label
     spare: np.ndarray,  # (L_t,) in: zeros; out: sum of T_end / likelihood
 ) -> float:  # fmt: skip
     """Divide by the likelihood of each pixel of a tile; returns the sum of their logarithms."""
     total = 0.0
     for b in range(TILE):
         known = np.int64(0)
-        for span in range(spans[b], spans[b + 1]):
+        for span in range(spans[b], spans[b + 1] if weights[b] > 0 else spans[b]):
             known |= np.int64(labels.lanes[span])
             # Each likelihood is at least 1e-30 and at most about 1: products of eight stay within a float64.
             product, s = 1.0, labels.slots[span]
@@ -227,12 +240,12 @@ def invert(
                     p = value[b, i] + rest[s] * rays[b, i]
                     # A pixel that nothing explains has no share to give, at any codes; its term is held at a floor.
                     product *= np.float64(max(p, _TINY))
-                    value[b, i] = 1.0 / p if p > _TINY else 0.0
+                    value[b, i] = weights[b] / p if p > _TINY else 0.0
                     spare[s] += rays[b, i] * value[b, i]
                 if i == TILE // 2 - 1:
-                    total += np.log(product)
+                    total += weights[b] * np.log(product)
                     product = 1.0
-            total += np.log(product)
+            total += weights[b] * np.log(product)
         for i in range(TILE):
             if not known >> i & 1:
                 value[b, i] = 0.0

@@ -15,7 +15,7 @@ import numpy as np
 from gsseg_core.csr_rows import starts
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.raster.cpu.blending import aim_next, in_tile, open_rays, stride_of, tile_of_turn
-from gsseg_core.raster.cpu.splat import OPEN, WIDTH, blend_block
+from gsseg_core.raster.cpu.splat import OPEN, SIDE, WIDTH, blend_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
 from gsseg_core.simd import FAST, LANES, add_where, count_bits, first_bit, nothing, sum_row
 
@@ -28,30 +28,34 @@ class Labels(NamedTuple):
     span_start: np.ndarray  # (16 T + 1,) int64: spans of block b of tile t are from span_start[16 t + b] to the next
     slots: np.ndarray  # (S,) int32: which of its tile's labels a span is
     lanes: np.ndarray  # (S,) int32: bit i is set where pixel i of the block has the label
+    weights: np.ndarray  # (T, 16) float32: of each block's pixels, where votes are shared
 
 
 class Lifted(NamedTuple):
     """A mask lifted into a view: the weights of every entry, summed by label."""
 
     classes: np.ndarray  # (L,) int32: labels that occur in the mask, ascending
-    areas: np.ndarray  # (L,) int64: pixels of each label
+    areas: np.ndarray  # (2, L) float64: pixels of each label; the sum of their weights
     labels: Labels  # the mask cut into tiles; its labels are positions in `classes`
     slot_start: np.ndarray  # (T + 1,) int64: where each tile's sums begin, one for each entry and label of the tile
     reached: np.ndarray  # (E,) uint16: blocks with a label in which the entry has a weight, one bit each
     sums: np.ndarray  # (slot_start[-1],) float32: sum of weights, in px
-    counts: np.ndarray  # (T, 3) int64: entries with such a block, their blocks, sums above zero
+    counts: np.ndarray  # (T, 4) int64: entries with such a block, with one that has a weight, these blocks; sums > 0
 
     @classmethod
-    def of(cls, tiles: Tiles, mask: np.ndarray) -> Lifted:
-        """Lift a mask, (H, W) and negative where unknown, into a view."""
+    def of(cls, tiles: Tiles, mask: np.ndarray, weights: np.ndarray | None = None) -> Lifted:
+        """Lift a mask, (H, W) and negative where unknown, into a view; for weights see `ViewOperator.observe`."""
         mask = np.ascontiguousarray(mask, np.int32)
-        cut, areas = _cut(mask, tiles.columns, tiles.rows, int(mask.max(initial=0)) + 1)
-        classes = np.flatnonzero(areas).astype(np.int32)
-        position = np.zeros(len(areas), np.int32)
+        blocks = np.ones((tiles.rows * SIDE, tiles.columns * SIDE), np.float32)
+        if weights is not None:
+            blocks[: weights.shape[0], : weights.shape[1]] = weights
+        cut, areas = _cut(mask, blocks, tiles.columns, tiles.rows, int(mask.max(initial=0)) + 1)
+        classes = np.flatnonzero(areas[0]).astype(np.int32)
+        position = np.zeros(areas.shape[1], np.int32)
         position[classes] = np.arange(len(classes))
         labels = Labels(*cut)._replace(present=position[cut[1]])
         slot_start = starts(np.diff(tiles.start) * np.diff(labels.start))
-        return cls(classes, areas[classes], labels, slot_start, *_lift(tiles, labels, slot_start))
+        return cls(classes, areas[:, classes], labels, slot_start, *_lift(tiles, labels, slot_start))
 
     @property
     def sees(self) -> bool:
@@ -60,21 +64,26 @@ class Lifted(NamedTuple):
 
 
 @kernel
-def _cut(mask: np.ndarray, columns: int, rows: int, num_labels: int) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """Make what `Labels` holds of a mask (H, W) int32, and count the pixels of each label, (num_labels,) int64."""
+def _cut(
+    mask: np.ndarray, blocks: np.ndarray, columns: int, rows: int, num_labels: int
+) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """Make what `Labels` holds of a mask (H, W) int32 with weights of `blocks`, (4 rows, 4 columns) float32.
+
+    Second come the pixels of each label, and the sum of their weights, (2, num_labels) float64.
+    """
     height, width = mask.shape
     start = np.zeros(columns * rows + 1, np.int64)
     present = np.empty(height * width, np.int32)
     span_start = np.zeros(columns * rows * TILE + 1, np.int64)
     slots, lanes = np.empty(height * width, np.int32), np.empty(height * width, np.int32)
     slot_of, span_of = np.full(num_labels, -1, np.int64), np.full(num_labels, -1, np.int64)
-    areas = np.zeros(num_labels, np.int64)
+    areas, weights = np.zeros((2, num_labels)), np.empty((columns * rows, TILE), np.float32)
     n = spans = 0
     for tile in range(columns * rows):
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
         alike = _is_uniform(mask, left, top)
         for b in range(TILE):
-            begin = spans
+            begin, weights[tile, b] = spans, blocks[top // SIDE + b // SIDE, left // SIDE + b % SIDE]
             for lane in range(1 if alike else LANES):
                 r, c = in_tile(b, lane)
                 label = mask[top + r, left + c] if top + r < height and left + c < width else -1
@@ -89,12 +98,14 @@ def _cut(mask: np.ndarray, columns: int, rows: int, num_labels: int) -> tuple[tu
                     slots[spans], lanes[spans] = slot_of[label], 0
                     spans += 1
                 lanes[span_of[label]] |= OPEN if alike else 1 << lane
-                areas[label] += LANES if alike else 1
+                pixels = LANES if alike else 1
+                areas[0, label] += pixels
+                areas[1, label] += pixels * weights[tile, b]
             span_start[tile * TILE + b + 1] = spans
         for i in range(start[tile], n):
             slot_of[present[i]] = -1
         start[tile + 1] = n
-    return (start, present[:n].copy(), span_start, slots[:spans].copy(), lanes[:spans].copy()), areas
+    return (start, present[:n].copy(), span_start, slots[:spans].copy(), lanes[:spans].copy(), weights), areas
 
 
 @called_by_kernels
@@ -113,14 +124,15 @@ def _is_uniform(mask: np.ndarray, left: int, top: int) -> bool:
 def _lift(tiles: Tiles, labels: Labels, slot_start: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Blend the view, and sum weights by entry and label: the last three attributes of `Lifted`."""
     reached, sums = np.empty(len(tiles.entries), np.uint16), np.empty(slot_start[-1], np.float32)
-    counts = np.empty((len(slot_start) - 1, 3), np.int64)
+    counts = np.empty((len(slot_start) - 1, 4), np.int64)
     stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
         tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
         label_count = labels.start[tile + 1] - labels.start[tile]
         blocks = reached[tiles.start[tile] : tiles.start[tile + 1]]
         blocks[:] = 0
-        with_block = num_blocks = positive = 0
+        with_block = with_weight = num_blocks = positive = 0
+        weighted = weighted_blocks(labels.weights[tile])
         if label_count:
             own = sums[slot_start[tile] : slot_start[tile + 1]]
             own[:] = 0.0
@@ -130,11 +142,22 @@ def _lift(tiles: Tiles, labels: Labels, slot_start: np.ndarray) -> tuple[np.ndar
                 _lift_tile(tiles, labels, tile, blocks, own, label_count)
             for e in range(len(blocks)):
                 with_block += blocks[e] > 0
-                num_blocks += count_bits(np.int64(blocks[e]))
+                with_weight += (blocks[e] & weighted) > 0
+                num_blocks += count_bits(blocks[e] & weighted)
             for i in range(len(own)):
                 positive += own[i] > 0
-        counts[tile, 0], counts[tile, 1], counts[tile, 2] = with_block, num_blocks, positive
+        of_tile = counts[tile]
+        of_tile[0], of_tile[1], of_tile[2], of_tile[3] = with_block, with_weight, num_blocks, positive
     return reached, sums, counts
+
+
+@called_by_kernels
+def weighted_blocks(weights: np.ndarray) -> int:  # (16,)
+    """Which blocks of a tile have a weight, as bits."""
+    blocks = 0
+    for b in range(TILE):
+        blocks |= (weights[b] > 0) << b
+    return blocks
 
 
 @nb.njit(inline="always")

@@ -13,10 +13,10 @@ from typing import Any
 from llvmlite import ir
 from numba.core import cgutils, types
 
-from gsseg_core.raster.constants import ALPHA_MAX, T_MIN
+from gsseg_core.raster.constants import ALPHA_MAX, BLOCK, T_MIN
 from gsseg_core.simd import BITS, F32, I64, LANES, ROW, Builder, constant, intrinsic, row_type
 
-SIDE = 4  # side of a block in px: its sixteen pixels, row by row, are one vector
+SIDE = BLOCK
 OPEN = (1 << LANES) - 1  # of the bits of `blend_block`, those of the rays that are still open
 LOG_ALPHA_MIN = -math.log2(255.0)  # log2 of the least alpha that counts
 

@@ -109,8 +109,8 @@ class TileOperator(ViewOperator):
             return pixels[here], rows[here], weights[here]
         return pixels, rows, weights
 
-    def _observe(self, labels: np.ndarray) -> Observation:
-        return TileObservation(self.camera.name, self.ids, self._tiles, Lifted.of(self._tiles, labels))
+    def _observe(self, labels: np.ndarray, weights: np.ndarray | None) -> Observation:
+        return TileObservation(self.camera.name, self.ids, self._tiles, Lifted.of(self._tiles, labels, weights))
 
     def _vote(
         self, labels: np.ndarray, evidence: LabelEvidence | None, total: np.ndarray, units: float, sign: int
@@ -130,20 +130,23 @@ def view_operator(scene: GaussianScene, camera: Camera, device: str) -> TileOper
 class TileObservation(Observation):
     """W of one view, cut down to the Gaussians that its labelled pixels see; remade from them in every product.
 
-    Holds about 56 bytes per Gaussian that is seen and 18 per tile in which it is.
+    Holds about 73 bytes per Gaussian that is seen, 4 per tile in which it is, and 10 more where a pixel has a weight.
     """
 
     def __init__(self, name: str, ids: np.ndarray, tiles: Tiles, lifted: Lifted) -> None:  # ids (M,)
-        self.name, self.classes, self.areas, self._mask = name, lifted.classes, lifted.areas, lifted.labels
+        self.name, self.classes, self._mask = name, lifted.classes, lifted.labels
+        self.areas, self.weighted_areas = lifted.areas[0].astype(np.int64), lifted.areas[1]
         label_count, counts = np.diff(self._mask.start), lifted.counts
-        start, self._slot_start = starts(counts[:, 0]), starts(counts[:, 0] * label_count)
-        self._records = counts[:, 1].copy()
-        kept, self._blocks = label_pairs.keep_entries(tiles.start, lifted.reached, start)
+        start, shared_start, self._slot_start = map(starts, (counts[:, 0], counts[:, 1], counts[:, 1] * label_count))
+        self._records = counts[:, 2].copy()
+        kept, shared, self._blocks = label_pairs.keep_entries(
+            tiles.start, lifted.reached, start, shared_start, self._mask.weights
+        )
         # A Gaussian has at most as many labels as sums, and each entry one sum, but for so many in all:
-        extra = counts[:, 2].sum() - counts[:, 0].sum()
+        extra = counts[:, 3].sum() - counts[:, 0].sum()
         chunks = np.arange(CHUNKS + 1) * len(ids) // CHUNKS
         capacity = tiles.gaussian_start[chunks] + extra * np.arange(len(chunks))
-        begins = (tiles.start, lifted.slot_start, start, self._slot_start, self._mask.start)
+        begins = (tiles.start, lifted.slot_start, shared_start, self._slot_start, self._mask.start)
         facts = np.stack([*(begin[:-1] for begin in begins), label_count], axis=1)
         entries, self._pair = np.empty(start[-1], np.int32), np.empty(self._slot_start[-1], np.int32)
         found, gaussians, label_counts, labels, votes = label_pairs.number_pairs(
@@ -168,6 +171,7 @@ class TileObservation(Observation):
         self._tiles = tiles._replace(
             table=table, start=start, entries=entries, gaussian_start=none, gaussian_entries=none.astype(np.int32)
         )
+        self._shared = self._tiles._replace(start=shared_start, entries=entries[shared])
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what `shares` was asked last."""
@@ -177,7 +181,8 @@ class TileObservation(Observation):
     def nbytes(self) -> int:
         """Memory that it holds, in bytes."""
         held = (self.ids, self._ids_by_row, self._number, self.start, self.labels, self._votes, *self._tiles[4:],
-                self._blocks, self._records, self._slot_start, self._pair, *self._mask)  # fmt: skip
+                self._shared.start, self._shared.entries, self._blocks, self._records, self._slot_start, self._pair,
+                *self._mask)  # fmt: skip
         # And what `shares` was asked last, and answered.
         return sum(array.nbytes for array in held) + 2 * self._votes.nbytes
 
@@ -193,7 +198,7 @@ class TileObservation(Observation):
         slots, numbered = (self._slot_start, self._pair), np.empty_like(likelihood)
         numbered[self._number] = likelihood
         logs, left_over, sums = label_pairs.share(
-            self._tiles, self._mask, self._blocks, self._records, *slots, numbered, rest
+            self._shared, self._mask, self._blocks, self._records, *slots, numbered, rest
         )
         pairs = label_pairs.add_up(*slots, sums, len(likelihood)).sum(axis=0)[self._number]
         total = np.bincount(self._mask.present, weights=left_over, minlength=len(rest))

@@ -1,0 +1,45 @@
+"""Which blocks of a mask EM goes through: all near boundaries, and of the others one for four."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gsseg_core.learn.em.block_weights import FAR, NEAR, STEP, block_weights
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(1, 70), st.integers(1, 70), st.integers(0, 10**6))
+def test_all_within_a_block_of_a_boundary_counts_once_and_of_the_rest_one_in_four_by_four(
+    height: int, width: int, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    labels = np.zeros((height, width), np.int32)
+    for label in range(1, 4):
+        y, x = rng.integers(0, height), rng.integers(0, width)
+        labels[y : y + rng.integers(0, 20), x : x + rng.integers(0, 20)] = rng.choice([label, -1])
+    weights = block_weights(labels, f"view{seed}")
+    assert weights.shape == (-(-height // 4), -(-width // 4))
+    rows, columns = np.indices(labels.shape)
+    for y, x in np.ndindex(*weights.shape):
+        first = (4 * (y - NEAR), 4 * (x - NEAR))
+        # One px more: a boundary has two sides.
+        near = (rows >= first[0] - 1) & (rows <= first[0] + 4 * (2 * NEAR + 1))
+        near &= (columns >= first[1] - 1) & (columns <= first[1] + 4 * (2 * NEAR + 1))
+        if len(np.unique(labels[near])) == 1:
+            assert weights[y, x] in (0, FAR)
+    inside = labels[8:-8, 8:-8]
+    if inside.size and (labels == labels[0, 0]).all():
+        assert (weights == FAR).sum() == pytest.approx(weights.size / STEP**2, abs=sum(weights.shape))
+    same = labels[:, 1:] != labels[:, :-1]
+    for y, x in zip(*same.nonzero(), strict=True):
+        assert weights[y // 4, x // 4] == weights[y // 4, (x + 1) // 4] == 1
+
+
+def test_of_a_view_that_stands_still_all_is_seen_in_time() -> None:
+    labels = np.zeros((64, 80), np.int32)
+    total = sum(block_weights(labels, f"frame{i:03d}") for i in range(40))
+    assert (total > 0).all()
+    np.testing.assert_array_equal(block_weights(labels, "frame000"), block_weights(labels, "frame000"))
