@@ -185,8 +185,9 @@ class GsplatOperator(ViewOperator):
         other._opacities = self._opacities.masked_fill(torch.tensor(hidden, device=self.device), 0)
         return other
 
-    def blend_seen(self, codes: np.ndarray) -> Blended:
-        """Blend codes (M, K) of what is visible."""
+    def blend_seen(self, codes: np.ndarray, wanted: np.ndarray | None = None) -> Blended:
+        """Blend codes (M, K) of what is visible; all pixels, whatever is wanted."""
+        del wanted
         image = np.empty((self.camera.height, self.camera.width, codes.shape[1]), np.float32)
         left_over = None
         with torch.no_grad():

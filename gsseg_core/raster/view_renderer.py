@@ -94,8 +94,11 @@ class ViewRenderer(ABC):
         return self.blend_seen(codes.take(self.ids, axis=0))
 
     @abstractmethod
-    def blend_seen(self, codes: np.ndarray) -> Blended:
-        """Do the same for codes (M, K) of `ids` alone."""
+    def blend_seen(self, codes: np.ndarray, wanted: np.ndarray | None = None) -> Blended:
+        """Do the same for codes (M, K) of `ids` alone.
+
+        If only some pixels are `wanted`, (H, W) bool, others may have any value.
+        """
 
     def blend_rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None = None) -> Blended:
         """Do the same for codes (N, K) of which only the entries that are not zero are at hand.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
@@ -17,12 +18,14 @@ from gsseg_core.data.view import View
 from gsseg_core.demo.mask_errors import resize
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn.em import boundary_alignment
-from gsseg_core.learn.em.boundary_alignment import _boundary_strengths, _nearest_regions, align_boundaries
+from gsseg_core.learn.em.block_weights import near_boundaries
+from gsseg_core.learn.em.boundary_alignment import _boundary_strengths, _nearest_regions, align_boundaries, reach
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.em.mask_offset import move_mask
 from gsseg_core.learn.em.rejected_regions import connected_pixels
 from gsseg_core.learn.em.scene_edges import scene_edges
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.constants import BLOCK
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 SCENE, _ = balls_on_a_table()
@@ -226,3 +229,21 @@ def test_a_view_is_taken_back_as_exactly_as_it_was_added() -> None:
 def test_a_negative_width_is_refused() -> None:
     with pytest.raises(SettingsError, match="edge_px"):
         EMSettings(edge_px=-1)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_edges_near_boundaries_are_all_that_moving_them_takes(seed: int) -> None:
+    """A mask is aligned with edges that are drawn near its boundaries as with those of the whole view."""
+    rng = np.random.default_rng(seed)
+    view = clean_views(4)[seed]
+    camera = replace(view.camera, width=320, height=280, K=view.camera.K * [[5], [5], [1]])
+    operator, labels = make_operator(SCENE, camera), np.zeros((280, 320), np.int32)
+    for label in range(1, 4):
+        y, x = rng.integers(0, 240, 2)
+        labels[y : y + 30, x : x + 25] = label
+    edges = scene_edges(operator, SCENE)
+    near = near_boundaries(labels, -(-(reach(3) + 1) // BLOCK))
+    assert not near.all()
+    some = scene_edges(operator, SCENE, near)
+    assert (some != edges).any()
+    np.testing.assert_array_equal(align_boundaries(labels, some, 3), align_boundaries(labels, edges, 3))

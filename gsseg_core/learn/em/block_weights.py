@@ -12,6 +12,7 @@ from zlib import crc32
 import numpy as np
 from scipy.ndimage import maximum_filter
 
+from gsseg_core.kernels.compiler import kernel
 from gsseg_core.raster.constants import BLOCK
 
 NEAR = 1  # blocks around one with a boundary in it
@@ -33,16 +34,28 @@ def block_weights(labels: np.ndarray, name: str) -> np.ndarray:
     -------
     (ceil(H / 4), ceil(W / 4)) float32
     """
-    changes = np.zeros(labels.shape, np.uint8)
-    across, down = labels[:, 1:] != labels[:, :-1], labels[1:] != labels[:-1]
-    changes[:, 1:] |= across
-    changes[:, :-1] |= across
-    changes[1:] |= down
-    changes[:-1] |= down
-    height, width = (-(-size // BLOCK) for size in labels.shape)
-    padded = np.pad(changes, ((0, height * BLOCK - labels.shape[0]), (0, width * BLOCK - labels.shape[1])))
-    blocks = padded.reshape(height, BLOCK, width, BLOCK).max(axis=(1, 3))
-    near = maximum_filter(blocks, 2 * NEAR + 1) > 0
-    first, some = crc32(name.encode()) % STEP**2, np.zeros((height, width), np.float32)
+    near = near_boundaries(labels, NEAR)
+    first, some = crc32(name.encode()) % STEP**2, np.zeros(near.shape, np.float32)
     some[first // STEP :: STEP, first % STEP :: STEP] = FAR
     return np.where(near, np.float32(1), some)
+
+
+def near_boundaries(labels: np.ndarray, distance: int) -> np.ndarray:
+    """Mark blocks with a boundary of a mask (H, W), and so many around them: (ceil(H / 4), ceil(W / 4)) bool."""
+    near: np.ndarray = maximum_filter(_with_boundary(labels), 2 * distance + 1)
+    return near
+
+
+@kernel
+def _with_boundary(labels: np.ndarray) -> np.ndarray:  # (H, W)
+    """Mark blocks with a pixel whose label is not that of all pixels beside, above and below it."""
+    height, width = labels.shape
+    blocks = np.zeros((-(-height // BLOCK), -(-width // BLOCK)), np.bool_)
+    for y in range(height):
+        for x in range(width):
+            here, right, below = labels[y, x], min(x + 1, width - 1), min(y + 1, height - 1)
+            if here != labels[y, right]:
+                blocks[y // BLOCK, x // BLOCK] = blocks[y // BLOCK, right // BLOCK] = True
+            if here != labels[below, x]:
+                blocks[y // BLOCK, x // BLOCK] = blocks[below // BLOCK, x // BLOCK] = True
+    return blocks

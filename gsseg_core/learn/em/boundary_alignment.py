@@ -29,8 +29,9 @@ import numpy as np
 
 from gsseg_core.csr_rows import starts
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
-from gsseg_core.learn.em.mask_offset import LOG_OFFSETS, likeliest_offset, move_mask
+from gsseg_core.learn.em.mask_offset import FARTHEST, LOG_OFFSETS, likeliest_offset, move_mask
 from gsseg_core.learn.em.rejected_regions import connected_pixels
+from gsseg_core.learn.em.scene_edges import sampled
 
 SHARPNESS = 3.0
 """Log-likelihood of edges of one unit in the mean, in nats, where `LENGTH` pixels lie along the boundary."""
@@ -54,6 +55,11 @@ BAND = 64  # rows of the image that are gone through at once
 ROUNDS = 6  # of the mean field, each with a better prior
 
 
+def reach(farthest: int) -> int:
+    """How far from boundaries `align_boundaries` looks at edges, in px to each side."""
+    return 2 * farthest + FARTHEST
+
+
 def align_boundaries(labels: np.ndarray, edges: np.ndarray, farthest: int) -> np.ndarray:
     """Align a mask and its boundaries with edges of the scene.
 
@@ -62,7 +68,7 @@ def align_boundaries(labels: np.ndarray, edges: np.ndarray, farthest: int) -> np
     labels : (H, W) int32
         The mask; negative where unknown.
     edges : (H, W) float32
-        Their strength, from `scene_edges`.
+        Their strength, from `scene_edges`, as far as `reach` from boundaries and in the sample.
     farthest : int
         S, in px: regions are drawn too wide or too narrow by this much at most.
 
@@ -101,7 +107,7 @@ def _align_regions(labels: np.ndarray, edges: np.ndarray, farthest: int) -> _Ali
     log_likelihood = _edge_log_likelihood(lengths[moving], strengths[moving])
     still = float(log_likelihood[:, 2 * farthest - 1].sum())
     near = slice(farthest, 3 * farthest)  # a boundary may lie this far from its edge
-    tells = bool(strengths[:, near].sum() >= TELLING * edges.mean() * lengths[:, near].sum())
+    tells = bool(strengths[:, near].sum() >= TELLING * sampled(edges).mean() * lengths[:, near].sum())
     aligned = labels.copy()
     if not tells:
         return _Alignment(aligned, still, tells, beside, weights)

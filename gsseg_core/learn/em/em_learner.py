@@ -33,8 +33,8 @@ from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn.em import em_kernels as kernels
-from gsseg_core.learn.em.block_weights import block_weights
-from gsseg_core.learn.em.boundary_alignment import align_boundaries
+from gsseg_core.learn.em.block_weights import block_weights, near_boundaries
+from gsseg_core.learn.em.boundary_alignment import align_boundaries, reach
 from gsseg_core.learn.em.confusion_model import ErrorModel
 from gsseg_core.learn.em.em_kernels import ViewPairs
 from gsseg_core.learn.em.leave_one_out import leave_one_out_counts, subtract_votes
@@ -42,6 +42,7 @@ from gsseg_core.learn.em.rejected_regions import find_rejected, split_regions
 from gsseg_core.learn.em.scene_edges import scene_edges
 from gsseg_core.learn.learner import VOTE_UNIT, Learner, Progress, silent
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.constants import BLOCK
 from gsseg_core.raster.observation import Observation, VoteShares
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import PixelGrid, Strongest, ViewRenderer
@@ -265,7 +266,10 @@ class EMLearner(Learner):
         if settings.errors and settings.edge_px and seen.evidence is None:
             # Where boundaries go is a decision, not a quantity: all devices have to see the very same edges.
             drawing = operator if self.device == "cpu" else make_operator(self.scene, operator.camera)
-            seen = SeenLabels(align_boundaries(seen.labels, scene_edges(drawing, self.scene), settings.edge_px))
+            # One px more, since edges are differences.
+            near = near_boundaries(seen.labels, -(-(reach(settings.edge_px) + 1) // BLOCK))
+            edges = scene_edges(drawing, self.scene, near)
+            seen = SeenLabels(align_boundaries(seen.labels, edges, settings.edge_px))
         return split_regions(seen) if settings.rejects_regions else seen
 
     def _reject_regions(

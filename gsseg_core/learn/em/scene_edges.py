@@ -1,7 +1,8 @@
 """Edges of the scene in a view, of colour and of depth, to which boundaries of masks can be aligned.
 
 Their strength is the gradient of the luminance plus the second differences of the inverse depth, each in units of its
-95th percentile over the view. On a plane, inverse depth is linear in the image, so that only creases and steps are
+95th percentile over the view, by a sample of it: edges are needed near boundaries of the mask, and only there, and in
+the sample, are they drawn. On a plane, inverse depth is linear in the image, so that only creases and steps are
 left. Depth alone is too blurred to locate boundaries: a scene of one colour has no edges.
 """
 
@@ -11,32 +12,64 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.kernels.compiler import kernel
+from gsseg_core.raster.constants import BLOCK
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 
+SQUARE = 4 * BLOCK  # px, side of the squares of the sample, which are tiles of the rasteriser
+EVERY = 3  # of rows and columns of squares, one is in the sample
+SMALL = 256  # px: of rows or columns of fewer, all are in the sample
 STRONGEST = 2.0  # edges count at most so much, in units of the view's 95th percentile
 
 _LIGHT: PerScene[np.ndarray] = PerScene()
 
 
-def scene_edges(operator: ViewOperator, scene: GaussianScene) -> np.ndarray:
-    """Strength of the edges of colour and depth of a view, (H, W) float32, at least 0; see above for units."""
+def scene_edges(operator: ViewOperator, scene: GaussianScene, near: np.ndarray | None = None) -> np.ndarray:
+    """Strength of the edges of colour and depth of a view, (H, W) float32, at least 0; see above for units.
+
+    If only those `near` something are wanted, (ceil(H / 4), ceil(W / 4)) bool by blocks, what has no such block around
+    it, and is not in the sample, has no meaning.
+    """
     camera, light = operator.camera, _LIGHT.of(scene, lambda: scene.colors().mean(axis=1))
     if light.min() == light.max():
         return np.zeros((camera.height, camera.width), np.float32)
     ahead = camera.world_to_camera[2].astype(np.float32)
     channels = _luminance_and_inverse_depth(scene.means, light, operator.ids, ahead)
-    light_edges, depth_edges = _differences(*operator.blend_seen(channels))
+    wanted = None if near is None else _near_or_sampled(near, camera.height, camera.width)
+    light_edges, depth_edges = _differences(*operator.blend_seen(channels, wanted))
     edges: np.ndarray = _in_units(light_edges) + _in_units(depth_edges)
     return edges
 
 
 def _in_units(edges: np.ndarray) -> np.ndarray:
-    some = edges[::2, ::2].ravel()  # every fourth pixel will do
+    some = sampled(edges)
     rank = 95 * (some.size - 1) // 100
     unit = np.partition(some, rank)[rank]
     return np.minimum(edges / unit, np.float32(STRONGEST)) if unit > 0 else np.zeros_like(edges)
+
+
+def sampled(image: np.ndarray) -> np.ndarray:
+    """Sample a view, (H, W): the pixels of some squares, but for their margins; all pixels of a small one."""
+    rows, columns = (_in_sample(size, 1) for size in image.shape)
+    some: np.ndarray = image[rows][:, columns].ravel()
+    return some
+
+
+def _in_sample(size: int, margin: int) -> np.ndarray:
+    """Mark the rows or columns of an image that meet squares of the sample, less their margins: (size,) bool."""
+    if size < SMALL:
+        return np.ones(size, bool)
+    first = np.arange(size) % (SQUARE * EVERY) - SQUARE
+    inside: np.ndarray = (first >= margin) & (first < SQUARE - margin)
+    return inside
+
+
+def _near_or_sampled(near: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Mark the pixels of blocks that are near, and of the squares of the sample, (H, W) bool."""
+    wanted: np.ndarray = near.repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)[:height, :width]
+    wanted |= np.logical_and.outer(_in_sample(height, 0), _in_sample(width, 0))
+    return wanted
 
 
 @kernel(parallel=True)

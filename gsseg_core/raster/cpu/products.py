@@ -228,8 +228,11 @@ def _blend_codes(
 
 
 @kernel(parallel=True, fastmath={"contract"}, error_model="numpy")
-def render_few(tiles: Tiles, codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Do what `render` does for codes (M, K) float32 with few zeros, K small: weights are used where they are made."""
+def render_few(tiles: Tiles, codes: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Do what `render` does for codes (M, K) float32 with few zeros, K small: weights are used where they are made.
+
+    Blocks of 4 x 4 pixels none of which is `wanted`, (H, W) bool or (0, 0) for all, are not looked at.
+    """
     channels = codes.shape[1]
     out, left_over = _blank(tiles, channels)
     stride = stride_of(tiles.rows)
@@ -237,8 +240,9 @@ def render_few(tiles: Tiles, codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]
         tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
         last = tiles.start[tile + 1]
         rays, lines = np.empty((TILE, TILE), np.float32), np.empty((2, 2, TILE), np.float32)
-        values = np.zeros((TILE, channels, TILE), np.float32)
+        values, corner = np.zeros((TILE, channels, TILE), np.float32), corner_of(tiles, tile)
         left, top, live = open_rays(tiles, tile, rays)
+        live &= _blocks_with(wanted, corner[0], corner[1]) if wanted.size else OPEN
         ahead = aim_next(tiles, tiles.start[tile] - 1, last, left, top, lines)
         for e in range(tiles.start[tile], last):
             g = tiles.entries[e]

@@ -24,6 +24,8 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.row_order import take_rows
 
+_all = np.empty((0, 0), np.bool_)  # pixels that are wanted, where no image says which
+
 
 class TileOperator(ViewOperator):
     """W of one view, remade tile by tile at every product and never stored.
@@ -60,11 +62,11 @@ class TileOperator(ViewOperator):
         other._tiles = self._tiles._replace(table=table)
         return other
 
-    def blend_seen(self, codes: np.ndarray) -> Blended:
+    def blend_seen(self, codes: np.ndarray, wanted: np.ndarray | None = None) -> Blended:
         """Blend codes (M, K) of what is visible."""
         codes = np.ascontiguousarray(codes, np.float32)
         if codes.shape[1] <= products.FEW:
-            return Blended(*products.render_few(self._tiles, codes))
+            return Blended(*products.render_few(self._tiles, codes, _all if wanted is None else wanted))
         # A Gaussian speaks for few classes; the others cost nothing.
         rows = np.arange(len(codes), dtype=np.int32)
         return Blended(*products.render(self._tiles, CSRRows.from_dense(codes), rows, codes.shape[1]))
@@ -82,7 +84,7 @@ class TileOperator(ViewOperator):
         others = np.ascontiguousarray(np.empty((len(self.ids), 0)) if beside is None else beside, np.float32)
         classes, known, some, image, left_over = products.strongest(
             self._tiles, codes, self._rows(of), num_classes, background, first, step, others,
-            np.empty((0, 0), np.bool_) if wanted is None else wanted,
+            _all if wanted is None else wanted,
         )  # fmt: skip
         return Strongest(classes, known, some, None if beside is None else Blended(image, left_over))
 
