@@ -236,10 +236,10 @@ def test_edges_near_boundaries_are_all_that_moving_them_takes(seed: int) -> None
     """A mask is aligned with edges that are drawn near its boundaries as with those of the whole view."""
     rng = np.random.default_rng(seed)
     view = clean_views(4)[seed]
-    camera = replace(view.camera, width=320, height=280, K=view.camera.K * [[5], [5], [1]])
-    operator, labels = make_operator(SCENE, camera), np.zeros((280, 320), np.int32)
+    camera = replace(view.camera, width=480, height=448, K=view.camera.K * [[7], [7], [1]])
+    operator, labels = make_operator(SCENE, camera), np.zeros((448, 480), np.int32)
     for label in range(1, 4):
-        y, x = rng.integers(0, 240, 2)
+        y, x = rng.integers(0, 400, 2)
         labels[y : y + 30, x : x + 25] = label
     edges = scene_edges(operator, SCENE)
     near = near_boundaries(labels, -(-(reach(3) + 1) // BLOCK))

@@ -19,7 +19,7 @@ from gsseg_core.scene.scene_cache import PerScene
 
 SQUARE = 4 * BLOCK  # px, side of the squares of the sample, which are tiles of the rasteriser
 EVERY = 3  # of rows and columns of squares, one is in the sample
-SMALL = 256  # px: of rows or columns of fewer, all are in the sample
+SMALL = 448  # px: of rows or columns of fewer, all are in the sample
 STRONGEST = 2.0  # edges count at most so much, in units of the view's 95th percentile
 
 _LIGHT: PerScene[np.ndarray] = PerScene()
