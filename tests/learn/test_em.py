@@ -155,7 +155,7 @@ def rejected_regions(scene: GaussianScene, views: list[View], settings: EMSettin
 def pixel_weights(view: View) -> np.ndarray:
     """By how much each pixel of a mask counts in the steps, (H W,)."""
     labels = view.read_labels()
-    blocks = block_weights(labels, view.name).astype(np.float64)
+    blocks = block_weights(labels, labels).astype(np.float64)
     return np.kron(blocks, np.ones((BLOCK, BLOCK)))[: labels.shape[0], : labels.shape[1]].ravel()
 
 

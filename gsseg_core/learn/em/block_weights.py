@@ -2,7 +2,7 @@
 
 Where an object ends is told by the pixels near the boundaries of its regions. Far inside, neighbouring pixels say the
 same of the same object, and most views that see a Gaussian at all see it there. So every block near a boundary is gone
-through, and of the others few, in each view other ones. docs/memory.md has what that saves and costs.
+through, and of the others few, in most views other ones. docs/memory.md has what that saves and costs.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 from zlib import crc32
 
 import numpy as np
-from scipy.ndimage import maximum_filter
 
 from gsseg_core.kernels.compiler import kernel
 from gsseg_core.raster.constants import BLOCK
@@ -20,35 +19,35 @@ STEP = 2  # in rows and columns, from one block to the next of those farther awa
 FAR = 4.0  # weight of these, each for the four that it stands for
 
 
-def block_weights(labels: np.ndarray, name: str) -> np.ndarray:
+def block_weights(labels: np.ndarray, mask: np.ndarray) -> np.ndarray:
     """Weigh the blocks of a view's mask; those of weight 0 are left out.
+
+    Which of those far from boundaries are gone through follows from where the mask had its boundaries, not from names
+    of views or classes: the same masks teach the same, whoever sends them.
 
     Parameters
     ----------
     labels : (H, W) int32
-        The mask.
-    name : str
-        Of the view, so that each has others: of what stands still before a robot, all is seen in time.
+        The mask as it is learnt from, its boundaries aligned.
+    mask : (H, W) int32
+        The mask as it came.
 
     Returns
     -------
     (ceil(H / 4), ceil(W / 4)) float32
     """
     near = near_boundaries(labels, NEAR)
-    first, some = crc32(name.encode()) % STEP**2, np.zeros(near.shape, np.float32)
+    first, some = crc32(near_boundaries(mask, 0).tobytes()) % STEP**2, np.zeros(near.shape, np.float32)
     some[first // STEP :: STEP, first % STEP :: STEP] = FAR
     return np.where(near, np.float32(1), some)
 
 
-def near_boundaries(labels: np.ndarray, distance: int) -> np.ndarray:
-    """Mark blocks with a boundary of a mask (H, W), and so many around them: (ceil(H / 4), ceil(W / 4)) bool."""
-    near: np.ndarray = maximum_filter(_with_boundary(labels), 2 * distance + 1)
-    return near
-
-
 @kernel
-def _with_boundary(labels: np.ndarray) -> np.ndarray:  # (H, W)
-    """Mark blocks with a pixel whose label is not that of all pixels beside, above and below it."""
+def near_boundaries(labels: np.ndarray, distance: int) -> np.ndarray:
+    """Mark blocks with a boundary of a mask (H, W), and so many around them: (ceil(H / 4), ceil(W / 4)) bool.
+
+    A boundary is met by pixels whose label is not that of a pixel beside, above or below them.
+    """
     height, width = labels.shape
     blocks = np.zeros((-(-height // BLOCK), -(-width // BLOCK)), np.bool_)
     for y in range(height):
@@ -58,4 +57,10 @@ def _with_boundary(labels: np.ndarray) -> np.ndarray:  # (H, W)
                 blocks[y // BLOCK, x // BLOCK] = blocks[y // BLOCK, right // BLOCK] = True
             if here != labels[below, x]:
                 blocks[y // BLOCK, x // BLOCK] = blocks[below // BLOCK, x // BLOCK] = True
-    return blocks
+    near = np.zeros_like(blocks)
+    for row in range(blocks.shape[0]):
+        for column in range(blocks.shape[1]):
+            if blocks[row, column]:
+                top, left = max(row - distance, 0), max(column - distance, 0)
+                near[top : row + distance + 1, left : column + distance + 1] = True
+    return near

@@ -258,7 +258,7 @@ class EMLearner(Learner):
     def _prepare(self, view: View, seen: SeenLabels) -> Observation:
         operator = self._operator_of(view)
         used = self._used_labels(seen, operator)
-        return operator.observe(*used, block_weights(used.labels, view.name))
+        return operator.observe(*used, block_weights(used.labels, seen.labels))
 
     def _used_labels(self, seen: SeenLabels, operator: ViewOperator) -> SeenLabels:
         """Align boundaries of a plain mask with edges, and give each region a label if regions may be rejected."""
