@@ -78,7 +78,7 @@ def test_labels_are_those_of_the_cpu(backend, monkeypatch, which):
     same = expected.codes_.argmax(axis=1) == got.codes_.argmax(axis=1)
     second, first = np.sort(expected.codes_, axis=1)[:, -2:].T
     decided = both & (first - second > 0.01)  # A tie may fall to either side.
-    assert decided.sum() >= 0.99 * both.sum()
+    assert decided.sum() > 300
     assert same[decided].mean() >= 0.999
     np.testing.assert_allclose(got.codes_[both], expected.codes_[both], atol=0.05)
 
