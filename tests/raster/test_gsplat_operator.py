@@ -76,10 +76,11 @@ def test_labels_are_those_of_the_cpu(backend, monkeypatch, which):
     both = expected.observed_ & got.observed_
     assert both.sum() >= 0.999 * expected.observed_.sum() > 300
     same = expected.codes_.argmax(axis=1) == got.codes_.argmax(axis=1)
+    # A tie may fall to either side: a lead of less than the two learners differ by, a thousandth each.
     second, first = np.sort(expected.codes_, axis=1)[:, -2:].T
-    decided = both & (first - second > 0.01)  # A tie may fall to either side.
-    assert decided.sum() > 300
-    assert same[decided].mean() >= 0.999
+    tied = (first - second < 0.002) & (which == "em")
+    assert (same | tied)[both].mean() >= 0.999
+    assert same[both].mean() >= 0.998
     np.testing.assert_allclose(got.codes_[both], expected.codes_[both], atol=0.05)
 
 

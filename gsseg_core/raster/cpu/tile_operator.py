@@ -24,7 +24,7 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.row_order import take_rows
 
-_all = np.empty((0, 0), np.bool_)  # pixels that are wanted, where no image says which
+_ALL_WANTED = np.empty((0, 0), np.bool_)  # pixels that are wanted, where no image says which
 
 
 class TileOperator(ViewOperator):
@@ -66,7 +66,7 @@ class TileOperator(ViewOperator):
         """Blend codes (M, K) of what is visible."""
         codes = np.ascontiguousarray(codes, np.float32)
         if codes.shape[1] <= products.FEW:
-            return Blended(*products.render_few(self._tiles, codes, _all if wanted is None else wanted))
+            return Blended(*products.render_few(self._tiles, codes, _ALL_WANTED if wanted is None else wanted))
         # A Gaussian speaks for few classes; the others cost nothing.
         rows = np.arange(len(codes), dtype=np.int32)
         return Blended(*products.render(self._tiles, CSRRows.from_dense(codes), rows, codes.shape[1]))
@@ -84,7 +84,7 @@ class TileOperator(ViewOperator):
         others = np.ascontiguousarray(np.empty((len(self.ids), 0)) if beside is None else beside, np.float32)
         classes, known, some, image, left_over = products.strongest(
             self._tiles, codes, self._rows(of), num_classes, background, first, step, others,
-            _all if wanted is None else wanted,
+            _ALL_WANTED if wanted is None else wanted,
         )  # fmt: skip
         return Strongest(classes, known, some, None if beside is None else Blended(image, left_over))
 
