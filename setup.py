@@ -87,9 +87,9 @@ setup(
         # Writing compressed PLY and SPZ, and reading SPZ of version 4 and YAML of masks.
         "formats": ["gsply>=0.4.6", "pyyaml>=6.0", "zstandard>=0.22"],
         "examples": ["rosbags>=0.10", "scikit-image>=0.25"],
-        # The view operator on CUDA. Below 1.6, since docs/gpu.md bounds what the rules of this version change. gsplat
-        # imports packaging without asking for it.
-        "gsplat": ["gsplat>=1.5.3,<1.6", "packaging>=21", "torch>=2.3"],
+        # Views on a GPU, with a driver of CUDA 12 or later, or of CUDA 13. numba-cuda 0.30 needs NumPy below 2.5.
+        "cuda12": ["numba-cuda[cu12]>=0.30", "numpy<2.5"],
+        "cuda13": ["numba-cuda[cu13]>=0.30", "numpy<2.5"],
         # ROS 2 Jazzy as wheels, for a machine without one from apt. Exact, because gsseg_msgs is compiled against them.
         "ros": [
             "ros-jazzy-common-interfaces==5.3.6",

@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"bench_gpu: {error}", file=sys.stderr)
         return 2
     warm_up("cpu")
-    print(f"{options.device}: {_gpu(options.device)}, gsplat {version('gsplat')}, torch {version('torch')}")
+    print(f"{options.device}: {_gpu(options.device)}, numba-cuda {version('numba-cuda')}, torch {version('torch')}")
     print(f"cpu: {processor()}\n")
 
     room = build_room(options.gaussians, num_views=options.views)

@@ -39,17 +39,18 @@ def main() -> int:
     parser.add_argument("--labels", default="labels_noisy", help="folder of the masks")
     parser.add_argument("--trees", type=Path, nargs="+", default=[REPOSITORY], help="checkouts to compare")
     parser.add_argument("--runs", type=int, default=1, help="of each")
+    parser.add_argument("--device", default="cpu", help="that renders the views")
     parser.add_argument("--child", metavar="OUT", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.child:
-        print(json.dumps(run_here(options.data, options.labels, options.child)))
+        print(json.dumps(run_here(options.data, options.labels, options.device, options.child)))
         return 0
     with tempfile.TemporaryDirectory() as work:
         folder = options.data or write_workload(Path(work) / "data", options.workload, options.share)
         answers: list[list[dict[str, Any]]] = [[] for _ in options.trees]
         for _ in range(options.runs):
             for tree, answer in zip(options.trees, answers, strict=True):
-                answer.append(run_in(tree.resolve(), folder, options.labels, Path(work) / "out"))
+                answer.append(run_in(tree.resolve(), folder, options.labels, options.device, Path(work) / "out"))
                 print(f"{tree}: {sum(answer[-1]['wall'].values()):.1f} s", file=sys.stderr, flush=True)
     print_table([str(tree) for tree in options.trees], answers)
     return 0
@@ -68,16 +69,18 @@ def write_workload(folder: Path, name: str, share: float) -> Path:
     return write_room(folder, part if share < 1 else size, wrong=True)
 
 
-def run_in(tree: Path, folder: Path, labels: str, out: Path) -> dict[str, Any]:
+def run_in(tree: Path, folder: Path, labels: str, device: str, out: Path) -> dict[str, Any]:
     """Run the command of a checkout in a process of its own."""
     command = [sys.executable, str(Path(__file__).resolve()), "--data", str(folder), "--labels", labels]
-    environment = {**os.environ, "PYTHONPATH": str(tree)}
+    command += ["--device", device]
+    path = os.pathsep.join([str(tree), *filter(None, [os.environ.get("PYTHONPATH")])])
+    environment = {**os.environ, "PYTHONPATH": path}
     done = subprocess.run([*command, "--child", str(out)], env=environment, check=True, capture_output=True, text=True)
     answer: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
     return answer
 
 
-def run_here(folder: Path, labels: str, out: str) -> dict[str, Any]:
+def run_here(folder: Path, labels: str, device: str, out: str) -> dict[str, Any]:
     """Do what `gsseg segment` does: seconds of each stage, by the clock and of all cores, and peak memory in GiB."""
     from machine import peak_memory
 
@@ -100,8 +103,8 @@ def run_here(folder: Path, labels: str, out: str) -> dict[str, Any]:
     from gsseg_core.warm_up import warm_up
 
     keep_freed_memory()
-    warm_up()
-    report = pipeline.segment(folder / "scene.ply", folder, out, labels=labels)
+    warm_up(device)
+    report = pipeline.segment(folder / "scene.ply", folder, out, labels=labels, device=device)
     return {"wall": wall, "cores": cores, "peak": peak_memory(), "steps": len(report["objective"])}
 
 

@@ -156,7 +156,7 @@ def segment(
         Whatever is wrong with the input; see `gsseg_core.errors`. What was in `out` before is whole and unchanged.
     """
     settings = RunSettings(
-        learner, str(labels), views, device, default_budget() if memory_budget is None else memory_budget, seed,
+        learner, str(labels), views, device, default_budget(device) if memory_budget is None else memory_budget, seed,
         scheduler, ids, refine or RefineSettings(), GraphSettings() if graph else None, granularity, scene_format,
         collision, None if label_map is None else str(label_map), quality,
     )  # fmt: skip

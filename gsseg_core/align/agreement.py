@@ -31,7 +31,7 @@ from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.depth import colours_and_depth
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.two_at_once import two_at_once
+from gsseg_core.several_at_once import several_at_once
 
 LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)  # of RGB, ITU-R BT.601
 _EDGE_PX = 3  # reach of the filter that finds edges, px of a picture
@@ -122,7 +122,7 @@ def agreement(
         picture = render(few, view.camera, device)
         return view.upside_down().score(picture), [each.score(picture) for each in shown]
 
-    upside_down, rows = zip(*two_at_once(compared, shown, device), strict=True)
+    upside_down, rows = zip(*several_at_once(compared, shown, device), strict=True)
     scores, turned = np.array(rows), float(np.mean(upside_down))
     score, own = float(np.diag(scores).mean()), np.eye(len(shown), dtype=bool)
     # Of a robot that stands still all views are the same, and of an endless floor both ways up.

@@ -50,7 +50,8 @@ _EXTRAS_FOR = {
     "usd": "--format usd, --collision surface, poisson",
     "ros": "the ROS 2 nodes, on a machine without ROS from apt",
     "distributed": "gsseg segment --scheduler, several machines",
-    "gsplat": "--device cuda, on a machine with an NVIDIA GPU",
+    "cuda12": "--device cuda, on a machine with an NVIDIA GPU",
+    "cuda13": "the same, with a driver of CUDA 13",
 }
 _ROS_MODULES = {
     "rclpy": "ROS 2 itself: source its setup file, or see the extra ros above",

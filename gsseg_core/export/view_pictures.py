@@ -21,7 +21,7 @@ from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.refine.silhouette_carving import Silhouette
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.two_at_once import two_at_once
+from gsseg_core.several_at_once import several_at_once
 
 _DIFFERENT = np.array([[0, 0, 0], [230, 40, 40]], np.uint8)
 SavePicture = Callable[[Path, np.ndarray, "str | None"], object]
@@ -76,7 +76,7 @@ def draw_views(
         labels, seen = segmentation.label_map_beside(operator, scene.colors(view.camera.center, operator.ids))
         return Drawn.of(view, labels, as_pixels(seen.image), segmentation.num_classes)
 
-    yield from two_at_once(draw, views, device)
+    yield from several_at_once(draw, views, device)
 
 
 def look_at(
@@ -98,7 +98,7 @@ def look_at(
             drawn[view.name] = Drawn.of(view, labels, as_pixels(image[..., :3]), segmentation.num_classes)
         return Silhouette.of(scene, operator, labels, surface_of(image[..., -1], left_over).depth)
 
-    yield from two_at_once(look, views, device)
+    yield from several_at_once(look, views, device)
 
 
 def write_pictures(
@@ -177,5 +177,5 @@ def draw_worst_views(
     for check in worst:
         trusted = f"{100 * check.reliability:.0f} % reliable" if check.checked else "unchecked"
         captions += [f"{check.name}: {trusted}", "what the other views say", "where they differ"]
-    images = [image for row in two_at_once(draw, worst, device) for image in row]
+    images = [image for row in several_at_once(draw, worst, device) for image in row]
     return contact_sheet(images, captions, 3)

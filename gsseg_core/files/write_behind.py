@@ -7,7 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Concatenate, ParamSpec
 
-from gsseg_core.two_at_once import kernels_run_beside_each_other
+from gsseg_core.several_at_once import kernels_run_beside_each_other
 
 Arguments = ParamSpec("Arguments")
 

@@ -26,7 +26,7 @@ from gsseg_core.raster.observation import Observation
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import PixelGrid, Strongest
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.two_at_once import two_at_once
+from gsseg_core.several_at_once import several_at_once
 
 VOTE_UNIT = 2.0**-24  # votes are counted in whole multiples of this many px, so that adding and taking back are exact
 UNITS = 1 / VOTE_UNIT  # units per px
@@ -91,7 +91,7 @@ class Learner(ABC):
     ) -> None:
         if num_classes < 1:
             raise SettingsError(f"num_classes is {num_classes}; expected at least 1")
-        memory_budget = default_budget() if memory_budget is None else memory_budget
+        memory_budget = default_budget(device) if memory_budget is None else memory_budget
         if memory_budget < 0:
             raise SettingsError(f"memory_budget is {memory_budget} bytes; expected at least 0")
         self.scene, self.num_classes, self.device = scene, num_classes, device
@@ -134,7 +134,7 @@ class Learner(ABC):
 
     def observe_all(self, views: Sequence[View], progress: Progress = silent) -> None:
         """Add views, as `observe` does; the error that one of them raises ends it."""
-        with closing(two_at_once(self._opened, views, self.device)) as opened:
+        with closing(several_at_once(self._opened, views, self.device)) as opened:
             for done, view in enumerate(views):
                 progress("observe", done, len(views))
                 if self.memory_budget == 0:
@@ -330,7 +330,7 @@ class Learner(ABC):
         def ask(name: str) -> R:
             return self._prepared.ask(name, self.observation(name), work)
 
-        with closing(two_at_once(ask, names, self.device)) as made:
+        with closing(several_at_once(ask, names, self.device)) as made:
             for name in names:
                 tick()
                 yield name, next(made)

@@ -24,7 +24,7 @@ from gsseg_core.data.view import View, spread
 from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.learn.temperature import VIEWS, Sample, grid_of, sample_grid
 from gsseg_core.scene.camera import Camera
-from gsseg_core.two_at_once import two_at_once
+from gsseg_core.several_at_once import several_at_once
 
 WORST = 4  # views that are trusted least, as pictures show them
 _ALL = 1 << 17  # px of the largest views of which all are compared; of others, every second tile of 16 x 16
@@ -108,13 +108,13 @@ class MaskChecker:
         """
         views = self.learner.views
         checks = {}
-        with closing(two_at_once(self._check, views.values(), self.learner.device)) as checked:
+        with closing(several_at_once(self._check, views.values(), self.learner.device)) as checked:
             for done, name in enumerate(views):
                 progress("check views", done, len(views))
                 checks[name] = next(checked)
         shown = shown_views(list(checks.values()))
         again = [views[check.name] for check in shown if not _is_of_all(check, views[check.name].camera)]
-        with closing(two_at_once(self._everywhere, again, self.learner.device)) as predicted:
+        with closing(several_at_once(self._everywhere, again, self.learner.device)) as predicted:
             for view, everywhere in zip(again, predicted, strict=True):
                 checks[view.name] = replace(checks[view.name], predicted=everywhere)
         progress("check views", len(views), len(views))

@@ -8,6 +8,7 @@ from typing import TypeVar
 
 from gsseg_core.files.scratch_file import ScratchFile
 from gsseg_core.learn.free_memory import free_memory
+from gsseg_core.raster.backends import free_memory_on
 from gsseg_core.raster.observation import Observation
 
 MEMORY_SHARE = 8  # they take this part of the free memory, unless asked otherwise; more goes to the file
@@ -18,8 +19,10 @@ R = TypeVar("R")
 _ALONE = threading.Lock()  # of two threads at work on a view each, one at a time keeps something
 
 
-def default_budget() -> int:
+def default_budget(device: str = "cpu") -> int:
     """Bytes of prepared views that are kept in memory where nobody says how many."""
+    if device != "cpu":  # Views are all that a GPU is for.
+        return (free_memory_on(device) or MEMORY_BUDGET) // 2
     free = free_memory()
     return MEMORY_BUDGET if free is None else free // MEMORY_SHARE
 
@@ -37,6 +40,7 @@ class PreparedViews:
 
     def __init__(self, budget: int, with_file: bool) -> None:
         self.in_memory: dict[str, Observation] = {}
+        self._sizes: dict[str, int] = {}  # bytes of each of these: asked once, not of all for every view that comes
         self._budget, self._with_file = budget, with_file
         self._file, self._answers = ScratchFile(), ScratchFile()  # views, and what each was asked and answered last
 
@@ -48,13 +52,14 @@ class PreparedViews:
     def nbytes(self) -> tuple[int, int]:
         """Bytes that are kept, in memory and in the temporary file."""
         in_file = self._file.nbytes + self._answers.nbytes
-        return sum(kept.nbytes for kept in self.in_memory.values()), in_file
+        return sum(self._sizes.values()), in_file
 
     def keep(self, name: str, observation: Observation) -> None:
         """Keep a view, where there is room."""
         with _ALONE:
-            if self.nbytes[0] + observation.nbytes <= self._budget:
-                self.in_memory[name] = observation
+            size = observation.nbytes
+            if self.nbytes[0] + size <= self._budget:
+                self.in_memory[name], self._sizes[name] = observation, size
             elif self._budget > 0 and self._with_file:
                 self._file.put(name, observation)
 
@@ -78,11 +83,13 @@ class PreparedViews:
     def drop(self, name: str) -> None:
         """Keep nothing of a view."""
         self.in_memory.pop(name, None)
+        self._sizes.pop(name, None)
         self._file.drop(name)
         self._answers.drop(name)
 
     def clear(self) -> None:
         """Keep nothing."""
         self.in_memory.clear()
+        self._sizes.clear()
         self._file.clear()
         self._answers.clear()

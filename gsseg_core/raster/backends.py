@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
+from types import ModuleType
 from typing import TYPE_CHECKING, NamedTuple
 
 from gsseg_core.errors import SettingsError
@@ -26,8 +27,8 @@ class Rasteriser(NamedTuple):
 RASTERISERS = [
     Rasteriser("cpu", "cpu", "gsseg_core.raster.cpu.tile_operator", "pip install gsseg"),
     Rasteriser(
-        "cuda(:[0-9]+)?", "cuda (the first GPU) or cuda:1 and so on", "gsseg_core.raster.gsplat_backend",
-        "a CUDA build of PyTorch, and gsplat: pip install 'gsseg[gsplat]'",
+        "cuda(:[0-9]+)?", "cuda (the first GPU) or cuda:1 and so on", "gsseg_core.raster.gpu.gpu_operator",
+        "a CUDA build of PyTorch, and numba-cuda: pip install 'gsseg[cuda12]'",
     ),
 ]  # fmt: skip
 
@@ -68,14 +69,23 @@ def make_operator(scene: GaussianScene, camera: Camera, device: str = "cpu") -> 
     SettingsError
         There is no such device, or what it needs is not installed.
     """
+    operator: ViewOperator = _module_of(device).view_operator(scene, camera, device)
+    return operator
+
+
+def free_memory_on(device: str) -> int | None:
+    """Tell how many bytes for views are free on a device, None where the system does not say; raises the same."""
+    free: int | None = _module_of(device).free_memory_on(device)
+    return free
+
+
+def _module_of(device: str) -> ModuleType:
     rasteriser = rasteriser_of(device)
     try:
-        module = importlib.import_module(rasteriser.module)
+        return importlib.import_module(rasteriser.module)
     except ModuleNotFoundError as missing:
         if not missing.name or missing.name.startswith("gsseg_core"):
             raise
         raise SettingsError(
             f"device is {device!r}, and the package {missing.name!r} is missing; expected {rasteriser.needs}"
         ) from missing
-    operator: ViewOperator = module.view_operator(scene, camera, device)
-    return operator

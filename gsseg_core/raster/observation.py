@@ -27,6 +27,21 @@ class VoteShares(NamedTuple):
     log_likelihood: float  # sum over the labelled pixels of log p(y_p), natural
 
 
+class ViewPairs(NamedTuple):
+    """The (Gaussian, label) pairs of a view as kernels take them; `Observation` says what the arrays are.
+
+    Attributes
+    ----------
+    ids : (M,) int32
+    start : (M + 1,) int64
+    labels : (P,) int32
+    """
+
+    ids: np.ndarray
+    start: np.ndarray
+    labels: np.ndarray
+
+
 class Observation(ABC):
     """A view with its mask: W cut down, in each pixel, to the label that was seen there.
 
@@ -71,6 +86,10 @@ class Observation(ABC):
         out = np.zeros((len(self.ids), len(self.classes)), values.dtype)
         out[self.rows, self.labels] = values
         return out
+
+    def votes_by_label(self) -> np.ndarray:
+        """Sum of the votes of each label, (L,) float64, in px."""
+        return np.bincount(self.labels, weights=self.votes(), minlength=len(self.classes))
 
     @abstractmethod
     def operator(self, camera: Camera, num_gaussians: int) -> ViewRenderer:

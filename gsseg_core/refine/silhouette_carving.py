@@ -33,7 +33,7 @@ from gsseg_core.raster.depth import BEHIND, depths, surface
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.two_at_once import two_at_once
+from gsseg_core.several_at_once import several_at_once
 
 STEPS = 2  # of the shares: all move at once and so overshoot; on held-out views five were no better
 KEPT = 0.4  # least share with which a Gaussian stays with its object, of the largest share in that object
@@ -99,7 +99,7 @@ def kept_shares(
     for step in range(steps):
         stay[asked] = 0
         speak = partial(_reasons_to_stay, views, kept.astype(np.float32), asked)
-        for ids, reasons in two_at_once(speak, range(len(views))):
+        for ids, reasons in several_at_once(speak, range(len(views))):
             stay[ids] += reasons
         kept[asked] = np.clip(kept[asked] * stay[asked] / go[asked], _LEAST, 1.0)
         if step == 0:

@@ -18,8 +18,8 @@ from gsseg_core.files.atomic import write_atomically
 from gsseg_core.report import sections
 from gsseg_core.report.findings import warnings_of
 from gsseg_core.report.sections import PageInputs
+from gsseg_core.several_at_once import several_at_once
 from gsseg_core.text import percent, printable
-from gsseg_core.two_at_once import two_at_once
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -86,7 +86,7 @@ def _contents(run: PageInputs) -> dict[str, sections.Content]:
     made: dict[str, sections.Content | None] = {}
     for anchors in (FIRST, [anchor for anchor in SECTIONS if anchor not in FIRST]):
         made |= zip(
-            anchors, two_at_once(lambda anchor: SECTIONS[anchor][1](run), anchors, run.images.device), strict=True
+            anchors, several_at_once(lambda anchor: SECTIONS[anchor][1](run), anchors, run.images.device), strict=True
         )
     return {anchor: content for anchor, content in made.items() if content is not None}
 

@@ -46,26 +46,6 @@ def naive_view(scene: GaussianScene, camera: Camera, rounding: float = 1e-4) -> 
     return NaiveView(weights, transmittance, slack)
 
 
-def naive_gsplat_view(scene: GaussianScene, camera: Camera, rounding: float = 1e-3) -> NaiveView:
-    """Blend as gsplat does, by the rules of docs/gpu.md.
-
-    Opacity instead of alpha is cut off at 0.99, and a ray ends before the Gaussian that would bring it to 1e-4. Where a
-    threshold is in doubt, slack is 1: anything goes.
-    """
-    weights = np.zeros((camera.height * camera.width, len(scene)))
-    transmittance, slack = np.ones(len(weights)), np.zeros(len(weights))
-    going_on = np.ones(len(weights), bool)
-    for i, alpha in _alphas(scene, camera, np.minimum(scene.opacities, 0.99)):
-        slack[going_on & (np.abs(alpha * 255 - 1) < rounding)] = 1.0
-        alpha[alpha < 1 / 255] = 0.0
-        behind = transmittance * (1 - alpha)
-        slack[going_on & (np.abs(behind * 1e4 - 1) < rounding)] = 1.0
-        going_on &= behind > 1e-4
-        weights[:, i] = np.where(going_on, alpha * transmittance, 0.0)
-        transmittance[going_on] = behind[going_on]
-    return NaiveView(weights, transmittance, slack)
-
-
 def _alphas(
     scene: GaussianScene,
     camera: Camera,

@@ -118,7 +118,7 @@ def test_nothing_is_asked_twice_of_a_view_that_is_in_the_file(monkeypatch: pytes
 
 
 @pytest.mark.parametrize("budget", [0, 1, 1 << 30])
-def test_views_that_are_worked_on_two_at_once_give_the_same_results(
+def test_views_that_are_worked_on_several_at_once_give_the_same_results(
     budget: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     camera = replace(VIEWS[0].camera, name="blank")
@@ -127,7 +127,7 @@ def test_views_that_are_worked_on_two_at_once_give_the_same_results(
     alone = EMLearner(SCENE, NUM_CLASSES)
     for view in views:
         alone.observe(view)
-    monkeypatch.setattr("gsseg_core.two_at_once.numba.get_num_threads", lambda: 2)
+    monkeypatch.setattr("gsseg_core.several_at_once.numba.get_num_threads", lambda: 2)
     together = EMLearner(SCENE, NUM_CLASSES, memory_budget=budget)
     together.observe_all(views)
     assert list(together.views) == list(alone.views) and together.rejected == alone.rejected != {}

@@ -8,16 +8,16 @@ int64 in units of `GRADIENT_UNIT`, and a `prior`, (Z,) float32 in px. The `likel
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numba as nb
 import numpy as np
 from llvmlite import ir
 from numba.core import types
 
-from gsseg_core.csr_rows import CSRRows
+from gsseg_core.csr_rows import CSRRows, starts
 from gsseg_core.kernels.compiler import kernel
-from gsseg_core.raster.observation import Observation
+from gsseg_core.raster.observation import Observation, ViewPairs
 from gsseg_core.simd import intrinsic
 
 BLOCKS = 16  # counts are summed in this many parts, then together, so that they do not depend on the number of threads
@@ -27,7 +27,7 @@ GRADIENT_UNIT = 2.0**-24
 
 _GRADIENT_UNIT = np.float32(GRADIENT_UNIT)
 
-_MAX_TERM = 2.0**27 - 8
+MAX_TERM = 2.0**27 - 8
 """Most that one pair can add to a gradient, in px. More occurs only where a class has next to no probability, which
 then rises less in this step."""
 
@@ -36,24 +36,20 @@ _ROUND = 1.5 * 2.0**28
 _ROUND_BITS = int(np.float64(_ROUND).view(np.int64))
 
 
-class ViewPairs(NamedTuple):
-    """The (Gaussian, label) pairs of a view as kernels take them; `Observation` says what the arrays are.
+def pairs_of(observation: Observation) -> ViewPairs:
+    """Take the pairs of an observation."""
+    return ViewPairs(observation.ids, observation.start, observation.labels)
 
-    Attributes
-    ----------
-    ids : (M,) int32
-    start : (M + 1,) int64
-    labels : (P,) int32
-    """
 
-    ids: np.ndarray
-    start: np.ndarray
-    labels: np.ndarray
+def by_row(pairs: ViewPairs) -> ViewPairs:
+    """Count the Gaussians of a view by their own rows."""
+    return pairs._replace(ids=np.arange(len(pairs.ids), dtype=np.int32))
 
-    @classmethod
-    def of(cls, observation: Observation) -> ViewPairs:
-        """Take the pairs of an observation."""
-        return cls(observation.ids, observation.start, observation.labels)
+
+def rows_like(rows: CSRRows, ids: np.ndarray) -> CSRRows:  # (M,)
+    """Make M rows as long as those of `ids`, with nothing written into them."""
+    indptr = starts(np.diff(rows.indptr)[ids])
+    return CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], rows.data.dtype))
 
 
 @intrinsic
@@ -61,7 +57,7 @@ def rounded_to_units(_: Any, __: Any) -> Any:
     """Round px, float32 of at least 0, to int64 in units of GRADIENT_UNIT, by instructions that vector units have."""
 
     def write(_: Any, llvm: Any, __: Any, arguments: Sequence[Any]) -> Any:
-        most, double, bits = ir.Constant(ir.FloatType(), _MAX_TERM), ir.DoubleType(), ir.IntType(64)
+        most, double, bits = ir.Constant(ir.FloatType(), MAX_TERM), ir.DoubleType(), ir.IntType(64)
         pixels = llvm.select(llvm.fcmp_ordered("<", arguments[0], most), arguments[0], most)
         shifted = llvm.fadd(llvm.fpext(pixels, double), ir.Constant(double, _ROUND))
         return llvm.sub(llvm.bitcast(shifted, bits), ir.Constant(bits, _ROUND_BITS))

@@ -24,10 +24,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 
-from gsseg_core.csr_rows import CSRRows, starts
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import resolved_votes
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
@@ -36,14 +38,12 @@ from gsseg_core.learn.em import em_kernels as kernels
 from gsseg_core.learn.em.block_weights import block_weights, near_boundaries
 from gsseg_core.learn.em.boundary_alignment import align_boundaries, reach
 from gsseg_core.learn.em.confusion_model import ErrorModel
-from gsseg_core.learn.em.em_kernels import ViewPairs
-from gsseg_core.learn.em.leave_one_out import leave_one_out_counts, subtract_votes
+from gsseg_core.learn.em.pair_kernels import kernels_on
 from gsseg_core.learn.em.rejected_regions import find_rejected, split_regions
 from gsseg_core.learn.em.scene_edges import scene_edges
 from gsseg_core.learn.learner import VOTE_UNIT, Learner, Progress, silent
-from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.constants import BLOCK
-from gsseg_core.raster.observation import Observation, VoteShares
+from gsseg_core.raster.observation import Observation, ViewPairs, VoteShares
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import PixelGrid, Strongest, ViewRenderer
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -148,7 +148,8 @@ class EMLearner(Learner):
         super().__init__(scene, num_classes, device=device, memory_budget=memory_budget)
         self.settings = settings or EMSettings()
         self.error_models_: dict[str, ErrorModel] = {}
-        self._last_step: tuple[CSRRows, np.ndarray] | None = None  # probabilities before it, and gradient of all views
+        # Probabilities before it and the gradient of all views, both on the device; whether any are of the background.
+        self._last_step: tuple[Any, Any, bool] | None = None
 
     @classmethod
     def default_settings(cls, max_steps: int | None, seed: int) -> tuple[EMSettings]:
@@ -203,7 +204,9 @@ class EMLearner(Learner):
             small = kernels.predicted_gain(codes, gradient, prior.data) < tolerance
             self.converged_ = small and last_round
             if self.converged_ or len(history) == settings.max_steps:
-                self._last_step = codes.with_data(codes.data.copy()), gradient
+                here, on_device = self._put(codes.with_data(codes.data.copy()), self.device)
+                background = bool((codes.indices == 0).any())
+                self._last_step = here, on_device.put(gradient, self.device), background
             elif small:
                 self._refit_error_models(codes, gradient, prior.data, models, tick)
                 rounds.append(0)
@@ -242,13 +245,13 @@ class EMLearner(Learner):
         ids come second; else of all. Third is told whether any code has a share of the background.
         """
         assert self._last_step is not None, "expected fit() first"
-        codes, gradient = self._last_step
-        observation, no_prior = self.observation(view.name), np.zeros_like(codes.data)
-        stepped = codes_without(observation, self.error_models_[view.name], codes, gradient, no_prior)
-        background = bool((codes.indices == 0).any())
+        codes, gradient, background = self._last_step
+        observation, on_device = self.observation(view.name), kernels_on(self.device)
+        no_prior, ids = on_device.zeros(codes, np.float32), on_device.pairs_of(observation).ids
+        stepped = codes_without(observation, self.error_models_[view.name], codes, gradient, no_prior, self.device)
         if only_labelled:
-            return stepped, observation.ids, background, observation.operator(view.camera, len(self.scene))
-        return codes.with_rows(observation.ids, stepped), None, background, self._operator_of(view)
+            return stepped, ids, background, observation.operator(view.camera, len(self.scene))
+        return on_device.with_rows(codes, ids, stepped), None, background, self._operator_of(view)
 
     def rejected_share(self, view: View) -> float:
         """Share of a view's labelled pixels that lie in rejected regions."""
@@ -264,11 +267,9 @@ class EMLearner(Learner):
         """Align boundaries of a plain mask with edges, and give each region a label if regions may be rejected."""
         settings = self.settings
         if settings.errors and settings.edge_px and seen.evidence is None:
-            # Where boundaries go is a decision, not a quantity: all devices have to see the very same edges.
-            drawing = operator if self.device == "cpu" else make_operator(self.scene, operator.camera)
             # One px more, since edges are differences.
             near = near_boundaries(seen.labels, -(-(reach(settings.edge_px) + 1) // BLOCK))
-            edges = scene_edges(drawing, self.scene, near)
+            edges = scene_edges(operator, self.scene, near)
             seen = SeenLabels(align_boundaries(seen.labels, edges, settings.edge_px))
         return split_regions(seen) if settings.rejects_regions else seen
 
@@ -286,17 +287,30 @@ class EMLearner(Learner):
         """
         possible = self._possible()
 
-        def find(_: str, observation: Observation) -> tuple[np.ndarray, Observation]:
-            return find_rejected(votes, observation, possible, self.settings.least_agreement), observation
+        device = self._device_of(votes)
+        here, on_device = self._put(votes, device)
+        remaining = on_device.zeros(here, np.int64)
+        rejected = {}
 
-        remaining, rejected = np.zeros_like(votes.data), {}
+        def find(_: str, observation: Observation) -> tuple[np.ndarray, Observation]:
+            return find_rejected(here, observation, possible, self.settings.least_agreement, device), observation
+
         for name, (labels, observation) in self._of_each(find, names, tick):
             if labels.any():
                 rejected[name] = labels
                 rejected_votes = observation.evidence.without_names(~labels).votes
-                total, pairs = votes.with_data(remaining), ViewPairs.of(observation)
-                subtract_votes(total, pairs, observation.votes(), rejected_votes)
-        return -remaining, rejected
+                on_device.subtract_votes(here.with_data(remaining), observation, rejected_votes)
+        return -on_device.returned(remaining), rejected
+
+    def _device_of(self, votes: CSRRows) -> str:
+        """Where votes are counted: what is voted against, the CPU alone resolves."""
+        return "cpu" if votes.data.min(initial=0) < 0 else self.device
+
+    @staticmethod
+    def _put(rows: CSRRows, device: str) -> tuple[Any, ModuleType]:
+        """Put rows on a device, and tell what works on them there."""
+        on_device = kernels_on(device)
+        return on_device.put_rows(rows, device), on_device
 
     def _initial_error_models(
         self, votes: CSRRows, rejected: Mapping[str, np.ndarray], tick: Tick, names: Iterable[str] | None = None
@@ -306,6 +320,7 @@ class EMLearner(Learner):
         The votes, int64, are without those of labels that are `rejected`: (L,) bool, of views that have any.
         """
         settings, possible = self.settings, self._possible()
+        here, on_device = self._put(votes, self._device_of(votes))
 
         def estimate(name: str, observation: Observation) -> ErrorModel:
             evidence, outliers = observation.evidence, settings.outliers
@@ -314,7 +329,7 @@ class EMLearner(Learner):
             if name in rejected:
                 evidence = evidence.without_names(rejected[name])
             pixels = int(observation.areas[evidence.informative].sum())
-            counts = leave_one_out_counts(votes, observation, possible, evidence, settings.majority)
+            counts = on_device.leave_one_out_counts(here, observation, possible, evidence, settings.majority)
             return ErrorModel.from_counts(evidence, counts, settings.error_prior, outliers, pixels)
 
         models = dict(self._of_each(estimate, names, tick))
@@ -330,31 +345,33 @@ class EMLearner(Learner):
         log_likelihoods : dict of str to float
             Of each view's labels, in nats.
         """
+        here, on_device = self._put(codes, self.device)
 
         def share(name: str, observation: Observation) -> tuple[ViewPairs, np.ndarray, VoteShares]:
-            (likelihood, used), pairs = models[name].by_label, ViewPairs.of(observation)
-            said = kernels.pair_likelihood(codes, pairs, likelihood)
-            return pairs, used, observation.shares(said, likelihood[:, 0])
+            (likelihood, used), pairs = models[name].by_label, on_device.pairs_of(observation)
+            said = on_device.pair_likelihood(here, pairs, likelihood)
+            return pairs, used, on_device.shares(observation, said, likelihood[:, 0])
 
-        gradient, log_likelihoods = np.zeros(len(codes.data), np.int64), {}
+        gradient, log_likelihoods = on_device.zeros(here, np.int64), {}
         for name, (pairs, used, shares) in self._of_each(share, models, tick):
             log_likelihoods[name] = shares.log_likelihood
-            kernels.accumulate(codes.with_data(gradient), pairs, used, shares.pairs)
-        return gradient, log_likelihoods
+            on_device.accumulate(here.with_data(gradient), pairs, used, shares.pairs)
+        return on_device.returned(gradient), log_likelihoods
 
     def _refit_error_models(
         self, codes: CSRRows, gradient: np.ndarray, prior: np.ndarray, models: dict[str, ErrorModel], tick: Tick
     ) -> dict[str, ErrorModel]:
         """Re-estimate each view's error model, in place, from the step without this view; see `codes_without`."""
+        here, on_device = self._put(codes, self.device)
+        all_gained, all_prior = (on_device.put(array, self.device) for array in (gradient, prior))
 
         def refit(name: str, observation: Observation) -> None:
-            model, pairs = models[name], ViewPairs.of(observation)
-            without = codes_without(observation, model, codes, gradient, prior)
-            rows = np.arange(len(pairs.ids), dtype=np.int32)
+            model, pairs = models[name], on_device.pairs_of(observation)
+            without = codes_without(observation, model, here, all_gained, all_prior, self.device)
             likelihood, _ = model.by_label
-            said = kernels.pair_likelihood(without, pairs._replace(ids=rows), likelihood)
-            shares = observation.shares(said, likelihood[:, 0])
-            counts = kernels.confusion_counts(without, pairs, shares.pairs, self.num_classes, len(likelihood))
+            said = on_device.pair_likelihood(without, on_device.by_row(pairs), likelihood)
+            shares = on_device.shares(observation, said, likelihood[:, 0])
+            counts = on_device.confusion_counts(without, pairs, shares.pairs, self.num_classes, len(likelihood))
             counts[0] += shares.rest
             # What was gone through of each label speaks for all of it.
             counts *= observation.areas / np.maximum(observation.weighted_areas, 1)
@@ -375,15 +392,17 @@ class EMLearner(Learner):
 
 
 def codes_without(
-    observation: Observation, model: ErrorModel, codes: CSRRows, gradient: np.ndarray, prior: np.ndarray
-) -> CSRRows:
+    observation: Observation, model: ErrorModel, codes: CSRRows, gradient: np.ndarray, prior: np.ndarray,
+    device: str = "cpu",
+) -> CSRRows:  # fmt: skip
     """Take an M-step without one view: probabilities of the M Gaussians that it sees.
 
-    The gradient is that of all views at these codes and models; see `gsseg_core.learn.em.em_kernels` for the arrays.
+    The gradient is that of all views at these codes and models; see `gsseg_core.learn.em.em_kernels` for the arrays,
+    which are on the device.
     """
-    (likelihood, used), pairs = model.by_label, ViewPairs.of(observation)
-    shares = observation.shares(kernels.pair_likelihood(codes, pairs, likelihood), likelihood[:, 0])
-    indptr = starts(np.diff(codes.indptr)[pairs.ids])
-    stepped = CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], np.float32))
-    kernels.m_step_without_view(codes, gradient, prior, pairs, used, shares.pairs, stepped)
+    on_device = kernels_on(device)
+    (likelihood, used), pairs = model.by_label, on_device.pairs_of(observation)
+    shares = on_device.shares(observation, on_device.pair_likelihood(codes, pairs, likelihood), likelihood[:, 0])
+    stepped: CSRRows = on_device.rows_like(codes, pairs.ids)
+    on_device.m_step_without_view(codes, gradient, prior, pairs, used, shares.pairs, stepped)
     return stepped

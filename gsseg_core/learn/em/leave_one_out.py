@@ -8,9 +8,9 @@ import numpy as np
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence, resolve_row, vote_units
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
-from gsseg_core.learn.em.em_kernels import BLOCKS, ViewPairs
+from gsseg_core.learn.em.em_kernels import BLOCKS, pairs_of
 from gsseg_core.learn.learner import UNITS
-from gsseg_core.raster.observation import Observation
+from gsseg_core.raster.observation import Observation, ViewPairs
 
 
 def leave_one_out_counts(
@@ -26,18 +26,19 @@ def leave_one_out_counts(
     Probabilities are raised to a power, and normalised, before they are counted: above 1, majorities stand out. A
     Gaussian counts at most `most` times the pixels that the other views saw of it.
     """
-    pairs, own, classes = ViewPairs.of(observation), observation.votes(), np.flatnonzero(possible)
+    pairs, own, classes = pairs_of(observation), observation.votes(), np.flatnonzero(possible)
     parts = np.zeros((BLOCKS, len(possible), evidence.votes.indptr.shape[0] - 1))
     _count(votes, pairs, own, evidence.votes, classes, power, most, parts)
     return np.asarray(parts.sum(axis=0))
 
 
-@kernel(parallel=True)
-def subtract_votes(total: CSRRows, pairs: ViewPairs, own: np.ndarray, label_votes: CSRRows) -> None:
-    """Subtract one view's votes from those of all, N rows of int64, in place.
+def subtract_votes(total: CSRRows, observation: Observation, label_votes: CSRRows) -> None:
+    """Subtract one view's votes, by `LabelEvidence.votes`, from those of all, N rows of int64, in place."""
+    _subtract_votes(total, pairs_of(observation), observation.votes(), label_votes)
 
-    Of the view are `Observation.votes`, (P,) float32, and `LabelEvidence.votes`, L rows of float64.
-    """
+
+@kernel(parallel=True)
+def _subtract_votes(total: CSRRows, pairs: ViewPairs, own: np.ndarray, label_votes: CSRRows) -> None:
     indptr, classes, data = total
     ids, start, labels = pairs
     for m in nb.prange(ids.shape[0]):
@@ -79,7 +80,7 @@ def _count(
     """Count as `leave_one_out_counts` does, row by row, so that the votes of the other views are never stored.
 
     The counts are the sum of `parts`, (BLOCKS, K, L) float64, which come as zeros. Here `possible` are the ids that
-    are classes, ascending; other arrays are those of `subtract_votes`.
+    are classes, ascending; other arrays are those of `_subtract_votes`.
     """
     indptr, classes, data = votes
     ids, start, labels = pairs

@@ -16,7 +16,7 @@ from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.kernels.compiler import kernel
-from gsseg_core.learn.em.leave_one_out import leave_one_out_counts
+from gsseg_core.learn.em.pair_kernels import kernels_on
 from gsseg_core.raster.observation import Observation
 
 SMALLEST = 64  # regions of fewer px are not split: all of one label are tested as one
@@ -45,22 +45,24 @@ def split_regions(seen: SeenLabels) -> SeenLabels:
     return SeenLabels(labels, LabelEvidence(classes.astype(np.int32), mass))
 
 
-def find_rejected(votes: CSRRows, observation: Observation, possible: np.ndarray, least: float) -> np.ndarray:
+def find_rejected(
+    votes: CSRRows, observation: Observation, possible: np.ndarray, least: float, device: str = "cpu"
+) -> np.ndarray:
     """Find the labels of a view that the votes of all other views contradict, (L,) bool; none of uncertain evidence.
 
     They are those under which less than the share `least`, by weight, is of their class by the votes of the others. A
     Gaussian that this view saw better than all others together counts by what they saw of it, no more: what shows
     through a gap in another view is little evidence. A region of which they saw too little is kept.
 
-    The other parameters are those of `leave_one_out_counts`.
+    The other parameters are those of `leave_one_out_counts`, with the votes on the device.
     """
     evidence = observation.evidence
     if not evidence.is_certain:
         return np.zeros(len(observation.classes), bool)
-    counts = leave_one_out_counts(votes, observation, possible, evidence, most=1.0)
+    counts = kernels_on(device).leave_one_out_counts(votes, observation, possible, evidence, most=1.0)
     label = np.arange(len(evidence.informative))
     covered = counts.sum(axis=0)
-    enough = covered >= COVERED * np.bincount(observation.labels, weights=observation.votes(), minlength=len(label))
+    enough = covered >= COVERED * observation.votes_by_label()
     rejected: np.ndarray = enough & (counts[evidence.named(), label] < least * covered)
     return rejected
 

@@ -1,7 +1,8 @@
-"""Work on two views at once, each with half of the threads: what one thread alone can do of a view leaves no core idle.
+"""Work on several views at once: what one thread alone can do of a view leaves no core idle.
 
 A mask is decoded, cut into regions and counted by one thread, and a view of another step comes out of a file, while the
-other cores would wait. More than two at once would gain little, and each takes the memory of a view.
+other cores would wait. On the CPU two views at once have half of the threads each: more would gain little, and each
+takes the memory of a view. On a GPU the rest of the work is such work, so each thread has a view of its own.
 """
 
 from __future__ import annotations
@@ -17,23 +18,23 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
-def two_at_once(work: Callable[[T], R], items: Iterable[T], device: str = "cpu") -> Generator[R, None, None]:
-    """Give what `work` makes of each item, in their order; the next two are worked on meanwhile.
+def several_at_once(work: Callable[[T], R], items: Iterable[T], device: str = "cpu") -> Generator[R, None, None]:
+    """Give what `work` makes of each item, in their order; the next ones are worked on meanwhile.
 
-    The error that one of them raises comes in its turn, and the work ends. `work` may be called in two threads at once;
-    on another device, with one core, or where kernels of two threads cannot run beside each other, in none but the
-    caller's.
+    The error that one of them raises comes in its turn, and the work ends. `work` may be called in several threads at
+    once; with one core, or where kernels of two threads cannot run beside each other, in none but the caller's.
     """
     threads = numba.get_num_threads()
-    if device != "cpu" or threads == 1 or not kernels_run_beside_each_other():
+    if threads == 1 or not kernels_run_beside_each_other():
         yield from map(work, items)
         return
+    many = 2 if device == "cpu" else threads
     begun: deque[Future[R]] = deque()
-    with ThreadPoolExecutor(2, "gsseg-view", numba.set_num_threads, (threads // 2,)) as pool:
+    with ThreadPoolExecutor(many, "gsseg-view", numba.set_num_threads, (threads // many,)) as pool:
         try:
             for item in items:
                 begun.append(pool.submit(work, item))
-                if len(begun) > 2:
+                if len(begun) > many:
                     yield begun.popleft().result()
             while begun:
                 yield begun.popleft().result()

@@ -10,7 +10,7 @@ import pytest
 from patience import PATIENCE
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.two_at_once import two_at_once
+from gsseg_core.several_at_once import several_at_once
 
 
 @pytest.fixture(autouse=True)
@@ -21,13 +21,13 @@ def kernels_have_run() -> None:
 @pytest.fixture
 def two_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have two views at once on any machine, in this session of tests with one thread, too."""
-    monkeypatch.setattr("gsseg_core.two_at_once.numba.get_num_threads", lambda: 2)
+    monkeypatch.setattr("gsseg_core.several_at_once.numba.get_num_threads", lambda: 2)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 10])
 @pytest.mark.usefixtures("two_threads")
 def test_results_come_in_the_order_of_the_items(count: int) -> None:
-    assert list(two_at_once(lambda i: i * i, range(count))) == [i * i for i in range(count)]
+    assert list(several_at_once(lambda i: i * i, range(count))) == [i * i for i in range(count)]
 
 
 @pytest.mark.usefixtures("two_threads")
@@ -40,7 +40,7 @@ def test_two_are_worked_on_at_once_and_no_more_are_begun_than_are_wanted() -> No
             meeting.wait()
         return i
 
-    results = two_at_once(work, range(100))
+    results = several_at_once(work, range(100))
     assert next(results) == 0
     results.close()
     assert set(begun) <= {0, 1, 2}
@@ -53,7 +53,7 @@ def test_an_error_comes_in_its_turn_and_ends_the_work() -> None:
             raise KeyError(i)
         return i
 
-    results = two_at_once(work, range(100))
+    results = several_at_once(work, range(100))
     assert [next(results) for _ in range(3)] == [0, 1, 2]
     with pytest.raises(KeyError):
         next(results)
@@ -63,22 +63,22 @@ def test_an_error_comes_in_its_turn_and_ends_the_work() -> None:
 @pytest.mark.usefixtures("two_threads")
 def test_each_of_the_two_has_half_of_the_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     given: list[int] = []
-    monkeypatch.setattr("gsseg_core.two_at_once.numba.set_num_threads", given.append)
-    list(two_at_once(lambda i: i, range(4)))
+    monkeypatch.setattr("gsseg_core.several_at_once.numba.set_num_threads", given.append)
+    list(several_at_once(lambda i: i, range(4)))
     assert given and set(given) == {1}
 
 
 @pytest.mark.parametrize("why", ["one thread", "kernels of one caller at a time"])
 def test_else_the_caller_works_alone(monkeypatch: pytest.MonkeyPatch, why: str) -> None:
-    monkeypatch.setattr("gsseg_core.two_at_once.numba.get_num_threads", lambda: 1 if why == "one thread" else 2)
-    monkeypatch.setattr("gsseg_core.two_at_once.numba.threading_layer", lambda: "workqueue")
-    threads = set(two_at_once(lambda _: threading.get_ident(), range(3)))
+    monkeypatch.setattr("gsseg_core.several_at_once.numba.get_num_threads", lambda: 1 if why == "one thread" else 2)
+    monkeypatch.setattr("gsseg_core.several_at_once.numba.threading_layer", lambda: "workqueue")
+    threads = set(several_at_once(lambda _: threading.get_ident(), range(3)))
     assert threads == {threading.get_ident()}
 
 
 def test_kernels_of_two_threads_give_the_same_bits() -> None:
     arrays = [np.random.default_rng(i).random((2000, 7), np.float32) for i in range(6)]
     expected = [CSRRows.from_dense(array).normalised().data for array in arrays]
-    found = list(two_at_once(lambda array: CSRRows.from_dense(array).normalised().data, arrays))
+    found = list(several_at_once(lambda array: CSRRows.from_dense(array).normalised().data, arrays))
     assert all(map(np.array_equal, found, expected))
     assert nb.get_num_threads() >= 1

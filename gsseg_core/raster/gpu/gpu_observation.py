@@ -1,0 +1,183 @@
+"""A view with its mask on a GPU."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+
+from gsseg_core.raster.constants import BLOCK
+from gsseg_core.raster.gpu import label_sharing as kernels
+from gsseg_core.raster.gpu.blending import THREADS
+from gsseg_core.raster.gpu.device import launch, on_device
+from gsseg_core.raster.gpu.projection import TileTensors
+from gsseg_core.raster.gpu.tensors import PairTensors, starts
+from gsseg_core.raster.observation import Observation, VoteShares
+from gsseg_core.scene.camera import Camera
+
+if TYPE_CHECKING:
+    from gsseg_core.raster.gpu.gpu_operator import GPUOperator
+
+
+class ShareTensors(NamedTuple):
+    """What `raster.observation.VoteShares` has on the CPU."""
+
+    pairs: torch.Tensor  # (P,) float32, on the GPU
+    rest: np.ndarray  # (L,) float64
+    log_likelihood: float
+
+
+class GPUObservation(Observation):
+    """W of one view, cut down to what its labelled pixels see; remade from it in every product.
+
+    Sums are of whole units of 2^-24 px, so they are the same in every run, whatever order threads come in.
+    """
+
+    def __init__(
+        self, operator: GPUOperator, tiles: TileTensors, labels: np.ndarray, weights: np.ndarray | None
+    ) -> None:  # labels (H, W)
+        self.name, self._operator, device = operator.camera.name, operator, tiles.table.device
+        self._shared: tuple[torch.Tensor, np.ndarray, ShareTensors] | None = None  # what was asked last
+        if weights is None:
+            weights = np.ones((-(-tiles.height // BLOCK), -(-tiles.width // BLOCK)), np.float32)
+        self._weights = on_device(weights, device)
+        mask = self._count_labels(on_device(labels, device))
+        self._slots, self._label_start, self._present = _cut(mask, tiles)
+        self._pair_up(tiles)
+
+    def _count_labels(self, labels: torch.Tensor) -> torch.Tensor:
+        """Set the classes of the mask and their areas; returns the mask by positions of classes, -1 where unknown."""
+        classes, positions, areas = torch.unique(labels, return_inverse=True, return_counts=True)
+        unknown = int((classes < 0).sum())
+        of_pixels = self._weights.repeat_interleave(BLOCK, dim=0).repeat_interleave(BLOCK, dim=1)
+        of_pixels = of_pixels[: labels.shape[0], : labels.shape[1]].double()
+        weighted = torch.bincount(positions.ravel(), of_pixels.ravel(), len(classes))
+        self.classes = classes[unknown:].int().cpu().numpy()
+        self.areas, self.weighted_areas = areas[unknown:].cpu().numpy(), weighted[unknown:].cpu().numpy()
+        of_classes: torch.Tensor = (positions - unknown).clamp_min(-1).int()
+        return of_classes
+
+    def _pair_up(self, tiles: TileTensors) -> None:
+        """Lift the mask, list the pairs, and keep the entries that pixels with a weight see."""
+        device, label_counts = tiles.table.device, self._label_start.diff()
+        slot_start = starts(tiles.start.diff() * label_counts)
+        sums = torch.zeros(int(slot_start[-1]), dtype=torch.int64, device=device)
+        reached = torch.zeros(len(tiles.entries), dtype=torch.uint8, device=device)
+        launch(
+            kernels.lift, len(label_counts), THREADS, tiles.table, tiles.start, tiles.entries, tiles.columns,
+            self._slots, self._label_start, slot_start, self._weights, reached, sums,
+        )  # fmt: skip
+        used = sums.nonzero()[:, 0]
+        tile = torch.searchsorted(slot_start, used, right=True) - 1
+        within = used - slot_start[tile]
+        entry = tiles.start[tile] + within // label_counts[tile]
+        slot = within % label_counts[tile]
+        label = self._present[self._label_start[tile] + slot].long()
+
+        key = tiles.ids[tiles.entries[entry].long()].long() * len(self.classes) + label
+        key, order = torch.sort(key)
+        pairs, number, slots_of_pair = torch.unique_consecutive(key, return_inverse=True, return_counts=True)
+        ends = starts(sums[used][order])[starts(slots_of_pair)]
+        ids, pairs_of_id = torch.unique_consecutive(
+            torch.div(pairs, max(len(self.classes), 1), rounding_mode="floor"), return_counts=True
+        )
+        labels = (pairs % max(len(self.classes), 1)).int()
+        self.pairs = PairTensors(ids.int(), starts(pairs_of_id), labels)
+        self.pair_votes = (ends.diff().double() / kernels.UNITS).float()
+
+        kept = starts(reached)
+        counts = kept[tiles.start].diff()
+        self._slot_start, start = starts(counts * label_counts), starts(counts)
+        still = reached[entry[order]] > 0
+        tile, place = tile[order][still], kept[entry[order]][still]
+        place = self._slot_start[tile] + (place - start[tile]) * label_counts[tile] + slot[order][still]
+        self._pair = torch.full((int(self._slot_start[-1]),), -1, dtype=torch.int32, device=device)
+        self._pair[place] = number[still].int()
+        self._tiles = tiles._replace(start=start, entries=tiles.entries[reached > 0])
+
+    @cached_property
+    def ids(self) -> np.ndarray:  # type: ignore[override] # these three are copied from the GPU when somebody asks
+        """Gaussians that some labelled pixel sees, (M,) int32."""
+        return np.asarray(self.pairs.ids.cpu().numpy())
+
+    @cached_property
+    def start(self) -> np.ndarray:  # type: ignore[override]
+        """Where the pairs of each begin, (M + 1,) int64."""
+        return np.asarray(self.pairs.start.cpu().numpy())
+
+    @cached_property
+    def labels(self) -> np.ndarray:  # type: ignore[override]
+        """Label of each pair, (P,) int32."""
+        return np.asarray(self.pairs.labels.cpu().numpy())
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it holds, in bytes, the operator's included; most of it on the GPU."""
+        held = (*self.pairs, self.pair_votes, self._weights, self._slots, self._label_start,
+                self._present, self._slot_start, self._pair, self._tiles.entries, self._tiles.start)  # fmt: skip
+        # And what `shares` was asked last, and answered.
+        return self._operator.nbytes + sum(array.nbytes for array in held) + 2 * self.pair_votes.nbytes
+
+    def operator(self, camera: Camera, num_gaussians: int) -> GPUOperator:
+        """Give the operator that it was observed with."""
+        return self._operator
+
+    def votes(self) -> np.ndarray:
+        """Weights summed by pair, (P,) float32."""
+        return np.asarray(self.pair_votes.cpu().numpy())
+
+    def votes_by_label(self) -> np.ndarray:
+        """Sum of the votes of each label, (L,) float64."""
+        units = (self.pair_votes.double() * kernels.UNITS).long()
+        total = units.new_zeros(len(self.classes)).index_add_(0, self.pairs.labels.long(), units)
+        return np.asarray(total.cpu().numpy() / kernels.UNITS)
+
+    def _shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares:
+        shares = self.shared(on_device(likelihood, self._pair.device), rest)
+        return VoteShares(np.asarray(shares.pairs.cpu().numpy()), shares.rest, shares.log_likelihood)
+
+    def shared(self, likelihood: torch.Tensor, rest: np.ndarray) -> ShareTensors:
+        """Do what `shares` does with a tensor, and answer with one; it is not asked twice either."""
+        known = self._shared
+        if known is None or not (torch.equal(known[0], likelihood) and np.array_equal(known[1], rest)):
+            self._shared = known = likelihood, rest.copy(), self._share(likelihood, rest)
+        return known[2]
+
+    def _share(self, likelihood: torch.Tensor, rest: np.ndarray) -> ShareTensors:
+        device, tiles = self._pair.device, self._tiles
+        of_labels, present = on_device(rest.astype(np.float32, copy=False), device), self._present.long()
+        logs = torch.zeros(self._slots.shape, device=device)
+        left_over = torch.zeros(len(present), dtype=torch.int64, device=device)
+        sums = torch.zeros(len(likelihood), dtype=torch.int64, device=device)
+        launch(
+            kernels.share, len(self._slots), THREADS, tiles.table, tiles.start, tiles.entries, tiles.columns,
+            self._slots, self._label_start, self._slot_start, self._weights, self._pair, likelihood,
+            of_labels[present], logs, left_over, sums,
+        )  # fmt: skip
+        total = torch.zeros(len(rest), dtype=torch.int64, device=device).index_add_(0, present, left_over)
+        pairs = (sums.double() / kernels.UNITS).float()
+        return ShareTensors(pairs, total.cpu().numpy() / kernels.UNITS, float(logs.sum(dtype=torch.float64)))
+
+
+def _cut(mask: torch.Tensor, tiles: TileTensors) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Give numbers to the labels of each tile of a mask, (H, W) int32.
+
+    Returns
+    -------
+    slots : (T, THREADS) int16
+        Number of the label of each pixel, by threads; -1 where unknown.
+    label_start : (T + 1,) int64
+        Labels of tile t are present[label_start[t]:label_start[t + 1]].
+    present : (label_start[-1],) int32
+        Positions of labels.
+    """
+    count, device = tiles.columns * tiles.rows, mask.device
+    slots = torch.empty((count, THREADS), dtype=torch.int16, device=device)
+    counts = torch.empty(count, dtype=torch.int32, device=device)
+    launch(kernels.number_labels, count, THREADS, mask, tiles.columns, slots, counts)
+    label_start = starts(counts)
+    present = torch.empty(int(label_start[-1]), dtype=torch.int32, device=device)
+    launch(kernels.list_labels, count, THREADS, mask, tiles.columns, slots, label_start, present)
+    return slots, label_start, present

@@ -1,0 +1,186 @@
+"""The view operator on a GPU."""
+
+from __future__ import annotations
+
+import copy
+from functools import cached_property
+
+import numpy as np
+import torch
+
+from gsseg_core.csr_rows import CSRRows
+from gsseg_core.raster.constants import ALPHA_MAX, T_MIN
+from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, U, V
+from gsseg_core.raster.cpu.tiling import TILE
+from gsseg_core.raster.gpu import blending
+from gsseg_core.raster.gpu.device import find_gpu, launch, on_device
+from gsseg_core.raster.gpu.gpu_observation import GPUObservation
+from gsseg_core.raster.gpu.projection import TileTensors, project
+from gsseg_core.raster.gpu.tensors import RowTensors
+from gsseg_core.raster.observation import Observation
+from gsseg_core.raster.view_operator import ViewOperator
+from gsseg_core.raster.view_renderer import Blended, PixelGrid, Strongest
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
+
+FEW, MANY = 4, 32  # channels that are blended at once: colours or depths, and classes
+
+
+class GPUOperator(ViewOperator):
+    """W of one view on a GPU, remade tile by tile at every product and never stored.
+
+    Arrays go in and come out as on the CPU. What is kept of the view, about 52 bytes per visible Gaussian and 12 per
+    tile that it touches, lies on the GPU. By the rules of the CPU, and as there, results are the same bit for bit in
+    every run and for any order of the Gaussians, unless two of them have the very same geometry and different codes.
+    """
+
+    def __init__(self, camera: Camera, num_gaussians: int, tiles: TileTensors) -> None:
+        self.camera, self.num_gaussians, self._tiles = camera, num_gaussians, tiles
+
+    @cached_property
+    def ids(self) -> np.ndarray:  # type: ignore[override] # it is copied from the GPU when somebody asks
+        """Gaussians that can reach the image, nearest first, (M,) int32."""
+        ids: np.ndarray = self._tiles.ids.cpu().numpy()
+        return ids
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it holds on the GPU, in bytes."""
+        return self._tiles.nbytes
+
+    @property
+    def _device(self) -> torch.device:
+        return self._tiles.table.device
+
+    def footprints(self) -> np.ndarray:
+        """Sum of the alphas of each of `ids` over an endless image, (M,) float32."""
+        table = self._tiles.table
+        area = torch.pi / np.log(2.0) / torch.sqrt(table[:, WIDTH] * table[:, HEIGHT])
+        areas: np.ndarray = (torch.exp2(table[:, LOG_OPACITY]) * area).cpu().numpy()
+        return areas
+
+    def _without(self, hidden: np.ndarray) -> GPUOperator:
+        other, table = copy.copy(self), self._tiles.table.clone()
+        table[on_device(hidden, self._device), LOG_OPACITY] = -torch.inf
+        other._tiles = self._tiles._replace(table=table)
+        return other
+
+    def blend_seen(self, codes: np.ndarray, wanted: np.ndarray | None = None) -> Blended:
+        """Blend codes (M, K) of what is visible; all pixels, whatever is wanted."""
+        del wanted
+        return _to_cpu(*self._blend(on_device(codes.astype(np.float32, copy=False), self._device)))
+
+    def blend_rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None = None) -> Blended:
+        """Blend codes of which only the entries that are not zero are at hand."""
+        return _to_cpu(*self._blend(self._dense(codes, num_classes, of)))
+
+    def strongest(
+        self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid | None = None,
+        of: np.ndarray | None = None, beside: np.ndarray | None = None, wanted: np.ndarray | None = None,
+    ) -> Strongest:  # fmt: skip
+        """Find the class of each pixel, whatever is wanted; the image of all classes stays on the GPU."""
+        image, left_over = self._blend(self._dense(codes, num_classes, of))
+        if background:
+            image[0] += left_over
+        classes, known = image.argmax(dim=0).int(), image.sum(dim=0) > 0.5
+        first, step = grid or (0, 1)
+        some = image[:, first::step, first::step] if grid else image[:, :0, :0]
+        return Strongest(
+            classes.cpu().numpy(), known.cpu().numpy(), some.permute(1, 2, 0).cpu().numpy(),
+            None if beside is None else self.blend_seen(beside),
+        )  # fmt: skip
+
+    def _dense(
+        self, codes: CSRRows | RowTensors, num_classes: int, of: np.ndarray | torch.Tensor | None
+    ) -> torch.Tensor:
+        """Write codes of `ids` out by class on the GPU, (M, K); `of` as in `blend_rows`. Both may be there already."""
+        rows = RowTensors.of(codes, self._device) if isinstance(codes, CSRRows) else codes
+        ids = self._tiles.ids.long()
+        if of is not None:
+            of = on_device(of, self._device) if isinstance(of, np.ndarray) else of
+            place = torch.zeros(self.num_gaussians, dtype=torch.int64, device=self._device)
+            place[of.long()] = torch.arange(len(of), device=self._device)
+            ids = place[ids]
+        return rows.dense(ids, num_classes)
+
+    def _blend(self, codes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:  # (M, K)
+        """Blend codes of `ids`: image (K, H, W), and final transmittance (H, W)."""
+        tiles, channels = self._tiles, codes.shape[1]
+        at_once = FEW if channels <= FEW else MANY
+        padded = torch.nn.functional.pad(codes, (0, max(-channels % at_once, at_once * (channels == 0))))
+        image = codes.new_empty((padded.shape[1], tiles.height, tiles.width))
+        left_over = codes.new_empty((tiles.height, tiles.width))
+        for k in range(0, padded.shape[1], at_once):
+            part = padded[:, k : k + at_once].contiguous()
+            launch(
+                blending.blend_kernel(at_once), tiles.columns * tiles.rows, blending.THREADS, tiles.table, tiles.start,
+                tiles.entries, part, tiles.columns, image[k : k + at_once], left_over,
+            )  # fmt: skip
+        return image[:channels], left_over
+
+    def _adjoint(self, residual: np.ndarray) -> np.ndarray:
+        tiles, channels, at_once = self._tiles, residual.shape[2], blending.CARRIED
+        carried = torch.empty((len(tiles.ids), channels), device=self._device)
+        values = on_device(residual.astype(np.float32, copy=False), self._device)
+        sums = torch.empty((len(tiles.entries), at_once), device=self._device)
+        for k in range(0, channels, at_once):
+            part = values[..., k : k + at_once]
+            of_part = torch.empty((len(tiles.ids), at_once), device=self._device)
+            launch(
+                blending.carry_back, tiles.columns * tiles.rows, blending.THREADS, tiles.table, tiles.start,
+                tiles.entries, tiles.place, tiles.columns,
+                torch.nn.functional.pad(part, (0, at_once - part.shape[2])).contiguous(), sums,
+            )  # fmt: skip
+            launch(blending.add_up, -(-len(of_part) // 128), 128, tiles.gaussian_start, sums, of_part)
+            carried[:, k : k + at_once] = of_part[:, : part.shape[2]]
+        out = np.zeros((self.num_gaussians, channels), np.float32)
+        out[self.ids] = carried.cpu().numpy()
+        return out
+
+    def _weights(self, pixel: tuple[int, int] | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Written in PyTorch: whoever lists weights is in no hurry."""
+        tiles = self._tiles
+        begins = tiles.start.tolist()
+        wanted = range(len(begins) - 1) if pixel is None else [pixel[0] // TILE * tiles.columns + pixel[1] // TILE]
+        parts = [(np.empty(0, np.int32), np.empty(0, np.int32), np.empty(0, np.float32))]
+        for tile in wanted:
+            top, left = tile // tiles.columns * TILE, tile % tiles.columns * TILE
+            bottom, right = min(top + TILE, tiles.height), min(left + TILE, tiles.width)
+            r, c = (place.ravel() for place in np.mgrid[top:bottom, left:right])
+            if pixel is not None:
+                r, c = np.array(pixel)[:, None]
+            entries = tiles.entries[begins[tile] : begins[tile + 1]].long()
+            here = self._weights_of(entries, on_device(np.stack([c, r], axis=1) + np.float32(0.5), self._device))
+            p, e = here.nonzero(as_tuple=True)
+            listed = (r * tiles.width + c)[p.cpu().numpy()].astype(np.int32)
+            parts.append((listed, entries[e].int().cpu().numpy(), here[p, e].cpu().numpy()))
+        pixels, rows, weights = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return pixels, rows, weights
+
+    def _weights_of(self, entries: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+        """Weights (P, E) of a tile's entries (E,), nearest first, in pixels with these centres, (P, 2) as x and y."""
+        u, v, shear, wide, high, log_opacity = self._tiles.table[entries].T[[U, V, SHEAR, WIDTH, HEIGHT, LOG_OPACITY]]
+        dx, dy = pixels[:, :1].float() - u, pixels[:, 1:].float() - v
+        power = log_opacity - wide * (dx - shear * dy) ** 2 - high * dy * dy
+        alpha = torch.where(power >= LOG_ALPHA_MIN, torch.exp2(power).clamp_max(ALPHA_MAX), 0)
+        behind = torch.cumprod(1 - alpha, dim=1)
+        before = torch.cat([torch.ones_like(behind[:, :1]), behind], dim=1)[:, :-1]
+        return alpha * before * (before >= T_MIN)
+
+    def _observe(self, labels: np.ndarray, weights: np.ndarray | None) -> Observation:
+        return GPUObservation(self, self._tiles, labels, weights)
+
+
+def _to_cpu(image: torch.Tensor, left_over: torch.Tensor) -> Blended:  # (K, H, W), (H, W)
+    return Blended(image.permute(1, 2, 0).contiguous().cpu().numpy(), left_over.cpu().numpy())
+
+
+def view_operator(scene: GaussianScene, camera: Camera, device: str) -> GPUOperator:
+    """Make the operator of a view on a GPU."""
+    return GPUOperator(camera, len(scene), project(scene, camera, find_gpu(device)))
+
+
+def free_memory_on(device: str) -> int | None:
+    """Bytes that are free on a GPU; where it is simulated, as many as a small one has."""
+    gpu = find_gpu(device)
+    return torch.cuda.mem_get_info(gpu)[0] if gpu.type == "cuda" else 1 << 30

@@ -1,0 +1,182 @@
+"""The kernels of the GPU, interpreted on the CPU: they give what those of the CPU give.
+
+`test_gpu_operator` runs these tests in a process of its own, in which numba simulates a GPU from the start.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from operator_cases import dense, make_camera, make_scene, random_mask, random_view
+
+from gsseg_core.csr_rows import CSRRows
+from gsseg_core.data.label_evidence import LabelEvidence
+from gsseg_core.learn.em import em_cpu_kernels, em_gpu_kernels
+from gsseg_core.learn.learner import UNITS
+from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.gpu.gpu_operator import GPUOperator
+from gsseg_core.raster.observation import Observation
+from gsseg_core.raster.view_operator import ViewOperator
+from gsseg_core.raster.view_renderer import PixelGrid
+
+WIDTH, HEIGHT, CLASSES = 19, 13, 6  # two tiles, one of them cut off
+SCENE, CAMERA = random_view(4, 80, WIDTH, HEIGHT)
+MASK = random_mask(4, WIDTH, HEIGHT)
+NEAR = 4e-6
+RNG = np.random.default_rng(0)
+
+
+def operators() -> list[ViewOperator]:
+    return [make_operator(SCENE, CAMERA, device) for device in ("cpu", "cuda")]
+
+
+def some_codes() -> np.ndarray:
+    return RNG.random((len(SCENE), CLASSES), np.float32) * (RNG.random((len(SCENE), CLASSES)) < 0.3)
+
+
+def test_a_gpu_is_simulated() -> None:
+    assert isinstance(operators()[1], GPUOperator)
+    assert not torch.cuda.is_available()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_weights_are_those_of_the_cpu(seed: int) -> None:
+    scene, camera = random_view(seed, 100, 40, 30)
+    ours, theirs = make_operator(scene, camera), make_operator(scene, camera, "cuda")
+    assert set(theirs.ids) <= set(ours.ids)
+    np.testing.assert_allclose(dense(theirs), dense(ours), atol=1e-6)
+    footprints = dict(zip(ours.ids.tolist(), ours.footprints(), strict=True))
+    expected = [footprints[i] for i in theirs.ids.tolist()]
+    np.testing.assert_allclose(theirs.footprints(), expected, rtol=1e-5)
+
+
+def test_gaussians_at_the_same_depth_are_blended_in_the_order_of_the_cpu() -> None:
+    # In one column of the image, three to a place; those of the first place are alike but for their opacity.
+    means = [[0.1, y, 2.0] for y in (0.0, 0.1, -0.1) for _ in range(3)]
+    quats, scales = [[1, 0.1 * i, 0.2, 0] for i in (0, 0, 0, 1, 2, 3, 3, 2, 1)], [[0.3, 0.2, 0.1]] * 9
+    scene, camera = make_scene(means, quats, scales, np.linspace(0.3, 0.9, 9)), make_camera(WIDTH, HEIGHT)
+    ours, theirs = (make_operator(scene, camera, device) for device in ("cpu", "cuda"))
+    np.testing.assert_array_equal(theirs.ids, ours.ids)
+
+
+@pytest.mark.parametrize("channels", [0, 3, 33])
+def test_renders_are_those_of_the_cpu(channels: int) -> None:
+    codes = RNG.random((len(SCENE), channels), np.float32)
+    (image, left_over), found = (operator.blend(codes) for operator in operators())
+    assert found.image.shape == (HEIGHT, WIDTH, channels)
+    np.testing.assert_allclose(found.image, image, atol=NEAR)
+    np.testing.assert_allclose(found.transmittance, left_over, atol=NEAR)
+
+
+def test_a_view_without_some_gaussians_is_that_of_the_cpu() -> None:
+    hidden = RNG.random(len(SCENE)) < 0.5
+    ours, theirs = (dense(operator.without(hidden)) for operator in operators())
+    np.testing.assert_allclose(theirs, ours, atol=1e-6)
+
+
+def test_what_is_carried_back_is_that_of_the_cpu() -> None:
+    residual = RNG.normal(size=(HEIGHT, WIDTH, 9)).astype(np.float32)
+    ours, theirs = (operator.adjoint(residual) for operator in operators())
+    np.testing.assert_allclose(theirs, ours, atol=1e-4, rtol=1e-5)
+
+
+@pytest.mark.parametrize("background", [False, True])
+def test_the_strongest_class_is_that_of_the_cpu(background: bool) -> None:
+    codes, colors = CSRRows.from_dense(some_codes()), RNG.random((len(SCENE), 3), np.float32)
+    ours, theirs = (
+        operator.strongest(codes, CLASSES, background, PixelGrid(1, 4), beside=colors[operator.ids])
+        for operator in operators()
+    )
+    np.testing.assert_array_equal(theirs.known, ours.known)
+    np.testing.assert_array_equal(theirs.classes[ours.known], ours.classes[ours.known])
+    assert ours.beside is not None and theirs.beside is not None
+    np.testing.assert_allclose(theirs.beside.image, ours.beside.image, atol=NEAR)
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_votes_and_shares_are_those_of_the_cpu(weighted: bool) -> None:
+    weights = RNG.choice(np.float32([0, 1, 4]), (-(-HEIGHT // 4), -(-WIDTH // 4))) if weighted else None
+    ours, theirs = (operator.observe(MASK, weights=weights) for operator in operators())
+    for name in ("ids", "start", "classes", "areas", "weighted_areas"):
+        np.testing.assert_array_equal(getattr(theirs, name), getattr(ours, name), err_msg=name)
+    np.testing.assert_allclose(theirs.dense(theirs.votes()), ours.dense(ours.votes()), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(theirs.votes_by_label(), ours.votes_by_label(), rtol=1e-5)
+    likelihood = RNG.random((len(ours.ids), len(ours.classes)), np.float32)
+    rest = RNG.random(len(ours.classes), np.float32)
+    shares = [seen.shares(likelihood[seen.rows, seen.labels], rest) for seen in (ours, theirs)]
+    pairs = [seen.dense(share.pairs) for seen, share in zip((ours, theirs), shares, strict=True)]
+    np.testing.assert_allclose(pairs[1], pairs[0], rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(shares[1].rest, shares[0].rest, rtol=1e-4, atol=1e-3)
+    assert shares[1].log_likelihood == pytest.approx(shares[0].log_likelihood, rel=1e-5)
+
+
+def test_nothing_seen_is_no_pairs() -> None:
+    behind = make_scene([[0, 0, -1.0]], [[1, 0, 0, 0]], [[0.1] * 3], [0.5])
+    operator = make_operator(behind, make_camera(WIDTH, HEIGHT), "cuda")
+    assert not len(operator.observe(MASK).ids)
+    assert (operator.transmittance() == 1).all()
+
+
+# Steps of EM
+
+
+def by_label(seen: Observation, values: np.ndarray) -> np.ndarray:
+    return np.asarray(seen.dense(np.asarray(values)))
+
+
+@pytest.fixture(scope="module")
+def step() -> dict[str, dict[str, np.ndarray]]:
+    """All that EM does with the pairs of a view, on each device."""
+    rng = np.random.default_rng(1)
+    codes = CSRRows.from_dense(some_codes()).normalised()
+    gradient = rng.integers(1 << 30, 1 << 40, len(codes.data))
+    prior = rng.random(len(codes.data), np.float32)
+    weights = rng.random((CLASSES, len(np.unique(MASK)) - 1), np.float32)
+    by_class = np.ascontiguousarray(weights.T)
+    votes = CSRRows.from_dense(rng.integers(0, int(100 * UNITS), (len(SCENE), CLASSES)))
+    found = {}
+    for name, kernels, operator in zip(("ours", "theirs"), (em_cpu_kernels, em_gpu_kernels), operators(), strict=True):
+        seen = operator.observe(MASK)
+        evidence = LabelEvidence(np.arange(len(seen.classes), dtype=np.int32))
+        # No view votes for more than all of them.
+        all_votes = votes.with_data(votes.data + int(300 * UNITS))
+        pairs, here, total = (
+            kernels.pairs_of(seen),
+            kernels.put_rows(codes, "cuda"),
+            kernels.put_rows(all_votes, "cuda"),
+        )
+        said = kernels.pair_likelihood(here, pairs, by_class)
+        shares = kernels.shares(seen, said, by_class[:, 0]).pairs
+        added = here.with_data(kernels.zeros(here, np.int64))
+        kernels.accumulate(added, pairs, by_class, shares)
+        stepped = kernels.rows_like(here, pairs.ids)
+        kernels.m_step_without_view(
+            here, kernels.put(gradient, "cuda"), kernels.put(prior, "cuda"), pairs, by_class, shares, stepped
+        )
+        found[name] = {
+            "likelihood": by_label(seen, kernels.returned(said)),
+            "gradient": kernels.returned(added.data) / 2.0**24,
+            "without": kernels.returned(stepped.data),
+            "classes": kernels.returned(stepped.indices).view(np.uint32),
+            "put": kernels.returned(kernels.with_rows(here, pairs.ids, stepped).data),
+            "confusion": kernels.confusion_counts(stepped, pairs, shares, CLASSES, len(seen.classes)),
+            "again": by_label(
+                seen, kernels.returned(kernels.pair_likelihood(stepped, kernels.by_row(pairs), by_class))
+            ),
+            "others": kernels.leave_one_out_counts(total, seen, np.ones(CLASSES, bool), evidence, 4.0),
+            "others at most": kernels.leave_one_out_counts(total, seen, np.ones(CLASSES, bool), evidence, 1.0, 0.5),
+        }
+        kernels.subtract_votes(total, seen, evidence.votes)
+        found[name]["subtracted"] = kernels.returned(total.data) / UNITS
+    return found
+
+
+@pytest.mark.parametrize(
+    "what",
+    ["likelihood", "gradient", "without", "classes", "put", "confusion", "again", "others", "others at most",
+     "subtracted"],
+)  # fmt: skip
+def test_steps_are_those_of_the_cpu(step: dict[str, dict[str, np.ndarray]], what: str) -> None:
+    assert step["ours"][what].any()
+    np.testing.assert_allclose(step["theirs"][what], step["ours"][what], rtol=2e-4, atol=1e-4)
