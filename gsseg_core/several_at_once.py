@@ -2,7 +2,7 @@
 
 A mask is decoded, cut into regions and counted by one thread, and a view of another step comes out of a file, while the
 other cores would wait. On the CPU two views at once have half of the threads each: more would gain little, and each
-takes the memory of a view. On a GPU the rest of the work is such work, so each thread has a view of its own.
+takes the memory of a view. On a GPU the rest of the work is such work, so there are half as many views as threads.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def several_at_once(work: Callable[[T], R], items: Iterable[T], device: str = "c
     if threads == 1 or not kernels_run_beside_each_other():
         yield from map(work, items)
         return
-    many = 2 if device == "cpu" else threads
+    many = 2 if device == "cpu" else max(threads // 2, 2)
     begun: deque[Future[R]] = deque()
     with ThreadPoolExecutor(many, "gsseg-view", numba.set_num_threads, (threads // many,)) as pool:
         try:

@@ -147,10 +147,10 @@ class GPUOperator(ViewOperator):
             top, left = tile // tiles.columns * TILE, tile % tiles.columns * TILE
             bottom, right = min(top + TILE, tiles.height), min(left + TILE, tiles.width)
             r, c = (place.ravel() for place in np.mgrid[top:bottom, left:right])
-            if pixel is not None:
-                r, c = np.array(pixel)[:, None]
             entries = tiles.entries[begins[tile] : begins[tile + 1]].long()
             here = self._weights_of(entries, on_device(np.stack([c, r], axis=1) + np.float32(0.5), self._device))
+            if pixel is not None:  # Of all pixels at once it comes out as it does among them.
+                here[on_device((r != pixel[0]) | (c != pixel[1]), self._device)] = 0
             p, e = here.nonzero(as_tuple=True)
             listed = (r * tiles.width + c)[p.cpu().numpy()].astype(np.int32)
             parts.append((listed, entries[e].int().cpu().numpy(), here[p, e].cpu().numpy()))
