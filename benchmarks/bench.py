@@ -87,6 +87,7 @@ def measure(report: Report, sizes: Sizes, data: Path, work: Path) -> bool:
     part("rasterisers of others", lambda: add_others(report, sizes, work))
     shutil.rmtree(room)
     part("growth", lambda: add_growth(report, sizes, work, tell))
+    report.say("on a GPU", (REPOSITORY / "benchmarks" / "gpu_figures.md").read_text(encoding="utf-8").strip())
     report.machine["minutes"] = round((time.perf_counter() - start) / 60, 1)
     return not failed
 
@@ -252,6 +253,8 @@ What to know before comparing:
   that of the process. Files were in memory, as after a first run, except for "load, from disk".
 - The loop in PyTorch and the rasterisers of others cannot take the large scenes in reasonable time; both sides of those
   ratios are measured on the same smaller ones, and small scenes flatter whoever has the least overhead.
+- The last section alone is not measured by `make bench`: it keeps what `benchmarks/bench_gpu.py` said on a machine with
+  a GPU (`benchmarks/gpu_figures.md`).
 """
 
 if __name__ == "__main__":

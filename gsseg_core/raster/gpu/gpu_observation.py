@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,10 +15,8 @@ from gsseg_core.raster.gpu.device import launch, on_device
 from gsseg_core.raster.gpu.projection import TileTensors
 from gsseg_core.raster.gpu.tensors import PairTensors, starts
 from gsseg_core.raster.observation import Observation, VoteShares
+from gsseg_core.raster.view_renderer import ViewRenderer
 from gsseg_core.scene.camera import Camera
-
-if TYPE_CHECKING:
-    from gsseg_core.raster.gpu.gpu_operator import GPUOperator
 
 
 class ShareTensors(NamedTuple):
@@ -36,7 +34,7 @@ class GPUObservation(Observation):
     """
 
     def __init__(
-        self, operator: GPUOperator, tiles: TileTensors, labels: np.ndarray, weights: np.ndarray | None
+        self, operator: ViewRenderer, tiles: TileTensors, labels: np.ndarray, weights: np.ndarray | None
     ) -> None:  # labels (H, W)
         self.name, self._operator, device = operator.camera.name, operator, tiles.table.device
         self._shared: tuple[torch.Tensor, np.ndarray, ShareTensors] | None = None  # what was asked last
@@ -45,6 +43,7 @@ class GPUObservation(Observation):
         self._weights = on_device(weights, device)
         mask = self._count_labels(on_device(labels, device))
         self._slots, self._label_start, self._present = _cut(mask, tiles)
+        self._operator_bytes = tiles.nbytes
         self._pair_up(tiles)
 
     def _count_labels(self, labels: torch.Tensor) -> torch.Tensor:
@@ -69,33 +68,33 @@ class GPUObservation(Observation):
             kernels.lift, len(label_counts), THREADS, tiles.table, tiles.start, tiles.entries, tiles.columns,
             self._slots, self._label_start, slot_start, self._weights, reached, sums,
         )  # fmt: skip
-        used = sums.nonzero()[:, 0]
+        used = sums.nonzero()[:, 0]  # Of these slots, their tile, entry, and number among the slots of the entry:
         tile = torch.searchsorted(slot_start, used, right=True) - 1
         within = used - slot_start[tile]
-        entry = tiles.start[tile] + within // label_counts[tile]
-        slot = within % label_counts[tile]
-        label = self._present[self._label_start[tile] + slot].long()
-
-        key = tiles.ids[tiles.entries[entry].long()].long() * len(self.classes) + label
-        key, order = torch.sort(key)
-        pairs, number, slots_of_pair = torch.unique_consecutive(key, return_inverse=True, return_counts=True)
-        ends = starts(sums[used][order])[starts(slots_of_pair)]
-        ids, pairs_of_id = torch.unique_consecutive(
-            torch.div(pairs, max(len(self.classes), 1), rounding_mode="floor"), return_counts=True
-        )
-        labels = (pairs % max(len(self.classes), 1)).int()
-        self.pairs = PairTensors(ids.int(), starts(pairs_of_id), labels)
-        self.pair_votes = (ends.diff().double() / kernels.UNITS).float()
+        entry, slot = tiles.start[tile] + within // label_counts[tile], within % label_counts[tile]
+        number = self._list_pairs(tiles, sums[used], entry, self._present[self._label_start[tile] + slot])
 
         kept = starts(reached)
-        counts = kept[tiles.start].diff()
+        counts, still = kept[tiles.start].diff(), reached[entry] > 0
         self._slot_start, start = starts(counts * label_counts), starts(counts)
-        still = reached[entry[order]] > 0
-        tile, place = tile[order][still], kept[entry[order]][still]
-        place = self._slot_start[tile] + (place - start[tile]) * label_counts[tile] + slot[order][still]
+        tile, slot, place = tile[still], slot[still], kept[entry[still]]
         self._pair = torch.full((int(self._slot_start[-1]),), -1, dtype=torch.int32, device=device)
-        self._pair[place] = number[still].int()
+        self._pair[self._slot_start[tile] + (place - start[tile]) * label_counts[tile] + slot] = number[still]
         self._tiles = tiles._replace(start=start, entries=tiles.entries[reached > 0])
+
+    def _list_pairs(
+        self, tiles: TileTensors, units: torch.Tensor, entry: torch.Tensor, label: torch.Tensor  # (S,) of slots
+    ) -> torch.Tensor:  # fmt: skip
+        """List the pairs that slots with a sum are of, and add up their votes; returns the number of each, (S,)."""
+        labels = max(len(self.classes), 1)
+        key, order = torch.sort(tiles.ids[tiles.entries[entry].long()].long() * labels + label)
+        pairs, number, counts = torch.unique_consecutive(key, return_inverse=True, return_counts=True)
+        ends = starts(units[order])[starts(counts)]
+        owner = torch.div(pairs, labels, rounding_mode="floor")
+        ids, counts = torch.unique_consecutive(owner, return_counts=True)
+        self.pairs = PairTensors(ids.int(), starts(counts), (pairs % labels).int())
+        self.pair_votes = (ends.diff().double() / kernels.UNITS).float()
+        return torch.empty_like(number, dtype=torch.int32).scatter_(0, order, number.int())
 
     @cached_property
     def ids(self) -> np.ndarray:  # type: ignore[override] # these three are copied from the GPU when somebody asks
@@ -118,9 +117,9 @@ class GPUObservation(Observation):
         held = (*self.pairs, self.pair_votes, self._weights, self._slots, self._label_start,
                 self._present, self._slot_start, self._pair, self._tiles.entries, self._tiles.start)  # fmt: skip
         # And what `shares` was asked last, and answered.
-        return self._operator.nbytes + sum(array.nbytes for array in held) + 2 * self.pair_votes.nbytes
+        return self._operator_bytes + sum(array.nbytes for array in held) + 2 * self.pair_votes.nbytes
 
-    def operator(self, camera: Camera, num_gaussians: int) -> GPUOperator:
+    def operator(self, camera: Camera, num_gaussians: int) -> ViewRenderer:
         """Give the operator that it was observed with."""
         return self._operator
 
