@@ -1,4 +1,4 @@
-"""Two views at once give what one after the other gives, in the same order, and never more are in memory."""
+"""Several views at once give what one after the other gives, in the same order, and never more are in memory."""
 
 from __future__ import annotations
 
@@ -66,6 +66,15 @@ def test_each_of_the_two_has_half_of_the_threads(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("gsseg_core.several_at_once.numba.set_num_threads", given.append)
     list(several_at_once(lambda i: i, range(4)))
     assert given and set(given) == {1}
+
+
+def test_on_a_gpu_half_as_many_are_worked_on_as_there_are_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[int] = []
+    monkeypatch.setattr("gsseg_core.several_at_once.numba.get_num_threads", lambda: 8)
+    monkeypatch.setattr("gsseg_core.several_at_once.numba.set_num_threads", given.append)
+    meeting = threading.Barrier(4, timeout=PATIENCE)
+    assert sorted(several_at_once(lambda i: (meeting.wait(), i)[1], range(4), "cuda")) == [0, 1, 2, 3]
+    assert set(given) == {2}
 
 
 @pytest.mark.parametrize("why", ["one thread", "kernels of one caller at a time"])

@@ -20,6 +20,7 @@ from operator_backends import CPU, why_missing
 from operator_cases import random_view
 from small_scenes import NUM_CLASSES, balls_on_a_table, ring, taught, true_labels
 
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn import prepared_views
@@ -55,6 +56,13 @@ def test_labels_are_those_of_the_cpu(backend, which):
     np.testing.assert_allclose(got.codes_, expected.codes_, atol=1e-3)
     for view in views[:2] if which == "em" else []:
         np.testing.assert_allclose(got.predict_without(view), expected.predict_without(view), atol=1e-3)
+
+
+def test_votes_against_classes_are_counted_on_the_cpu() -> None:
+    learner = EMLearner(balls_on_a_table()[0], NUM_CLASSES, device="cuda", memory_budget=1)
+    votes = np.array([[3, 0, 2]])
+    assert learner._device_of(CSRRows.from_dense(votes)) == "cuda"
+    assert learner._device_of(CSRRows.from_dense(votes - 1)) == "cpu"
 
 
 def test_a_scene_is_copied_to_a_device_once_and_forgotten_with_the_scene() -> None:

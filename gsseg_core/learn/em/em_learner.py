@@ -285,12 +285,9 @@ class EMLearner(Learner):
         rejected : dict of str to (L,) bool
             Which they are; views without any are left out.
         """
-        possible = self._possible()
-
-        device = self._device_of(votes)
+        possible, device = self._possible(), self._device_of(votes)
         here, on_device = self._put(votes, device)
-        remaining = on_device.zeros(here, np.int64)
-        rejected = {}
+        remaining, rejected = on_device.zeros(here, np.int64), {}
 
         def find(_: str, observation: Observation) -> tuple[np.ndarray, Observation]:
             return find_rejected(here, observation, possible, self.settings.least_agreement, device), observation

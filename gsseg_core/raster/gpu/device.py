@@ -19,6 +19,7 @@ import torch
 from numba import cuda as _cuda
 
 from gsseg_core.errors import SettingsError
+from gsseg_core.kernels import kernel_cache
 
 cuda: Any = _cuda  # which has no types
 
@@ -28,11 +29,12 @@ if not SIMULATED:
     # A small image starts few blocks, which nobody needs to be warned of.
     cuda.dispatcher.config.CUDA_LOW_OCCUPANCY_WARNINGS = 0
 
-gpu_kernel: Callable[..., Any] = functools.partial(cuda.jit, fastmath=True, **({} if SIMULATED else {"cache": True}))
-"""Compiles a kernel for the GPU, to be started by `launch`, and keeps it from one run to the next."""
+_KEPT = {"cache": True} if kernel_cache.FOLDER and not SIMULATED else {}
+
+gpu_kernel: Callable[..., Any] = functools.partial(cuda.jit, fastmath=True, **_KEPT)
+"""Compiles a kernel for the GPU, to be started by `launch`, and keeps it from one run to the next if that can be."""
 
 called_by_kernels: Callable[..., Any] = functools.partial(cuda.jit, device=True, fastmath=True)
-
 
 NEEDED = "numba-cuda: pip install 'gsseg[cuda12]' or, with a driver of CUDA 13, 'gsseg[cuda13]'"
 
