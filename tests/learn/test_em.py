@@ -56,7 +56,7 @@ def slow_em(
         classes = np.unique(view.read_labels()[view.read_labels() >= 0])
         parts = np.unique(y[y >= K])  # rejected regions, each a word of its own
         onehot = (y[:, None] == np.append(classes, parts)).astype(np.float64)
-        known, weights = y >= 0, pixel_weights(view)
+        known, weights = y >= 0, pixel_weights(view, settings.errors)
         seen.append((W[known], rest[known], onehot[known], classes))
         each.append(weights[known, None])
         # Counts of the error models speak for whole regions, by what was gone through of them.
@@ -152,9 +152,11 @@ def rejected_regions(scene: GaussianScene, views: list[View], settings: EMSettin
     return words
 
 
-def pixel_weights(view: View) -> np.ndarray:
+def pixel_weights(view: View, errors: bool) -> np.ndarray:
     """By how much each pixel of a mask counts in the steps, (H W,)."""
     labels = view.read_labels()
+    if not errors:
+        return np.ones(labels.size)
     blocks = block_weights(labels, labels).astype(np.float64)
     return np.kron(blocks, np.ones((BLOCK, BLOCK)))[: labels.shape[0], : labels.shape[1]].ravel()
 
