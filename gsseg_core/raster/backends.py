@@ -20,7 +20,7 @@ class Rasteriser(NamedTuple):
 
     devices: str  # regular expression of the devices' names
     described: str  # the same for readers, as in "device is 'x'; expected ..."
-    module: str  # where its `view_operator(scene, camera, device)` is; loaded when a view is first rendered there
+    module: str  # where its `view_operator(scene, camera, device)` is; loaded when first asked for
     needs: str  # what to install where the module does not find a package
 
 

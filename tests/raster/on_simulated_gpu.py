@@ -159,7 +159,7 @@ def step() -> dict[str, dict[str, np.ndarray]]:
             "gradient": kernels.returned(added.data) / 2.0**24,
             "without": kernels.returned(stepped.data),
             "classes": kernels.returned(stepped.indices).view(np.uint32),
-            "put": kernels.returned(kernels.with_rows(here, pairs.ids, stepped).data),
+            "put": kernels.returned(here.with_rows(pairs.ids, stepped).data),
             "confusion": kernels.confusion_counts(stepped, pairs, shares, CLASSES, len(seen.classes)),
             "again": by_label(
                 seen, kernels.returned(kernels.pair_likelihood(stepped, kernels.by_row(pairs), by_class))

@@ -19,7 +19,7 @@ from gsseg_core.raster.observation import Observation, VoteShares
 
 __all__ = [
     "accumulate", "by_row", "confusion_counts", "leave_one_out_counts", "m_step_without_view", "pair_likelihood",
-    "pairs_of", "put", "put_rows", "returned", "rows_like", "shares", "subtract_votes", "with_rows", "zeros",
+    "pairs_of", "put", "put_rows", "returned", "rows_like", "shares", "subtract_votes", "zeros",
 ]  # fmt: skip
 
 
@@ -48,8 +48,3 @@ def returned(array: np.ndarray) -> np.ndarray:
 def zeros(rows: CSRRows, kind: type[np.generic]) -> np.ndarray:
     """Make an array of zeros, of as many as rows have entries."""
     return np.zeros(len(rows.data), kind)
-
-
-def with_rows(rows: CSRRows, ids: np.ndarray, others: CSRRows) -> CSRRows:  # (M,) distinct; M rows
-    """Replace the entries of some rows."""
-    return rows.with_rows(ids, others)

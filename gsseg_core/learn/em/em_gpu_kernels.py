@@ -1,7 +1,7 @@
 """What `em_kernels` and `leave_one_out` do with the (Gaussian, label) pairs of a view, on a GPU.
 
-There is one thread to each Gaussian that the view
-sees. Sums over Gaussians are of whole units, so that they do not depend on the order in which threads come to add.
+There is one thread to each Gaussian that the view sees. Sums over Gaussians are of whole units, so that they do not
+depend on the order in which threads come to add.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import torch
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence
-from gsseg_core.learn.em.em_kernels import MAX_TERM
+from gsseg_core.learn.em.em_kernels import GRADIENT_UNIT, MAX_TERM
 from gsseg_core.learn.learner import UNITS
 from gsseg_core.raster.gpu.device import called_by_kernels, cuda, find_gpu, gpu_kernel, launch, on_device
 from gsseg_core.raster.gpu.gpu_observation import GPUObservation, ShareTensors
@@ -21,7 +21,7 @@ from gsseg_core.raster.gpu.tensors import PairTensors, RowTensors, starts
 from gsseg_core.raster.observation import Observation
 
 THREADS = 128
-_PX = 2.0**24  # units of a px in counts
+_PX = 1 / GRADIENT_UNIT  # units of a px, in counts as in gradients
 _MOST = np.float32(MAX_TERM)
 _NOTHING = np.float32(0)
 
@@ -58,11 +58,6 @@ def zeros(rows: RowTensors, kind: type[np.generic]) -> torch.Tensor:
 
 
 _KINDS: dict[type[np.generic], torch.dtype] = {np.int64: torch.int64, np.float32: torch.float32}
-
-
-def with_rows(rows: RowTensors, ids: torch.Tensor, others: RowTensors) -> RowTensors:  # (M,) distinct; M rows
-    """Replace the entries of some rows."""
-    return rows.with_rows(ids, others)
 
 
 def _launch(kernel: Any, threads: int, *arguments: Any) -> None:

@@ -38,7 +38,7 @@ from gsseg_core.learn.em import em_kernels as kernels
 from gsseg_core.learn.em.block_weights import block_weights, near_boundaries
 from gsseg_core.learn.em.boundary_alignment import align_boundaries, reach
 from gsseg_core.learn.em.confusion_model import ErrorModel
-from gsseg_core.learn.em.pair_kernels import kernels_on
+from gsseg_core.learn.em.pair_kernels import codes_without, kernels_on
 from gsseg_core.learn.em.rejected_regions import find_rejected, split_regions
 from gsseg_core.learn.em.scene_edges import scene_edges
 from gsseg_core.learn.learner import VOTE_UNIT, Learner, Progress, silent
@@ -251,7 +251,7 @@ class EMLearner(Learner):
         stepped = codes_without(observation, self.error_models_[view.name], codes, gradient, no_prior, self.device)
         if only_labelled:
             return stepped, ids, background, observation.operator(view.camera, len(self.scene))
-        return on_device.with_rows(codes, ids, stepped), None, background, self._operator_of(view)
+        return codes.with_rows(ids, stepped), None, background, self._operator_of(view)
 
     def rejected_share(self, view: View) -> float:
         """Share of a view's labelled pixels that lie in rejected regions."""
@@ -388,20 +388,3 @@ class EMLearner(Learner):
         codes = votes.with_data(votes.data.astype(np.float32) * np.float32(VOTE_UNIT)).normalised()
         mean = neighbours.mean_codes(codes, self.observed_, self.num_classes).normalised()
         return mean.with_data(np.float32(self.settings.prior_weight) * mean.data)
-
-
-def codes_without(
-    observation: Observation, model: ErrorModel, codes: CSRRows, gradient: np.ndarray, prior: np.ndarray,
-    device: str = "cpu",
-) -> CSRRows:  # fmt: skip
-    """Take an M-step without one view: probabilities of the M Gaussians that it sees.
-
-    The gradient is that of all views at these codes and models; see `gsseg_core.learn.em.em_kernels` for the arrays,
-    which are on the device.
-    """
-    on_device = kernels_on(device)
-    (likelihood, used), pairs = model.by_label, on_device.pairs_of(observation)
-    shares = on_device.shares(observation, on_device.pair_likelihood(codes, pairs, likelihood), likelihood[:, 0])
-    stepped: CSRRows = on_device.rows_like(codes, pairs.ids)
-    on_device.m_step_without_view(codes, gradient, prior, pairs, used, shares.pairs, stepped)
-    return stepped

@@ -5,7 +5,30 @@ from __future__ import annotations
 import importlib
 from types import ModuleType
 
+import numpy as np
+
+from gsseg_core.csr_rows import CSRRows
+from gsseg_core.learn.em.confusion_model import ErrorModel
+from gsseg_core.raster.observation import Observation
+
 
 def kernels_on(device: str) -> ModuleType:
     """Return the module whose functions work on a device: `em_cpu_kernels`, or its like for a GPU."""
     return importlib.import_module(f"gsseg_core.learn.em.{'em_cpu_kernels' if device == 'cpu' else 'em_gpu_kernels'}")
+
+
+def codes_without(
+    observation: Observation, model: ErrorModel, codes: CSRRows, gradient: np.ndarray, prior: np.ndarray,
+    device: str = "cpu",
+) -> CSRRows:  # fmt: skip
+    """Take an M-step without one view: probabilities of the M Gaussians that it sees.
+
+    The gradient is that of all views at these codes and models; see `gsseg_core.learn.em.em_kernels` for the arrays,
+    which are on the device.
+    """
+    on_device = kernels_on(device)
+    (likelihood, used), pairs = model.by_label, on_device.pairs_of(observation)
+    shares = on_device.shares(observation, on_device.pair_likelihood(codes, pairs, likelihood), likelihood[:, 0])
+    stepped: CSRRows = on_device.rows_like(codes, pairs.ids)
+    on_device.m_step_without_view(codes, gradient, prior, pairs, used, shares.pairs, stepped)
+    return stepped
