@@ -198,8 +198,8 @@ def segment(
             with watch.stage("carve"):
                 asked = {view.name for view in inputs.pictured}
                 asked |= {check.name for check in shown_views(assessment.checks or ())}
-                seen = look_at(inputs.scene, result, inputs.looked_at, asked, drawn, device)
-                result = result.carved_by(inputs.scene, seen)
+                look = partial(look_at, inputs.scene, result, asked, drawn, device)
+                result = result.carved_by(inputs.scene, inputs.looked_at, look, device)
         with watch.stage("pictures"):
             left = [view for view in inputs.pictured if view.name not in drawn]
             drawn |= {one.view.name: one for one in draw_views(inputs.scene, result, left, device=device)}

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -38,6 +38,8 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import neighbours_of
 from gsseg_core.spatial.row_order import take_rows
 from gsseg_core.text import clipped, quoted
+
+T = TypeVar("T")
 
 UNOBSERVED, REMOVED = -1, -2
 """Labels of Gaussians that no view spoke for, and of those that the filter took out."""
@@ -272,12 +274,18 @@ class Segmentation:
         all masks together, so that errors of single masks carve nothing away. So many of the views have their say,
         spread evenly.
         """
-        operators = (make_operator(scene, camera, device) for camera in spread(cameras, num_views))
-        return self.carved_by(scene, (Silhouette.of(scene, each, self.label_map(each)) for each in operators))
 
-    def carved_by(self, scene: GaussianScene, silhouettes: Iterable[Silhouette]) -> Segmentation:
-        """Take out of each object what sticks out of silhouettes that `label_map` has made; else as `carved`."""
-        return self._without(carve(scene, self.labels, silhouettes))
+        def look(camera: Camera) -> Silhouette:
+            operator = make_operator(scene, camera, device)
+            return Silhouette.of(scene, operator, self.label_map(operator))
+
+        return self.carved_by(scene, spread(cameras, num_views), look, device)
+
+    def carved_by(
+        self, scene: GaussianScene, views: Iterable[T], look: Callable[[T], Silhouette], device: str = "cpu"
+    ) -> Segmentation:
+        """Take out of each object what sticks out of silhouettes, of which `look` makes one of a view; as `carved`."""
+        return self._without(carve(scene, self.labels, views, look, device=device))
 
     def label_map(self, operator: ViewOperator) -> np.ndarray:
         """Class of every pixel of a view, (H, W) int32: those of `render`, without the confidence."""

@@ -82,23 +82,19 @@ def draw_views(
 def look_at(
     scene: GaussianScene,
     segmentation: Segmentation,
-    views: Iterable[View],
     asked: Collection[str],
     drawn: dict[str, Drawn],
-    device: str = "cpu",
-) -> Iterator[Silhouette]:
-    """Tell what views show, to carve objects by, and draw those of the `asked` names on the way, into `drawn`."""
-
-    def look(view: View) -> Silhouette:
-        operator, pictured = make_operator(scene, view.camera, device), view.name in asked
-        nothing = np.empty((len(operator.ids), 0), np.float32)
-        colors = scene.colors(view.camera.center, operator.ids) if pictured else nothing
-        labels, (image, left_over) = segmentation.label_map_beside(operator, with_depths(scene, operator, colors))
-        if pictured:
-            drawn[view.name] = Drawn.of(view, labels, as_pixels(image[..., :3]), segmentation.num_classes)
-        return Silhouette.of(scene, operator, labels, surface_of(image[..., -1], left_over).depth)
-
-    yield from several_at_once(look, views, device)
+    device: str,
+    view: View,
+) -> Silhouette:
+    """Tell what a view shows, to carve objects by; if it is of the `asked` names, draw it on the way, into `drawn`."""
+    operator, pictured = make_operator(scene, view.camera, device), view.name in asked
+    nothing = np.empty((len(operator.ids), 0), np.float32)
+    colors = scene.colors(view.camera.center, operator.ids) if pictured else nothing
+    labels, (image, left_over) = segmentation.label_map_beside(operator, with_depths(scene, operator, colors))
+    if pictured:
+        drawn[view.name] = Drawn.of(view, labels, as_pixels(image[..., :3]), segmentation.num_classes)
+    return Silhouette.of(scene, operator, labels, surface_of(image[..., -1], left_over).depth)
 
 
 def write_pictures(

@@ -20,9 +20,9 @@ Gaussian is all there is, it stays although it sticks out. One that never sticks
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -39,6 +39,8 @@ STEPS = 2  # of the shares: all move at once and so overshoot; on held-out views
 KEPT = 0.4  # least share with which a Gaussian stays with its object, of the largest share in that object
 _LEAST = np.float32(0.01)  # of a share, so that a Gaussian may come back
 _MEMORY = 2 << 30  # bytes of projected views that are kept between the steps; others are projected anew
+
+T = TypeVar("T")
 
 
 class Silhouette(NamedTuple):
@@ -70,7 +72,13 @@ class Silhouette(NamedTuple):
 
 
 def kept_shares(
-    scene: GaussianScene, labels: np.ndarray, silhouettes: Iterable[Silhouette], steps: int = STEPS
+    scene: GaussianScene,
+    labels: np.ndarray,
+    views: Iterable[T],
+    look: Callable[[T], Silhouette],
+    *,
+    device: str = "cpu",
+    steps: int = STEPS,
 ) -> np.ndarray:
     """Find how much of each Gaussian its object should keep.
 
@@ -80,8 +88,12 @@ def kept_shares(
         N Gaussians.
     labels : (N,) int32
         Class of each; those of class 0 and below belong to no object and are not looked at.
-    silhouettes : iterable of Silhouette
-        Views.
+    views : iterable
+        Views, of any kind that `look` takes.
+    look : function of a view
+        Tells what it shows. It may be called in several threads at once.
+    device : str
+        Where `look` renders: on the CPU, two views at once.
     steps : int
         How often to go through them, at least 1.
 
@@ -90,22 +102,34 @@ def kept_shares(
     (N,) float64
         0.01 to 1; 1 where it has no object or no view says anything.
     """
-    views = _ObjectViews(scene, np.ascontiguousarray(labels, np.int32))
+    labels = np.ascontiguousarray(labels, np.int32)
     go, kept, stay = np.zeros(len(scene)), np.ones(len(scene)), np.zeros(len(scene))
-    for shown in silhouettes:
-        alone, behind = views.add(shown), shown.depth * np.float32(BEHIND)
-        go[alone.ids] += alone.reasons_to_go(depths(scene, shown.camera, alone.ids), shown.labels, behind)
+    known = _ObjectViews(scene, labels)
+    for shown, alone, reasons in several_at_once(partial(_look, scene, labels, look), views, device):
+        known.add(shown, alone)
+        go[alone.ids] += reasons
     asked = go > 0
     for step in range(steps):
         stay[asked] = 0
-        speak = partial(_reasons_to_stay, views, kept.astype(np.float32), asked)
-        for ids, reasons in several_at_once(speak, range(len(views))):
+        speak = partial(_reasons_to_stay, known, kept.astype(np.float32), asked)
+        for ids, reasons in several_at_once(speak, range(len(known)), device):
             stay[ids] += reasons
         kept[asked] = np.clip(kept[asked] * stay[asked] / go[asked], _LEAST, 1.0)
         if step == 0:
             # The less is kept, the more reason there is to stay: who stays beside all others stays beside fewer.
             asked &= kept < 1
     return kept
+
+
+def _look(
+    scene: GaussianScene, labels: np.ndarray, look: Callable[[T], Silhouette], view: T
+) -> tuple[_Shown, ObjectsAlone, np.ndarray]:
+    """Tell what a view shows, which objects are in it, and what speaks there against each Gaussian in its object."""
+    camera, seen, depth, operator = look(view)
+    operator = operator or TileOperator.of(scene, camera)  # on the CPU, which alone tells reasons
+    alone = operator.objects_alone(labels)
+    reasons = alone.reasons_to_go(depths(scene, camera, alone.ids), seen, depth * np.float32(BEHIND))
+    return _Shown(camera, seen), alone, reasons
 
 
 def _reasons_to_stay(
@@ -118,39 +142,48 @@ def _reasons_to_stay(
     return alone.ids[wanted], reasons[wanted]
 
 
+class _Shown(NamedTuple):
+    """What is kept of a silhouette."""
+
+    camera: Camera
+    labels: np.ndarray  # (H, W) int32
+
+
 class _ObjectViews:
     """Views with the objects in them, of which those that do not fit into memory are projected again each time."""
 
     def __init__(self, scene: GaussianScene, labels: np.ndarray) -> None:  # (N,) int32
         self._scene, self._labels = scene, labels
-        self._shown: list[Silhouette] = []
+        self._shown: list[_Shown] = []
         self._kept: dict[int, ObjectsAlone] = {}
 
-    def add(self, shown: Silhouette) -> ObjectsAlone:
-        """Project a view, unless it comes with its operator."""
-        alone = self._project(shown)
+    def add(self, shown: _Shown, alone: ObjectsAlone) -> None:
+        """Keep a view, and its objects if there is room."""
         if alone.nbytes + sum(kept.nbytes for kept in self._kept.values()) <= _MEMORY:
             self._kept[len(self._shown)] = alone
-        self._shown.append(shown._replace(operator=None))
-        return alone
+        self._shown.append(shown)
 
     def __len__(self) -> int:
         return len(self._shown)
 
-    def __getitem__(self, number: int) -> tuple[Silhouette, ObjectsAlone]:
-        return self._shown[number], self._kept.get(number) or self._project(self._shown[number])
-
-    def _project(self, shown: Silhouette) -> ObjectsAlone:
-        operator = shown.operator or TileOperator.of(self._scene, shown.camera)  # on the CPU, which alone tells reasons
-        return operator.objects_alone(self._labels)
+    def __getitem__(self, number: int) -> tuple[_Shown, ObjectsAlone]:
+        shown, alone = self._shown[number], self._kept.get(number)
+        return shown, alone or TileOperator.of(self._scene, shown.camera).objects_alone(self._labels)
 
 
-def carve(scene: GaussianScene, labels: np.ndarray, silhouettes: Iterable[Silhouette]) -> np.ndarray:
+def carve(
+    scene: GaussianScene,
+    labels: np.ndarray,
+    views: Iterable[T],
+    look: Callable[[T], Silhouette],
+    *,
+    device: str = "cpu",
+) -> np.ndarray:
     """Find the Gaussians that stick out of their objects, (N,) bool; takes what `kept_shares` takes.
 
     Results depend neither on the order of the Gaussians nor on the number of threads.
     """
-    return sticking_out(kept_shares(scene, labels, silhouettes), labels)
+    return sticking_out(kept_shares(scene, labels, views, look, device=device), labels)
 
 
 def sticking_out(kept: np.ndarray, labels: np.ndarray) -> np.ndarray:  # (N,), (N,) int32

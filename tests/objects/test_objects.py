@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
 import numba as nb
@@ -33,10 +34,11 @@ from gsseg_core.errors import EmptySceneError, MaskSizeError, SettingsError
 from gsseg_core.export.class_files import export_classes
 from gsseg_core.objects.removal import without_objects
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.cpu.objects_alone import ObjectsAlone
 from gsseg_core.raster.depth import BEHIND, depths, surface
 from gsseg_core.refine import silhouette_carving
 from gsseg_core.refine.settings import UNREFINED, RefineSettings
-from gsseg_core.refine.silhouette_carving import Silhouette, carve, kept_shares, sticking_out
+from gsseg_core.refine.silhouette_carving import Silhouette, kept_shares, sticking_out
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
@@ -50,6 +52,14 @@ def silhouettes(scene: GaussianScene = SCENE, cameras: list[Camera] | None = Non
     for camera in cameras or ring(3):
         out.append(Silhouette.of(scene, make_operator(scene, camera), true_labels(SCENE, TRUTH, camera)))
     return out
+
+
+def shares_of(scene: GaussianScene, labels: np.ndarray, views: list[Silhouette], steps: int) -> np.ndarray:
+    return kept_shares(scene, labels, views, lambda shown: shown, steps=steps)
+
+
+def carve(scene: GaussianScene, labels: np.ndarray, views: list[Silhouette]) -> np.ndarray:
+    return silhouette_carving.carve(scene, labels, views, lambda shown: shown)
 
 
 def scores(labels: np.ndarray, scene: GaussianScene = SCENE, turn: float = 0.3) -> ObjectScores:
@@ -103,7 +113,7 @@ def test_shares_agree_with_their_slow_twin() -> None:
         shown = true_labels(SCENE, TRUTH, camera)
         shown[:10] = -1
         views.append(Silhouette.of(scene, make_operator(scene, camera), shown))
-    result = kept_shares(scene, labels, views, steps=3)
+    result = shares_of(scene, labels, views, steps=3)
     np.testing.assert_allclose(result, slow_shares(scene, labels, views, 3), atol=2e-3)
     assert (result < 0.5).any() and (result == 1).any()
 
@@ -139,11 +149,33 @@ def test_views_that_do_not_fit_into_memory_are_projected_anew_and_change_nothing
     np.testing.assert_array_equal(carve(scene, labels, silhouettes()), out)
 
 
+def test_who_looks_at_a_view_projects_and_weighs_it_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One thread after the other would wait for the caller's, where what renders the views is no CPU."""
+    scene, labels, _ = with_fringe()
+    expected = carve(scene, labels, silhouettes())
+    monkeypatch.setattr("gsseg_core.several_at_once.numba.get_num_threads", lambda: 2)
+    looked: list[int] = []
+    weighed: list[int] = []
+    weigh = ObjectsAlone.reasons_to_go
+
+    def weigh_here(alone: ObjectsAlone, *asked: np.ndarray) -> np.ndarray:
+        weighed.append(threading.get_ident())
+        return weigh(alone, *asked)
+
+    def look(shown: Silhouette) -> Silhouette:
+        looked.append(threading.get_ident())
+        return shown._replace(operator=None)
+
+    monkeypatch.setattr(ObjectsAlone, "reasons_to_go", weigh_here)
+    np.testing.assert_array_equal(silhouette_carving.carve(scene, labels, silhouettes(), look), expected)
+    assert sorted(looked) == sorted(weighed) and threading.get_ident() not in weighed
+
+
 def test_an_object_of_one_gaussian_that_sticks_out_stays() -> None:
     scene, truth = many_classes(9)
     camera = look_at("above", np.array([0.1, 0.1, 3.5]), 120, 90, 125.0)
     shown = true_labels(scene, truth, camera)
-    shares = kept_shares(scene, truth, [Silhouette.of(scene, make_operator(scene, camera), shown)], steps=5)
+    shares = shares_of(scene, truth, [Silhouette.of(scene, make_operator(scene, camera), shown)], steps=5)
     assert (shares[1:] < 0.5).any() and not sticking_out(shares, truth).any()
 
 
