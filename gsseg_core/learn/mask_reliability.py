@@ -21,6 +21,7 @@ from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN, PackedLabels
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View, spread
+from gsseg_core.kernels.compiler import kernel
 from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.learn.temperature import VIEWS, Sample, grid_of, sample_grid
 from gsseg_core.scene.camera import Camera
@@ -152,8 +153,8 @@ def _compared(labels: np.ndarray) -> np.ndarray:  # (H, W)
     """Choose the pixels of a mask that are compared, (H, W) bool: large masks tell enough by half of them."""
     wanted: np.ndarray = labels >= 0
     if wanted.size > _ALL:
-        rows, columns = (np.arange(size) // 16 for size in wanted.shape)
-        wanted &= np.add.outer(rows, columns) % 2 == 0
+        rows, columns = (np.arange(size) // 16 % 2 for size in wanted.shape)
+        wanted &= np.equal.outer(rows, columns)
     return wanted
 
 
@@ -219,11 +220,24 @@ def compare_mask(
     seen = seen or view.read_seen()
     labels, evidence = seen.named(), seen.evidence
     width = int(max(labels.max(initial=-1), -1 if evidence is None else evidence.classes.max(initial=-1))) + 1
-    # Of all pixels at once: where a partial mask names no class, it may say "none of these", and else nothing.
-    column = np.where(labels >= 0, labels, np.where(seen.labels >= 0, width, width + 1))
-    cells = (predicted.astype(np.int64) + 1) * (width + 2) + column
-    table = np.bincount(cells.ravel(), minlength=(num_classes + 1) * (width + 2)).reshape(-1, width + 2)
+    table = np.zeros((num_classes + 1, width + 2), np.int64)
+    _count_pixels(predicted, labels, seen.labels, table)
     classes = np.flatnonzero(table[:, :width].any(axis=0)).astype(np.int32) if evidence is None else evidence.vocabulary
     known = table[:, : width + 1 if evidence is not None and evidence.has_none_of_these else width]
     counts = table[1:, np.where(classes >= 0, classes, width)]
     return ViewCheck(view.name, int(known.sum()), classes, counts, PackedLabels(predicted), evidence)
+
+
+@kernel
+def _count_pixels(
+    predicted: np.ndarray, labels: np.ndarray, seen: np.ndarray, table: np.ndarray  # (H, W) each; (K + 1, W + 2) out
+) -> None:  # fmt: skip
+    """Count pixels by class predicted, the first row for none, and by label.
+
+    Where a partial mask names no class, it may say "none of these", the last column but one, and else nothing.
+    """
+    width = table.shape[1] - 2
+    for y in range(labels.shape[0]):
+        for x in range(labels.shape[1]):
+            unnamed = width if seen[y, x] >= 0 else width + 1
+            table[predicted[y, x] + 1, labels[y, x] if labels[y, x] >= 0 else unnamed] += 1
