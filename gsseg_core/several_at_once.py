@@ -2,7 +2,7 @@
 
 A mask is decoded, cut into regions and counted by one thread, and a view of another step comes out of a file, while the
 other cores would wait. On the CPU two views at once have half of the threads each: more would gain little, and each
-takes the memory of a view. On a GPU the rest of the work is such work, so there are half as many views as threads.
+takes the memory of a view. On a GPU the rest of the work is such work, so there are as many views as threads.
 """
 
 from __future__ import annotations
@@ -28,19 +28,29 @@ def several_at_once(work: Callable[[T], R], items: Iterable[T], device: str = "c
     if threads == 1 or not kernels_run_beside_each_other():
         yield from map(work, items)
         return
-    many = 2 if device == "cpu" else max(threads // 2, 2)
-    begun: deque[Future[R]] = deque()
-    with ThreadPoolExecutor(many, "gsseg-view", numba.set_num_threads, (threads // many,)) as pool:
+    many = 2 if device == "cpu" else threads
+    each, begun = threads // many, deque[Future[R]]()
+    beside = max(each, threads // 4)
+    with ThreadPoolExecutor(many, "gsseg-view", numba.set_num_threads, (each,)) as pool:
         try:
             for item in items:
                 begun.append(pool.submit(work, item))
                 if len(begun) > many:
-                    yield begun.popleft().result()
+                    yield from _with_threads(beside, begun.popleft().result(), threads)
             while begun:
-                yield begun.popleft().result()
+                yield from _with_threads(beside, begun.popleft().result(), threads)
         finally:
             for future in begun:
                 future.cancel()
+
+
+def _with_threads(few: int, made: R, usual: int) -> Generator[R, None, None]:
+    """Give something to the caller, whose kernels take few threads until he wants the next: the others have them."""
+    numba.set_num_threads(few)
+    try:
+        yield made
+    finally:
+        numba.set_num_threads(usual)
 
 
 def kernels_run_beside_each_other() -> bool:

@@ -60,21 +60,44 @@ def test_an_error_comes_in_its_turn_and_ends_the_work() -> None:
     assert list(results) == []
 
 
+@pytest.fixture
+def given(monkeypatch: pytest.MonkeyPatch) -> dict[threading.Thread, int]:
+    """How many threads the kernels of each thread were given last."""
+    given: dict[threading.Thread, int] = {}
+
+    def note(number: int) -> None:
+        given[threading.current_thread()] = number
+
+    monkeypatch.setattr("gsseg_core.several_at_once.numba.set_num_threads", note)
+    return given
+
+
 @pytest.mark.usefixtures("two_threads")
-def test_each_of_the_two_has_half_of_the_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    given: list[int] = []
-    monkeypatch.setattr("gsseg_core.several_at_once.numba.set_num_threads", given.append)
-    list(several_at_once(lambda i: i, range(4)))
-    assert given and set(given) == {1}
+def test_each_of_the_two_has_half_of_the_threads_and_so_has_who_takes_what_they_make(
+    given: dict[threading.Thread, int],
+) -> None:
+    for _ in several_at_once(lambda i: i, range(4)):
+        assert set(given.values()) == {1} and threading.current_thread() in given
+    assert given.pop(threading.current_thread()) == 2
+    assert set(given.values()) == {1}
 
 
-def test_on_a_gpu_half_as_many_are_worked_on_as_there_are_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    given: list[int] = []
+@pytest.mark.usefixtures("two_threads")
+def test_who_stops_early_has_all_threads_again(given: dict[threading.Thread, int]) -> None:
+    results = several_at_once(lambda i: i, range(4))
+    next(results)
+    results.close()
+    assert given[threading.current_thread()] == 2
+
+
+def test_on_a_gpu_as_many_are_worked_on_as_there_are_threads(
+    monkeypatch: pytest.MonkeyPatch, given: dict[threading.Thread, int]
+) -> None:
     monkeypatch.setattr("gsseg_core.several_at_once.numba.get_num_threads", lambda: 8)
-    monkeypatch.setattr("gsseg_core.several_at_once.numba.set_num_threads", given.append)
-    meeting = threading.Barrier(4, timeout=PATIENCE)
-    assert sorted(several_at_once(lambda i: (meeting.wait(), i)[1], range(4), "cuda")) == [0, 1, 2, 3]
-    assert set(given) == {2}
+    meeting = threading.Barrier(8, timeout=PATIENCE)
+    assert sorted(several_at_once(lambda i: (meeting.wait(), i)[1], range(8), "cuda")) == list(range(8))
+    assert given.pop(threading.current_thread()) == 8
+    assert set(given.values()) == {1}
 
 
 @pytest.mark.parametrize("why", ["one thread", "kernels of one caller at a time"])
