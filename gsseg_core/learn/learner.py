@@ -22,7 +22,7 @@ from gsseg_core.learn.prepared_views import PreparedViews, default_budget
 from gsseg_core.progress import Progress as Progress
 from gsseg_core.progress import silent as silent
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.raster.observation import Observation
+from gsseg_core.raster.observation import Observation, PairVotes
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import PixelGrid, Strongest
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -35,6 +35,9 @@ NO_MASK, SEES_NOTHING, ALL_UNKNOWN = "no mask", "sees no Gaussian", "all pixels 
 
 Self = TypeVar("Self", bound="Learner")
 R = TypeVar("R")
+
+Opened = tuple[Observation, PairVotes]
+"""A view that is prepared, with its votes."""
 
 _ALONE = threading.Lock()  # of two threads at work on a view each, one at a time lends out the votes
 
@@ -295,14 +298,14 @@ class Learner(ABC):
         if not operator.vote(*self._used_labels(seen, operator), self._votes, UNITS, sign):
             raise UnusableViewError(SEES_NOTHING)
 
-    def _opened(self, view: View) -> Observation | UnusableViewError:
+    def _opened(self, view: View) -> Opened | UnusableViewError:
         """Prepare a view that is new; what is wrong with it is returned."""
         try:
             return self._open(view)
         except UnusableViewError as why:
             return why
 
-    def _add(self, view: View, opened: Observation | UnusableViewError | None) -> bool:
+    def _add(self, view: View, opened: Opened | UnusableViewError | None) -> bool:
         """Count a view, and add its votes if it is prepared, or say why it cannot be used."""
         if isinstance(opened, UnusableViewError):
             self.rejected[view.name] = str(opened)
@@ -310,8 +313,9 @@ class Learner(ABC):
         if opened is not None:
             if view.name in self.views:
                 self.retract(view.name)
-            opened.vote(self._votes, UNITS)
-            self._prepared.keep(view.name, opened)
+            observation, votes = opened
+            observation.vote(self._votes, UNITS, own=votes)
+            self._prepared.keep(view.name, observation)
         self.rejected.pop(view.name, None)
         self.views[view.name] = view
         return True
@@ -335,11 +339,12 @@ class Learner(ABC):
                 tick()
                 yield name, next(made)
 
-    def _open(self, view: View) -> Observation:
+    def _open(self, view: View) -> Opened:
         observation = self._prepare(view, self._read(view))
-        if not len(observation.ids):
+        votes = observation.pair_votes()
+        if not len(votes.ids):
             raise UnusableViewError(SEES_NOTHING)
-        return observation
+        return observation, votes
 
     def _read(self, view: View) -> SeenLabels:
         if not view.has_mask:

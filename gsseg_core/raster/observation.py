@@ -42,6 +42,23 @@ class ViewPairs(NamedTuple):
     labels: np.ndarray
 
 
+class PairVotes(NamedTuple):
+    """The same with their votes, on the CPU: what is added to the votes of other views.
+
+    Attributes
+    ----------
+    ids : (M,) int32
+    start : (M + 1,) int64
+    labels : (P,) int32
+    votes : (P,) float32
+    """
+
+    ids: np.ndarray
+    start: np.ndarray
+    labels: np.ndarray
+    votes: np.ndarray
+
+
 class Observation(ABC):
     """A view with its mask: W cut down, in each pixel, to the label that was seen there.
 
@@ -103,9 +120,17 @@ class Observation(ABC):
     def votes(self) -> np.ndarray:
         """Sum of weights of each pair, the entries of W^T onehot(y) that are not zero: (P,) float32, in px."""
 
-    def vote(self, total: np.ndarray, units: float, sign: int = 1) -> None:
-        """Add the votes to those of other views, (N, K) int64, or take them away, in whole units."""
-        add_votes(total, self.ids, self.start, self.labels, self.evidence.votes, self.votes(), units, sign)
+    def pair_votes(self) -> PairVotes:
+        """Return the pairs with their votes; those that lie on a GPU are copied."""
+        return PairVotes(self.ids, self.start, self.labels, self.votes())
+
+    def vote(self, total: np.ndarray, units: float, sign: int = 1, own: PairVotes | None = None) -> None:
+        """Add the votes to those of other views, (N, K) int64, or take them away, in whole units.
+
+        They are taken from the view's own `pair_votes`, unless these are at hand.
+        """
+        ids, start, labels, votes = own or self.pair_votes()
+        add_votes(total, ids, start, labels, self.evidence.votes, votes, units, sign)
 
     def shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares:
         """Share one vote per labelled pixel, times its weight, among the Gaussians that made it.

@@ -19,6 +19,7 @@ from gsseg_core.raster.gpu.gpu_operator import GPUOperator
 from gsseg_core.raster.observation import Observation
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import PixelGrid
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 WIDTH, HEIGHT, CLASSES = 19, 13, 6  # two tiles, one of them cut off
 SCENE, CAMERA = random_view(4, 80, WIDTH, HEIGHT)
@@ -119,6 +120,18 @@ def test_nothing_seen_is_no_pairs() -> None:
 
 
 # Steps of EM
+
+
+@pytest.mark.parametrize("grey", [False, True])
+def test_edges_of_the_scene_are_those_of_the_cpu(grey: bool) -> None:
+    colors = np.zeros_like(SCENE.sh) if grey else RNG.random(SCENE.sh.shape, np.float32)
+    scene = GaussianScene.from_arrays(SCENE.means, SCENE.quats, SCENE.scales, SCENE.opacities, colors)
+    ours, theirs = (
+        kernels.edges_along(make_operator(scene, CAMERA, device), scene, MASK, max(HEIGHT, WIDTH))
+        for kernels, device in ((em_cpu_kernels, "cpu"), (em_gpu_kernels, "cuda"))
+    )
+    assert ours.any() != grey
+    np.testing.assert_allclose(theirs, ours, atol=1e-4)
 
 
 def by_label(seen: Observation, values: np.ndarray) -> np.ndarray:

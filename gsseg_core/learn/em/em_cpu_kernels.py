@@ -15,11 +15,12 @@ from gsseg_core.learn.em.em_kernels import (
     rows_like,
 )
 from gsseg_core.learn.em.leave_one_out import leave_one_out_counts, subtract_votes
+from gsseg_core.learn.em.scene_edges import edges_along
 from gsseg_core.raster.observation import Observation, VoteShares
 
 __all__ = [
-    "accumulate", "by_row", "confusion_counts", "leave_one_out_counts", "m_step_without_view", "pair_likelihood",
-    "pairs_of", "put", "put_rows", "returned", "rows_like", "shares", "subtract_votes", "zeros",
+    "accumulate", "by_row", "confusion_counts", "edges_along", "leave_one_out_counts", "m_step_without_view",
+    "pair_likelihood", "pairs_of", "put", "put_rows", "returned", "rows_like", "shares", "subtract_votes", "zeros",
 ]  # fmt: skip
 
 

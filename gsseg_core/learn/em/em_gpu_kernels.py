@@ -14,13 +14,15 @@ import torch
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.learn.em.em_kernels import GRADIENT_UNIT, MAX_TERM
+from gsseg_core.learn.em.gpu_edges import edges_along as edges_along
 from gsseg_core.learn.learner import UNITS
-from gsseg_core.raster.gpu.device import called_by_kernels, cuda, find_gpu, gpu_kernel, launch, on_device
+from gsseg_core.raster.gpu.device import called_by_kernels, cuda, find_gpu, gpu_kernel, launch, on_device, to_cpu
 from gsseg_core.raster.gpu.gpu_observation import GPUObservation, ShareTensors
 from gsseg_core.raster.gpu.tensors import PairTensors, RowTensors, starts
 from gsseg_core.raster.observation import Observation
 
 THREADS = 128
+_CELLS = 1 << 20  # of all tables that are counted in, at most, unless one alone is larger
 _PX = 1 / GRADIENT_UNIT  # units of a px, in counts as in gradients
 _MOST = np.float32(MAX_TERM)
 _NOTHING = np.float32(0)
@@ -49,7 +51,7 @@ def put_rows(rows: CSRRows, device: str) -> RowTensors:
 
 def returned(array: torch.Tensor) -> np.ndarray:
     """Return an array from there."""
-    return np.asarray(array.cpu().numpy())
+    return to_cpu(array)
 
 
 def zeros(rows: RowTensors, kind: type[np.generic]) -> torch.Tensor:
@@ -158,31 +160,37 @@ def confusion_counts(
     codes: RowTensors, pairs: PairTensors, shares: torch.Tensor, num_classes: int, num_labels: int
 ) -> np.ndarray:
     """Sum over the pairs of codes[m] times share, by class and label, (K, L) float64; row m is of `pairs.ids[m]`."""
-    counts = torch.zeros((num_classes, num_labels), dtype=torch.int64, device=shares.device)
+    counts = _counters(num_classes, num_labels, shares.device)
     _launch(_confusion_counts, len(pairs.ids), *codes, *pairs[1:], shares, counts)
     return _in_px(counts)
 
 
-def _in_px(counts: torch.Tensor) -> np.ndarray:
-    return np.asarray(counts.cpu().numpy() / _PX)
+def _counters(num_classes: int, num_labels: int, device: torch.device) -> torch.Tensor:
+    """Make tables to count in, (C, K, L): most pairs are of few cells, where threads would wait for each other."""
+    tables = max(min(_CELLS // max(num_classes * num_labels, 1), 64), 1)
+    return torch.zeros((tables, num_classes, num_labels), dtype=torch.int64, device=device)
+
+
+def _in_px(counts: torch.Tensor) -> np.ndarray:  # (C, K, L)
+    return to_cpu(counts.sum(dim=0)) / _PX
 
 
 @gpu_kernel
 def _confusion_counts(
     indptr: np.ndarray, classes: np.ndarray, data: np.ndarray, start: np.ndarray, labels: np.ndarray,
-    shares: np.ndarray, counts: np.ndarray,  # (P,); (K, L) int64 in and out
+    shares: np.ndarray, counts: np.ndarray,  # (P,); (C, K, L) int64 in and out
 ) -> None:  # fmt: skip
-    m = cuda.grid(1)
+    m, table = cuda.grid(1), counts[cuda.blockIdx.x % counts.shape[0]]
     if m < indptr.shape[0] - 1:
         for s in range(start[m], start[m + 1]):
             for z in range(indptr[m], indptr[m + 1]):
-                cuda.atomic.add(counts, (classes[z], labels[s]), _units(shares[s] * data[z]))
+                cuda.atomic.add(table, (classes[z], labels[s]), _units(shares[s] * data[z]))
 
 
 def subtract_votes(total: RowTensors, observation: Observation, label_votes: CSRRows) -> None:
     """Subtract one view's votes, by `LabelEvidence.votes`, from those of all, N rows of int64, in place."""
     assert isinstance(observation, GPUObservation)
-    pairs, own = observation.pairs, observation.pair_votes
+    pairs, own = observation.pairs, observation.own_votes
     _launch(_subtract_votes, len(pairs.ids), *total, *pairs, own, *RowTensors.of(label_votes, own.device))
 
 
@@ -217,9 +225,9 @@ def leave_one_out_counts(
 ) -> np.ndarray:  # fmt: skip
     """Count the pixels (K, L) of each class under each label of a view by the votes of all others, none against."""
     assert isinstance(observation, GPUObservation)
-    pairs, own = observation.pairs, observation.pair_votes
+    pairs, own = observation.pairs, observation.own_votes
     label_votes, rest = RowTensors.of(evidence.votes, own.device), rows_like(votes, pairs.ids)
-    counts = torch.zeros((len(possible), len(label_votes.indptr) - 1), dtype=torch.int64, device=own.device)
+    counts = _counters(len(possible), len(label_votes.indptr) - 1, own.device)
     _launch(
         _leave_one_out, len(pairs.ids), *votes, *pairs, own, *label_votes, rest.indptr, rest.data, power,
         min(most, 1e30), counts,
@@ -232,9 +240,9 @@ def _leave_one_out(
     indptr: np.ndarray, classes: np.ndarray, data: np.ndarray, ids: np.ndarray, start: np.ndarray, labels: np.ndarray,
     own: np.ndarray, vote_indptr: np.ndarray, vote_classes: np.ndarray, votes: np.ndarray,
     rest_indptr: np.ndarray, rest: np.ndarray, power: float, most: float,  # scratch, rows as long as those of `ids`
-    counts: np.ndarray,  # (K, L) int64 in and out
+    counts: np.ndarray,  # (C, K, L) int64 in and out
 ) -> None:  # fmt: skip
-    m = cuda.grid(1)
+    m, table = cuda.grid(1), counts[cuda.blockIdx.x % counts.shape[0]]
     if m >= ids.shape[0]:
         return
     first, total, largest = indptr[ids[m]] - rest_indptr[m], np.int64(0), np.int64(0)
@@ -254,4 +262,4 @@ def _leave_one_out(
     for z in range(rest_indptr[m], rest_indptr[m + 1]):
         code = share * (np.float64(rest[z]) / np.float64(largest)) ** power
         for s in range(start[m], start[m + 1]):
-            cuda.atomic.add(counts, (classes[first + z], labels[s]), np.int64(own[s] * code * _PX + 0.5))
+            cuda.atomic.add(table, (classes[first + z], labels[s]), np.int64(own[s] * code * _PX + 0.5))

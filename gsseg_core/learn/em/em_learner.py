@@ -35,14 +35,12 @@ from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn.em import em_kernels as kernels
-from gsseg_core.learn.em.block_weights import block_weights, near_boundaries
+from gsseg_core.learn.em.block_weights import block_weights
 from gsseg_core.learn.em.boundary_alignment import align_boundaries, reach
 from gsseg_core.learn.em.confusion_model import ErrorModel
 from gsseg_core.learn.em.pair_kernels import codes_without, kernels_on
 from gsseg_core.learn.em.rejected_regions import find_rejected, split_regions
-from gsseg_core.learn.em.scene_edges import scene_edges
 from gsseg_core.learn.learner import VOTE_UNIT, Learner, Progress, silent
-from gsseg_core.raster.constants import BLOCK
 from gsseg_core.raster.observation import Observation, ViewPairs, VoteShares
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import PixelGrid, Strongest, ViewRenderer
@@ -269,9 +267,8 @@ class EMLearner(Learner):
         """Align boundaries of a plain mask with edges, and give each region a label if regions may be rejected."""
         settings = self.settings
         if settings.errors and settings.edge_px and seen.evidence is None:
-            # One px more, since edges are differences.
-            near = near_boundaries(seen.labels, -(-(reach(settings.edge_px) + 1) // BLOCK))
-            edges = scene_edges(operator, self.scene, near)
+            distance = reach(settings.edge_px) + 1  # One px more, since edges are differences.
+            edges = kernels_on(self.device).edges_along(operator, self.scene, seen.labels, distance)
             seen = SeenLabels(align_boundaries(seen.labels, edges, settings.edge_px))
         return split_regions(seen) if settings.rejects_regions else seen
 

@@ -12,6 +12,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.kernels.compiler import kernel
+from gsseg_core.learn.em.block_weights import near_boundaries
 from gsseg_core.raster.constants import BLOCK
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -25,13 +26,23 @@ STRONGEST = 2.0  # edges count at most so much, in units of the view's 95th perc
 _LIGHT: PerScene[np.ndarray] = PerScene()
 
 
+def luminance(scene: GaussianScene) -> np.ndarray:
+    """Mean of the channels of each Gaussian's colour, (N,) float32."""
+    return _LIGHT.of(scene, lambda: scene.colors().mean(axis=1))
+
+
+def edges_along(operator: ViewOperator, scene: GaussianScene, labels: np.ndarray, distance: int) -> np.ndarray:
+    """Do the same where it is within so many px of the boundaries of a mask, (H, W) int32, and in the sample."""
+    return scene_edges(operator, scene, near_boundaries(labels, -(-distance // BLOCK)))
+
+
 def scene_edges(operator: ViewOperator, scene: GaussianScene, near: np.ndarray | None = None) -> np.ndarray:
     """Strength of the edges of colour and depth of a view, (H, W) float32, at least 0; see above for units.
 
     If only those `near` something are wanted, (ceil(H / 4), ceil(W / 4)) bool by blocks, what has no such block around
     it, and is not in the sample, has no meaning.
     """
-    camera, light = operator.camera, _LIGHT.of(scene, lambda: scene.colors().mean(axis=1))
+    camera, light = operator.camera, luminance(scene)
     if light.min() == light.max():
         return np.zeros((camera.height, camera.width), np.float32)
     ahead = camera.world_to_camera[2].astype(np.float32)
@@ -44,16 +55,26 @@ def scene_edges(operator: ViewOperator, scene: GaussianScene, near: np.ndarray |
 
 def _in_units(edges: np.ndarray) -> np.ndarray:
     some = sampled(edges)
-    rank = 95 * (some.size - 1) // 100
+    rank = rank_of_unit(some.size)
     unit = np.partition(some, rank)[rank]
     return np.minimum(edges / unit, np.float32(STRONGEST)) if unit > 0 else np.zeros_like(edges)
 
 
+def rank_of_unit(count: int) -> int:
+    """Tell which of so many edges, sorted, is the unit."""
+    return 95 * (count - 1) // 100
+
+
 def sampled(image: np.ndarray) -> np.ndarray:
     """Sample a view, (H, W): the pixels of some squares, but for their margins; all pixels of a small one."""
-    rows, columns = (_in_sample(size, 1) for size in image.shape)
+    rows, columns = rows_and_columns_in_sample(*image.shape)
     some: np.ndarray = image[rows][:, columns].ravel()
     return some
+
+
+def rows_and_columns_in_sample(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Mark those that `sampled` takes, (H,) and (W,) bool."""
+    return _in_sample(height, 1), _in_sample(width, 1)
 
 
 def _in_sample(size: int, margin: int) -> np.ndarray:

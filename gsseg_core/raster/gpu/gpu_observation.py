@@ -11,10 +11,10 @@ import torch
 from gsseg_core.raster.constants import BLOCK
 from gsseg_core.raster.gpu import label_sharing as kernels
 from gsseg_core.raster.gpu.blending import THREADS
-from gsseg_core.raster.gpu.device import launch, on_device
+from gsseg_core.raster.gpu.device import launch, on_device, to_cpu
 from gsseg_core.raster.gpu.projection import TileTensors
 from gsseg_core.raster.gpu.tensors import PairTensors, starts
-from gsseg_core.raster.observation import Observation, VoteShares
+from gsseg_core.raster.observation import Observation, PairVotes, VoteShares
 from gsseg_core.raster.view_renderer import ViewRenderer
 from gsseg_core.scene.camera import Camera
 
@@ -53,8 +53,8 @@ class GPUObservation(Observation):
         of_pixels = self._weights.repeat_interleave(BLOCK, dim=0).repeat_interleave(BLOCK, dim=1)
         of_pixels = of_pixels[: labels.shape[0], : labels.shape[1]].double()
         weighted = torch.bincount(positions.ravel(), of_pixels.ravel(), len(classes))
-        self.classes = classes[unknown:].int().cpu().numpy()
-        self.areas, self.weighted_areas = areas[unknown:].cpu().numpy(), weighted[unknown:].cpu().numpy()
+        self.classes = to_cpu(classes[unknown:].int())
+        self.areas, self.weighted_areas = to_cpu(areas[unknown:]), to_cpu(weighted[unknown:])
         of_classes: torch.Tensor = (positions - unknown).clamp_min(-1).int()
         return of_classes
 
@@ -93,31 +93,31 @@ class GPUObservation(Observation):
         owner = torch.div(pairs, labels, rounding_mode="floor")
         ids, counts = torch.unique_consecutive(owner, return_counts=True)
         self.pairs = PairTensors(ids.int(), starts(counts), (pairs % labels).int())
-        self.pair_votes = (ends.diff().double() / kernels.UNITS).float()
+        self.own_votes = (ends.diff().double() / kernels.UNITS).float()
         return torch.empty_like(number, dtype=torch.int32).scatter_(0, order, number.int())
 
     @cached_property
     def ids(self) -> np.ndarray:  # type: ignore[override] # these three are copied from the GPU when somebody asks
         """Gaussians that some labelled pixel sees, (M,) int32."""
-        return np.asarray(self.pairs.ids.cpu().numpy())
+        return to_cpu(self.pairs.ids)
 
     @cached_property
     def start(self) -> np.ndarray:  # type: ignore[override]
         """Where the pairs of each begin, (M + 1,) int64."""
-        return np.asarray(self.pairs.start.cpu().numpy())
+        return to_cpu(self.pairs.start)
 
     @cached_property
     def labels(self) -> np.ndarray:  # type: ignore[override]
         """Label of each pair, (P,) int32."""
-        return np.asarray(self.pairs.labels.cpu().numpy())
+        return to_cpu(self.pairs.labels)
 
     @property
     def nbytes(self) -> int:
         """Memory that it holds, in bytes, the operator's included; most of it on the GPU."""
-        held = (*self.pairs, self.pair_votes, self._weights, self._slots, self._label_start,
+        held = (*self.pairs, self.own_votes, self._weights, self._slots, self._label_start,
                 self._present, self._slot_start, self._pair, self._tiles.entries, self._tiles.start)  # fmt: skip
         # And what `shares` was asked last, and answered.
-        return self._operator_bytes + sum(array.nbytes for array in held) + 2 * self.pair_votes.nbytes
+        return self._operator_bytes + sum(array.nbytes for array in held) + 2 * self.own_votes.nbytes
 
     def operator(self, camera: Camera, num_gaussians: int) -> ViewRenderer:
         """Give the operator that it was observed with."""
@@ -125,17 +125,21 @@ class GPUObservation(Observation):
 
     def votes(self) -> np.ndarray:
         """Weights summed by pair, (P,) float32."""
-        return np.asarray(self.pair_votes.cpu().numpy())
+        return to_cpu(self.own_votes)
+
+    def pair_votes(self) -> PairVotes:
+        """Copy the pairs with their votes from the GPU."""
+        return PairVotes(*map(to_cpu, (*self.pairs, self.own_votes)))
 
     def votes_by_label(self) -> np.ndarray:
         """Sum of the votes of each label, (L,) float64."""
-        units = (self.pair_votes.double() * kernels.UNITS).long()
+        units = (self.own_votes.double() * kernels.UNITS).long()
         total = units.new_zeros(len(self.classes)).index_add_(0, self.pairs.labels.long(), units)
-        return np.asarray(total.cpu().numpy() / kernels.UNITS)
+        return to_cpu(total) / kernels.UNITS
 
     def _shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares:
         shares = self.shared(on_device(likelihood, self._pair.device), rest)
-        return VoteShares(np.asarray(shares.pairs.cpu().numpy()), shares.rest, shares.log_likelihood)
+        return VoteShares(to_cpu(shares.pairs), shares.rest, shares.log_likelihood)
 
     def shared(self, likelihood: torch.Tensor, rest: np.ndarray) -> ShareTensors:
         """Do what `shares` does with a tensor, and answer with one; it is not asked twice either."""
@@ -157,7 +161,7 @@ class GPUObservation(Observation):
         )  # fmt: skip
         total = torch.zeros(len(rest), dtype=torch.int64, device=device).index_add_(0, present, left_over)
         pairs = (sums.double() / kernels.UNITS).float()
-        return ShareTensors(pairs, total.cpu().numpy() / kernels.UNITS, float(logs.sum(dtype=torch.float64)))
+        return ShareTensors(pairs, to_cpu(total) / kernels.UNITS, float(logs.sum(dtype=torch.float64)))
 
 
 def _cut(mask: torch.Tensor, tiles: TileTensors) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -13,7 +13,7 @@ from gsseg_core.raster.constants import ALPHA_MAX, T_MIN
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, U, V
 from gsseg_core.raster.cpu.tiling import TILE
 from gsseg_core.raster.gpu import blending
-from gsseg_core.raster.gpu.device import find_gpu, launch, on_device
+from gsseg_core.raster.gpu.device import find_gpu, launch, on_device, to_cpu
 from gsseg_core.raster.gpu.gpu_observation import GPUObservation
 from gsseg_core.raster.gpu.projection import TileTensors, project
 from gsseg_core.raster.gpu.tensors import RowTensors
@@ -35,58 +35,56 @@ class GPUOperator(ViewOperator):
     """
 
     def __init__(self, camera: Camera, num_gaussians: int, tiles: TileTensors) -> None:
-        self.camera, self.num_gaussians, self._tiles = camera, num_gaussians, tiles
+        self.camera, self.num_gaussians, self.tiles = camera, num_gaussians, tiles
 
     @cached_property
     def ids(self) -> np.ndarray:  # type: ignore[override] # it is copied from the GPU when somebody asks
         """Gaussians that can reach the image, nearest first, (M,) int32."""
-        ids: np.ndarray = self._tiles.ids.cpu().numpy()
-        return ids
+        return to_cpu(self.tiles.ids)
 
     @property
     def nbytes(self) -> int:
         """Memory that it holds on the GPU, in bytes."""
-        return self._tiles.nbytes
+        return self.tiles.nbytes
 
     @property
     def _device(self) -> torch.device:
-        return self._tiles.table.device
+        return self.tiles.table.device
 
     def footprints(self) -> np.ndarray:
         """Sum of the alphas of each of `ids` over an endless image, (M,) float32."""
-        table = self._tiles.table
+        table = self.tiles.table
         area = torch.pi / np.log(2.0) / torch.sqrt(table[:, WIDTH] * table[:, HEIGHT])
-        areas: np.ndarray = (torch.exp2(table[:, LOG_OPACITY]) * area).cpu().numpy()
-        return areas
+        return to_cpu(torch.exp2(table[:, LOG_OPACITY]) * area)
 
     def _without(self, hidden: np.ndarray) -> GPUOperator:
-        other, table = copy.copy(self), self._tiles.table.clone()
+        other, table = copy.copy(self), self.tiles.table.clone()
         table[on_device(hidden, self._device), LOG_OPACITY] = -torch.inf
-        other._tiles = self._tiles._replace(table=table)
+        other.tiles = self.tiles._replace(table=table)
         return other
 
     def blend_seen(self, codes: np.ndarray, wanted: np.ndarray | None = None) -> Blended:
         """Blend codes (M, K) of what is visible; all pixels, whatever is wanted."""
         del wanted
-        return _to_cpu(*self._blend(on_device(codes.astype(np.float32, copy=False), self._device)))
+        return _to_cpu(*self.blend_there(on_device(codes.astype(np.float32, copy=False), self._device)))
 
     def blend_rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None = None) -> Blended:
         """Blend codes of which only the entries that are not zero are at hand."""
-        return _to_cpu(*self._blend(self._dense(codes, num_classes, of)))
+        return _to_cpu(*self.blend_there(self._dense(codes, num_classes, of)))
 
     def strongest(
         self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid | None = None,
         of: np.ndarray | None = None, beside: np.ndarray | None = None, wanted: np.ndarray | None = None,
     ) -> Strongest:  # fmt: skip
         """Find the class of each pixel, whatever is wanted; the image of all classes stays on the GPU."""
-        image, left_over = self._blend(self._dense(codes, num_classes, of))
+        image, left_over = self.blend_there(self._dense(codes, num_classes, of))
         if background:
             image[0] += left_over
         classes, known = image.argmax(dim=0).int(), image.sum(dim=0) > 0.5
         first, step = grid or (0, 1)
         some = image[:, first::step, first::step] if grid else image[:, :0, :0]
         return Strongest(
-            classes.cpu().numpy(), known.cpu().numpy(), some.permute(1, 2, 0).cpu().numpy(),
+            to_cpu(classes), to_cpu(known), to_cpu(some.permute(1, 2, 0)),
             None if beside is None else self.blend_seen(beside),
         )  # fmt: skip
 
@@ -95,7 +93,7 @@ class GPUOperator(ViewOperator):
     ) -> torch.Tensor:
         """Write codes of `ids` out by class on the GPU, (M, K); `of` as in `blend_rows`. Both may be there already."""
         rows = RowTensors.of(codes, self._device) if isinstance(codes, CSRRows) else codes
-        ids = self._tiles.ids.long()
+        ids = self.tiles.ids.long()
         if of is not None:
             of = on_device(of, self._device) if isinstance(of, np.ndarray) else of
             place = torch.zeros(self.num_gaussians, dtype=torch.int64, device=self._device)
@@ -103,9 +101,9 @@ class GPUOperator(ViewOperator):
             ids = place[ids]
         return rows.dense(ids, num_classes)
 
-    def _blend(self, codes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:  # (M, K)
-        """Blend codes of `ids`: image (K, H, W), and final transmittance (H, W)."""
-        tiles, channels = self._tiles, codes.shape[1]
+    def blend_there(self, codes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:  # (M, K)
+        """Blend codes of `tiles.ids`: image (K, H, W), and final transmittance (H, W), both on the GPU."""
+        tiles, channels = self.tiles, codes.shape[1]
         at_once = FEW if channels <= FEW else MANY
         padded = torch.nn.functional.pad(codes, (0, max(-channels % at_once, at_once * (channels == 0))))
         image = codes.new_empty((padded.shape[1], tiles.height, tiles.width))
@@ -119,7 +117,7 @@ class GPUOperator(ViewOperator):
         return image[:channels], left_over
 
     def _adjoint(self, residual: np.ndarray) -> np.ndarray:
-        tiles, channels, at_once = self._tiles, residual.shape[2], blending.CARRIED
+        tiles, channels, at_once = self.tiles, residual.shape[2], blending.CARRIED
         carried = torch.empty((len(tiles.ids), channels), device=self._device)
         values = on_device(residual.astype(np.float32, copy=False), self._device)
         sums = torch.empty((len(tiles.entries), at_once), device=self._device)
@@ -134,12 +132,12 @@ class GPUOperator(ViewOperator):
             launch(blending.add_up, -(-len(of_part) // 128), 128, tiles.gaussian_start, sums, of_part)
             carried[:, k : k + at_once] = of_part[:, : part.shape[2]]
         out = np.zeros((self.num_gaussians, channels), np.float32)
-        out[self.ids] = carried.cpu().numpy()
+        out[self.ids] = to_cpu(carried)
         return out
 
     def _weights(self, pixel: tuple[int, int] | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Written in PyTorch: whoever lists weights is in no hurry."""
-        tiles = self._tiles
+        tiles = self.tiles
         begins = tiles.start.tolist()
         wanted = range(len(begins) - 1) if pixel is None else [pixel[0] // TILE * tiles.columns + pixel[1] // TILE]
         parts = [(np.empty(0, np.int32), np.empty(0, np.int32), np.empty(0, np.float32))]
@@ -152,14 +150,14 @@ class GPUOperator(ViewOperator):
             if pixel is not None:  # Of all pixels at once it comes out as it does among them.
                 here[on_device((r != pixel[0]) | (c != pixel[1]), self._device)] = 0
             p, e = here.nonzero(as_tuple=True)
-            listed = (r * tiles.width + c)[p.cpu().numpy()].astype(np.int32)
-            parts.append((listed, entries[e].int().cpu().numpy(), here[p, e].cpu().numpy()))
+            listed = (r * tiles.width + c)[to_cpu(p)].astype(np.int32)
+            parts.append((listed, to_cpu(entries[e].int()), to_cpu(here[p, e])))
         pixels, rows, weights = (np.concatenate(part) for part in zip(*parts, strict=True))
         return pixels, rows, weights
 
     def _weights_of(self, entries: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
         """Weights (P, E) of a tile's entries (E,), nearest first, in pixels with these centres, (P, 2) as x and y."""
-        u, v, shear, wide, high, log_opacity = self._tiles.table[entries].T[[U, V, SHEAR, WIDTH, HEIGHT, LOG_OPACITY]]
+        u, v, shear, wide, high, log_opacity = self.tiles.table[entries].T[[U, V, SHEAR, WIDTH, HEIGHT, LOG_OPACITY]]
         dx, dy = pixels[:, :1].float() - u, pixels[:, 1:].float() - v
         power = log_opacity - wide * (dx - shear * dy) ** 2 - high * dy * dy
         alpha = torch.where(power >= LOG_ALPHA_MIN, torch.exp2(power).clamp_max(ALPHA_MAX), 0)
@@ -168,11 +166,11 @@ class GPUOperator(ViewOperator):
         return alpha * before * (before >= T_MIN)
 
     def _observe(self, labels: np.ndarray, weights: np.ndarray | None) -> Observation:
-        return GPUObservation(self, self._tiles, labels, weights)
+        return GPUObservation(self, self.tiles, labels, weights)
 
 
 def _to_cpu(image: torch.Tensor, left_over: torch.Tensor) -> Blended:  # (K, H, W), (H, W)
-    return Blended(image.permute(1, 2, 0).contiguous().cpu().numpy(), left_over.cpu().numpy())
+    return Blended(to_cpu(image.permute(1, 2, 0).contiguous()), to_cpu(left_over))
 
 
 def view_operator(scene: GaussianScene, camera: Camera, device: str) -> GPUOperator:

@@ -81,8 +81,7 @@ def project(scene: GaussianScene, camera: Camera, device: torch.device) -> TileT
     launch(_project, -(-count // THREADS), THREADS, *tensors, lens, columns, rows, table, depth, touched)
 
     seen = touched.nonzero()[:, 0]
-    order = _nearest_first(depth[seen], table[seen])
-    seen = seen[order]
+    seen = seen[_nearest_first(depth[seen], table, seen)]
     table, touched = table[seen].contiguous(), touched[seen]
     gaussian_start = starts(touched)
     total = int(gaussian_start[-1])
@@ -98,15 +97,17 @@ def project(scene: GaussianScene, camera: Camera, device: torch.device) -> TileT
     )
 
 
-def _nearest_first(depth: torch.Tensor, table: torch.Tensor) -> torch.Tensor:  # (M,), (M, 8)
+def _nearest_first(
+    depth: torch.Tensor, table: torch.Tensor, seen: torch.Tensor  # (M,), (N, 8), (M,) which rows
+) -> torch.Tensor:  # fmt: skip
     """Sort by depth, and where that is the same by the rows of the table, as `raster.cpu.projection` does: (M,)."""
-    across = table[:, U].contiguous().view(torch.int32)  # whose order as numbers is this, for the negative ones too:
+    across = table[seen, U].view(torch.int32)  # whose order as numbers is this, for the negative ones too:
     across = torch.where(across < 0, across ^ 0x7FFFFFFF, across)
     key, order = torch.sort((depth.view(torch.int32).long() << 32) + across, stable=True)
     if not bool((key[1:] == key[:-1]).any()):
         return order
     order = torch.arange(len(depth), device=depth.device)
-    for key in (*table.unbind(dim=1)[::-1], depth):
+    for key in (*table[seen].unbind(dim=1)[::-1], depth):
         order = order[torch.argsort(key[order], stable=True)]
     return order
 
