@@ -29,6 +29,7 @@ import shutil
 import stat
 import time
 from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from gsseg_core.errors import GssegError, PathTakenError, WriteError
@@ -136,7 +137,9 @@ class StagedRun:
         """Make what was written the result."""
         files = [path for path in self.folder.rglob("*") if not path.is_dir()]
         try:
-            records = {path.relative_to(self.folder).as_posix(): FileRecord.of(path) for path in files}
+            with ThreadPoolExecutor() as threads:  # A digest leaves the other cores to others.
+                places = [path.relative_to(self.folder).as_posix() for path in files]
+                records = dict(zip(places, threads.map(FileRecord.of, files), strict=True))
             for folder in {path.parent for path in files} | {self.folder, self._staging}:
                 sync_folder(folder)
             with _locked(self.out):

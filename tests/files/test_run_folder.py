@@ -13,12 +13,14 @@ from pathlib import Path
 
 import pytest
 from clean_process import in_clean_process
+from patience import PATIENCE
 from test_atomic import small_files_only
 
 from gsseg_core.errors import PathTakenError, SettingsError, WriteError
 from gsseg_core.files import run_folder
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.run_folder import COMMIT_FILE, RUN_FILE, settle, staged_run
+from gsseg_core.files.run_manifest import FileRecord, Manifest
 
 FIRST = ["a.npz", "classes/1_cup.ply", "classes/2_box.ply", "old/gone.png", "report.json"]
 SECOND = ["a.npz", "classes/1_cup.ply", "classes/3_ball.ply", "new/here.png", "report.json"]
@@ -196,6 +198,22 @@ def test_a_file_that_was_edited_since_keeps_its_content_under_another_name(tmp_p
     assert contents(out) == dict.fromkeys(SECOND, last) | {
         f"report.edited-{last}.json": "edited", f"classes/2_box.edited-{last}.ply": "edited",
     }  # fmt: skip
+
+
+def test_digests_of_files_are_made_beside_each_other_and_each_is_of_its_own_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    meeting, record = threading.Barrier(2, timeout=PATIENCE), FileRecord.of
+
+    def of(path: Path) -> FileRecord:
+        meeting.wait()
+        return record(path)
+
+    monkeypatch.setattr(FileRecord, "of", of)
+    files = FIRST[:4]
+    write(tmp_path, files)
+    recorded = Manifest.read(tmp_path / RUN_FILE).files("segment")
+    assert recorded == {name: record(tmp_path / name) for name in files}
 
 
 def test_a_copy_of_a_folder_is_as_much_gssegs_as_the_folder(tmp_path: Path) -> None:
