@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,8 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.several_at_once import several_at_once
 
 WORST = 4  # views that are trusted least, as pictures show them
-_ALL = 1 << 17  # px of the largest views of which all are compared; of others, every second tile of 16 x 16
+_ALL = 1 << 17  # px of the largest views of which all are compared; of others, every second tile
+_TILE = 16  # px a side
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +46,8 @@ class ViewCheck:
     predicted: PackedLabels | None = None  # (H, W): what the other views predict, for pictures
     evidence: LabelEvidence | None = None  # of a soft or partial mask; `classes` are its vocabulary
     rejected: float = 0.0  # `Learner.rejected_share`
+    # (C,) int32: classes that the border of the image cuts; mask and prediction agree on some of its pixels.
+    cut: np.ndarray = field(default_factory=lambda: np.empty(0, np.int32))
 
     @property
     def checked(self) -> int:
@@ -60,6 +63,22 @@ class ViewCheck:
         """Unpack what the other views predict, (H, W) int32."""
         assert self.predicted is not None, f"check of {self.name} came without its prediction"
         return self.predicted.unpack()
+
+    def completed(self, mask: np.ndarray) -> np.ndarray:  # (H, W) int32
+        """Give what is predicted, and a guess where nothing is, as in every second tile of a large view; (H, W) int32.
+
+        The guess is the label of the mask if that is predicted a tile further on, in any direction, else what is.
+        """
+        predicted = self.prediction()
+        unknown = predicted == UNKNOWN
+        if not unknown.any():
+            return predicted
+        around = np.pad(predicted, _TILE, constant_values=UNKNOWN)
+        inside, before, behind = slice(_TILE, -_TILE), slice(None, -2 * _TILE), slice(2 * _TILE, None)
+        for place in ((inside, before), (inside, behind), (before, inside), (behind, inside)):
+            beside = around[place]
+            predicted = np.where(unknown & ((predicted == UNKNOWN) | (beside == mask)), beside, predicted)
+        return predicted
 
     def confusions(self, count: int = 3) -> list[tuple[int, int, float]]:
         """List what was most often taken for something else: class predicted, label seen, share of checked pixels."""
@@ -153,7 +172,7 @@ def _compared(labels: np.ndarray) -> np.ndarray:  # (H, W)
     """Choose the pixels of a mask that are compared, (H, W) bool: large masks tell enough by half of them."""
     wanted: np.ndarray = labels >= 0
     if wanted.size > _ALL:
-        rows, columns = (np.arange(size) // 16 % 2 for size in wanted.shape)
+        rows, columns = (np.arange(size) // _TILE % 2 for size in wanted.shape)
         wanted &= np.equal.outer(rows, columns)
     return wanted
 
@@ -225,7 +244,9 @@ def compare_mask(
     classes = np.flatnonzero(table[:, :width].any(axis=0)).astype(np.int32) if evidence is None else evidence.vocabulary
     known = table[:, : width + 1 if evidence is not None and evidence.has_none_of_these else width]
     counts = table[1:, np.where(classes >= 0, classes, width)]
-    return ViewCheck(view.name, int(known.sum()), classes, counts, PackedLabels(predicted), evidence)
+    at_border = [np.concatenate([one[0], one[-1], one[:, 0], one[:, -1]]) for one in (labels, predicted)]
+    cut = np.unique(at_border[0][(at_border[0] == at_border[1]) & (at_border[0] >= 0)])
+    return ViewCheck(view.name, int(known.sum()), classes, counts, PackedLabels(predicted), evidence, cut=cut)
 
 
 @kernel

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from jinja2 import Environment
 
 FIRST = ("preview", "views-shown")
-"""Sections that are made before the others, which choose views by what these have rendered."""
+"""Sections that are made beside each other, before the others, which choose views by what these have rendered."""
 
 SECTIONS: Mapping[str, tuple[str, Callable[[PageInputs], sections.Content | None]]] = {
     "preview": ("In 3D", sections.preview),
@@ -82,12 +82,11 @@ def report_page(run: PageInputs) -> str:
 
 
 def _contents(run: PageInputs) -> dict[str, sections.Content]:
-    """Make the contents of the sections that there are, by anchor, two at once."""
-    made: dict[str, sections.Content | None] = {}
-    for anchors in (FIRST, [anchor for anchor in SECTIONS if anchor not in FIRST]):
-        made |= zip(
-            anchors, several_at_once(lambda anchor: SECTIONS[anchor][1](run), anchors, run.images.device), strict=True
-        )
+    """Make the contents of the sections that there are, by anchor."""
+    at_once = several_at_once(lambda anchor: SECTIONS[anchor][1](run), FIRST)
+    made = dict(zip(FIRST, at_once, strict=True))
+    # Of these, what takes time works on several views at once itself.
+    made |= {anchor: make(run) for anchor, (_, make) in SECTIONS.items() if anchor not in FIRST}
     return {anchor: content for anchor, content in made.items() if content is not None}
 
 

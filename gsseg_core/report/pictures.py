@@ -19,6 +19,7 @@ from gsseg_core.learn.mask_reliability import ViewCheck
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.report.findings import Evidence
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.several_at_once import several_at_once
 
 PICTURE_PX = 480
 """Views are shrunk to this many pixels a side."""
@@ -26,10 +27,12 @@ THUMBNAIL_PX = 128
 MARGIN = 0.25
 """Around the object in a thumbnail, as a share of its size."""
 SMALLEST_CROP_PX = 32
-CANDIDATES = 3
-"""Views, those that show most of a class, among which its thumbnail is chosen."""
+ENOUGH = THUMBNAIL_PX**2
+"""Pixels of a class that fill its thumbnail: more of them show no more."""
 CUT = 0.3
 """What a view in which the margin cuts an object counts, beside one that shows it whole."""
+UNSEEN = 0.5
+"""What a view counts whose image would have to be rendered, beside one whose image is at hand."""
 
 _AGREE, _DIFFER, _UNKNOWN = (40, 44, 52), (236, 72, 60), (128, 131, 138)
 
@@ -52,9 +55,8 @@ class ViewImages:
             self.keep(one.view, one.image)
 
     def keep(self, view: View, rendered: np.ndarray) -> None:
-        """Keep a rendering (H, W, 3) uint8 that has been made anyway, unless there is a photo."""
-        if view.image_path is None:
-            self._images[view.name, view.camera.width] = rendered
+        """Keep a rendering (H, W, 3) uint8 that has been made anyway."""
+        self._images[view.name, view.camera.width] = rendered
 
     def at_hand(self, view: View) -> bool:
         """Whether nothing needs to be rendered."""
@@ -62,7 +64,7 @@ class ViewImages:
 
     def of(self, view: View) -> np.ndarray:
         """Give the image, (H, W, 3) uint8 of the camera's size."""
-        photo = None if (view.name, view.camera.width) in self._images else read_photo(view)
+        photo = read_photo(view)
         return self.rendered(view) if photo is None else photo
 
     def rendered(self, view: View) -> np.ndarray:
@@ -91,37 +93,27 @@ def draw_triple(check: ViewCheck, view: View, images: ViewImages, colors: np.nda
 def thumbnails(
     classes: Iterable[int], evidence: Evidence, images: ViewImages, colors: np.ndarray
 ) -> dict[int, tuple[str, np.ndarray]]:
-    """Cut classes out of the views that show them best, outlined in their colours (K, 3).
-
-    That is, of the views in which most pixels are predicted as the class and labelled so, the one with the most; less
-    if the margin cuts the object, or if the view's image would have to be rendered.
+    """Cut classes out of the views that show them best, outlined in their colours (K, 3), several views at once.
 
     Returns
     -------
     dict of int to (str, (THUMBNAIL_PX, THUMBNAIL_PX, 3) uint8)
         For each of the classes that some view shows: the view's name, and the picture.
     """
-    borders: dict[str, np.ndarray] = {}  # Of each view only once, however many classes ask for it.
-    chosen: dict[str, list[int]] = {}
-    checks = {check.name: check for check in evidence.checks}
+    chosen: dict[int, list[int]] = {}
+    best = _best_views(evidence, images, len(colors))
     for k in classes:
-        best = None
-        for pixels, check in _candidates(evidence, k):
-            view = evidence.views[check.name]
-            if check.name not in borders:
-                borders[check.name] = _agreed_at_border(view.read_labels(), check.prediction())
-            score = pixels * (CUT if k in borders[check.name] else 1) * (1 if images.at_hand(view) else 0.5)
-            if best is None or score > best[0]:
-                best = score, view.name
-        if best is not None:
-            chosen.setdefault(best[1], []).append(k)
-    found = {}
-    for name, shown in chosen.items():
-        view = evidence.views[name]
-        image, mask, predicted = images.of(view), view.read_labels(), checks[name].prediction()
-        for k in shown:
-            found[k] = name, _crop(image, (mask == k) & (predicted == k), colors[k])
-    return found
+        if k in best:
+            chosen.setdefault(best[k], []).append(k)
+
+    def cut_from(place: int) -> dict[int, tuple[str, np.ndarray]]:
+        check = evidence.checks[place]
+        view = evidence.views[check.name]
+        image, mask = images.of(view), view.read_labels()
+        predicted = check.completed(mask)
+        return {k: (view.name, _crop(image, (mask == k) & (predicted == k), colors[k])) for k in chosen[place]}
+
+    return {k: found for some in several_at_once(cut_from, chosen, images.device) for k, found in some.items()}
 
 
 def jpeg_uri(image: np.ndarray, largest: int) -> str:
@@ -134,16 +126,25 @@ def jpeg_uri(image: np.ndarray, largest: int) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
-def _candidates(evidence: Evidence, k: int) -> list[tuple[int, ViewCheck]]:
-    """Find the views with most pixels on which mask and prediction agree that they are of a class, and how many."""
-    pixels = [(int(check.counts[k, check.classes == k].sum()), check) for check in evidence.checks]
-    return [pair for pair in sorted(pixels, key=lambda pair: -pair[0])[:CANDIDATES] if pair[0]]
+def _best_views(evidence: Evidence, images: ViewImages, num_classes: int) -> dict[int, int]:
+    """Find the check of the view that shows each class best, by class; of those that some view shows.
 
-
-def _agreed_at_border(mask: np.ndarray, predicted: np.ndarray) -> np.ndarray:  # (H, W), (H, W)
-    """List the labels on which both agree along the border of an image."""
-    mask, predicted = (np.concatenate([one[0], one[-1], one[:, 0], one[:, -1]]) for one in (mask, predicted))
-    return np.unique(mask[mask == predicted])
+    That is the one with most pixels on which mask and prediction agree, but `ENOUGH` are as good as more. It counts
+    less if the margin cuts the object, or if the view's image would have to be rendered. A small rest of an object that
+    is large elsewhere is not looked at, though nothing cuts it.
+    """
+    checks = evidence.checks
+    pixels, cut = (np.zeros((len(checks), num_classes), kind) for kind in (np.int64, np.bool_))
+    for place, check in enumerate(checks):
+        named = np.flatnonzero(check.classes >= 0)
+        known = check.classes[named]
+        pixels[place, known] = check.counts[known, named]
+        cut[place, check.cut] = True
+    at_hand = np.array([images.at_hand(evidence.views[check.name]) for check in checks], bool)
+    worth = np.minimum(pixels, ENOUGH) * np.where(cut, CUT, 1) * np.where(at_hand, 1, UNSEEN)[:, None]
+    worth[pixels < np.minimum(ENOUGH, CUT * pixels.max(axis=0, initial=0))] = 0
+    best = np.where(worth == worth.max(axis=0, initial=0), pixels, -1)
+    return {k: int(best[:, k].argmax()) for k in np.flatnonzero(pixels.any(axis=0)).tolist()}
 
 
 def _crop(image: np.ndarray, own: np.ndarray, color: np.ndarray) -> np.ndarray:

@@ -93,8 +93,8 @@ def preview(run: PageInputs) -> Content:
     cameras = [views[check.name].camera for check in ranked[:LOOKS]]
     poster = None
     if ranked:
-        seen = run.images.of(views[ranked[0].name])
-        seen, predicted = shown_at(POSTER_PX, seen, ranked[0].prediction())
+        view = views[ranked[0].name]
+        seen, predicted = shown_at(POSTER_PX, run.images.of(view), ranked[0].completed(view.read_labels()))
         poster = overlay(seen, predicted, run.colors)
     legend = [
         {"label": k, "name": name, "color": colors[k].tolist(), "count": count, "now": k < segmentation.num_classes}

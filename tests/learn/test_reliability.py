@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, taught
+from small_scenes import HEIGHT, NAMES, NUM_CLASSES, WIDTH, balls_on_a_table, clean_views, ring, taught
 from view_errors import corrupt_views
 from wrong_masks import WrongMasks
 
@@ -17,7 +17,7 @@ from gsseg_core.data.view import View
 from gsseg_core.export.view_pictures import draw_worst_views
 from gsseg_core.learn import mask_reliability
 from gsseg_core.learn.em.em_learner import EMLearner
-from gsseg_core.learn.mask_reliability import ViewCheck, check_views, reliability_report, worst_views
+from gsseg_core.learn.mask_reliability import ViewCheck, check_views, compare_mask, reliability_report, worst_views
 from gsseg_core.report.pictures import ViewImages
 
 SCENE, _ = balls_on_a_table()
@@ -102,9 +102,10 @@ def test_unknown_pixels_do_not_count() -> None:
 
 
 def test_of_large_views_half_is_compared_which_tells_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    every = checks()
     monkeypatch.setattr(mask_reliability, "_ALL", 100)
     for half in check_views(learner_with_bad_frames()):
-        whole = checks()[half.name]
+        whole = every[half.name]
         assert half.num_pixels == whole.num_pixels and half.checked == pytest.approx(whole.checked / 2, rel=0.1)
         assert half.reliability == pytest.approx(whole.reliability, abs=0.03)  # Of views of 3,072 px.
         shown = half.prediction()
@@ -129,6 +130,15 @@ def test_every_view_is_told_of_and_nothing_that_was_learnt_changes() -> None:
     check_views(learner, lambda stage, done, total: told.append((stage, done, total)))
     np.testing.assert_array_equal(learner.codes_, codes)
     assert told == [("check views", done, 12) for done in range(13)]
+
+
+def test_a_check_tells_which_classes_the_border_cuts() -> None:
+    labels, predicted = np.zeros((2, HEIGHT, WIDTH), np.int32)
+    labels[5:9, :3], predicted[7, :3] = 2, 2  # they agree there
+    labels[5:9, -1], predicted[5:9, -1] = 1, 3
+    labels[20:30, 20:30] = predicted[20:30, 20:30] = 4
+    check = compare_mask(View.from_arrays(ring(1)[0], labels), predicted, 5)
+    np.testing.assert_array_equal(check.cut, [0, 2])
 
 
 def test_the_same_views_give_the_same_figures() -> None:

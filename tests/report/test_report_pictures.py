@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import base64
+import threading
 from pathlib import Path
 
 import numpy as np
+import pytest
+from patience import PATIENCE
 from report_cases import painted
 from small_scenes import balls_on_a_table, look_at
 
@@ -13,6 +16,7 @@ from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.export.pictures import palette
 from gsseg_core.learn.mask_reliability import compare_mask
+from gsseg_core.report import pictures
 from gsseg_core.report.findings import Evidence
 from gsseg_core.report.pictures import THUMBNAIL_PX, ViewImages, draw_triple, jpeg_uri, thumbnails
 
@@ -40,6 +44,82 @@ def test_thumbnail_is_cut_from_the_view_that_shows_the_class_whole() -> None:
     # 16 x 24 px in a square of 36: two thirds of the width, the rest dimmed.
     assert bright[middle, middle] and 0.2 < bright.mean() < 0.35
     assert (picture[:8] < 100).all() and (picture == palette(3)[1]).all(axis=2).any()
+
+
+def evidence_of(*views: View) -> Evidence:
+    checks = [compare_mask(view, view.read_labels(), 3) for view in views]
+    return Evidence(checks, {view.name: view for view in views}, True)
+
+
+def test_enough_pixels_at_hand_are_as_good_as_more_that_would_have_to_be_rendered(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    most = view_of("most", painted((1, slice(10, 40), slice(10, 50))))
+    enough = view_of("enough", painted((1, slice(10, 22), slice(10, 22))))
+    few = view_of("few", painted((1, slice(10, 17), slice(10, 17))))
+    evidence, grey = evidence_of(few, most, enough), np.full((48, 64, 3), 120, np.uint8)
+
+    def shown_with(*at_hand: View) -> str:
+        images = ViewImages(SCENE)
+        for view in at_hand:
+            images.keep(view, grey)
+        return thumbnails([1], evidence, images, palette(3))[1][0]
+
+    assert shown_with(few, enough) == "most"
+    monkeypatch.setattr(pictures, "ENOUGH", 144)
+    assert shown_with(few, enough) == "enough" and shown_with(few) == "most"
+    # Where nothing needs to be rendered, more is still better.
+    assert shown_with(few, enough, most) == "most"
+
+
+def test_a_small_rest_is_not_shown_because_nothing_cuts_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pictures, "ENOUGH", 100)
+    views = view_of("large", painted((1, slice(0, 30), slice(0, 50)))), view_of("rest", painted((1, 9, slice(9, 59))))
+    assert thumbnails([1], evidence_of(*views), ViewImages(SCENE), palette(3))[1][0] == "large"
+
+
+def test_views_that_have_to_be_rendered_for_thumbnails_are_so_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsseg_core.several_at_once.numba.get_num_threads", lambda: 2)
+    meeting = threading.Barrier(2, timeout=PATIENCE)
+
+    def rendered(_: ViewImages, view: View) -> np.ndarray:
+        meeting.wait()
+        return np.zeros((view.camera.height, view.camera.width, 3), np.uint8)
+
+    monkeypatch.setattr(ViewImages, "rendered", rendered)
+    views = [view_of(str(k), painted((k, slice(10, 20), slice(10, 20)))) for k in (1, 2)]
+    found = thumbnails([1, 2], evidence_of(*views), ViewImages(SCENE), palette(3))
+    assert {k: name for k, (name, _) in found.items()} == {1: "1", 2: "2"}
+
+
+def test_thumbnails_of_large_views_have_no_holes_where_nothing_was_compared() -> None:
+    labels = np.zeros((480, 640), np.int32)
+    labels[100:300, 200:400] = 1
+    labels[350:450, 50:150] = 1  # which is a mistake of the mask
+    predicted = np.where(np.arange(480)[:, None] < 320, labels, 0)
+    camera = look_at("a", np.array([3.0, 0, 3]), 640, 480)
+    view = View.from_arrays(camera, labels)
+    compared = np.add.outer(np.arange(480) // 16, np.arange(640) // 16) % 2 == 0
+    evidence = Evidence([compare_mask(view, np.where(compared, predicted, UNKNOWN), 2)], {"a": view}, True)
+    images = ViewImages(SCENE)
+    images.keep(view, np.full((480, 640, 3), 200, np.uint8))
+    _, picture = thumbnails([1], evidence, images, palette(2))[1]
+    bright = (picture == 200).all(axis=2)
+    assert bright[28:100, 28:100].all() and not bright[112:].any() and not bright[:, :16].any()
+    np.testing.assert_array_equal(evidence.checks[0].completed(labels)[32:-32, 32:-32] == 1,
+                                  (predicted == 1)[32:-32, 32:-32])  # fmt: skip
+
+
+def test_what_is_rendered_is_kept_beside_a_photo(tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    from PIL import Image
+
+    Image.new("RGB", (64, 48), (10, 200, 30)).save(tmp_path / "photo.png")
+    view, image = replace(view_of("a", painted()), image_path=tmp_path / "photo.png"), np.zeros((48, 64, 3), np.uint8)
+    images = ViewImages(SCENE)
+    images.keep(view, image)
+    assert images.rendered(view) is image and (images.of(view) == (10, 200, 30)).all()
 
 
 def test_what_only_the_mask_says_is_on_no_thumbnail() -> None:
