@@ -27,7 +27,7 @@ from gsseg_core.simd import LANES, add_scaled, apart, divided, empty_rows, load_
 from gsseg_core.spatial.knn import CHUNK
 from gsseg_core.spatial.neighbour_graph import NEIGHBOURS, Graph, graph_of
 
-SETTLED = np.float32(3e-4)
+SETTLED = np.float32(1e-3)
 """A Gaussian is left alone while no probability around it changes by more than this in a step."""
 
 SCARCE = 1 / 6
