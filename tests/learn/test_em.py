@@ -31,7 +31,7 @@ from gsseg_core.learn.em.block_weights import block_weights
 from gsseg_core.learn.em.confusion_model import PART_PRIOR
 from gsseg_core.learn.em.em_kernels import GRADIENT_UNIT, ViewPairs, accumulate, m_step, predicted_gain
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings, codes_without
-from gsseg_core.learn.em.rejected_regions import SMALLEST
+from gsseg_core.learn.em.rejected_regions import RIVALLED, SMALLEST
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.constants import BLOCK
@@ -138,17 +138,23 @@ def rejected_regions(scene: GaussianScene, views: list[View], settings: EMSettin
         weights.append(W)
         onehots.append(onehot)
         regions.append(slow_regions(labels))
-    votes = sum(W.T @ onehot for W, onehot in zip(weights, onehots, strict=True))
+    insides = [(part.reshape(-1, 1) == np.arange(len(classes))).astype(np.float64) for part, classes in regions]
+    doubted = [np.ones(len(classes), bool) for _, classes in regions]
+    for without in (False, True):
+        said = [onehot * (inside @ ~(without & d))[:, None]
+                for onehot, inside, d in zip(onehots, insides, doubted, strict=True)]  # fmt: skip
+        votes = [W.T @ one for W, one in zip(weights, said, strict=True)]
+        found = []
+        for W, own, inside, (_, classes), d in zip(weights, votes, insides, regions, doubted, strict=True):
+            counts = scaled(np.maximum(sum(votes) - own, 0)).T @ (W.T @ inside)
+            agreed = counts[classes, np.arange(len(classes))]
+            asked = np.maximum(counts.sum(axis=0), RIVALLED * counts.max(axis=0))
+            found.append(d & (agreed < settings.least_agreement * asked))
+        doubted = found
     words = []
-    for view, W, onehot, (of_pixel, classes) in zip(views, weights, onehots, regions, strict=True):
-        others = scaled(np.maximum(votes - W.T @ onehot, 0))
-        inside = (of_pixel.reshape(-1, 1) == np.arange(len(classes))).astype(np.float64)
-        counts = others.T @ (W.T @ inside)
-        word = view.read_labels()
-        for region, label in enumerate(classes):
-            if counts[label, region] < settings.least_agreement * counts[:, region].sum():
-                word[of_pixel == region] = NUM_CLASSES + region
-        words.append(word)
+    for view, (of_pixel, _), d in zip(views, regions, doubted, strict=True):
+        inside = np.isin(of_pixel, np.flatnonzero(d))
+        words.append(np.where(inside, NUM_CLASSES + of_pixel, view.read_labels()))
     return words
 
 

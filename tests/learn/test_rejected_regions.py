@@ -85,6 +85,26 @@ def test_what_one_view_alone_claims_against_all_others_is_rejected() -> None:
     assert mean_iou(learner) > mean_iou(clean) - 0.01
 
 
+def test_what_is_rejected_has_no_say_against_others() -> None:
+    right, wrong, *others = clean_views(6)
+    # Two views show a ball, and one of them gives it and much around it a label of its own.
+    labels = wrong.read_labels()
+    around = ndimage.binary_dilation(labels == 1, iterations=16)
+    views = [right, View.from_arrays(wrong.camera, np.where(around, NUM_CLASSES, labels))]
+    for view in others:
+        near = ndimage.binary_dilation(view.read_labels() == 1, iterations=12)
+        views.append(View.from_arrays(view.camera, np.where(near, UNKNOWN, view.read_labels())))
+    learner = taught(EMLearner(SCENE, NUM_CLASSES + 1), views)
+    votes, evidence = CSRRows.from_dense(learner._votes), learner.observation(right.name).evidence
+    _, at_first = learner._find_rejected(votes, lambda: None, dict.fromkeys(learner.views))
+    assert evidence.named()[at_first[right.name]].tolist() == [1]
+    _, rejected = learner._reject_regions(votes, lambda: None)
+    assert rejected.keys() == {wrong.name}
+    learner.fit()
+    assert learner.rejected_share(right) == 0
+    assert 1 in learner.codes_.argmax(axis=1)
+
+
 def test_gaussians_of_which_only_doubtful_regions_speak_have_no_code() -> None:
     first, *others = clean_views(4)
     # A blob over all of the table in one view; the others leave open what is near one of the balls.
@@ -109,6 +129,20 @@ def test_a_region_is_rejected_only_where_the_others_saw_enough_of_it(seen: float
     observation, possible = learner._prepared.in_memory[view.name], np.ones(NUM_CLASSES + 1, bool)
     rejected = find_rejected(CSRRows.from_dense(votes), observation, possible, EMSettings().least_agreement)
     assert len(rejected) >= NUM_CLASSES
+    np.testing.assert_array_equal(rejected, expected)
+
+
+@pytest.mark.parametrize(("rivals", "expected"), [(1, True), (2, False)])
+def test_one_other_class_speaks_against_a_label_more_than_many(rivals: int, expected: bool) -> None:
+    view = clean_views(1)[0]
+    learner = EMLearner(SCENE, NUM_CLASSES + rivals)
+    learner.observe(view)
+    votes = learner._votes.copy()
+    others = votes[:, :NUM_CLASSES].sum(axis=1)
+    votes[:, :NUM_CLASSES] += (0.07 * votes[:, :NUM_CLASSES]).astype(np.int64)
+    votes[:, NUM_CLASSES:] = (0.93 / rivals * others)[:, None]
+    observation, possible = learner._prepared.in_memory[view.name], np.ones(NUM_CLASSES + rivals, bool)
+    rejected = find_rejected(CSRRows.from_dense(votes), observation, possible, EMSettings().least_agreement)
     np.testing.assert_array_equal(rejected, expected)
 
 

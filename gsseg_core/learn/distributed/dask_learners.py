@@ -233,10 +233,13 @@ class DistributedEM(_OnWorkers, EMLearner):
 
     checks_masks = False  # which would prepare all views here
 
-    def _reject_regions(
-        self, votes: CSRRows, tick: Callable[[], None], names: Iterable[str] | None = None
+    def _find_rejected(
+        self, votes: CSRRows, tick: Callable[[], None], doubted: Mapping[str, np.ndarray | None]
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        return self._step(dask_worker.reject_regions, tick, None, votes)
+        views = {name: self.views[name] for name in doubted}
+        if not views:
+            return np.zeros(len(votes.data), np.int64), {}
+        return self._sum(dask_worker.find_rejected, views, lambda done: tick(), doubted, votes)
 
     def _initial_error_models(
         self, votes: CSRRows, rejected: Mapping[str, np.ndarray], tick: Callable[[], None],

@@ -109,10 +109,10 @@ def sum_votes(shard: Shard, wanted: dict[str, Any]) -> Part:
     return votes, {name: shard.rejected.get(name, "") for name in wanted}
 
 
-def reject_regions(shard: Shard, wanted: dict[str, None], votes: CSRRows) -> Part:
+def find_rejected(shard: Shard, doubted: dict[str, np.ndarray | None], votes: CSRRows) -> Part:
     """Sum the votes of rejected regions; beside them, which labels of each view these are."""
     with _all_threads():
-        return shard._reject_regions(_as_compiled_for(votes), _go_on, wanted)
+        return shard._find_rejected(_as_compiled_for(votes), _go_on, doubted)
 
 
 def initial_error_models(shard: Shard, rejected: dict[str, np.ndarray | None], votes: CSRRows) -> Part:

@@ -177,8 +177,7 @@ class EMLearner(Learner):
         votes, tick = CSRRows.from_dense(self._votes), partial(progress, "em", 0, settings.max_steps)
         rejected: dict[str, np.ndarray] = {}
         if settings.rejects_regions:
-            rejected_votes, rejected = self._reject_regions(votes, tick)
-            votes = votes.with_data(votes.data - rejected_votes).nonzero()
+            votes, rejected = self._reject_regions(votes, tick)
         resolved = resolved_votes(votes, self._possible())
         self.observed_ = np.diff(resolved.indptr) > 0
         resolved, prior = resolved.united(self._spatial_prior(resolved))
@@ -272,15 +271,27 @@ class EMLearner(Learner):
             seen = SeenLabels(align_boundaries(seen.labels, edges, settings.edge_px))
         return split_regions(seen) if settings.rejects_regions else seen
 
-    def _reject_regions(
-        self, votes: CSRRows, tick: Tick, names: Iterable[str] | None = None
+    def _reject_regions(self, votes: CSRRows, tick: Tick) -> tuple[CSRRows, dict[str, np.ndarray]]:
+        """Reject labels that the other views contradict; return the votes that are left, and by view which those are.
+
+        What is rejected has no say against others: each is tested once more, by the votes that are left.
+        """
+        rejected_votes, doubted = self._find_rejected(votes, tick, dict.fromkeys(self.views))
+        left = votes.with_data(votes.data - rejected_votes)
+        rejected_votes, rejected = self._find_rejected(left, tick, doubted)
+        return votes.with_data(votes.data - rejected_votes).nonzero(), rejected
+
+    def _find_rejected(
+        self, votes: CSRRows, tick: Tick, doubted: Mapping[str, np.ndarray | None]
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Find the labels of each view, or of some, that the other views contradict, by the votes of all, int64.
+        """Find the labels of some views that the other views contradict, by the votes of all, int64.
+
+        For None, all labels of a view are tested, else those that are doubted, (L,) bool, which have no votes there.
 
         Returns
         -------
         rejected_votes : (Z,) int64
-            Their part of each entry of the votes.
+            Votes of those that are found, for each entry of the votes.
         rejected : dict of str to (L,) bool
             Which they are; views without any are left out.
         """
@@ -288,10 +299,11 @@ class EMLearner(Learner):
         here, on_device = self._put(votes, device)
         remaining, rejected = on_device.zeros(here, np.int64), {}
 
-        def find(_: str, observation: Observation) -> tuple[np.ndarray, Observation]:
-            return find_rejected(here, observation, possible, self.settings.least_agreement, device), observation
+        def find(name: str, observation: Observation) -> tuple[np.ndarray, Observation]:
+            least = self.settings.least_agreement
+            return find_rejected(here, observation, possible, least, device, doubted[name]), observation
 
-        for name, (labels, observation) in self._of_each(find, names, tick):
+        for name, (labels, observation) in self._of_each(find, doubted, tick):
             if labels.any():
                 rejected[name] = labels
                 rejected_votes = observation.evidence.without_names(~labels).votes

@@ -3,8 +3,9 @@
 Most errors of a segmenter sit in one place: a blob of clutter, an object under another's id, a whole bad frame. The
 confusion matrix of a view, the same all over it, does not model them. So each *region* of a mask, connected pixels of
 one label, is tested against the votes of all other views. Where they saw enough of it, and next to nothing of that has
-its label, the label is rejected. The pixels still belong together, so the region becomes a word of its own in the
-view's vocabulary, of which the confusion matrix tells what it means. docs/method.md has the reasons.
+its label, the label is rejected. What is rejected has no say against others: each is tested once more, by the votes
+that are left. The pixels still belong together, so the region becomes a word of its own in the view's vocabulary, of
+which the confusion matrix tells what it means. docs/method.md has the reasons.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ SMALLEST = 64  # regions of fewer px are not split: all of one label are tested 
 
 COVERED = 0.25
 """Share of a region, by weight, that the other views must have seen as well as this one for it to be rejected."""
+
+RIVALLED = 2.0
+"""Where one other class has a region by the votes of the other views, this many times the share is asked for."""
 
 MOST = 500  # regions of a mask that are split at most, the largest; what is left of each label is tested as one
 
@@ -46,25 +50,30 @@ def split_regions(seen: SeenLabels) -> SeenLabels:
 
 
 def find_rejected(
-    votes: CSRRows, observation: Observation, possible: np.ndarray, least: float, device: str = "cpu"
-) -> np.ndarray:
+    votes: CSRRows, observation: Observation, possible: np.ndarray, least: float, device: str = "cpu",
+    doubted: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
     """Find the labels of a view that the votes of all other views contradict, (L,) bool; none of uncertain evidence.
 
-    They are those under which less than the share `least`, by weight, is of their class by the votes of the others. A
-    Gaussian that this view saw better than all others together counts by what they saw of it, no more: what shows
-    through a gap in another view is little evidence. A region of which they saw too little is kept.
+    They are those under which less than the share `least`, by weight, is of their class by the votes of the others, or
+    less than `RIVALLED` times `least` of what is of another class: an even mixture of many speaks less against a label
+    than one class all over. A Gaussian that this view saw better than all others together counts by what they saw of
+    it, no more: what shows through a gap in another view is little evidence. A region of which they saw too little is
+    kept.
 
-    The other parameters are those of `leave_one_out_counts`, with the votes on the device.
+    If there are `doubted` labels, (L,) bool, they have no votes among these, and only they can be rejected. The other
+    parameters are those of `leave_one_out_counts`, with the votes on the device.
     """
     evidence = observation.evidence
     if not evidence.is_certain:
         return np.zeros(len(observation.classes), bool)
-    counts = kernels_on(device).leave_one_out_counts(votes, observation, possible, evidence, most=1.0)
+    voted_with = evidence if doubted is None else evidence.without_names(doubted)
+    counts = kernels_on(device).leave_one_out_counts(votes, observation, possible, voted_with, most=1.0)
     label = np.arange(len(evidence.informative))
-    covered = counts.sum(axis=0)
+    covered, rival = counts.sum(axis=0), counts.max(axis=0)
     enough = covered >= COVERED * observation.votes_by_label()
-    rejected: np.ndarray = enough & (counts[evidence.named(), label] < least * covered)
-    return rejected
+    rejected: np.ndarray = enough & (counts[evidence.named(), label] < least * np.maximum(covered, RIVALLED * rival))
+    return rejected if doubted is None else rejected & doubted
 
 
 @kernel
