@@ -25,13 +25,14 @@ from gsseg_core.demo.table_scene import DemoScene, build_demo
 from gsseg_core.errors import GssegError
 from gsseg_core.export.pictures import contact_sheet, palette, save_png
 from gsseg_core.export.view_pictures import write_overview
+from gsseg_core.files.run_folder import StagedRun, staged_run
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.metrics import evaluate_folders
 from gsseg_core.progress import Stopwatch, progress_bars
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.text import percent, seconds_table, table
 from gsseg_ros.child_nodes import ChildNodes
-from gsseg_ros.client import Exported, NodeUnavailableError, SegmentationClient, Viewpoint
+from gsseg_ros.client import Exported, NodeUnavailableError, RenderedView, SegmentationClient, Viewpoint
 
 T = TypeVar("T")
 
@@ -72,13 +73,16 @@ def run_demo(out: Path, nodes: ChildNodes, *, seed: int = 0, rate: float = 10.0,
             client.segment(viewpoint=Viewpoint.of(test[0].camera))
         train = spread(Dataset(demo.root).views("train"), COMPARED_VIEWS)
         with watch.stage(f"render {len(test) + len(train)} views"):
-            pictures = [_render(client, view, out / "rendered") for view in test]
+            rendered = [client.render_view(Viewpoint.of(view.camera), with_overlay=True) for view in test]
             seen = [client.render_view(Viewpoint.of(view.camera)).labels for view in train]
         with watch.stage("export"):
             exported = client.export("segmented")
     with watch.stage("pictures and scores"):
         segmentation = Segmentation.load(exported.folder / "segmentation.npz", demo.scene)
-        write_overview(segmentation, pictures, [view.name for view in test], out / "rendered/overlays")
+        # As `gsseg render` writes it, so that either demo may go where the other has been.
+        with staged_run(out / "rendered", "render") as run:
+            overlays = [_write(one, view, run) for one, view in zip(rendered, test, strict=True)]
+            write_overview(segmentation, overlays, [view.name for view in test], run.folder / "overlays", run.id)
         _compare(demo, train, seen, out / "masks_and_result.png")
         scores = evaluate_folders(out / "rendered", demo.root / "labels_true").as_dict(demo.class_names)
         overlap = gaussian_ious(demo, exported.folder / "segmentation.npz")
@@ -135,11 +139,11 @@ def _in_slices(nodes: ChildNodes, wait: Callable[[float], T], seconds: float) ->
                 raise
 
 
-def _render(client: SegmentationClient, view: View, folder: Path) -> np.ndarray:  # (H, W, 3)
-    seen = client.render_view(Viewpoint.of(view.camera), with_overlay=True)
+def _write(seen: RenderedView, view: View, run: StagedRun) -> np.ndarray:  # (H, W, 3)
+    """Write the labels that the node saw in a view, and their overlay, which is returned."""
     assert seen.overlay is not None
-    write_mask(folder / f"{view.name}.png", seen.labels, 8)
-    save_png(folder / "overlays" / f"{view.name}.png", seen.overlay)
+    write_mask(run.folder / f"{view.name}.png", seen.labels, 8, run.id)
+    save_png(run.folder / "overlays" / f"{view.name}.png", seen.overlay, run.id)
     return seen.overlay
 
 

@@ -20,6 +20,7 @@ from small_scenes import NAMES, write_dataset
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
+from gsseg_core.cli.main import main
 from gsseg_core.data.label_images import read_mask
 from gsseg_core.demo.furniture import CLASS_NAMES
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -98,6 +99,8 @@ def test_the_demo_segments_its_scene_well_and_shows_it(demo_out: Path) -> None:
         assert str(picture) in output or "legend" in picture
         with Picture.open(demo_out / picture) as image:
             assert min(image.size) > 200 and np.asarray(image).std() > 20
+    # The demo without ROS goes where this one has been.
+    assert main(["demo", "--out", str(demo_out), "--quiet"]) == 0
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 128 + signal.SIGTERM)])
