@@ -36,9 +36,6 @@ NO_MASK, SEES_NOTHING, ALL_UNKNOWN = "no mask", "sees no Gaussian", "all pixels 
 Self = TypeVar("Self", bound="Learner")
 R = TypeVar("R")
 
-Opened = tuple[Observation, PairVotes]
-"""A view that is prepared, with its votes."""
-
 _ALONE = threading.Lock()  # of two threads at work on a view each, one at a time lends out the votes
 
 
@@ -298,14 +295,14 @@ class Learner(ABC):
         if not operator.vote(*self._used_labels(seen, operator), self._votes, UNITS, sign):
             raise UnusableViewError(SEES_NOTHING)
 
-    def _opened(self, view: View) -> Opened | UnusableViewError:
+    def _opened(self, view: View) -> tuple[Observation, PairVotes] | UnusableViewError:
         """Prepare a view that is new; what is wrong with it is returned."""
         try:
             return self._open(view)
         except UnusableViewError as why:
             return why
 
-    def _add(self, view: View, opened: Opened | UnusableViewError | None) -> bool:
+    def _add(self, view: View, opened: tuple[Observation, PairVotes] | UnusableViewError | None) -> bool:
         """Count a view, and add its votes if it is prepared, or say why it cannot be used."""
         if isinstance(opened, UnusableViewError):
             self.rejected[view.name] = str(opened)
@@ -323,7 +320,7 @@ class Learner(ABC):
     def _of_each(
         self, work: Callable[[str, Observation], R], names: Iterable[str] | None, tick: Callable[[], None]
     ) -> Iterator[tuple[str, R]]:
-        """Give what is made of each prepared view, or of some of them, two at once; ticks before each.
+        """Give what is made of each prepared view, or of some of them, several at once; ticks before each.
 
         Every second time the last view comes first: of a file that is larger than the memory that caches it, what was
         read last is still there.
@@ -339,7 +336,7 @@ class Learner(ABC):
                 tick()
                 yield name, next(made)
 
-    def _open(self, view: View) -> Opened:
+    def _open(self, view: View) -> tuple[Observation, PairVotes]:
         observation = self._prepare(view, self._read(view))
         votes = observation.pair_votes()
         if not len(votes.ids):

@@ -21,8 +21,8 @@ def edges_along(operator: ViewOperator, scene: GaussianScene, labels: np.ndarray
     del labels, distance
     assert isinstance(operator, GPUOperator)
     camera, device = operator.camera, operator.tiles.table.device
-    light = luminance(scene)
-    if light.min() == light.max():
+    light, differs = luminance(scene)
+    if not differs:
         return np.zeros((camera.height, camera.width), np.float32)
     light_there = _LIGHT.of(scene, lambda: on_device(light, device), lambda known: known.device == device)
     ids, ahead = operator.tiles.ids.long(), on_device(camera.world_to_camera[2].astype(np.float32), device)

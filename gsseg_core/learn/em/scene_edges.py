@@ -23,16 +23,21 @@ EVERY = 3  # of rows and columns of squares, one is in the sample
 SMALL = 448  # px: of rows or columns of fewer, all are in the sample
 STRONGEST = 2.0  # edges count at most so much, in units of the view's 95th percentile
 
-_LIGHT: PerScene[np.ndarray] = PerScene()
+_LIGHT: PerScene[tuple[np.ndarray, bool]] = PerScene()
 
 
-def luminance(scene: GaussianScene) -> np.ndarray:
-    """Mean of the channels of each Gaussian's colour, (N,) float32."""
-    return _LIGHT.of(scene, lambda: scene.colors().mean(axis=1))
+def luminance(scene: GaussianScene) -> tuple[np.ndarray, bool]:
+    """Mean of the channels of each Gaussian's colour, (N,) float32, and whether any differ: else nothing has edges."""
+
+    def measured() -> tuple[np.ndarray, bool]:
+        light = scene.colors().mean(axis=1)
+        return light, bool(light.min() < light.max())
+
+    return _LIGHT.of(scene, measured)
 
 
 def edges_along(operator: ViewOperator, scene: GaussianScene, labels: np.ndarray, distance: int) -> np.ndarray:
-    """Do the same where it is within so many px of the boundaries of a mask, (H, W) int32, and in the sample."""
+    """Find `scene_edges` within so many px of the boundaries of a mask, (H, W) int32, and in the sample."""
     return scene_edges(operator, scene, near_boundaries(labels, -(-distance // BLOCK)))
 
 
@@ -42,8 +47,8 @@ def scene_edges(operator: ViewOperator, scene: GaussianScene, near: np.ndarray |
     If only those `near` something are wanted, (ceil(H / 4), ceil(W / 4)) bool by blocks, what has no such block around
     it, and is not in the sample, has no meaning.
     """
-    camera, light = operator.camera, luminance(scene)
-    if light.min() == light.max():
+    camera, (light, differs) = operator.camera, luminance(scene)
+    if not differs:
         return np.zeros((camera.height, camera.width), np.float32)
     ahead = camera.world_to_camera[2].astype(np.float32)
     channels = _luminance_and_inverse_depth(scene.means, light, operator.ids, ahead)
