@@ -145,6 +145,11 @@ def _learn_something(device: str) -> None:
     learner.fit()
     learner.predict_without(view)
     learner.evidence()
+    # What only some learners, live maps and programs ask of a view; here, as the process beside has more to compile.
+    operator = make_operator(scene, camera)
+    operator.adjoint(np.ones((*labels.shape, 1), np.float32))
+    operator.weights()
+    ray_ends(scene, camera, labels)
 
 
 def refine_something(device: str = "cpu") -> None:
@@ -163,16 +168,7 @@ def refine_something(device: str = "cpu") -> None:
     operator.render(scene.colors(camera.center))
     overlay(np.zeros((*labels.shape, 3), np.uint8), labels, palette(2))
     reordered(scene, curve_order(scene.means))
-    _do_what_is_rare(scene, camera, labels)
-
-
-def _do_what_is_rare(scene: GaussianScene, camera: Camera, labels: np.ndarray) -> None:  # (32, 32)
-    """Do what only some inputs need, as soft masks and maps that change, or only programs that use the library."""
+    # What only some inputs need: soft masks, and colours that are not of a PLY.
     quantise(np.stack([labels == 0, labels == 1]).astype(np.float32))
     resolved_votes(CSRRows.from_dense(np.array([[-1, 1]])), np.ones(2, bool))
-    ray_ends(scene, camera, labels)
-    harmonics = basis(np.eye(3), 3)
-    seen_colors(harmonics, scene.means, np.arange(3, dtype=np.int32), np.zeros(3, np.float32), 0)  # not of a PLY
-    operator = make_operator(scene, camera)
-    operator.adjoint(np.ones((*labels.shape, 1), np.float32))
-    operator.weights()
+    seen_colors(basis(np.eye(3), 3), scene.means, np.arange(3, dtype=np.int32), np.zeros(3, np.float32), 0)
