@@ -43,6 +43,9 @@ from gsseg_core.text import clipped, quoted
 
 FORMAT = "gsseg-state-1"
 
+OBJECTS_OF_ONE_SESSION = "holds objects that its own session found and numbered (ids per-view)"
+"""What errors say of a state with `per_view`, where classes are expected that mean the same to others."""
+
 _MOST_VIEWS = 2**31 - 1
 _MOST_VOTES = 2.0**62
 _VIEW_VOTES = 2.0**24 * LIMITS.max_pixels  # votes of one view for one Gaussian, at most, in units of `VOTE_UNIT`

@@ -11,7 +11,7 @@ import numpy as np
 from gsseg_core.data.class_names import class_name
 from gsseg_core.data.view import View
 from gsseg_core.errors import StateFileError, StateMismatchError
-from gsseg_core.learn.learner_state import State
+from gsseg_core.learn.learner_state import OBJECTS_OF_ONE_SESSION, State
 from gsseg_core.scene.group_frames import is_same
 from gsseg_core.scene.living_scene import LivingScene
 
@@ -50,8 +50,7 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
             )
         if one.state.per_view and len(saved) > 1:
             raise StateFileError(
-                f"{one.source}: holds objects that its own session found and numbered (ids per-view); expected classes "
-                "whose ids mean the same in all states"
+                f"{one.source}: {OBJECTS_OF_ONE_SESSION}; expected classes whose ids mean the same in all states"
             )
         _add_names(names, one)
         for other in saved[:number]:
@@ -65,7 +64,9 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
             name = _free_name(view.name, views)
             views[name] = view if name == view.name else replace(view, camera=replace(view.camera, name=name))
     num_fused = sum(one.state.num_fused for one in saved)
-    return State(votes, list(views.values()), num_fused, dict(sorted(names.items())), living=first.state.living)
+    class_names = dict(sorted(names.items()))
+    # One state alone stays of its kind.
+    return State(votes, [*views.values()], num_fused, class_names, None, first.state.living, first.state.per_view)
 
 
 def _add_names(names: dict[int, str], one: Saved) -> None:

@@ -16,7 +16,7 @@ from gsseg_core.data.class_names import BACKGROUND_NAME, class_name
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View, spread
 from gsseg_core.errors import GssegError, NoCodesError, NoUsableViewsError, SettingsError, StateFileError
-from gsseg_core.learn.learner_state import Learnt, State
+from gsseg_core.learn.learner_state import OBJECTS_OF_ONE_SESSION, Learnt, State
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.class_numbers import add_names, ids_by_name, require_affordable
@@ -318,7 +318,8 @@ class LiveSession:
         ------
         StateFileError
             The file is missing or damaged, or has more classes than there are names for, or without names than
-            `max_classes`, or other names than were given. Nothing has changed.
+            `max_classes`, or other names than were given, or objects that its own session numbered
+            (`PerViewSession`), where labels of views are no such numbers. Nothing has changed.
         StateMismatchError
             It belongs to another scene. Nothing has changed.
         PathNotAllowedError
@@ -372,7 +373,9 @@ class LiveSession:
         return State.load(path, self.scene.digest, len(self.scene), within)
 
     def _check_classes(self, path: str | os.PathLike[str], state: State) -> None:
-        """Raise `StateFileError` if a state has too many classes, or other names than were declared."""
+        """Raise `StateFileError` if a state has too many classes, other names than were declared, or objects."""
+        if state.per_view and not self._PER_VIEW:
+            raise StateFileError(f"{path}: {OBJECTS_OF_ONE_SESSION}; expected classes, or a session with ids per-view")
         most, why = (len(self._names), ", as were named") if self._declared else (self.max_classes, " (max_classes)")
         if state.num_classes > most:
             raise StateFileError(f"{path}: holds {state.num_classes} classes; expected at most {most}{why}")

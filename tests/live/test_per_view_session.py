@@ -17,13 +17,15 @@ from small_scenes import (
     write_dataset,
 )
 
+from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
-from gsseg_core.errors import SettingsError, UnknownLabelError
+from gsseg_core.errors import SettingsError, StateFileError, UnknownLabelError
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner_state import Learnt
 from gsseg_core.live.per_view_session import PerViewSession
+from gsseg_core.live.session import LiveSession
 from gsseg_core.refine.settings import UNREFINED
 
 SCENE, TRUTH = balls_on_a_table()
@@ -61,6 +63,23 @@ def test_a_live_session_goes_on_with_its_objects_after_saving_and_loading(tmp_pa
     np.testing.assert_array_equal(other.codes(), session.codes())
     with pytest.raises(SettingsError, match="from the views received only"):
         other.learn(dataset=Dataset(write_dataset(tmp_path / "data")))
+
+
+def test_objects_that_a_session_has_numbered_are_no_classes_of_another(tmp_path: Path) -> None:
+    finder = PerViewSession(SCENE)
+    for view in VIEWS[:3]:
+        finder.fuse(shuffled(view))
+    finder.save(tmp_path / "objects.npz")
+    assert main(["merge", str(tmp_path / "objects.npz"), "-o", str(tmp_path / "again.npz")]) == 0
+    session = LiveSession(SCENE)
+    session.fuse(VIEWS[0])
+    before = session.codes()
+    for name in ("objects.npz", "again.npz"):
+        with pytest.raises(StateFileError, match=rf"{name}: holds objects that its own session found and numbered"):
+            session.load(tmp_path / name)
+    np.testing.assert_array_equal(session.codes(), before)
+    session.save(tmp_path / "classes.npz")
+    assert PerViewSession(SCENE).load(tmp_path / "classes.npz") == 1  # Classes may become objects.
 
 
 def test_votes_of_views_that_are_gone_follow_their_object() -> None:
