@@ -12,7 +12,7 @@ import unicodedata
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from gsseg_core.errors import ClassesFileError, SettingsError
+from gsseg_core.errors import ClassesFileError, GssegError, SettingsError
 from gsseg_core.files.json_files import read_object
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.text import clipped, quoted
@@ -54,6 +54,19 @@ def read_classes(path: str | os.PathLike[str], within: Path | None = None) -> di
 def class_name(names: Mapping[int, str], k: int) -> str:
     """Name of a class, one like "class_07" where it has none."""
     return names.get(k, f"class_{k:02d}")
+
+
+def check_same_names(
+    names: Mapping[int, str], known: Mapping[int, str], source: object, where: str, error: type[GssegError]
+) -> None:
+    """Raise `error` if the names of a source call a class otherwise than it is called elsewhere.
+
+    Names like "class_07", which were made up where there were none, may be any.
+    """
+    for k in sorted(names.keys() & known.keys()):
+        here, there = names[k], known[k]
+        if here != there and class_name({}, k) not in (here, there):
+            raise error(f"{source}: calls class {k} {quoted(here)}; expected {quoted(there)}, as in {where}")
 
 
 def flaw_of_class_name(name: object) -> str:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gsseg_core.data.class_names import class_name
+from gsseg_core.data.class_names import check_same_names
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import PER_VIEW, UNKNOWN
 from gsseg_core.data.soft_masks import TOLERANCE, SeenLabels
@@ -79,16 +79,8 @@ class State:
         return max(int(self.votes.shape[1]), 0 if self.learnt is None else int(self.learnt.codes.shape[1]))
 
     def check_names(self, known: Mapping[int, str], source: str | os.PathLike[str], where: str) -> None:
-        """Raise `StateFileError` if this state, of `source`, calls a class otherwise than it is called elsewhere.
-
-        Names like "class_07", which were made up where there were none, may be any.
-        """
-        for k in sorted(self.class_names.keys() & known.keys()):
-            here, there = self.class_names[k], known[k]
-            if here != there and class_name({}, k) not in (here, there):
-                raise StateFileError(
-                    f"{source}: calls class {k} {quoted(here)}; expected {quoted(there)}, as in {where}"
-                )
+        """Raise `StateFileError` if this state, of `source`, calls a class otherwise than it is called elsewhere."""
+        check_same_names(self.class_names, known, source, where, StateFileError)
 
     def save(self, path: str | os.PathLike[str], digest: str) -> None:
         """Write the state of the scene with this digest, atomically. Colours of the scene are not in the file.

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
+from gsseg_core.data.class_names import check_same_names, class_name
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
-from gsseg_core.errors import UnknownLabelError
+from gsseg_core.errors import ClassesFileError, UnknownLabelError
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.learner_state import Learnt
@@ -42,3 +43,19 @@ def num_classes_with(dataset: Dataset, num_classes: int, max_classes: int) -> in
             "class_names that declare them"
         )
     return num_classes
+
+
+def check_names_of(dataset: Dataset, names: Mapping[int, str]) -> None:
+    """Raise `ClassesFileError` if a dataset calls a class otherwise than a session does, whose votes it would mix with.
+
+    0 is the background, whatever it is called.
+    """
+    declared = next((view.class_names for view in dataset.views()), None) or {}  # Those made up take reading all masks.
+    called = {k: name for k, name in declared.items() if k}
+    check_same_names(called, names, dataset.root, "the session that is to learn from it", ClassesFileError)
+
+
+def names_with(dataset: Dataset, names: Mapping[int, str]) -> dict[int, str]:
+    """Add the names of a dataset's classes to those of a session, in whose place no name that is made up comes."""
+    found = dataset.class_names
+    return {**names, **{k: name for k, name in found.items() if k not in names or name != class_name({}, k)}}

@@ -20,7 +20,7 @@ from gsseg_core.learn.learner_state import OBJECTS_OF_ONE_SESSION, Learnt, State
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.class_numbers import add_names, ids_by_name, require_affordable
-from gsseg_core.live.fitting import Report, fitted, num_classes_with
+from gsseg_core.live.fitting import Report, check_names_of, fitted, names_with, num_classes_with
 from gsseg_core.live.results import SCENE_CHANGED, Outcome, Rejection
 from gsseg_core.progress import Stopwatch
 from gsseg_core.refine.settings import UNREFINED, RefineSettings
@@ -202,15 +202,14 @@ class LiveSession:
         ------
         NoUsableViewsError
             There is no view to learn from, or all that was known was forgotten meanwhile.
-        UnknownLabelError
-            The dataset has more classes than `max_classes`.
-        GssegError
-            A file of the dataset is broken.
+        UnknownLabelError, ClassesFileError, GssegError
+            The dataset has more classes than `max_classes`, calls one otherwise than it is called here, or is broken.
         """
         with self._lock:
             views, num_classes, era, scene = self._posed_views(), self._live.num_classes, self._era, self.scene
         if dataset is not None:
             views = dataset.views("train")
+            check_names_of(dataset, self._names if self._declared or self.num_fused else {})
             if not self._declared:
                 num_classes = num_classes_with(dataset, num_classes, self.max_classes)
         made = make_learner(learner, scene, num_classes, max_steps=max_steps, device=self.device)
@@ -220,7 +219,7 @@ class LiveSession:
             if era is not self._era:
                 raise NoUsableViewsError("all views were forgotten while they were learnt from; nothing was learnt")
             if dataset is not None and not self._declared:
-                self._names.update(dataset.class_names)
+                self._names = names_with(dataset, self._names)
             self._live.grow(num_classes)
             outcome = replace(outcome, learnt=self._carried(outcome.learnt, scene))
             self._learnt = outcome.learnt
@@ -318,8 +317,7 @@ class LiveSession:
         ------
         StateFileError
             The file is missing or damaged, or has more classes than there are names for, or without names than
-            `max_classes`, or other names than were given, or objects that its own session numbered
-            (`PerViewSession`), where labels of views are no such numbers. Nothing has changed.
+            `max_classes`, or other names than were given, or objects of a `PerViewSession`. Nothing has changed.
         StateMismatchError
             It belongs to another scene. Nothing has changed.
         PathNotAllowedError

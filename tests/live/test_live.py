@@ -15,6 +15,7 @@ from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.errors import (
+    ClassesFileError,
     MaskFormatError,
     NoCodesError,
     NoUsableViewsError,
@@ -202,6 +203,23 @@ def test_learning_from_a_folder_takes_its_train_views_and_its_names(tmp_path: Pa
     assert math.isnan(session.learn("votes", data).loss)
 
 
+def test_a_folder_that_calls_classes_otherwise_is_not_learnt_from(tmp_path: Path) -> None:
+    named = Dataset(write_dataset(tmp_path / "named"))
+    swapped = NAMES | {1: NAMES[2], 2: NAMES[1]}
+    told = LiveSession(SCENE)
+    told.number_classes(swapped)
+    for session in (LiveSession(SCENE, swapped), fed(told)):
+        with pytest.raises(ClassesFileError, match=f"named: calls class 1 '{NAMES[1]}'; expected '{NAMES[2]}'"):
+            session.learn(dataset=named)
+        assert session.learnt is None and session.class_names == swapped
+    told.reset()  # Then there are no votes to mix with.
+    told.learn("votes", named)
+    assert told.class_names == NAMES
+    (tmp_path / "named" / "classes.json").unlink()
+    fed(told).learn("votes", Dataset(tmp_path / "named"))
+    assert told.class_names == NAMES  # Names that are made up take the place of none.
+
+
 @pytest.mark.parametrize("stage", ["observe", "em"])
 def test_learning_that_is_stopped_changes_nothing(stage: str) -> None:
     class StoppedError(Exception):
@@ -227,7 +245,7 @@ def test_learning_from_broken_files_names_the_file_and_changes_nothing(tmp_path:
     with pytest.raises(MaskFormatError, match=r"view1\.png"):
         session.learn(dataset=Dataset(root))
     with pytest.raises(UnknownLabelError):
-        LiveSession(SCENE, {0: "background", 1: "one"}).learn(dataset=Dataset(write_dataset(tmp_path / "other")))
+        LiveSession(SCENE, {0: "background", 1: NAMES[1]}).learn(dataset=Dataset(write_dataset(tmp_path / "other")))
     np.testing.assert_array_equal(session.codes(), before)
 
 

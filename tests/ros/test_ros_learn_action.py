@@ -326,11 +326,19 @@ def break_classes(folder: Path) -> str:
 
 
 def take_a_class_away(folder: Path) -> str:
-    (folder / "classes.json").write_text('{"1": "red ball", "2": "cup"}')
+    (folder / "classes.json").write_text('{"1": "red ball", "2": "cup/mug"}')
     return "broken/labels/view0.png: mask holds the labels 3"
 
 
-@pytest.mark.parametrize("spoil", [break_mask, break_cameras, break_split, break_classes, take_a_class_away])
+def call_a_class_otherwise(folder: Path) -> str:
+    (folder / "classes.json").write_text('{"1": "red ball", "2": "box", "3": "cup/mug"}')
+    return "broken: calls class 2 'box'; expected 'cup/mug'"
+
+
+BROKEN = [break_mask, break_cameras, break_split, break_classes, take_a_class_away, call_a_class_otherwise]
+
+
+@pytest.mark.parametrize("spoil", BROKEN)
 def test_a_broken_dataset_aborts_it_and_the_message_names_the_file(
     robot: Robot, root: Path, tmp_path_factory: pytest.TempPathFactory, spoil: Any
 ) -> None:
