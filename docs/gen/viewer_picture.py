@@ -19,7 +19,8 @@ from gsseg_core.data.dataset import Dataset
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.viewer.access import listen
-from gsseg_core.viewer.model import Labelling, ViewModel, read_reliability
+from gsseg_core.viewer.learnt_views import LearntFrom
+from gsseg_core.viewer.model import Labelling, ViewModel
 from gsseg_core.viewer.viewer import Viewer
 from gsseg_core.viewer.viewpoint import camera_of
 
@@ -32,7 +33,7 @@ def main(demo: Path = ROOT / "demo_out", out: Path = ROOT / "docs/pictures/viewe
     scene = GaussianScene.load(demo / "scene/scene.ply")
     result = Segmentation.load(demo / "segmented/segmentation.npz", scene)
     views = [view for view in Dataset(demo / "scene").views("train") if view.has_mask]
-    reliability = read_reliability(demo / "segmented/report.json")
+    reliability = LearntFrom.read(demo / "segmented/report.json").reliability
     viewer = Viewer(ViewModel(scene, Labelling.of(result)), views, reliability, listener=listen(port=18400))
     with (
         closing(viewer),

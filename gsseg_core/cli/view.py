@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 from gsseg_core.cli.shared import add_device, add_frame, add_quiet, load_kernels
-from gsseg_core.cli.terminal import tell
+from gsseg_core.cli.terminal import note, tell
 from gsseg_core.errors import SettingsError
 from gsseg_core.progress import progress_bars
 
@@ -60,17 +60,18 @@ def run(options: argparse.Namespace) -> int:
 
 def _show(options: argparse.Namespace, listener: Listener, viewer_module: ModuleType) -> int:
     from gsseg_core.align.placing import place
-    from gsseg_core.data.dataset import Dataset
     from gsseg_core.scene.gaussian_scene import GaussianScene
     from gsseg_core.segmentation import Segmentation
+    from gsseg_core.viewer.learnt_views import LearntFrom
     from gsseg_core.viewer.live_source import open_source
-    from gsseg_core.viewer.model import BY_CLASS, TRUE_COLOURS, Labelling, ViewModel, read_reliability
+    from gsseg_core.viewer.model import BY_CLASS, TRUE_COLOURS, Labelling, ViewModel
 
     load_kernels(options.quiet, options.device)
     scene = GaussianScene.load(options.scene)
     segmentation = Segmentation.load(options.segmentation, scene) if options.segmentation else None
     class_ids = segmentation.class_ids.tolist() if segmentation else None
-    dataset = Dataset(options.data) if options.data else None
+    learnt = LearntFrom.read(Path(options.segmentation).parent / "report.json") if segmentation else LearntFrom()
+    dataset = learnt.dataset(options.data) if options.data else None
     if dataset:
         with progress_bars(options.quiet) as progress:
             dataset = place(
@@ -80,11 +81,11 @@ def _show(options: argparse.Namespace, listener: Listener, viewer_module: Module
     if dataset and not options.ros:  # The node's ids are as they are.
         class_ids = class_ids or list(dataset.class_ids)
         dataset = dataset.numbered(class_ids)
-    views = [view for view in dataset.views("train") if view.has_mask] if dataset else []
-    reliability: dict[str, float] = {}
+    views = learnt.views(dataset) if dataset else []
+    if dataset and not views:
+        note(f"there are no views to jump to: found no mask of a train view in {Path(options.data) / learnt.labels}")
     if segmentation:
         labelling = Labelling.of(segmentation.numbered())
-        reliability = read_reliability(Path(options.segmentation).parent / "report.json")
     else:
         labelling = Labelling.unknown(len(scene), dataset.class_names if dataset else None)
     source = open_source("ros", scene) if options.ros else None
@@ -92,7 +93,7 @@ def _show(options: argparse.Namespace, listener: Listener, viewer_module: Module
     tree = segmentation.tree if segmentation and not options.ros else None  # A node tells labels alone.
     model = ViewModel(scene, labelling, mode=mode, class_ids=tuple(class_ids or ()), tree=tree)
     viewer = viewer_module.Viewer(
-        model, views, reliability, source, listener=listener, draw=options.draw, device=options.device
+        model, views, learnt.reliability, source, listener=listener, draw=options.draw, device=options.device
     )
     with closing(viewer), suppress(KeyboardInterrupt):  # How it is meant to end.
         tell(f"gsseg: {len(scene):,} Gaussians at {viewer.url} (Ctrl-C ends it)")

@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from gsseg_core.data.class_names import BACKGROUND_NAME, class_name
 from gsseg_core.data.object_tree import ObjectTree
-from gsseg_core.errors import StateFileError, UnknownLabelError
+from gsseg_core.errors import UnknownLabelError
 from gsseg_core.export.pictures import FILL, palette
-from gsseg_core.files.json_files import read_json
 from gsseg_core.files.npz_files import SHARES_TOLERANCE
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
@@ -209,23 +207,3 @@ def ramp(values: np.ndarray) -> np.ndarray:
     colors: np.ndarray = np.rint(_RAMP[first] * (1 - part) + _RAMP[first + 1] * part).astype(np.uint8)
     colors[np.isnan(values)] = NOTHING_KNOWN
     return colors
-
-
-def read_reliability(report: Path) -> dict[str, float]:
-    """Read from the `report.json` of a run how far each view can be trusted, in [0, 1], by name; empty without one.
-
-    Raises
-    ------
-    StateFileError
-        The file is there, but no report.
-    """
-    if not report.is_file():
-        return {}
-    content = read_json(report, StateFileError)
-    try:
-        entries = content["views"].get("reliability", [])  # type: ignore[index]
-        return {str(e["name"]): float(e["reliability"]) for e in entries if e["reliability"] is not None}
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise StateFileError(
-            f"{report}: no report of a run ({error}); expected the report.json of `gsseg segment`"
-        ) from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +14,7 @@ from hypothesis import strategies as st
 from parts_of_balls import tree_of_balls
 from small_scenes import NAMES, balls_on_a_table, ring
 
-from gsseg_core.errors import SettingsError, StateFileError, UnknownLabelError
+from gsseg_core.errors import SettingsError, UnknownLabelError
 from gsseg_core.export.pictures import FILL
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 from gsseg_core.viewer.model import (
@@ -27,7 +26,6 @@ from gsseg_core.viewer.model import (
     Labelling,
     ViewModel,
     ramp,
-    read_reliability,
 )
 from gsseg_core.viewer.picture import BANDS, Node, Picture, cut
 
@@ -127,17 +125,6 @@ def test_colours_are_of_the_mode() -> None:
 
 def test_the_ramp_has_its_ends_and_grey_for_what_is_unknown() -> None:
     assert ramp(np.array([-1, 0, 1, 2, np.nan])).tolist() == [[122, 1, 30]] * 2 + [[0, 90, 130]] * 2 + [[120] * 3]
-
-
-def test_reliability_is_read_from_a_report(tmp_path: Path) -> None:
-    report = tmp_path / "report.json"
-    assert read_reliability(report) == {}
-    entries = [{"name": "a", "reliability": 0.5}, {"name": "b", "reliability": None}]
-    report.write_text(json.dumps({"views": {"reliability": entries}}))
-    assert read_reliability(report) == {"a": 0.5}
-    report.write_text("[]")
-    with pytest.raises(StateFileError, match=r"report.json: no report of a run .*; expected the report.json of `gsseg"):
-        read_reliability(report)
 
 
 LABELS = st.lists(st.integers(-2, 30), min_size=1, max_size=200)
