@@ -228,8 +228,8 @@ Three kinds of rows are no refinement, as they go by the truth:
 
 What is lost in the demo is a rim less than a pixel wide around each object, since discs on a curved surface stick out
 at its outline, and from wrong masks some of the table at an object's foot. Little of that can be told from train views:
-by their true masks, which nobody has, carving would gain 0.3 points of visible IoU at most, and in the apartment 0.8 from
-true masks and 1.9 from wrong ones; the best choice of Gaussians 0.1 to 0.7, and there 1.5 and 2.4.
+by their true masks, which nobody has, carving would gain 0.3 points of visible IoU at most, and in the apartment 0.8
+from true masks and 1.9 from wrong ones; the best choice of Gaussians 0.1 to 0.7, and there 1.5 and 2.4.
 
 ## The scene without an object
 
