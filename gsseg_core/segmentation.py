@@ -15,7 +15,7 @@ from gsseg_core.csr_rows import CSRRows, largest
 from gsseg_core.data.class_names import class_name
 from gsseg_core.data.object_tree import ObjectTree, check_granularity
 from gsseg_core.data.view import spread
-from gsseg_core.errors import SettingsError
+from gsseg_core.errors import SettingsError, StateMismatchError
 from gsseg_core.files.npz_files import (
     NpzArrays,
     UnfitError,
@@ -113,7 +113,7 @@ class Segmentation:
         scene : GaussianScene
             N Gaussians.
         codes : (N, K) float32
-            Class probabilities; a row of zeros where nothing is known.
+            Class probabilities; a row of zeros where nothing is known. Another N raises `StateMismatchError`.
         class_names : mapping from id to name
             Classes without a name get one like "class_07".
         settings : RefineSettings, optional
@@ -123,6 +123,8 @@ class Segmentation:
         """
         settings = settings or RefineSettings()
         codes = np.array(codes, np.float32, order="C") if copy else np.ascontiguousarray(codes, np.float32)
+        if codes.ndim != 2 or len(codes) != len(scene):
+            raise StateMismatchError(f"codes are {codes.shape}; expected ({len(scene)}, K), of the scene that is given")
         result = cls.unfiltered(scene, codes, class_names, settings)
         return result.filtered(scene, settings) if settings.filter else result
 
@@ -141,6 +143,12 @@ class Segmentation:
             clustered, learnt = cluster_in_place(scene.means, codes, observed, settings.k, settings.beta, neighbours)
         _, labels = largest(codes)  # -1, which is UNOBSERVED, where nothing is known
         return cls(labels, codes, names, scene.digest, clustered, learnt, ids=scene.ids)
+
+    def require(self, scene: GaussianScene) -> None:
+        """Raise `StateMismatchError` unless this is a segmentation of a scene: its indices are of no other."""
+        if self.scene_digest != scene.digest:
+            found, given = self.scene_digest[:12], scene.digest[:12]
+            raise StateMismatchError(f"segmentation: belongs to the scene {found}; expected {given}, the one given")
 
     def filtered(self, scene: GaussianScene, settings: RefineSettings) -> Segmentation:
         """Take the outliers out of each object: the paper's statistical filter."""
@@ -272,8 +280,9 @@ class Segmentation:
 
         What the views show are the label maps that the segmentation itself renders, not the masks: they are learnt from
         all masks together, so that errors of single masks carve nothing away. So many of the views have their say,
-        spread evenly.
+        spread evenly. Raises `StateMismatchError` for another scene.
         """
+        self.require(scene)
 
         def look(camera: Camera) -> Silhouette:
             operator = make_operator(scene, camera, device)

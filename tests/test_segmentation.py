@@ -12,8 +12,10 @@ from parts_of_balls import tree_of_balls
 from small_scenes import NAMES, NUM_CLASSES, OUT_OF_SIGHT, balls_on_a_table, clean_views, ring, taught
 
 from gsseg_core.errors import SettingsError, StateFileError, StateMismatchError, WriteError
+from gsseg_core.export.class_files import export_classes
 from gsseg_core.learn.vote_learner import VoteLearner
-from gsseg_core.objects.removal import left_without
+from gsseg_core.objects.oriented_boxes import object_boxes
+from gsseg_core.objects.removal import left_without, without_objects
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.settings import PAPER, UNREFINED, RefineSettings
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
@@ -98,6 +100,23 @@ def test_a_segmentation_of_another_scene_is_refused(tmp_path: Path) -> None:
     refined().save(tmp_path / "segmentation.npz")
     with pytest.raises(StateMismatchError, match=r"segmentation\.npz: belongs to the scene .* expected"):
         Segmentation.load(tmp_path / "segmentation.npz", balls_on_a_table(seed=1)[0])
+
+
+def test_a_segmentation_is_neither_made_nor_used_with_another_scene(tmp_path: Path) -> None:
+    other, view, result = balls_on_a_table(seed=1)[0], clean_views(1)[0], refined()
+    assert len(other) == len(SCENE)  # So that no index tells.
+    for use in (
+        lambda: export_classes(other, result, tmp_path / "classes"),
+        lambda: object_boxes(other, result),
+        lambda: without_objects(other, result, [1]),
+        lambda: result.carved(other, [view.camera]),
+    ):
+        with pytest.raises(StateMismatchError, match=r"segmentation: belongs to the scene .* expected"):
+            use()
+    assert not (tmp_path / "classes").exists()
+    for codes in (CODES[:-1], CODES[:, 0]):
+        with pytest.raises(StateMismatchError, match=rf"codes are \(\d+,.*\); expected \({len(SCENE)}, K\)"):
+            Segmentation.from_codes(SCENE, codes, NAMES)
 
 
 def test_a_missing_truncated_or_foreign_file_is_refused(tmp_path: Path) -> None:

@@ -55,6 +55,8 @@ def export_classes(
     ------
     SettingsError
         There is no such format or kind of mesh, or the library that it needs is not installed.
+    StateMismatchError
+        The segmentation belongs to another scene.
     SceneValueError
         The format cannot hold the scene.
     PathTakenError
@@ -64,6 +66,7 @@ def export_classes(
     """
     check_format(scene_format)
     check_collision(collision)
+    segmentation.require(scene)
     folder = Path(folder)
     with staged_run(folder, "classes") as run:
         meshes = collision_meshes(scene, segmentation, collision) if collision else {}

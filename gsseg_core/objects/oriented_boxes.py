@@ -172,7 +172,13 @@ def object_boxes(scene: GaussianScene, result: Segmentation) -> dict[int, Orient
     -------
     dict of int to OrientedBox
         By class id, ascending; neither the background nor classes without a Gaussian.
+
+    Raises
+    ------
+    StateMismatchError
+        The segmentation belongs to another scene.
     """
+    result.require(scene)
     order, confidence = np.argsort(result.labels, kind="stable"), result.confidence
     bounds = np.searchsorted(result.labels[order], np.arange(1, result.num_classes + 1))
     members = {k: order[first:last] for k, (first, last) in enumerate(pairwise(bounds.tolist()), start=1)}

@@ -31,12 +31,15 @@ def without_objects(scene: GaussianScene, segmentation: Segmentation, classes: C
         A class has no Gaussians.
     EmptySceneError
         Nothing would be left.
+    StateMismatchError
+        The segmentation belongs to another scene.
     """
     return scene.subset(left_without(scene, segmentation, classes))
 
 
 def left_without(scene: GaussianScene, segmentation: Segmentation, classes: Collection[int]) -> np.ndarray:
     """Tell which Gaussians of a scene `without_objects` leaves, (N,) bool; it raises the same errors."""
+    segmentation.require(scene)
     gone = {k: segmentation.members(k) for k in classes}
     empty = [k for k, members in gone.items() if not members.any()]
     if empty or not classes:
