@@ -5,17 +5,19 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import numpy as np
 from numpy.lib.recfunctions import repack_fields
 
 from gsseg_core.export.collision import check_collision, collision_meshes
+from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.run_folder import staged_run
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.ply import write_vertices
 from gsseg_core.scene.scene_writers import DEFAULT, SCENE_WRITERS, SceneObject, check_format, write_objects, write_scene
-from gsseg_core.scene.triangle_mesh import TriangleMesh
+from gsseg_core.scene.triangle_mesh import LONE, TriangleMesh
 from gsseg_core.scene.vertices import chosen
 from gsseg_core.segmentation import Segmentation
 
@@ -112,7 +114,8 @@ def write_selection(
 ) -> None:
     """Write some Gaussians of a scene as one file, in which USD keeps the classes of these labels apart.
 
-    Meshes to collide with go into the USD, or beside another file, as `<its stem>_<id>_<name>.obj`.
+    Meshes to collide with go into the USD, or beside another file, as `<its stem>_<id>_<name>.obj`, where those of
+    other classes that an earlier call wrote go. If anything cannot be written, all files are as they were.
 
     Raises
     ------
@@ -123,15 +126,30 @@ def write_selection(
     """
     part = scene.subset(chosen)
     if not SCENE_WRITERS[scene_format].together:
-        for k, mesh in meshes.items():
-            mesh.save(Path(path).with_name(f"{stem_of(path, scene_format)}_{mesh_file_name(k, class_names[k])}"))
-        write_scene(part, path, scene_format)
+        stem = stem_of(path, scene_format)
+        places = {k: Path(path).with_name(f"{stem}_{mesh_file_name(k, name)}") for k, name in class_names.items()}
+        with ExitStack() as written:  # Meshes get their names once the scene has its own.
+            for k, mesh in meshes.items():
+                mesh.write(written.enter_context(write_atomically(places[k])))
+            write_scene(part, path, scene_format)
+        for k in places.keys() - meshes.keys() if meshes else ():
+            _remove_mesh(places[k])
         return
     labels = labels[chosen]
     objects = _objects(part, labels, class_names, meshes)
     if (labels < 0).any():
         objects.append(SceneObject(part.subset(labels < 0)))
     write_objects(objects, path, scene_format)
+
+
+def _remove_mesh(path: Path) -> None:
+    """Remove the mesh of an earlier selection, if that is what is there."""
+    with suppress(OSError, UnicodeDecodeError):
+        if path.is_file() and not path.is_symlink():
+            with open(path, encoding="ascii") as file:
+                is_ours = file.readline(len(LONE)) == LONE
+            if is_ours:
+                path.unlink()
 
 
 def _objects(

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.files.atomic import write_atomically
+
+LONE = "# gsseg\n"
+"""First line of an OBJ that belongs to no run."""
 
 
 class TriangleMesh(NamedTuple):
@@ -20,8 +24,12 @@ class TriangleMesh(NamedTuple):
 
     def save(self, path: str | os.PathLike[str], run: str | None = None) -> None:
         """Write an OBJ, atomically (`WriteError`); `run` is the id of the run that it belongs to, for a comment."""
-        with write_atomically(path) as temporary, open(temporary, "w", encoding="ascii") as file:
-            if run is not None:
-                file.write(f"# gsseg_run {run}\n")
+        with write_atomically(path) as temporary:
+            self.write(temporary, run)
+
+    def write(self, path: Path, run: str | None = None) -> None:
+        """Write an OBJ where nobody reads it yet."""
+        with open(path, "w", encoding="ascii") as file:
+            file.write(LONE if run is None else f"# gsseg_run {run}\n")
             np.savetxt(file, self.points, "v %.9g %.9g %.9g")
             np.savetxt(file, self.triangles + 1, "f %d %d %d")

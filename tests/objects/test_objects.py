@@ -324,6 +324,33 @@ def test_gsseg_remove_writes_meshes_of_the_objects_that_are_left(tmp_path: Path)
     assert len(meshes) == 2 and len(list(out.iterdir())) == 4
 
 
+def test_meshes_beside_what_is_left_are_of_that_and_of_nothing_before(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = write_dataset(tmp_path / "data")
+    segmentation().save(tmp_path / "segmentation.npz")
+    out = tmp_path / "out"
+
+    def remove(name: str, *options: str) -> int:
+        given = [f"{data}/scene.ply", "--segmentation", f"{tmp_path}/segmentation.npz", "--class", name]
+        return main(["remove", *given, "--out", f"{out}/rest.ply", *options])
+
+    assert remove("box", "--collision") == 0
+    (out / "rest_0_background.obj").write_text("v 0 0 0\n")  # somebody's
+    (out / "other_1_red_ball.obj").write_bytes((out / "rest_1_red_ball.obj").read_bytes())
+    assert remove("red ball", "--collision") == 0
+    written = ["rest.ply", "rest_2_cup_mug.obj", "rest_3_box.obj"]
+    others = ["other_1_red_ball.obj", "rest_0_background.obj"]
+    assert sorted(path.name for path in out.iterdir()) == sorted(written + others)
+    assert remove("red ball") == 0 and (out / "rest_3_box.obj").is_file()  # They were not asked for again.
+    before = {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
+    (out / "rest_2_cup_mug.obj").unlink()
+    (out / "rest_2_cup_mug.obj").mkdir()
+    del before["rest_2_cup_mug.obj"]
+    assert remove("box", "--collision") == 2 and "rest_2_cup_mug.obj" in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()} == before
+
+
 def test_gsseg_segment_carves_when_asked_to(tmp_path: Path) -> None:
     data = write_dataset(tmp_path / "data")
     out = tmp_path / "out"
