@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from gsseg_core.cli.shared import check_not_read
 from gsseg_core.cli.terminal import tell
 
 DESCRIPTION = """
@@ -30,6 +31,8 @@ def run(options: argparse.Namespace) -> int:
     from gsseg_core.text import counted
 
     check_writable(options.out)
+    for path in options.states:  # The same command once more would count all others twice.
+        check_not_read(options.out, "state", path)
     saved = [Saved(path, *State.load_alone(path)) for path in options.states]
     merged = merge_states(saved)
     merged.save(options.out, saved[0].scene)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import os
 
-from gsseg_core.cli.shared import add_collision, add_format
+from gsseg_core.cli.shared import add_collision, add_format, check_not_read
 from gsseg_core.cli.terminal import tell
 
 DESCRIPTION = """
@@ -38,7 +37,7 @@ def run(options: argparse.Namespace) -> int:
     import numpy as np
 
     from gsseg_core.data.class_names import class_ids, listed
-    from gsseg_core.errors import PathTakenError, SettingsError
+    from gsseg_core.errors import SettingsError
     from gsseg_core.export.class_files import write_selection
     from gsseg_core.export.collision import check_collision, collision_meshes
     from gsseg_core.files.atomic import check_writable
@@ -49,9 +48,8 @@ def run(options: argparse.Namespace) -> int:
     from gsseg_core.text import clipped, counted
 
     check_writable(options.out)
-    for what, path in (("scene", options.scene), ("segmentation", options.segmentation)):
-        if os.path.exists(options.out) and os.path.exists(path) and os.path.samefile(options.out, path):
-            raise PathTakenError(f"{options.out}: is the {what} that is read, and would be lost; expected another file")
+    check_not_read(options.out, "scene", options.scene)
+    check_not_read(options.out, "segmentation", options.segmentation)
     scene_format = format_of(options.out, options.format)
     check_format(scene_format)
     check_collision(options.collision)

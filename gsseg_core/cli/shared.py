@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable
 
 from gsseg_core.cli.terminal import note
-from gsseg_core.errors import SettingsError
+from gsseg_core.errors import PathTakenError, SettingsError
 from gsseg_core.raster.backends import devices, rasteriser_of
 from gsseg_core.scene.scene_writers import SCENE_WRITERS
 
@@ -80,3 +80,9 @@ def _device(text: str) -> str:
     except SettingsError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
     return text
+
+
+def check_not_read(out: str, what: str, path: str) -> None:
+    """Raise `PathTakenError` if a file to write, links followed, is one that is read, which is then called `what`."""
+    if os.path.exists(out) and os.path.exists(path) and os.path.samefile(out, path):
+        raise PathTakenError(f"{out}: is the {what} that is read, and would be lost; expected another file")

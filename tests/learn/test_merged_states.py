@@ -124,3 +124,13 @@ def test_names_that_were_made_up_give_way_to_real_ones(tmp_path: Path) -> None:
     fresh = LivingSession(SCENE)
     fresh.load(tmp_path / "c.npz")
     assert fresh.class_names == NAMES
+
+
+def test_no_state_is_lost_to_what_comes_of_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one, other = robot(tmp_path / "a.npz", VIEWS[:2]), robot(tmp_path / "b.npz", VIEWS[2:])
+    (tmp_path / "link.npz").symlink_to("b.npz")
+    before = [Path(path).read_bytes() for path in (one, other)]
+    for out in (one, other, str(tmp_path / "link.npz")):
+        assert main(["merge", one, other, "-o", out]) == 2
+        assert f"{out}: is the state that is read, and would be lost" in capsys.readouterr().err
+    assert [Path(path).read_bytes() for path in (one, other)] == before
