@@ -2,8 +2,8 @@
 
 Usage: python benchmarks/soft_masks.py [--data FOLDER] [--seeds N]
 
-FOLDER holds `replica_apartment/` (default: the environment variable GSSEG_DATA, else ../shared/data); without it, only
-the demo scene is measured. Prints the table, in Markdown: mIoU of rendered label maps of the test views.
+FOLDER holds the scenes (default: the environment variable GSSEG_DATA, else ../shared/data); those that are absent are
+left out. Prints the table, in Markdown: mIoU of rendered label maps of the test views.
 
 Soft masks are drawn by a segmenter that makes errors and knows how likely they are (`uncertain`): its probabilities
 against their argmax. Partial masks have the classes that were looked for in each view, a third of them at random, told
@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 from machine import DATA
-from results import markdown, points, score
+from results import SCENES, markdown, points, score
 from scipy.ndimage import distance_transform_edt
 from scipy.special import ndtr
 
@@ -52,7 +52,7 @@ class Bench(NamedTuple):
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default=DATA, type=Path, help="folder that holds replica_apartment/")
+    parser.add_argument("--data", default=DATA, type=Path, help="folder that holds the scenes")
     parser.add_argument("--seeds", default=2, type=int, help="draws of the masks, of which the mean is printed")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
@@ -61,12 +61,14 @@ def main() -> None:
 
 
 def benches(folder: Path, data: Path) -> Iterator[Bench]:
-    """Build the demo scene in a folder; open the real one, if it is there."""
+    """Build the demo scene in a folder; open the others that are there."""
     scene = build_demo(folder).scene
-    yield Bench("demo scene", scene, Dataset(folder, "labels_true"))
-    real = data / "replica_apartment"
-    if real.is_dir():
-        yield Bench("real scene", GaussianScene.load(real / "scene.ply"), Dataset(real))
+    yield Bench("demo", scene, Dataset(folder, "labels_true"))
+    for name in SCENES:
+        if (data / name).is_dir():
+            yield Bench(name, GaussianScene.load(data / name / "scene.ply"), Dataset(data / name))
+        else:
+            print(f"{data / name}: not there, and so not measured")
 
 
 def measure(bench: Bench, seeds: int) -> Iterator[list[str]]:

@@ -32,6 +32,7 @@ TOLERANCE = 0.01
 """Probabilities of a pixel may sum to so much more than 1; half precision and images of 8 bits do."""
 
 _SURE = np.float32(1 - 1e-4)
+_TIED = np.float32(0.01)  # of a step, by which equal probabilities may differ
 
 
 class SeenLabels(NamedTuple):
@@ -57,6 +58,13 @@ class SeenLabels(NamedTuple):
         if self.evidence is None:
             return self.labels
         return np.append(self.evidence.named(), np.int32(UNKNOWN))[self.labels]
+
+    def hardened(self) -> SeenLabels:
+        """Reduce a soft mask of all classes to a plain one, if it names any; a partial mask stays as it is."""
+        if self.evidence is None or self.evidence.supervised is not None:
+            return self
+        named = self.named()
+        return SeenLabels(named) if (named >= 0).any() else self
 
     def undistorted(self, undistortion: Undistortion) -> SeenLabels:
         """Make the mask of a pinhole view of the one drawn on its image, by nearest pixels; `UNKNOWN` outside it."""
@@ -161,9 +169,10 @@ def quantise(
 ) -> SeenLabels:
     """Make prototypes of the probabilities that one segmenter gives.
 
-    Each probability is rounded to the nearest step, or, where a pixel's would then sum to more than 1, down. So none
-    changes by as much as 1/16, or one of the coarser `STEPS` where there would be more than `MOST_PROTOTYPES`. What a
-    pixel's probabilities lack to 1 is the rest.
+    Each probability is rounded to the nearest step, or, where a pixel's would then sum to more than 1, down. Where
+    another would come up to the likeliest, that is rounded up and all others down. So none changes by as much as 1/16,
+    or one of the coarser `STEPS` where there would be more than `MOST_PROTOTYPES`. What a pixel's probabilities lack to
+    1 is the rest.
 
     Parameters
     ----------
@@ -295,10 +304,19 @@ def restrict(labels: npt.NDArray[np.integer], supervised: Collection[int], sourc
 
 
 def _rounded(values: npt.NDArray[np.float32], steps: int) -> npt.NDArray[np.uint8]:  # (H, W, C)
+    if not values.size:
+        return values.astype(np.uint8)
     scaled = values * np.float32(steps)
     parts: npt.NDArray[np.float32] = np.rint(scaled)
     over = parts.sum(axis=2) > steps
     parts[over] = np.floor(scaled[over])
+    # What is likeliest stays so: where another has as many steps, it alone is rounded up, and all others down.
+    first = scaled.argmax(axis=2)[..., None]
+    most, given = (np.take_along_axis(values, first, axis=2) for values in (parts, scaled))
+    tied = ((parts >= most) & (most > 0) & (scaled < given - _TIED)).any(axis=2)
+    down = np.floor(scaled[tied])
+    np.put_along_axis(down, first[tied], np.ceil(given[tied]), axis=1)
+    parts[tied] = down
     return parts.astype(np.uint8)
 
 

@@ -60,6 +60,11 @@ def test_no_probability_changes_by_as_much_as_one_step(seed: int, classes: int, 
     assert probabilities[:, ~known].max(initial=0) <= 0.5 / STEPS[0], "only what rounds to nothing is unknown"
     assert rounded[:, known].sum(axis=0).max(initial=0) <= 1
     assert len(np.unique(seen.labels[known])) <= MOST_PROTOTYPES
+    # What is likeliest stays so, if it rounds to anything.
+    first = probabilities.argmax(axis=0)
+    second = np.partition(np.vstack([probabilities, np.zeros_like(probabilities)]), -2, axis=0)[-2]
+    clear = known & (probabilities.max(axis=0) > second + 0.001) & (probabilities.max(axis=0) > 0.51 / STEPS[0])
+    np.testing.assert_array_equal(rounded.argmax(axis=0)[clear], first[clear])
 
 
 def test_too_many_prototypes_are_rounded_more_coarsely_and_never_lost() -> None:

@@ -166,15 +166,30 @@ def test_regions_of_a_single_view_are_never_rejected() -> None:
     assert learner.observed_.any()
 
 
-def test_labels_of_soft_and_partial_masks_are_never_rejected() -> None:
+def test_labels_of_partial_masks_and_of_soft_ones_that_name_no_class_are_never_rejected() -> None:
     views = clean_views(5)
     odd = with_clutter(views[0]).read_labels()
-    chances = np.stack([np.where(odd == k, 0.8, 0.2 / 3) for k in range(NUM_CLASSES)])
-    views[0] = View.from_probabilities(views[0].camera, chances)
+    views[0] = View.from_probabilities(views[0].camera, np.stack([0.4 * (odd == k) for k in range(NUM_CLASSES)]))
     odd = with_clutter(views[1]).read_labels()
     views[1] = View.from_arrays(views[1].camera, np.where(odd == 3, 3, 0), supervised=[3])
     learner = taught(EMLearner(SCENE, NUM_CLASSES), views).fit()
     assert not any(learner.rejected_share(view) for view in views[:2])
+    assert all(learner.observation(view.name).evidence.nameless is None for view in views[:2])
+
+
+def test_soft_masks_of_all_classes_are_learnt_from_as_what_they_hold_likeliest() -> None:
+    views = clean_views(5)
+    odd = with_clutter(views[0]).read_labels()
+    chances = np.stack([np.where(odd == k, 0.7, 0.3 / (NUM_CLASSES - 1)) for k in range(NUM_CLASSES)])
+    chances[:, :9] *= 0.5  # There more is left open than any class has, and so nothing is known.
+    soft = [View.from_probabilities(views[0].camera, chances), *views[1:]]
+    hard = [View.from_arrays(views[0].camera, np.where(np.arange(48)[:, None] < 9, -1, odd)), *views[1:]]
+    one, two = (taught(EMLearner(SCENE, NUM_CLASSES), each).fit() for each in (soft, hard))
+    np.testing.assert_array_equal(one.codes_, two.codes_)
+    assert one.rejected_share(soft[0]) == two.rejected_share(hard[0]) > 0
+    for view in soft:
+        one.retract(view.name)
+    assert not one._votes.any()
 
 
 def test_views_come_and_go_exactly_with_regions_too() -> None:

@@ -259,12 +259,13 @@ class EMLearner(Learner):
         operator = self._operator_of(view)
         used = self._used_labels(seen, operator)
         # Without error models, what is wrong in few pixels would weigh too much: up to a point of mIoU was lost by it.
-        weights = block_weights(used.labels, seen.labels) if self.settings.errors else None
+        weights = block_weights(used.labels, seen.hardened().labels) if self.settings.errors else None
         return operator.observe(*used, weights)
 
     def _used_labels(self, seen: SeenLabels, operator: ViewOperator) -> SeenLabels:
         """Align boundaries of a plain mask with edges, and give each region a label if regions may be rejected."""
         settings = self.settings
+        seen = seen.hardened() if settings.errors else seen  # Errors are of whole regions, probabilities of pixels.
         if settings.errors and settings.edge_px and seen.evidence is None:
             distance = reach(settings.edge_px) + 1  # One px more, since edges are differences.
             edges = kernels_on(self.device).edges_along(operator, self.scene, seen.labels, distance)
