@@ -201,7 +201,7 @@ def segment(
                 look = partial(look_at, inputs.scene, result, shown, drawn, device)
                 result = result.carved_by(inputs.scene, inputs.looked_at, look, device)
         with watch.stage("pictures"):
-            # All now: when the scene is in the order of its file, to fetch its colours takes ten times as long.
+            # All now: when the scene is in the order of its file, to fetch its colours takes three times as long.
             left = [view for name, view in shown.items() if name not in drawn]
             drawn |= {one.view.name: one for one in draw_views(inputs.scene, result, left, device=device)}
         with watch.stage("refine"):
