@@ -211,14 +211,16 @@ def quantise(
     ids = np.arange(len(probabilities), dtype=np.int32) if given is None else given.astype(np.int32)
     supervised = None if given is None else np.sort(ids)
     occurs = [c for c in np.argsort(ids) if probabilities[c].max(initial=0) > 0]
-    values = np.ascontiguousarray(np.moveaxis(probabilities[occurs], 0, -1), np.float32)  # (H, W, C')
+    size = probabilities.shape[1:]
+    by_pixel = np.moveaxis(probabilities[occurs], 0, -1).reshape(size[0] * size[1], len(occurs))
+    values = np.ascontiguousarray(by_pixel, np.float32)
     for steps in STEPS:
-        parts = _rounded(values, steps).reshape(values.shape[0] * values.shape[1], -1 if occurs else 0)
+        parts = _rounded(values, steps)
         labels, firsts = _group(parts)
         if len(firsts) <= MOST_PROTOTYPES:
             break
     mass = parts[firsts] / np.float32(steps)
-    return _tidied(labels.reshape(values.shape[:2]).astype(np.int32), ids[occurs], mass, supervised, unknown)
+    return _tidied(labels.reshape(size).astype(np.int32), ids[occurs], mass, supervised, unknown)
 
 
 _Form = npt.NDArray[Any] | Header
@@ -303,21 +305,27 @@ def restrict(labels: npt.NDArray[np.integer], supervised: Collection[int], sourc
     return SeenLabels(table[labels], LabelEvidence(named, mass, looked_for))
 
 
-def _rounded(values: npt.NDArray[np.float32], steps: int) -> npt.NDArray[np.uint8]:  # (H, W, C)
-    if not values.size:
-        return values.astype(np.uint8)
-    scaled = values * np.float32(steps)
-    parts: npt.NDArray[np.float32] = np.rint(scaled)
-    over = parts.sum(axis=2) > steps
-    parts[over] = np.floor(scaled[over])
-    # What is likeliest stays so: where another has as many steps, it alone is rounded up, and all others down.
-    first = scaled.argmax(axis=2)[..., None]
-    most, given = (np.take_along_axis(values, first, axis=2) for values in (parts, scaled))
-    tied = ((parts >= most) & (most > 0) & (scaled < given - _TIED)).any(axis=2)
-    down = np.floor(scaled[tied])
-    np.put_along_axis(down, first[tied], np.ceil(given[tied]), axis=1)
-    parts[tied] = down
-    return parts.astype(np.uint8)
+@kernel
+def _rounded(values: np.ndarray, steps: int) -> np.ndarray:  # (P, C) float32 in [0, 1]
+    """Probabilities of pixels in steps, (P, C) uint8, whose sum is at most `steps`; what is likeliest stays so."""
+    count, classes = values.shape
+    parts, scaled = np.zeros((count, classes), np.uint8), np.empty(classes, np.float32)
+    for p in range(count if classes else 0):
+        first, total = 0, np.float32(0)
+        for c in range(classes):
+            scaled[c] = values[p, c] * np.float32(steps)
+            total += np.rint(scaled[c])
+            first = c if scaled[c] > scaled[first] else first
+        down = total > steps
+        most, tied = np.floor(scaled[first]) if down else np.rint(scaled[first]), False
+        for c in range(classes):
+            part = np.floor(scaled[c]) if down else np.rint(scaled[c])
+            parts[p, c] = np.uint8(part)
+            tied |= part == most and most > 0 and scaled[c] < scaled[first] - _TIED
+        if tied:  # The likeliest alone is rounded up, and all others down.
+            for c in range(classes):
+                parts[p, c] = np.uint8(np.ceil(scaled[c]) if c == first else np.floor(scaled[c]))
+    return parts
 
 
 def _tidied(

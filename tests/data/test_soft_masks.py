@@ -19,6 +19,7 @@ from gsseg_core.data.soft_masks import (
     STEPS,
     PackedMask,
     SeenLabels,
+    _rounded,
     combine_detections,
     quantise,
     restrict,
@@ -48,6 +49,25 @@ def said(seen: SeenLabels, num_classes: int) -> np.ndarray:
         table = np.zeros((len(seen.evidence.mass), num_classes), np.float32)
         table[:, seen.evidence.classes] = seen.evidence.mass
     return np.where(seen.labels >= 0, np.moveaxis(table[seen.labels], -1, 0), np.nan)
+
+
+def slow_rounded(probabilities: np.ndarray, steps: int) -> np.ndarray:  # (K,) of one pixel
+    scaled = probabilities.astype(np.float32) * steps
+    parts = np.rint(scaled) if np.rint(scaled).sum() <= steps else np.floor(scaled)
+    first = scaled.argmax()
+    if parts[first] > 0 and ((parts == parts[first]) & (scaled < scaled[first] - np.float32(0.01))).any():
+        parts = np.floor(scaled)
+        parts[first] = np.ceil(scaled[first])
+    return parts
+
+
+@pytest.mark.parametrize("steps", STEPS)
+@pytest.mark.parametrize("classes", [0, 1, 2, 5])
+def test_the_kernel_that_rounds_does_what_its_slow_twin_does(steps: int, classes: int) -> None:
+    values = np.random.default_rng(steps).dirichlet(np.ones(classes + 1), 500)[:, :classes].astype(np.float32)
+    values[::3] = np.rint(20 * values[::3]) / 20  # Equal ones among them.
+    expected = [slow_rounded(pixel, steps) for pixel in values] if classes else np.empty((500, 0))
+    np.testing.assert_array_equal(_rounded(values, steps), expected)
 
 
 @given(st.integers(0, 10_000), st.integers(1, 6), st.sampled_from([0.5, 4.0, 40.0]))
