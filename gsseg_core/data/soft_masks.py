@@ -323,8 +323,11 @@ def _rounded(values: np.ndarray, steps: int) -> np.ndarray:  # (P, C) float32 in
             parts[p, c] = np.uint8(part)
             tied |= part == most and most > 0 and scaled[c] < scaled[first] - _TIED
         if tied:  # The likeliest alone is rounded up, and all others down.
+            left = np.float32(steps)
             for c in range(classes):
-                parts[p, c] = np.uint8(np.ceil(scaled[c]) if c == first else np.floor(scaled[c]))
+                parts[p, c] = np.uint8(np.floor(scaled[c]))
+                left -= np.floor(scaled[c]) if c != first else np.float32(0)
+            parts[p, first] = np.uint8(min(np.ceil(scaled[first]), left))
     return parts
 
 
