@@ -299,7 +299,9 @@ def test_a_goal_that_was_canceled_before_is_not_confused_with_the_next(robot: Ro
     robot.cancel(first)
     second = robot.goal()
     assert robot.outcome(second)[0] == GoalStatus.STATUS_SUCCEEDED
-    answer = robot.ros.result(second.handle.cancel_goal_async(), "the answer to a cancel that comes too late")
+    answer = robot.ros.result(
+        robot.ros.run(second.handle.cancel_goal_async), "the answer to a cancel that comes too late"
+    )
     assert answer.return_code != answer.ERROR_NONE and not answer.goals_canceling
     assert robot.outcome(second)[1].error_code == Learn.Result.NONE
 
