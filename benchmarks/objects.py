@@ -19,7 +19,7 @@ import numpy as np
 from machine import DATA, REPOSITORY
 from object_ceiling import best_selection
 from object_scores import ObjectScores, objects_of
-from results import machine, markdown, points
+from results import SCENES, machine, markdown, points
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View, spread
@@ -39,7 +39,6 @@ WITHOUT_VIEWS = {
     "KNN": RefineSettings(),
     "KNN + filter (paper)": PAPER,
 }
-SCENES = ("replica_apartment", "shelf", "kitchen_table", "workbench")
 CARVED, TRUE_SILHOUETTES = "KNN + carving", "KNN + carving, by true masks"
 BEFORE, CEILING = "KNN + chosen by the truth of the train views", "KNN + chosen by the truth"
 HELD_OUT = slice(3, None, 7)

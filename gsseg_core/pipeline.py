@@ -193,16 +193,15 @@ def segment(
                 codes = spread_if_scarce(inputs.scene, codes, evidence)
             result = Segmentation.from_codes(inputs.scene, codes, inputs.class_names, settings.refine, copy=False)
             del codes
-        shown = {check.name: assessment.views[check.name] for check in shown_views(assessment.checks or ())}
-        shown |= {view.name: view for view in inputs.pictured}
         drawn: dict[str, Drawn] = {}
         if settings.refine.carve:
             with watch.stage("carve"):
-                look = partial(look_at, inputs.scene, result, shown, drawn, device)
+                asked = {view.name for view in inputs.pictured}
+                asked |= {check.name for check in shown_views(assessment.checks or ())}
+                look = partial(look_at, inputs.scene, result, asked, drawn, device)
                 result = result.carved_by(inputs.scene, inputs.looked_at, look, device)
         with watch.stage("pictures"):
-            # All now: when the scene is in the order of its file, to fetch its colours takes three times as long.
-            left = [view for name, view in shown.items() if name not in drawn]
+            left = [view for view in inputs.pictured if view.name not in drawn]
             drawn |= {one.view.name: one for one in draw_views(inputs.scene, result, left, device=device)}
         with watch.stage("refine"):
             result = result.calibrated(assessment.calibration.temperature)
