@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from typing import Any
 
 from rclpy.executors import Executor, ExternalShutdownException, ShutdownException, TimeoutException
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.task import Task
 
 from gsseg_ros.node.services import AT_WORK, WAITING, describe
+
+InvalidHandle = rclpy_implementation.InvalidHandle
 
 THREADS = AT_WORK + WAITING + 7
 """Those that requests hold that take long, one for a learn job, one for a transition, one for obstacles, and always
@@ -35,6 +40,8 @@ class NodeExecutor(Executor):
             self._pool.submit(self._run, self.wait_for_ready_callbacks(timeout_sec)[0])
         except (TimeoutException, ShutdownException, ExternalShutdownException):
             pass
+        except InvalidHandle:  # A topic was taken away in this moment; the next time it is not asked for any more.
+            pass
         except Exception as error:
             self._log.error(describe(error))
 
@@ -46,6 +53,16 @@ class NodeExecutor(Executor):
     def silence(self) -> None:
         """Log nothing any more: the node is taken away from callbacks that cannot be waited for."""
         self._heard = False
+
+    def _take_waitable(self, waitable: Any) -> Any:
+        """Take what has come of an event; nothing where its topic was taken away meanwhile.
+
+        rclpy does so for all but these. What is raised here would keep their callback group busy for good: in that of
+        the publishers, nobody could ask for a parameter any more.
+        """
+        with suppress(InvalidHandle):
+            return super()._take_waitable(waitable)
+        return None
 
     def _run(self, task: Task) -> None:
         try:
