@@ -113,7 +113,8 @@ class Segmentation:
         scene : GaussianScene
             N Gaussians.
         codes : (N, K) float32
-            Class probabilities; a row of zeros where nothing is known. Another N raises `StateMismatchError`.
+            Class probabilities, which sum to 1; a row of zeros where nothing is known. Other values raise
+            `SettingsError`, and another N `StateMismatchError`.
         class_names : mapping from id to name
             Classes without a name get one like "class_07".
         settings : RefineSettings, optional
@@ -125,6 +126,7 @@ class Segmentation:
         codes = np.array(codes, np.float32, order="C") if copy else np.ascontiguousarray(codes, np.float32)
         if codes.ndim != 2 or len(codes) != len(scene):
             raise StateMismatchError(f"codes are {codes.shape}; expected ({len(scene)}, K), of the scene that is given")
+        check_shares("codes", codes, SettingsError)
         result = cls.unfiltered(scene, codes, class_names, settings)
         return result.filtered(scene, settings) if settings.filter else result
 

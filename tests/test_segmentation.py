@@ -119,6 +119,14 @@ def test_a_segmentation_is_neither_made_nor_used_with_another_scene(tmp_path: Pa
             Segmentation.from_codes(SCENE, codes, NAMES)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -0.5, 3.0])
+def test_codes_that_are_no_probabilities_are_refused_and_not_taken_for_unobserved(value: float) -> None:
+    codes = CODES.copy()
+    codes[7, 1] = value
+    with pytest.raises(SettingsError, match=r"array codes .* in row 7 \(1 of .* rows are unusable\); expected"):
+        Segmentation.from_codes(SCENE, codes, NAMES)
+
+
 def test_a_missing_truncated_or_foreign_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "segmentation.npz"
     with pytest.raises(StateFileError, match="does not exist"):

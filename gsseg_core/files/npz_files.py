@@ -143,15 +143,15 @@ def class_names_of(header: dict[str, Any]) -> dict[int, str]:
     return dict(sorted(by_id.items()))
 
 
-def check_shares(name: str, rows: npt.NDArray[np.float32]) -> None:  # (N, K)
-    """Raise `UnfitError` unless every row holds probabilities that sum to 1, or zeros."""
+def check_shares(name: str, rows: npt.NDArray[np.float32], unfit: type[Exception] = UnfitError) -> None:  # (N, K)
+    """Raise `unfit` unless every row holds probabilities that sum to 1, or zeros."""
     with np.errstate(all="ignore"):  # What is infinite or NaN is found below.
         sums, low = rows.sum(axis=1, dtype=np.float64), rows.min(axis=1, initial=0)
     bad = np.flatnonzero(~((low >= 0) & ((sums == 0) | (np.abs(sums - 1) <= SHARES_TOLERANCE))))
     if bad.size:
         i = int(bad[0])
         found = f"sum to {sums[i]:.4g}" if low[i] >= 0 and np.isfinite(sums[i]) else "are NaN, infinite or negative"
-        raise UnfitError(
+        raise unfit(
             f"values of array {name} {found} in row {i} ({bad.size:,} of {len(rows):,} rows are unusable); expected "
             "probabilities that sum to 1, or zeros"
         )
