@@ -366,7 +366,7 @@ def render(
     dataparser: str | os.PathLike[str] | None = None,
     progress: Progress = silent,
 ) -> list[Path]:
-    """Render label maps of a split as `<stem>.png`, in the masks' own encoding, and overlays in `overlays/`.
+    """Render label maps of a split as `<stem>.png`, of 16 bits if ids take them, and overlays in `overlays/`.
 
     Those of an earlier `render` into the same folder are replaced, all of them, whatever their split.
 
@@ -382,7 +382,7 @@ def render(
     views = placed.dataset.views(split)
     if not views:
         raise NoUsableViewsError(f"{data}: split {split!r} has no views; expected at least one to render")
-    bits = 16 if result.num_classes > 255 else max((view.mask_bits or 8 for view in views), default=8)
+    bits = 8 if max(ids) < 255 else 16  # 255 means unknown in masks of 8 bits
     names = [view_file_name(view.name) for view in views]
     overlays = []
     places = [*names, *(f"overlays/{name}" for name in (*names, "contact_sheet.png", "legend.png"))]

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from gsseg_core.cli import interrupts
 
 if TYPE_CHECKING:
+    from argparse import Namespace
     from collections.abc import Sequence
 
 
@@ -56,6 +57,7 @@ def _run(arguments: Sequence[str] | None) -> int:
 
     from gsseg_core.freed_memory import keep_freed_memory
 
+    _refuse_empty(options)
     _check_threads()
     keep_freed_memory()
     try:
@@ -66,6 +68,15 @@ def _run(arguments: Sequence[str] | None) -> int:
     finally:
         if arguments is None:
             interrupts.leave_at_once()
+
+
+def _refuse_empty(options: Namespace) -> None:
+    """Raise `SettingsError` for what was given as "": as a path, that would be the current folder."""
+    from gsseg_core.errors import SettingsError
+
+    for name, value in vars(options).items():
+        if value == "" or (isinstance(value, list) and "" in value):
+            raise SettingsError(f"{name} is ''; expected something (a variable of the shell may not be set)")
 
 
 def _check_threads() -> None:

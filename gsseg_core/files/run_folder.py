@@ -28,7 +28,7 @@ import secrets
 import shutil
 import stat
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -129,9 +129,9 @@ class StagedRun:
         PathTakenError
             There is one.
         """
-        own = Manifest.read(self.out / RUN_FILE).files(self._kind)
+        manifest = Manifest.read(self.out / RUN_FILE)
         for place in places:
-            _refuse_stranger(self.out, place, own, self._kind)
+            _refuse_stranger(self.out, place, manifest, self._kind)
 
     def commit(self) -> None:
         """Make what was written the result."""
@@ -235,7 +235,7 @@ def _move_aside(path: Path, run_id: str) -> None:
     os.rename(path, aside)
 
 
-def _refuse_stranger(out: Path, place: str, own: Mapping[str, FileRecord], kind: str) -> None:
+def _refuse_stranger(out: Path, place: str, manifest: Manifest, kind: str) -> None:
     for folder in reversed(Path(place).parents[:-1]):
         if os.path.lexists(out / folder) and not _is_folder(out / folder):
             raise PathTakenError(f"{out / folder}: is a link or a file; expected a folder, or nothing")
@@ -244,7 +244,12 @@ def _refuse_stranger(out: Path, place: str, own: Mapping[str, FileRecord], kind:
         return
     if not stat.S_ISREG(path.lstat().st_mode):
         raise PathTakenError(f"{path}: is a link, a folder or a device; expected a file of gsseg {kind}, or nothing")
-    if place not in own:
+    if place not in manifest.files(kind):
+        if not manifest.runs and os.path.lexists(out / RUN_FILE):
+            raise PathTakenError(
+                f"{out / RUN_FILE}: is damaged, so nobody knows who wrote {path}, which is not replaced; expected the "
+                "manifest as gsseg wrote it, or another folder"
+            )
         raise PathTakenError(
             f"{path}: was not written by gsseg {kind}, so it is not replaced; expected nothing there, or another folder"
         )

@@ -73,6 +73,14 @@ def test_render_and_eval_score_the_views_that_were_not_learnt_from(
     assert len(list((place / "maps").glob("*.png"))) == 6
 
 
+def test_render_needs_no_mask_that_can_be_read(place: Path) -> None:
+    for path in (place / "data/labels").iterdir():
+        path.write_text("damaged")
+    inputs = [f"{place}/data/scene.ply", "--data", f"{place}/data", "--quiet", "--out", f"{place}/maps"]
+    assert main(["render", *inputs, "--segmentation", f"{place}/out/segmentation.npz"]) == 0
+    assert read_mask(place / "maps/view2.png").bits == 8
+
+
 @pytest.mark.parametrize("learner", ["votes", "gradient"])
 def test_the_other_learners_and_settings_can_be_chosen(place: Path, learner: str) -> None:
     assert main(segment(place, "--learner", learner, "--views", "2", "--no-filter", "--k", "9", "--beta", "0.5")) == 0

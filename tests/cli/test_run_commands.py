@@ -161,6 +161,28 @@ def test_an_out_that_cannot_be_written_or_holds_what_is_not_ours_is_said_before_
     assert contents(place) == before
 
 
+def test_a_damaged_manifest_is_named_before_learning(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (place / "out" / RUN_FILE).write_text("{")
+    before = contents(place)
+    assert main(command(place)) == 2
+    assert_one_line(capsys.readouterr().err, f"out/{RUN_FILE}: is damaged, so nobody knows who wrote ")
+    assert contents(place) == before
+
+
+@pytest.mark.parametrize("kind", ["segment", "render"])
+def test_an_empty_path_is_not_taken_for_the_folder_where_the_command_is_typed(
+    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    monkeypatch.chdir(place)
+    before = contents(place)
+    for option in ("out", "data"):
+        assert main([*command(place, kind), f"--{option}", ""]) == 2
+        assert_one_line(capsys.readouterr().err, f"{option} is ''; expected something")
+    assert main(["remove", "s.ply", "--segmentation", "s.npz", "--class", "", "--out", "x.ply"]) == 2
+    assert_one_line(capsys.readouterr().err, "classes is ''")
+    assert contents(place) == before
+
+
 def test_too_little_memory_is_one_clear_line_and_the_results_of_before_stay(
     place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
