@@ -170,10 +170,10 @@ def boundary_band(labels: np.ndarray, width: int) -> np.ndarray:  # (H, W) of a 
 
 
 def evaluate_folders(pred_dir: str | Path, truth_dir: str | Path, cameras: Iterable[Camera] = ()) -> Evaluation:
-    """Compare every `<stem>.png` in one folder of label images with the file of the same name in another.
+    """Compare every `<stem>.png` in one folder of label images with the mask of the same view in another.
 
     Truth without a prediction is ignored, since a folder of true masks holds the train views too. With `cameras`, truth
-    that was drawn on images that a lens bent is undistorted: predictions are of the pinhole views.
+    is read as masks to learn from are: undistorted where a lens bent the image, and scaled to its size.
 
     Raises
     ------
@@ -185,19 +185,22 @@ def evaluate_folders(pred_dir: str | Path, truth_dir: str | Path, cameras: Itera
         A prediction and its truth differ in size.
     """
     pred_dir, truth_dir, predictions = Path(pred_dir), Path(truth_dir), predicted_maps(pred_dir)
-    from gsseg_core.data.view import View  # It loads numba, which is of no use to anybody else here.
+    from gsseg_core.data.mask_files import masks_below  # They load numba, which is of no use to anybody else here.
+    from gsseg_core.data.view import View
 
-    bent = {camera.name: camera for camera in cameras if camera.undistortion is not None}
-    truths = [truth_dir / (f"{bent[path.stem].image}.png" if path.stem in bent else path.name) for path in predictions]
-    missing = [path.name for path in truths if not path.is_file()]
+    known = {camera.name: camera for camera in cameras}
+    images = [known[path.stem].image if path.stem in known else path.stem for path in predictions]
+    truths = masks_below(truth_dir, images)
+    missing = [f"{image}.png" for image in images if image not in truths]
     if missing:
         raise MaskFormatError(
             f"{truth_dir}: found no {missing[0]} (and {len(missing) - 1} more of {len(predictions)} are missing); "
             f"expected a true mask for every prediction in {pred_dir}"
         )
     evaluation = Evaluation()
-    for path, truth in zip(predictions, truths, strict=True):
-        labels = View(bent[path.stem], truth).read_labels() if path.stem in bent else read_mask(truth).labels
+    for path, image in zip(predictions, images, strict=True):
+        is_known, truth = path.stem in known, truths[image]
+        labels = View(known[path.stem], truth).read_labels() if is_known else read_mask(truth).labels
         evaluation.add(labels, read_mask(path).labels, name=str(path))
     return evaluation
 

@@ -33,6 +33,11 @@ def one_line(text: str) -> str:
     return line if len(line) <= _LONGEST else f"{line[: _LONGEST // 2]} ... {line[-_LONGEST // 3 :]}"
 
 
+def composed(name: str) -> str:
+    """Write accented letters as one character, not as two as macOS does: names that look alike are alike."""
+    return unicodedata.normalize("NFC", name)
+
+
 def clipped(value: object, most: int = 80) -> str:
     """Give a foreign name or value as it goes into a message or a table: printable, and not long."""
     text = str(value)

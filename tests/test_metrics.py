@@ -12,6 +12,7 @@ from scipy import ndimage
 from gsseg_core.data.label_images import UNKNOWN, write_mask
 from gsseg_core.errors import MaskFormatError, MaskSizeError, NoUsableViewsError
 from gsseg_core.metrics import BOUNDARY_SHARE, Evaluation, evaluate_folders
+from gsseg_core.scene.camera import Camera
 
 
 def make_views(seed: int, num_views: int = 3, num_classes: int = 7) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -145,6 +146,17 @@ def test_folders_are_paired_by_name_and_more_truth_is_ignored(tmp_path: Path) ->
     evaluation = evaluate_folders(tmp_path / "pred", tmp_path / "truth")
     assert evaluation.num_views == 2
     np.testing.assert_array_equal(evaluation.confusion, evaluate(views[1:]).confusion)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.JPG.png", "a_mask.png", "left/a.png"])
+def test_truth_is_found_and_scaled_as_masks_to_learn_from_are(tmp_path: Path, name: str) -> None:
+    labels = np.arange(24).reshape(4, 6)
+    write_mask(tmp_path / "pred/a.png", labels, bits=8)
+    (tmp_path / "truth" / name).parent.mkdir(parents=True)
+    write_mask(tmp_path / "truth" / name, labels.repeat(2, 0).repeat(2, 1), bits=8)
+    camera = Camera("a", 6, 4, np.array([[5.0, 0, 3], [0, 5, 2], [0, 0, 1]]), np.eye(4))
+    found = evaluate_folders(tmp_path / "pred", tmp_path / "truth", [camera])
+    np.testing.assert_array_equal(found.confusion, np.eye(24))
 
 
 def test_folders_that_cannot_be_compared_are_refused_with_one_clear_error(tmp_path: Path) -> None:

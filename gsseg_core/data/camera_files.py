@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 from collections import Counter
+from dataclasses import replace
+from itertools import takewhile
 from pathlib import Path
 
 from gsseg_core.data.camera_formats.table import CAMERA_FORMATS, CameraFormat
@@ -18,9 +20,10 @@ from gsseg_core.text import quoted
 def read_cameras(folder: str | os.PathLike[str], within: Path | None = None) -> list[Camera]:
     """Read the cameras of a dataset folder, from the first of `CAMERA_FORMATS` that it has, in the order of the file.
 
-    Names are the stems of the image names. Where a lens bent the images, the cameras are those of their pinhole views;
-    of a panorama there are six, named `<stem>_front` and so on: see `Camera.undistortion`. With `within`, the files
-    must lie below that folder, links followed.
+    Names are the stems of the image names, after those of their folders where two images share a stem: `left_0001` and
+    `right_0001` of `left/0001.jpg` and `right/0001.jpg`. Where a lens bent the images, the cameras are those of their
+    pinhole views; of a panorama there are six, named `<stem>_front` and so on: see `Camera.undistortion`. With
+    `within`, the files must lie below that folder, links followed.
 
     Raises
     ------
@@ -39,7 +42,7 @@ def read_cameras(folder: str | os.PathLike[str], within: Path | None = None) -> 
         *most, last = (f"{known.looked_for} ({known.name})" for known in CAMERA_FORMATS)
         raise CameraFileError(f"{folder}: {what}; looked for {', '.join(most)}, and {last}{hint}")
     camera_format, path = found
-    cameras = camera_format.read(path, within)
+    cameras = _named(camera_format.read(path, within))
     if not cameras:
         raise CameraFileError(f"{path}: holds no camera; expected at least one")
     for camera in cameras:
@@ -49,6 +52,17 @@ def read_cameras(folder: str | os.PathLike[str], within: Path | None = None) -> 
     if count > 1:
         raise CameraFileError(f"{path}: {count} images have the stem {quoted(stem)}; expected another one for each")
     return cameras
+
+
+def _named(cameras: list[Camera]) -> list[Camera]:
+    """Name cameras, whose names are still those of images in folders, as `read_cameras` says."""
+    paths = [camera.name.split("/") for camera in cameras]
+    names = [path[-1] for path in paths]
+    if len(set(names)) < len(names):
+        folders = zip(*(path[:-1] for path in paths), strict=False)
+        shared = len(list(takewhile(lambda level: len(set(level)) == 1, folders)))
+        names = ["_".join(path[shared:]) for path in paths]
+    return [replace(camera, name=name) for camera, name in zip(cameras, names, strict=True)]
 
 
 def frame_of_training(folder: Path, dataparser: Path) -> Similarity | None:

@@ -15,13 +15,13 @@ from gsseg_core.data.camera_files import read_cameras
 from gsseg_core.data.class_names import BACKGROUND_NAME, class_name, read_classes
 from gsseg_core.data.label_images import GLOBAL, PER_VIEW
 from gsseg_core.data.label_map import read_label_map
-from gsseg_core.data.mask_files import mask_files, read_supervises
+from gsseg_core.data.mask_files import masks_below, read_supervises
 from gsseg_core.data.mask_formats.masks import MaskSet
-from gsseg_core.data.mask_formats.place import SUPERVISES
+from gsseg_core.data.mask_formats.place import SUPERVISES, view_of, with_folders
 from gsseg_core.data.mask_formats.table import LABEL_IMAGES, open_masks
 from gsseg_core.data.view import View
 from gsseg_core.errors import ClassesFileError, SettingsError, SplitFileError
-from gsseg_core.files.input_files import READABLE_IMAGES, is_there, list_folder
+from gsseg_core.files.input_files import READABLE_IMAGES, is_there, list_below, list_folder
 from gsseg_core.files.json_files import read_object
 from gsseg_core.scene.camera import Camera
 from gsseg_core.text import clipped, quoted
@@ -84,16 +84,22 @@ class Dataset:
             self._take_own_masks(self.root / labels, images)
         else:
             self._take_masks(self.masks)
-        photos = list_folder(self.root / "images", self._within)
-        photo = {path.stem: path for path in photos if path.suffix.lower() in READABLE_IMAGES}
+        photo = self._photos(list_folder) or self._photos(list_below)
         self._change_views(lambda view: {"image_path": photo.get(view.camera.image), "class_names": self._declared})
         if label_map is not None:
             self._apply_label_map(label_map)
         self._split = _read_split(self.root / "split.json", self.cameras, self._within)
 
+    def _photos(self, listed: Callable[[Path, Path | None], list[Path]]) -> dict[str, Path]:
+        """Find photos by the names of images, among those that are listed in `images`."""
+        folder, names = self.root / "images", {camera.image for camera in self.cameras}
+        photos = [path for path in listed(folder, self._within) if path.suffix.lower() in READABLE_IMAGES]
+        named = ((with_folders(str(path.relative_to(folder).with_suffix(""))), path) for path in photos)
+        return {name: path for names_of_path, path in named for name in names_of_path if name in names}
+
     def _take_own_masks(self, folder: Path, images: list[str]) -> None:
         """Find the masks of images, by their stems, in gsseg's own forms."""
-        masks = mask_files(folder, images, self._within)
+        masks = masks_below(folder, images, self._within)
         supervised = read_supervises(folder / SUPERVISES, masks, images, self._declared, self._within)
         self._change_views(
             lambda view: {"mask_path": masks.get(view.camera.image), "supervised": supervised.get(view.camera.image)}
@@ -217,7 +223,8 @@ def _read_split(path: Path, cameras: Sequence[Camera], within: Path | None = Non
     for name, stems in split.items():
         if not isinstance(stems, list) or not all(isinstance(stem, str) for stem in stems):
             raise SplitFileError(f'{path}: "{name}" is {clipped(stems)}; expected a list of image stems')
-        unknown_stems = [stem for stem in stems if stem not in views]
+        split[name] = [view_of(stem, views) or stem for stem in stems]
+        unknown_stems = [stem for stem in split[name] if stem not in views]
         if unknown_stems:
             raise SplitFileError(
                 f'{path}: "{name}" names views without a camera ({len(unknown_stems)}, the first '

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from itertools import product
 from pathlib import Path
 
 from gsseg_core.data.camera_formats.table import CAMERA_FORMATS
 from gsseg_core.data.label_images import mask_header
-from gsseg_core.data.mask_files import mask_files
+from gsseg_core.data.mask_files import mask_files, masks_below
 from gsseg_core.data.mask_formats.place import SUPERVISES
 from gsseg_core.errors import GssegError
 from gsseg_core.files.input_files import READABLE_IMAGES
@@ -63,9 +63,11 @@ def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
     if classes:
         wrong = f"{labels}/ has a folder for each class, such as {classes[0].name}/"
         return f"{looked}, but {wrong}: make one for each view, {labels}/{stem}/<class id>.png ({_MORE})"
-    others = [(len(_masks(path, stems)), path) for path in _folders(root) if path != root / labels]
+    others = [(len(_masks(mask_files, path, stems)), path) for path in _folders(root) if path != root / labels]
     count, folder = max(others, key=lambda found: found[0], default=(0, root))
     if count:
+        if (more := len(_masks(masks_below, folder.parent, stems))) > count and folder.parent != root:
+            count, folder = more, folder.parent
         name = os.path.relpath(folder, root)
         return f"{looked}, found {count} masks of these names in {name}/: type --labels {shlex.quote(name)}"
     if not (root / labels).is_dir():
@@ -110,10 +112,10 @@ def _stems(folder: Path) -> set[str]:
     return set()
 
 
-def _masks(folder: Path, stems: Collection[str]) -> list[Path]:
+def _masks(finder: Callable[..., dict[str, Path]], folder: Path, stems: Collection[str]) -> list[Path]:
     """List masks of the given stems, of every kind; none where the first label image is a photo."""
     with suppress(GssegError, OSError):
-        found = list(mask_files(folder, stems).values())
+        found = list(finder(folder, stems).values())
         images = [path for path in found if path.suffix.lower() == ".png"]
         if images:
             mask_header(images[0])

@@ -16,12 +16,12 @@ import numpy.typing as npt
 from gsseg_core.data.mask_formats.place import view_of
 from gsseg_core.data.soft_masks import SeenLabels, check_forms, combine_detections, quantise
 from gsseg_core.errors import MaskFormatError, SupervisesFileError, UnknownLabelError
-from gsseg_core.files.input_files import check_pixels, is_there, list_folder, open_image
+from gsseg_core.files.input_files import check_pixels, is_there, list_below, list_folder, open_image
 from gsseg_core.files.json_files import read_object
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.npz_files import NpzArrays, open_arrays
 from gsseg_core.scene.camera import Camera
-from gsseg_core.text import clipped, quoted
+from gsseg_core.text import clipped, composed, quoted
 
 DETECTIONS = (".png", ".tif", ".tiff")
 CLASS_ID = r"0|[1-9][0-9]{0,4}"
@@ -43,7 +43,7 @@ def mask_files(folder: Path, stems: Iterable[str], within: Path | None = None) -
     wanted, others = set(stems), []
     for path in list_folder(folder, within):
         is_folder = path.is_dir()
-        stem = path.name if is_folder else path.stem
+        stem = composed(path.name if is_folder else path.stem)
         if not is_folder and path.suffix.lower() not in (".png", ".npz"):
             continue
         if stem in wanted:
@@ -56,6 +56,24 @@ def mask_files(folder: Path, stems: Iterable[str], within: Path | None = None) -
         if view is not None and view not in found:
             _add(longer, view, path)
     return found | longer
+
+
+def masks_below(folder: Path, stems: Iterable[str], within: Path | None = None) -> dict[str, Path]:
+    """Find the masks of views, by `mask_files`, or, where there is none, in folders as their images are: `left/1.png`.
+
+    Where a view has several of those, they are something else, one for each class perhaps, and there is none.
+    """
+    wanted = set(stems)
+    found = mask_files(folder, wanted, within)
+    if found:
+        return found
+    for path in list_below(folder, within):
+        view = view_of(str(path.relative_to(folder)), wanted) if path.suffix.lower() in (".png", ".npz") else None
+        if view in found:
+            return {}
+        if view is not None:
+            found[view] = path
+    return found
 
 
 def _add(found: dict[str, Path], stem: str, path: Path) -> None:

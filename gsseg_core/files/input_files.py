@@ -97,6 +97,17 @@ def list_folder(folder: Path, within: Path | None) -> list[Path]:
     return sorted(folder.iterdir())
 
 
+def list_below(folder: Path, within: Path | None, depth: int = 4) -> list[Path]:
+    """List the files in a folder and, so deep, in those in it that are not hidden; as `list_folder` does."""
+    files: list[Path] = []
+    for path in list_folder(folder, within):
+        if not path.is_dir():
+            files.append(path)
+        elif depth and not path.name.startswith("."):
+            files += list_below(path, within, depth - 1)
+    return files
+
+
 def is_there(path: Path, error: type[GssegError]) -> bool:
     """Tell whether an optional file is there; whatever else has its name is refused.
 

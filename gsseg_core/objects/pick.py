@@ -30,7 +30,7 @@ import numpy as np
 
 from gsseg_core.data.class_names import class_ids
 from gsseg_core.data.label_images import UNKNOWN
-from gsseg_core.data.mask_files import CLASS_ID, mask_files
+from gsseg_core.data.mask_files import CLASS_ID, masks_below
 from gsseg_core.data.mask_formats.images import read_label_image
 from gsseg_core.data.mask_formats.table import open_masks
 from gsseg_core.data.view import View
@@ -198,7 +198,7 @@ def read_object_mask(path: str | os.PathLike[str], camera: Camera, label: str | 
     path, names = Path(path), None
     masks = None if path.suffix.lower() == ".png" else open_masks(path, [camera.image])
     if masks is None:
-        path = mask_files(path, [camera.image]).get(camera.image, path) if path.is_dir() else path
+        path = masks_below(path, [camera.image]).get(camera.image, path) if path.is_dir() else path
         labels = read_label_image(path, camera)
     else:
         names, labels = masks.class_names, masks.views[camera.image].labels(camera)

@@ -49,7 +49,7 @@ def test_names_are_stems_of_image_names(tmp_path: Path, name: str, stem: str) ->
         ({"cameras": []}, CameraFileError, ("holds an object", "expected a list of cameras")),
         ([entry_3dgs(), 7], CameraFileError, ("expected a list of cameras, each an object",)),
         ([entry_3dgs(), entry_3dgs()], CameraFileError, ("2 images have the stem '0001'",)),
-        ([entry_3dgs("a/1.jpg"), entry_3dgs("b/1.png")], CameraFileError, ("2 images have the stem '1'",)),
+        ([entry_3dgs("a/1.jpg"), entry_3dgs("a/1.png")], CameraFileError, ("2 images have the stem '1'",)),
         ([entry_3dgs("")], CameraFileError, ("entry 0", "'img_name' is ''")),
         ([entry_3dgs(), {"img_name": "b"}], CameraFileError, ("entry 1", "lacks 'width' (has img_name)")),
         ([entry_3dgs(rotation=[1, 2, 3])], CameraFileError, ("'rotation' is [1, 2, 3]", "3 x 3 numbers")),

@@ -59,9 +59,14 @@ def test_colmap_lenses_without_distortion_are_accepted(
     assert_lands(read_cameras(tmp_path)[0], 55, 20 + fy / 8)
 
 
-def test_colmap_images_of_one_stem_are_refused(tmp_path: Path) -> None:
-    write_colmap(tmp_path / "sparse" / "0", ("left/1.jpg", "right/1.jpg"))
-    assert_refused(tmp_path, CameraFileError, "2 images have the stem '1'")
+def test_colmap_images_of_one_stem_are_named_after_their_folders(tmp_path: Path) -> None:
+    write_colmap(tmp_path / "sparse" / "0", ("rig/left/1.jpg", "rig/right/1.jpg", "rig/right/2.jpg"))
+    assert [camera.name for camera in read_cameras(tmp_path)] == ["left_1", "right_1", "right_2"]
+
+
+def test_colmap_images_of_one_name_after_their_folders_too_are_refused(tmp_path: Path) -> None:
+    write_colmap(tmp_path / "sparse" / "0", ("a/b_1.jpg", "a_b/1.jpg", "c/1.jpg"))
+    assert_refused(tmp_path, CameraFileError, "2 images have the stem 'a_b_1'")
 
 
 def test_a_colmap_model_of_no_registered_image_is_refused(tmp_path: Path) -> None:

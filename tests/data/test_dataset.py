@@ -27,11 +27,15 @@ WIDTH, HEIGHT = 6, 4
 LABELS = np.arange(WIDTH * HEIGHT, dtype=np.int32).reshape(HEIGHT, WIDTH) % 4
 
 
+def write_cameras(root: Path, images: tuple[str, ...]) -> None:
+    camera = {"width": WIDTH, "height": HEIGHT, "position": [0, 0, 0], "rotation": np.eye(3).tolist(), "fx": 5, "fy": 5}
+    (root / "cameras.json").write_text(json.dumps([camera | {"img_name": image} for image in images]))
+
+
 def make_dataset(root: Path, stems: tuple[str, ...] = ("a", "b", "c"), labels: np.ndarray = LABELS) -> Path:
     """Write cameras, and labels for all but the last."""
-    camera = {"width": WIDTH, "height": HEIGHT, "position": [0, 0, 0], "rotation": np.eye(3).tolist(), "fx": 5, "fy": 5}
     root.mkdir(exist_ok=True)
-    (root / "cameras.json").write_text(json.dumps([camera | {"img_name": stem} for stem in stems]))
+    write_cameras(root, stems)
     for stem in stems[:-1]:
         write_mask(root / "labels" / f"{stem}.png", labels, 8)
     return root
@@ -197,6 +201,47 @@ def test_a_split_is_followed_in_its_order(tmp_path: Path) -> None:
         dataset.views("spare")
 
 
+def test_a_split_may_name_views_as_files(tmp_path: Path) -> None:
+    (make_dataset(tmp_path) / "split.json").write_text('{"train": ["c.jpg", "images/a.png"], "test": ["b.png"]}')
+    assert [view.name for view in Dataset(tmp_path).views("train")] == ["c", "a"]
+
+
+IMAGES = {
+    "one stem each": (("left/1.jpg", "right/2.jpg"), ("1", "2")),
+    "stems twice": (("left/1.jpg", "right/1.jpg"), ("left_1", "right_1")),
+}
+
+
+@pytest.mark.parametrize("case", IMAGES)
+def test_masks_and_photos_in_folders_as_their_images_are_found(tmp_path: Path, case: str) -> None:
+    images, names = IMAGES[case]
+    write_cameras(tmp_path, tuple(f"images/{name}" for name in images))
+    for i, name in enumerate(images):
+        for folder in ("images", "labels"):
+            (tmp_path / folder / name).parent.mkdir(parents=True, exist_ok=True)
+        write_mask(tmp_path / f"labels/{name}.png", np.full((HEIGHT, WIDTH), i + 1), bits=8)
+        Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "images" / name)
+    views = Dataset(tmp_path).views()
+    assert [view.name for view in views] == list(names)
+    assert [view.read_labels().max() for view in views] == [1, 2]
+    assert [view.image_path for view in views] == [tmp_path / "images" / name for name in images]
+
+
+def test_folders_with_several_masks_for_a_view_are_no_masks(tmp_path: Path) -> None:
+    write_cameras(tmp_path, ("a.jpg",))
+    for thing in ("cup", "box"):
+        (tmp_path / "labels" / thing).mkdir(parents=True)
+        write_mask(tmp_path / f"labels/{thing}/a.png", np.ones((HEIGHT, WIDTH), int), bits=8)
+    assert not Dataset(tmp_path).views()[0].has_mask
+
+
+def test_an_accented_name_is_one_however_its_file_system_writes_it(tmp_path: Path) -> None:
+    write_cameras(tmp_path, ("K\u00fcche.jpg",))
+    (tmp_path / "labels").mkdir()
+    write_mask(tmp_path / "labels/Ku\u0308che.png", np.ones((HEIGHT, WIDTH), int), bits=8)
+    assert Dataset(tmp_path).views()[0].has_mask
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -209,7 +254,8 @@ def test_a_split_is_followed_in_its_order(tmp_path: Path) -> None:
             '{"train": ["a", "x", "y"]}',
             r""""train" names views without a camera \(2, the first 'x'\); expected .* such as 'a'""",
         ),
-        ('{"train": ["a"], "test": ["b.png"]}', r""""test" names views without a camera \(1, the first 'b.png'\)"""),
+        ('{"train": ["a"], "test": ["b.x"]}', r""""test" names views without a camera \(1, the first 'b.x'\)"""),
+        ('{"train": ["a", "a.png"]}', "stem 'a' occurs 2 times; expected each stem once"),
         ('{"train": ["a", "b"], "test": ["b"]}', "stem 'b' occurs 2 times; expected each stem once"),
     ],
 )

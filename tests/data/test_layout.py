@@ -51,6 +51,13 @@ def test_masks_in_a_folder_of_another_name_are_found_and_the_option_that_is_told
                  "--labels", folder]) == 0  # fmt: skip
 
 
+def test_masks_in_several_folders_are_found_together(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for i, path in enumerate(sorted((data / "labels").iterdir())):
+        (data / f"masks/{i % 2}").mkdir(parents=True, exist_ok=True)
+        path.rename(data / f"masks/{i % 2}" / path.name)
+    assert "found 4 masks of these names in masks/: type --labels masks" in error_of(capsys, data)
+
+
 def photos(data: Path) -> None:
     shutil.rmtree(data / "labels")
     (data / "images").mkdir()

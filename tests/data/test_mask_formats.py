@@ -276,12 +276,13 @@ def test_yolo_takes_names_from_classes_txt(tmp_path: Path) -> None:
     [
         ("a.png", "a"), ("a.jpg.png", "a"), ("a_mask.png", "a"), ("a_labels.json", "a"), ("a.jpg.json", "a"),
         ("images/a.JPG", "a"), ("C:\\x\\a.jpg", "a"), ("a_jpg.rf.0123abcd.jpg", "a"), ("a.jpg_mask.png", "a"),
+        ("upload/1/0123abcd-a.jpg", "a"), ("images/left/1.JPG.png", "left_1"), ("left/x/1.png", None),
         ("a.b.png", "a.b"), ("a_mask_mask.png", None), ("ab.png", None), ("a.c.png", None), ("../a.png", "a"),
         ("", None), ("/", None), ("x" * 10**6, None),
     ],
 )  # fmt: skip
 def test_names_of_files_tell_their_view(name: str, view: str | None) -> None:
-    assert view_of(name, {"a", "a.b"}) == view
+    assert view_of(name, {"a", "a.b", "left_1"}) == view
 
 
 def test_a_view_whose_name_looks_like_that_of_a_mask_goes_before_another(tmp_path: Path) -> None:

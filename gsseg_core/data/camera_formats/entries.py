@@ -16,7 +16,7 @@ from gsseg_core.files.json_files import kind_of
 from gsseg_core.scene.camera import Camera, undistorted_camera
 from gsseg_core.scene.lens import Lens, LensModel, Projection
 from gsseg_core.scene.undistortion import undistortions
-from gsseg_core.text import clipped, quoted
+from gsseg_core.text import clipped, composed, quoted
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Entry:
         return array
 
     def stem(self, key: str) -> str:
-        """Read the name of an image, and give its stem."""
+        """Read the name of an image, and give its stem; see `stem_of`."""
         name = self._value(key)
         if not isinstance(name, str) or not stem_of(name):
             raise CameraFileError(f"{self.where}: '{key}' is {quoted(name)}; expected the name of an image")
@@ -130,6 +130,7 @@ def inverse_pose(
 
 
 def stem_of(name: str) -> str:
-    """File name without folders and without the suffix of an image; a dot in a name that lacks one is kept."""
-    path = PureWindowsPath(name)  # takes both kinds of slash
-    return path.stem if path.suffix.lower() in IMAGE_SUFFIXES else path.name
+    """Name of an image with its folders, `left/0001`, without its suffix; a dot in a name that lacks one is kept."""
+    path = PureWindowsPath(composed(name))  # takes both kinds of slash
+    stem = path.stem if path.suffix.lower() in IMAGE_SUFFIXES else path.name
+    return "/".join([*(part for part in path.parts[:-1] if part not in (path.anchor, "..")), stem])

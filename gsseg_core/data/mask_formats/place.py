@@ -12,13 +12,17 @@ from gsseg_core.errors import MaskFormatError
 from gsseg_core.files.input_files import IMAGE_SUFFIXES, list_folder, open_input, reason
 from gsseg_core.files.json_files import read_json
 from gsseg_core.files.limits import LIMITS
+from gsseg_core.text import composed
 
 SUPERVISES = "supervises.json"
 """Which classes were looked for in gsseg's own label images; see `data/mask_files.py`."""
 
 _SUFFIXES = IMAGE_SUFFIXES | {".json", ".npz", ".txt", ".xml"}
 _MARK = re.compile(r"[_.-](?:masks?|labels?|seg|segmentation)$", re.IGNORECASE)
-_RENAMED = re.compile(r"_(?:bmp|jpe?g|png|tiff?|webp)\.rf\.[0-9a-f]+$", re.IGNORECASE)  # as Roboflow renames images
+_RENAMED = re.compile(  # by Roboflow, by Label Studio
+    r"_(?:bmp|jpe?g|png|tiff?|webp)\.rf\.[0-9a-f]+$|^[0-9a-f]{8}-", re.IGNORECASE
+)
+_FOLDERS = 4  # above a file that may be part of its view's name
 _PEEKED = 4096
 
 
@@ -26,9 +30,9 @@ def view_of(name: str, stems: Collection[str]) -> str | None:
     """Find the view that a file of masks belongs to, by its name; None if there is none.
 
     `frame_1.png`, `frame_1.jpg.png`, `frame_1_mask.png`, `images/frame_1.jpg` and the like all belong to `frame_1`,
-    unless there is a view that is closer to the name.
+    and `left/1.png` to `left_1`, unless there is a view that is closer to the name.
     """
-    candidates = [PureWindowsPath(name[-1000:]).name]  # takes both kinds of slash
+    candidates = with_folders(name)
     for _ in range(4):
         tried = list(dict.fromkeys(s for c in candidates for s in (c, _MARK.sub("", c), _RENAMED.sub("", c))))
         for stem in tried:
@@ -37,6 +41,12 @@ def view_of(name: str, stems: Collection[str]) -> str | None:
         parts = [name.rpartition(".") for name in tried]
         candidates = [stem for stem, dot, suffix in parts if dot + suffix.lower() in _SUFFIXES]
     return None
+
+
+def with_folders(name: str) -> list[str]:
+    """List what a file may be called: its name, alone and after those of folders above it, as `read_cameras` does."""
+    parts = PureWindowsPath(composed(name[-1000:])).parts  # takes both kinds of slash
+    return ["_".join(parts[-count:]) for count in range(1, min(len(parts), 1 + _FOLDERS) + 1)]
 
 
 @dataclass(frozen=True, eq=False)
