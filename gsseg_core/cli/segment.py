@@ -87,6 +87,7 @@ def run(options: argparse.Namespace) -> int:
             scene_format=options.format, collision=options.collision, align=options.align,
             dataparser=options.dataparser, quality=options.quality, progress=progress,
         )  # fmt: skip
+    from gsseg_core.report.findings import NO_OBJECTS, has_objects
     from gsseg_core.text import segment_summary
 
     agreement = report["frame"]["agreement"]
@@ -96,5 +97,7 @@ def run(options: argparse.Namespace) -> int:
             f"the scene {looks} as the {agreement['compared']} do from these cameras: the two may be in different "
             f"frames; try --align, or gsseg doctor {options.data} --scene {options.scene}"
         )
+    if not has_objects(report):
+        note(f"no Gaussian is part of an object: {NO_OBJECTS}")
     tell(segment_summary(report, options.out))
     return 0

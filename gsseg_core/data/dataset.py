@@ -106,10 +106,11 @@ class Dataset:
         )
 
     def _take_masks(self, masks: MaskSet) -> None:
-        """Take the masks of another program, with its names of classes if it has any."""
+        """Take the masks of another program, with its names of classes if it has any; blank ones are none."""
         names = self._declared if masks.class_names is None else dict(sorted(masks.class_names.items()))
         self._declared = None if masks.per_view else names
-        self._change_views(lambda view: {"foreign_mask": masks.views.get(view.camera.image)})
+        drawn = {image: mask for image, mask in masks.views.items() if not mask.blank}
+        self._change_views(lambda view: {"foreign_mask": drawn.get(view.camera.image)})
 
     def _apply_label_map(self, path: str | os.PathLike[str]) -> None:
         """Have all views give their labels by a label map."""

@@ -21,6 +21,10 @@ TRUSTED = 0.7
 KNOWN_CLASS = 0.5
 """... and of classes whose IoU with the masks is smaller than this."""
 FEW_VIEWS = 3
+NO_OBJECTS = (
+    "the masks name none, or contradict each other; expected ids from 1, as 0 is the background and 255 (in masks of "
+    "16 bits 65535) unknown; detections of 8 bits are 0 to 255, not 0 and 1"
+)
 NOTED = 5
 """Names in a warning, at most."""
 
@@ -71,6 +75,11 @@ def most_confused(confusion: np.ndarray, count: int) -> list[int]:
     return sorted(order)
 
 
+def has_objects(report: Mapping[str, Any]) -> bool:
+    """Whether a Gaussian belongs to a class that is not the background, by what `report.json` holds."""
+    return any(entry["gaussians"] for entry in report["classes"] if entry["id"])
+
+
 def warnings_of(report: Mapping[str, Any], ious: np.ndarray | None) -> list[str]:
     """Say in sentences what about a run should make its user look twice, what weighs most first.
 
@@ -82,7 +91,7 @@ def warnings_of(report: Mapping[str, Any], ious: np.ndarray | None) -> list[str]
         IoU of each class with the masks, in the order of the report, NaN where there is none.
     """
     views, gaussians = report["views"], report["gaussians"]
-    warnings = []
+    warnings = [] if has_objects(report) else [f"No Gaussian is part of an object: {NO_OBJECTS}."]
     if views["used"] < FEW_VIEWS:
         warnings.append(
             f"Learnt from {counted(views['used'], 'view')} only. With fewer than {FEW_VIEWS}, "

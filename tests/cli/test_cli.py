@@ -120,11 +120,16 @@ def test_more_than_255_classes_work_with_16_bit_masks_from_end_to_end(tmp_path: 
     assert (mask.labels == read_mask(data / "labels/v2.png").labels).mean() > 0.93
 
 
-def test_one_class_only_works_from_end_to_end(place: Path) -> None:
+@pytest.mark.parametrize("drawn", [0, 255])
+def test_masks_without_an_object_work_from_end_to_end_and_that_is_said(
+    place: Path, capsys: pytest.CaptureFixture[str], drawn: int
+) -> None:
     (place / "data/classes.json").unlink()
     for path in (place / "data/labels").iterdir():
-        Image.fromarray(np.zeros((48, 64), np.uint8)).save(path)
+        Image.fromarray(np.where(np.array(Image.open(path)) > 0, drawn, 0).astype(np.uint8)).save(path)
     assert main(segment(place)) == 0
+    assert "no Gaussian is part of an object: the masks name none" in capsys.readouterr().err
+    assert "No Gaussian is part of an object: the masks name none" in (place / "out/report.html").read_text()
     assert [path.name for path in (place / "out/classes").iterdir()] == ["0_background.ply"]
 
 

@@ -268,6 +268,26 @@ def test_yolo_takes_names_from_classes_txt(tmp_path: Path) -> None:
     assert Dataset(tmp_path, "texts").class_names == {0: "background", 1: "cat", 2: "dog"}
 
 
+@pytest.mark.parametrize("place", ["texts", ".", ".."])  # LabelImg, Label Studio
+def test_yolo_takes_names_from_above_and_texts_of_windows(tmp_path: Path, place: str) -> None:
+    texts = tmp_path / "data/texts"
+    texts.mkdir(parents=True)
+    make_cameras(tmp_path / "data")
+    (texts / "frame_001.txt").write_bytes(b"\xef\xbb\xbf1 0 0 0.5 0 0.5 1 0 1\r\n")
+    (texts.parent / place / "classes.txt").write_bytes(b"cat\r\ndog\r\n")
+    data = Dataset(tmp_path / "data", "texts")
+    assert data.class_names == {0: "background", 1: "cat", 2: "dog"}
+    assert data.views()[0].read_labels().max() == 2
+
+
+@pytest.mark.parametrize("writer", [mask_writers.coco, mask_writers.cvat])
+def test_an_image_that_is_listed_without_an_annotation_has_no_mask(tmp_path: Path, writer: Writer) -> None:
+    labels = label_images()
+    labels[STEMS[1]][:] = 0
+    data = Dataset(tmp_path, written(tmp_path, writer, labels))
+    assert [view.has_mask for view in data.views()] == [True, False, False]
+
+
 # Names of files
 
 
@@ -348,9 +368,9 @@ def test_a_folder_with_nothing_but_the_file_of_annotations_is_as_good_as_the_fil
     assert Dataset(tmp_path, "masks").class_names == NAMES
 
 
-def test_annotations_of_other_images_are_refused_with_names_that_were_expected(tmp_path: Path) -> None:
+def test_annotations_of_other_images_are_refused_with_names_that_were_found_and_expected(tmp_path: Path) -> None:
     place = written(tmp_path, mask_writers.coco, {"elsewhere": label_images()["frame_001"]})
-    with pytest.raises(MaskFormatError, match=r"has masks of no view; expected names of views, such as 'frame_001'"):
+    with pytest.raises(MaskFormatError, match=r"of no view but of 'images/elsewhere\.jpg'; expected .* 'frame_001'"):
         Dataset(tmp_path, place)
 
 

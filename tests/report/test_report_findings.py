@@ -57,6 +57,7 @@ def test_a_run_without_fault_gets_no_warning() -> None:
 
 
 CUP = {"id": 1, "name": "cup", "gaussians": 0}
+BOX = {"id": 2, "name": "box", "gaussians": 9}
 DOUBTFUL = [{"name": "v7", "reliability": 0.5}, {"name": "v8", "reliability": None}]
 
 
@@ -74,7 +75,8 @@ DOUBTFUL = [{"name": "v7", "reliability": 0.5}, {"name": "v8", "reliability": No
             0.9,
             "1 of 2 masks disagrees with the other views in more than 30 % of its pixels: v7",
         ),
-        ({"classes": [CUP]}, 0.9, "1 class got no Gaussian: cup"),
+        ({"classes": [CUP, BOX]}, 0.9, "1 class got no Gaussian: cup"),
+        ({"classes": []}, 0.9, "No Gaussian is part of an object"),
         ({}, 0.3, "overlap by less than half (IoU below 0.5): cup"),
         ({"gaussians": {"unobserved": 40}}, 0.9, "40 % of the Gaussians were seen by no mask"),
     ],

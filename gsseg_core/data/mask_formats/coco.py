@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsseg_core.data.class_names import BACKGROUND_NAME
 from gsseg_core.data.mask_formats.masks import MaskSet, ViewMask, ids_from_zero
-from gsseg_core.data.mask_formats.place import Place, view_of
+from gsseg_core.data.mask_formats.place import Place
 from gsseg_core.data.mask_formats.record import Record
 from gsseg_core.data.mask_formats.rle import run_lengths
 from gsseg_core.data.mask_formats.shapes import Drawing, Polygons, Region, Runs, Shape
@@ -93,7 +93,7 @@ def _images(whole: Record, place: Place, path: Path) -> dict[object, tuple[str, 
         name = image.text("file_name")
         extra = image.fields.get("extra")
         given = extra.get("name") if isinstance(extra, dict) else None  # Roboflow's: the name before it renamed it.
-        view = view_of(name, place.stems) or (view_of(given, place.stems) if isinstance(given, str) else None)
+        view = place.view_of(name) or (place.view_of(given) if isinstance(given, str) else None)
         if view is None:
             continue
         if view in taken:

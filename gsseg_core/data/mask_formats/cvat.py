@@ -7,13 +7,12 @@ one the last. Tags say nothing of pixels and are left out; boxes and other shape
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 from xml.parsers import expat
 
 from gsseg_core.data.mask_formats.masks import MaskSet, ViewMask, check_name, names_of, number_names
-from gsseg_core.data.mask_formats.place import Place, view_of
+from gsseg_core.data.mask_formats.place import Place
 from gsseg_core.data.mask_formats.record import Record
 from gsseg_core.data.mask_formats.rle import run_lengths, runs_to_mask
 from gsseg_core.data.mask_formats.shapes import Bitmap, Drawing, Polygons, Region, Shape
@@ -45,7 +44,7 @@ def read_cvat(place: Place) -> MaskSet:
     """Read CVAT for images."""
     path = place.only(".xml")
     assert path is not None
-    reader = _Reader(path, place.stems)
+    reader = _Reader(path, place)
     parser = expat.ParserCreate()
     parser.StartDoctypeDeclHandler = reader.refuse_doctype  # With it, all entities are refused.
     parser.StartElementHandler, parser.EndElementHandler = reader.start, reader.end
@@ -68,10 +67,10 @@ def read_cvat(place: Place) -> MaskSet:
 class _Reader:
     """What is read of the XML, element by element: names of labels, and images by view."""
 
-    def __init__(self, path: Path, stems: Collection[str]) -> None:
+    def __init__(self, path: Path, place: Place) -> None:
         self.names: list[str] = []
         self.images: dict[str, _Image] = {}
-        self._path, self._stems = path, stems
+        self._path, self._place = path, place
         self._open: list[str] = []  # elements that are open, the innermost last
         self._text: list[str] = []  # of the name of a label
         self._image: _Image | None = None
@@ -107,7 +106,7 @@ class _Reader:
 
     def _start_image(self, attributes: dict[str, str]) -> None:
         name = attributes.get("name", "")
-        view, where = view_of(name, self._stems), f"{self._path}, image {quoted(name)}"
+        view, where = self._place.view_of(name), f"{self._path}, image {quoted(name)}"
         width, height = (_whole(attributes, key, where) for key in ("width", "height"))
         self._image = _Image(where, Record(where, {"width": width, "height": height}).size("width", "height"), [])
         if view in self.images:

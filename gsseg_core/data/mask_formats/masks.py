@@ -25,17 +25,20 @@ _IGNORED = "__ignore__"
 class ViewMask:
     """The mask of one view: where it stands, and how it is read, when it is asked for.
 
-    `size` is the mask's own, width and height, as far as it is known without reading it.
+    `size` is the mask's own, width and height, as far as it is known without reading it. One is `blank` if its image is
+    listed in a file without a shape: nobody may have looked at it.
     """
 
     where: str
     read: Callable[[Camera], npt.NDArray[np.int32]]
     size: tuple[int, int] | None = None
+    blank: bool = False
 
     @classmethod
     def of(cls, drawing: Drawing, where: str) -> ViewMask:
         """Make the mask of a drawing."""
-        return cls(where, partial(drawing.labels, where=where), (drawing.width, drawing.height))
+        size = drawing.width, drawing.height
+        return cls(where, partial(drawing.labels, where=where), size, blank=not drawing.shapes)
 
     def labels(self, camera: Camera) -> npt.NDArray[np.int32]:
         """Read labels (H, W) of the size of the image as it was taken, scaled if the mask has another one.

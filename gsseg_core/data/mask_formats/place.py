@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path, PureWindowsPath
 
@@ -56,6 +56,7 @@ class Place:
     path: Path
     stems: frozenset[str]
     within: Path | None = None
+    strangers: list[str] = field(default_factory=list)  # names that are of no view, for messages
 
     @cached_property
     def entries(self) -> list[Path]:
@@ -66,6 +67,13 @@ class Place:
     def folders(self) -> list[Path]:
         """Folders in it that are not hidden."""
         return [path for path in self.entries if path.is_dir() and not path.name.startswith(".")]
+
+    def view_of(self, name: str) -> str | None:
+        """Find the view that a name belongs to, by the function of this name."""
+        view = view_of(name, self.stems)
+        if view is None:
+            self.strangers.append(name)
+        return view
 
     def by_view(self, suffix: str) -> dict[str, Path]:
         """Find the files with a suffix that belong to a view, by view: those in a folder, or the file itself.
@@ -86,7 +94,7 @@ class Place:
         """Find the views that names belong to; raises as `by_view` does."""
         found: dict[str, Path] = {}
         for name, path in named:
-            view = view_of(name, self.stems)
+            view = self.view_of(name)
             if view is not None and view in found:
                 raise MaskFormatError(
                     f"{self.path}: has {found[view].name} and {path.name} for view '{view}'; expected one mask per view"

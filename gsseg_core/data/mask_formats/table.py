@@ -120,13 +120,16 @@ def open_masks(path: Path, stems: Iterable[str], within: Path | None = None) -> 
         raise MaskFormatError(f"{path}: is nested too deep; expected masks") from cause
     if masks is not None and not masks.views:
         names_of_views = ", ".join(map(quoted, sorted(place.stems)[:3]))
-        raise MaskFormatError(f"{path}: has masks of no view; expected names of views, such as {names_of_views}")
+        others = f" but of {quoted(place.strangers[-1])}" if place.strangers else ""
+        raise MaskFormatError(
+            f"{path}: has masks of no view{others}; expected names of views, such as {names_of_views}"
+        )
     return None if masks is None else replace(masks, format=found[0].name)
 
 
 def known_formats() -> str:
     """List all formats for messages."""
-    own = f"{LABEL_IMAGES} (<stem>.png)"
+    own = f"{LABEL_IMAGES} (a folder of <stem>.png)"
     return ", ".join([own, *(f"{known.name} ({known.looked_for.replace('`', '')})" for known in MASK_FORMATS)])
 
 

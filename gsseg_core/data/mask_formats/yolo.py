@@ -1,7 +1,7 @@
 """YOLO segmentation: a text file per image, in each line a class and a polygon in shares of the image's size.
 
-Class c is id c + 1, since its 0 is an object. Names come from `data.yaml` beside the texts or up to two folders above,
-or else from `classes.txt` beside them. The last line is on top. Predictions may end a line with a confidence, or with
+Class c is id c + 1, since its 0 is an object. Names come from `data.yaml` or else `classes.txt`, beside the texts or up
+to two folders above. The last line is on top. Predictions may end a line with a confidence, or with
 the id of a track, which are left out; of an object of a pixel or two they have one or two points, which cover nothing.
 """
 
@@ -25,7 +25,7 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.text import quoted
 
 _NUMBER, _END = r"(?:[ \t]+[-+0-9.eE]+)", r"[ \t]*(?:[\r\n]|$)"
-_LINE = rf"\s*(?:(?:[0-9]+{_NUMBER}{{0,3}}[ \t]*[\r\n]+)*[0-9]+{_NUMBER}{{4,}}{_END}|$)".encode()
+_LINE = rf"(?:\xef\xbb\xbf)?\s*(?:(?:[0-9]+{_NUMBER}{{0,3}}[ \t]*[\r\n]+)*[0-9]+{_NUMBER}{{4,}}{_END}|$)".encode()
 _BOX = 4
 
 
@@ -90,9 +90,9 @@ def _names(place: Place) -> dict[int, str] | None:
         for name in ("data.yaml", "data.yml"):
             if (above / name).is_file():
                 return _named(read_yaml(above / name, MaskFormatError, place.within), above / name)
-    if (folder / "classes.txt").is_file():
-        lines = [line.strip() for line in place.text(folder / "classes.txt").splitlines()]
-        return {c: check_name(line, str(folder / "classes.txt")) for c, line in enumerate(lines) if line}
+        if (path := above / "classes.txt").is_file():
+            lines = [line.strip() for line in place.text(path).splitlines()]
+            return {c: check_name(line, str(path)) for c, line in enumerate(lines) if line}
     return None
 
 
