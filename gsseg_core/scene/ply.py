@@ -92,9 +92,17 @@ def _parse(path: Path, within: Path | None) -> Any:
         ) from error
 
 
+def is_ply(head: bytes) -> bool:
+    """Tell a PLY by its first bytes."""
+    return head.startswith((b"ply\n", b"ply\r"))
+
+
 def _is_text(file: BinaryIO) -> bool:
     """Tell from its header whether a PLY is text; raises `ValueError` if the file is too short for its counts."""
-    if b"end_header" not in file.read(_MAX_HEADER):
+    head = file.read(_MAX_HEADER)
+    if not is_ply(head):
+        raise ValueError(f"begins with {head[:24]!r}, not with 'ply'" if head else "is empty")
+    if b"end_header" not in head:
         raise ValueError(f"no end of its header in the first {_MAX_HEADER:,} bytes")
     file.seek(0)
     ply = plyfile.PlyData._parse_header(file)

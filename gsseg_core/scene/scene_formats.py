@@ -10,7 +10,7 @@ from pathlib import Path
 
 from gsseg_core.errors import SceneFileError
 from gsseg_core.files.input_files import open_input, reason
-from gsseg_core.scene import checkpoint, compressed_ply, gltf, ksplat, ply_variants, sog, splat, spz
+from gsseg_core.scene import checkpoint, compressed_ply, gltf, ksplat, ply, ply_variants, sog, splat, spz
 from gsseg_core.scene.vertices import ReadScene
 
 _HEAD = 1 << 16  # bytes that tell one format from another; a header of PLY with 60 properties takes 2,000
@@ -99,14 +99,15 @@ def find_format(path: Path, within: Path | None = None) -> SceneFormat | None:
     suited = [known for known in SCENE_FORMATS if name.endswith(known.suffixes)]
     if path.is_dir():
         return next((known for known in SCENE_FORMATS if known.name == "SOG" and (path / "meta.json").exists()), None)
-    by_suffix = next((known for known in suited if known.marks is None and known is not SCENE_FORMATS[0]), None)
     try:
         with open_input(path, within) as file:
             head = file.read(_HEAD)
     except OSError:
         head = b""
-    by_content = (known for known in SCENE_FORMATS if known.marks and known.marks(head))
-    return by_suffix or next(by_content, None) or next(iter(suited), None)
+    by_content = [known for known in SCENE_FORMATS if known.marks and known.marks(head)]
+    if ply.is_ply(head):  # None of its variants, perhaps; and no suffix makes it something else.
+        by_content.append(SCENE_FORMATS[0])
+    return next(iter([*by_content, *suited]), None)
 
 
 def read_scene(path: str | os.PathLike[str], within: Path | None = None) -> ReadScene:

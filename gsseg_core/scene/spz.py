@@ -22,7 +22,7 @@ from gsseg_core.scene.spherical_harmonics import MAX_DEGREE
 from gsseg_core.scene.vertices import ReadScene, logits, pack_in_blocks, pack_vertices
 
 _MAGIC = b"NGSP"
-_GZIP = b"\x1f\x8b"
+_GZIP = b"\x1f\x8b\x08"  # deflated, as all are
 _HEADER = struct.Struct("<4sIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved or streams
 _HEADER_4 = 32  # from version 4 on; the offset of the table of streams follows those above
 _ANTIALIASED, _EXTENSIONS = 1, 2

@@ -149,6 +149,16 @@ def test_a_count_beyond_the_file_is_refused_before_memory_is_taken(tmp_path: Pat
         tracemalloc.stop()
 
 
+@pytest.mark.parametrize(
+    ("content", "found"),
+    [(b"", "is empty"), (b"version https://git-lfs.github.com/spec/v1\n", "begins with b'version https://git-lfs.'")],
+)
+def test_a_file_that_is_no_ply_is_refused_with_what_it_begins_with(tmp_path: Path, content: bytes, found: str) -> None:
+    (tmp_path / "scene.ply").write_bytes(content)
+    with pytest.raises(SceneFileError, match=rf"scene\.ply: truncated or not a PLY file \({found}"):
+        read_vertices(tmp_path / "scene.ply")
+
+
 def test_a_file_without_the_end_of_a_header_is_not_read_through(tmp_path: Path) -> None:
     (tmp_path / "scene.ply").write_bytes(b"ply\nformat ascii 1.0\ncomment " + b"x" * (2 << 20))
     with pytest.raises(SceneFileError, match=r"no end of its header in the first 1,048,576 bytes"):

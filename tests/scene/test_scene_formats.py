@@ -104,9 +104,10 @@ def test_the_format_is_told_by_its_content_or_its_suffix_and_names_its_version(t
     known = find_format(path)
     assert known is not None and known.name == case.format and known.keeps
     assert known.read(path, None).version == case.version
-    if known.marks:
-        other = path.rename(path.with_name("scene.bin"))
-        assert find_format(other) is known and len(read_scene(other).vertices) == 70
+    if known.marks or known.name == "3DGS PLY":
+        for wrong in ("scene.ksplat", "scene.splat", "scene.pt"):
+            path = path.rename(path.with_name(wrong))
+            assert find_format(path) is known and len(read_scene(path).vertices) == 70
 
 
 @pytest.mark.parametrize(
