@@ -200,13 +200,11 @@ class _Window(NamedTuple):
 
 def _edges(picture: np.ndarray) -> np.ndarray:  # (S, S)
     """Edges of a picture, the square root of the gradient, so that a few strong ones are not all that counts."""
-    edges: np.ndarray = np.sqrt(_gradient(picture))
-    return edges
+    return np.sqrt(_gradient(picture))
 
 
 def _gradient(picture: np.ndarray) -> np.ndarray:  # (S, S)
-    gradient: np.ndarray = ndimage.gaussian_gradient_magnitude(picture, 1.0)
-    return gradient
+    return ndimage.gaussian_gradient_magnitude(picture, 1.0)
 
 
 def _correlation(first: np.ndarray, second: np.ndarray) -> float:  # (P,), (P,)

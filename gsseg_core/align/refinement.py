@@ -38,8 +38,7 @@ class _Ties(NamedTuple):
         """Reprojection errors of points, (P, 2), in px."""
         local = np.einsum("pij,pj->pi", self.rotations, points) + self.translations
         depth = np.maximum(local[:, 2:], 1e-9)
-        errors: np.ndarray = local[:, :2] / depth * self.lenses[:, :2] + self.lenses[:, 2:] - self.pixels
-        return errors
+        return local[:, :2] / depth * self.lenses[:, :2] + self.lenses[:, 2:] - self.pixels
 
 
 def refined(

@@ -52,8 +52,7 @@ class Part:
         """Corners (8, 3) of the bounding box in the world."""
         grid = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, 8).T
         low, high = self.solid.corners
-        corners: np.ndarray = (low + grid * (high - low)) @ self.rotation.T + self.position
-        return corners
+        return (low + grid * (high - low)) @ self.rotation.T + self.position
 
     def hit(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Distances along world rays."""

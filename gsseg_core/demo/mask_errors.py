@@ -85,5 +85,4 @@ def relabel(labels: np.ndarray, objects: np.ndarray, new_labels: np.ndarray) -> 
     """Give objects (M,) of a map (H, W) int32 other labels (M,); all other pixels stay as they are."""
     table = np.arange(labels.max(initial=0) + 1, dtype=np.int32)
     table[objects] = new_labels
-    relabelled: np.ndarray = np.where(labels < 0, labels, table[np.maximum(labels, 0)])
-    return relabelled
+    return np.where(labels < 0, labels, table[np.maximum(labels, 0)])

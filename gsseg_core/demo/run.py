@@ -62,5 +62,4 @@ def gaussian_ious(demo: DemoScene, segmentation: Path) -> list[float]:
     labels, truth = Segmentation.load(segmentation, demo.scene).labels, demo.truth
     real = truth >= 0
     parts = truth[real & (labels == truth)], truth[real], labels[real & (labels >= 0)]
-    ious: list[float] = iou(*(np.bincount(part, minlength=len(demo.class_names)) for part in parts)).tolist()
-    return ious
+    return iou(*(np.bincount(part, minlength=len(demo.class_names)) for part in parts)).tolist()

@@ -39,8 +39,7 @@ class Ellipsoid:
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Which points (M, 3) are in its matter, (M,) bool."""
-        inside: np.ndarray = dot(points / self.radii, points / self.radii) <= 1
-        return inside
+        return dot(points / self.radii, points / self.radii) <= 1
 
     def sample(self, u: np.ndarray, inset: float) -> tuple[np.ndarray, np.ndarray]:
         """Surface points (M, 3), `inset` metres off sharp edges, and unit normals (M, 3), from (M, 3) in [0, 1)."""
@@ -78,8 +77,7 @@ class Box:
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Which points are inside."""
         low, high = self.corners
-        inside: np.ndarray = np.all((points >= low) & (points <= high), axis=-1)
-        return inside
+        return np.all((points >= low) & (points <= high), axis=-1)
 
     def sample(self, u: np.ndarray, inset: float) -> tuple[np.ndarray, np.ndarray]:
         """Surface points and normals."""
@@ -182,8 +180,7 @@ Solid = Ellipsoid | Box | Cone
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Scalar products along the last axis."""
-    product: np.ndarray = np.einsum("...i,...i->...", a, b)
-    return product
+    return np.einsum("...i,...i->...", a, b)
 
 
 def _roots(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -194,5 +191,4 @@ def _roots(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> tuple[np.ndarray, np.
 
 def _nearest(*hits: tuple[np.ndarray, np.ndarray | bool]) -> np.ndarray:
     """Smallest of several distances that is ahead and marked as a hit; infinite where there is none."""
-    distances: np.ndarray = np.min([np.where((t > 1e-6) & ok, t, np.inf) for t, ok in hits], axis=0)
-    return distances
+    return np.min([np.where((t > 1e-6) & ok, t, np.inf) for t, ok in hits], axis=0)

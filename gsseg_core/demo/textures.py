@@ -166,5 +166,4 @@ def written(text: str, u: np.ndarray, v: np.ndarray, cell: float) -> np.ndarray:
 
 
 def _where(chosen: np.ndarray, color: Color, other: Color) -> np.ndarray:
-    colors: np.ndarray = np.where(chosen[:, None], color, other)
-    return colors
+    return np.where(chosen[:, None], color, other)

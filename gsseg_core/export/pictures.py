@@ -86,8 +86,7 @@ def overlay(image: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.nda
     tints = FILL * colors.astype(np.float32)
     tints[:1] = 0.65 * 30
     lines = np.minimum(1.12 * colors, 255).astype(np.float32)
-    picture: np.ndarray = _tinted(np.array(image, order="C"), np.array(labels, np.int32, order="C"), tints, lines)
-    return picture
+    return _tinted(np.array(image, order="C"), np.array(labels, np.int32, order="C"), tints, lines)
 
 
 @kernel  # By one thread: several pictures are drawn at once.
@@ -240,5 +239,4 @@ def _oklab(rgb: np.ndarray) -> np.ndarray:
         [[0.2104542553, 0.7936177850, -0.0040720468], [1.9779984951, -2.4285922050, 0.4505937099],
          [0.0259040371, 0.7827717662, -0.8086757660]]
     )  # fmt: skip
-    lab: np.ndarray = np.cbrt(linear @ to_cones.T) @ to_lab.T
-    return lab
+    return np.cbrt(linear @ to_cones.T) @ to_lab.T

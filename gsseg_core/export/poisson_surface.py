@@ -121,8 +121,7 @@ def _potential(field: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:  # (3
     squared = (k**2).sum(axis=0)
     divergence = sum(1j * k[i] * fft.rfftn(field[i]) for i in range(3))
     solved = np.where(squared > 0, divergence / np.maximum(squared, 1e-12), 0) * np.exp(-(_SMOOTH**2) * squared / 2)
-    potential: npt.NDArray[np.float64] = fft.irfftn(solved, shape)
-    return potential
+    return fft.irfftn(solved, shape)
 
 
 def _sphere() -> npt.NDArray[np.float64]:
@@ -136,5 +135,4 @@ def _disc() -> npt.NDArray[np.float64]:
     """Points (S, 2) spread evenly over a disc of radius 0.7, half as large as the unit disc."""
     i = np.arange(_DISC) + 0.5
     turn = np.pi * (1 + 5**0.5) * i
-    points: npt.NDArray[np.float64] = 0.7 * np.sqrt(i / _DISC)[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    return points
+    return 0.7 * np.sqrt(i / _DISC)[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)

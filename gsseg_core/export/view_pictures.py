@@ -48,8 +48,7 @@ def background_image(scene: GaussianScene, operator: ViewOperator) -> np.ndarray
 
 def as_pixels(image: np.ndarray) -> np.ndarray:  # (H, W, 3) in [0, 1]
     """Round blended colours to pixels, (H, W, 3) uint8."""
-    pixels: np.ndarray = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
-    return pixels
+    return np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
 
 
 class Drawn(NamedTuple):

@@ -97,8 +97,7 @@ class AssociationSettings:
     def sight(self, seen: np.ndarray, most: np.ndarray) -> np.ndarray:
         """Say how much views count for what they see of clusters, (C, views) px; the most that any sees is (C, 1)."""
         full = np.minimum(self.full_sight * most, self.plenty)
-        counts: np.ndarray = np.minimum(seen / np.maximum(full, 1e-9), 1) * seen / (seen + self.full_sight_px)
-        return counts
+        return np.minimum(seen / np.maximum(full, 1e-9), 1) * seen / (seen + self.full_sight_px)
 
 
 class Association(NamedTuple):
@@ -280,8 +279,7 @@ class _Votes(NamedTuple):
 
     def _agreement(self, together: np.ndarray, see: np.ndarray, show: np.ndarray) -> np.ndarray:
         doubt = self.settings.doubt
-        agreement: np.ndarray = together / np.sqrt((see + doubt) * (show + doubt))
-        return agreement
+        return together / np.sqrt((see + doubt) * (show + doubt))
 
     def doubted(self, touching: sparse.csr_matrix) -> float:
         """Tell which share of the clusters that touch, (C, C), may be parts of one object."""
@@ -319,8 +317,7 @@ def _goes_on(borders: Borders, first: np.ndarray, second: np.ndarray) -> np.ndar
         return np.ones(0)
     length, edges = (np.asarray(part[first, second], np.float64).ravel() for part in borders)
     share = (edges + _USUAL * _BORDER) / (length + _BORDER)
-    factor: np.ndarray = np.clip(np.exp(_SURFACE * (_USUAL - share)), *_FACTORS)
-    return factor
+    return np.clip(np.exp(_SURFACE * (_USUAL - share)), *_FACTORS)
 
 
 def _in_parts(doubted: float) -> float:

@@ -147,8 +147,7 @@ def _price(means: np.ndarray, size: np.ndarray, a: int, b: int, border: int) -> 
     distance = 0.0
     for d in range(means.shape[1]):
         distance += (means[a, d] - means[b, d]) ** 2
-    price: float = size[a] * size[b] / (size[a] + size[b]) * distance / border
-    return price
+    return size[a] * size[b] / (size[a] + size[b]) * distance / border
 
 
 @kernel
@@ -250,5 +249,4 @@ def _members(tree: MergeTree, region: int) -> np.ndarray:
     part[region] = True
     for below in range(region - 1, -1, -1):  # parents have larger numbers
         part[below] |= part[tree.parent[below]]
-    cells: np.ndarray = part[: (len(part) + 1) // 2]
-    return cells
+    return part[: (len(part) + 1) // 2]

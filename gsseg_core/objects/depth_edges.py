@@ -66,8 +66,7 @@ def depth_edges(scene: GaussianScene, operator: ViewOperator) -> DepthEdges:
     padded = np.pad(inverse, _REACH, mode="edge")
 
     def moved(down: int, right: int) -> np.ndarray:
-        moved: np.ndarray = padded[_REACH + down :, _REACH + right :][:rows, :columns]
-        return moved
+        return padded[_REACH + down :, _REACH + right :][:rows, :columns]
 
     bend = np.zeros_like(inverse)
     for down, right in ((0, _REACH), (_REACH, 0), (_REACH, _REACH), (_REACH, -_REACH)):

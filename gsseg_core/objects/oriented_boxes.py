@@ -86,8 +86,7 @@ class OrientedBox:
     def corners(self) -> Array:
         """The eight corners (8, 3)."""
         signs = np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5], indexing="ij"), axis=-1).reshape(8, 3)
-        corners: Array = self.center + (signs * self.size) @ self.axes.T
-        return corners
+        return self.center + (signs * self.size) @ self.axes.T
 
     def moved(self, rotation: Array, translation: Array, scale: float) -> OrientedBox:
         """Return the box after x -> scale * rotation (3, 3) @ x + translation (3,); its axes stay in their order."""
@@ -197,8 +196,7 @@ def without_floaters(points: Array, weights: Array) -> npt.NDArray[np.bool_]:
         if np.linalg.norm(middle - before) <= _SETTLED * distance.max():
             break
     limit = FAR * _quantile(distance[:, None], weights / weights.sum(), 0.9)
-    kept: npt.NDArray[np.bool_] = (distance <= limit) & (weights > 0)
-    return kept
+    return (distance <= limit) & (weights > 0)
 
 
 def _turned(offsets: Array, share: Array, axes: Array) -> Array:
@@ -291,15 +289,13 @@ def _quantile(values: Array, share: Array, part: float) -> Array:
     reached = np.cumsum(share[order], axis=0) >= part * (1 - 1e-9)
     rows = np.where(reached.any(axis=0), reached.argmax(axis=0), len(values) - 1)
     columns = np.arange(values.shape[1])
-    found: Array = values[order[rows, columns], columns]
-    return found
+    return values[order[rows, columns], columns]
 
 
 def _pointed(axes: Array) -> Array:
     """Choose one of the two directions of each axis (3, 3), the same way for all boxes, so that they are a rotation."""
     first, second = (axis * np.copysign(1.0, axis[np.abs(axis).argmax()]) for axis in axes.T[:2])
-    pointed: Array = np.stack([first, second, np.cross(first, second)], axis=1)
-    return pointed
+    return np.stack([first, second, np.cross(first, second)], axis=1)
 
 
 def _rounded(values: Array) -> Any:

@@ -71,8 +71,7 @@ class Pick:
 
         What a ray has left over is not the object.
         """
-        seen: np.ndarray = make_operator(scene, camera, device).render(self.membership[:, None])[..., 0] >= 0.5
-        return seen
+        return make_operator(scene, camera, device).render(self.membership[:, None])[..., 0] >= 0.5
 
     def next_view(self, scene: GaussianScene, cameras: Sequence[Camera], *, device: str = "cpu") -> int:
         """Find the camera whose mask would tell most: where the most of what is in doubt is seen, in px.

@@ -59,8 +59,7 @@ class Evidence:
 
 def class_ious(confusion: np.ndarray) -> np.ndarray:
     """IoU of each class between prediction and masks, (K,) of (K, K) pixels; NaN for a class that is in neither."""
-    ious: np.ndarray = iou(confusion.diagonal(), confusion.sum(axis=0), confusion.sum(axis=1))
-    return ious
+    return iou(confusion.diagonal(), confusion.sum(axis=0), confusion.sum(axis=1))
 
 
 def largest_confusions(confusion: np.ndarray, count: int) -> list[tuple[int, int, int]]:

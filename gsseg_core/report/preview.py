@@ -190,5 +190,4 @@ def _limit(keys: np.ndarray, count: int) -> float:
 
 def _quantised(values: np.ndarray, low: Any, high: Any, largest: int) -> np.ndarray:
     spans = np.maximum(np.asarray(high) - low, 1e-12)
-    steps: np.ndarray = np.rint((values - low) / spans * largest)
-    return steps
+    return np.rint((values - low) / spans * largest)

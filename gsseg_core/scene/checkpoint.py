@@ -89,8 +89,7 @@ def _array(tensors: Mapping[str, Any], name: str, most: int) -> npt.NDArray[np.f
         raise UnfitError(f"has no tensor of numbers {name!r}; expected means, scales, quats, opacities and SH")
     if tensor.numel() * tensor.element_size() > most:
         raise UnfitError(f"{name} is of shape {tuple(tensor.shape)}, more than the file holds")
-    array: npt.NDArray[np.float32] = np.array(tensor.detach().float().numpy())
-    return array
+    return np.array(tensor.detach().float().numpy())
 
 
 def _vertices(

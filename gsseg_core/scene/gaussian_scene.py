@@ -245,10 +245,7 @@ class GaussianScene:
 
         ids = np.arange(len(self)) if ids is None else ids
         degree, center = (0, np.zeros(3)) if camera_center is None else (self.sh_degree, np.asarray(camera_center))
-        seen: npt.NDArray[np.float32] = seen_colors(
-            self._coefficients, self.means, ids.astype(np.int32), center.astype(np.float32), degree
-        )
-        return seen
+        return seen_colors(self._coefficients, self.means, ids.astype(np.int32), center.astype(np.float32), degree)
 
 
 def _sh_names(vertices: npt.NDArray[np.void], source: str) -> tuple[str, ...]:

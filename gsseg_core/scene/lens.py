@@ -176,8 +176,7 @@ class Lens:
     def _radial(self, squared: Floats) -> Floats:
         ks = [self._named.get(f"k{i}", 0.0) for i in range(1, 7)]
         above, below = (ks[:3], ks[3:]) if self.model.rational else (ks[:4], [])
-        quotient: Floats = np.polyval([*above[::-1], 1.0], squared) / np.polyval([*below[::-1], 1.0], squared)
-        return quotient
+        return np.polyval([*above[::-1], 1.0], squared) / np.polyval([*below[::-1], 1.0], squared)
 
     def _distorted(
         self,

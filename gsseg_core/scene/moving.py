@@ -41,8 +41,7 @@ def move(
 @lru_cache(maxsize=4)
 def _turned(turn: bytes, degree: int) -> npt.NDArray[np.float64]:
     """Matrix (B, B) that turns coefficients above degree 0; kept, as files are moved block by block."""
-    matrix: npt.NDArray[np.float64] = spherical_harmonics.turned(np.frombuffer(turn).reshape(3, 3), degree)[1:, 1:]
-    return matrix
+    return spherical_harmonics.turned(np.frombuffer(turn).reshape(3, 3), degree)[1:, 1:]
 
 
 def _change_signs(
@@ -75,5 +74,4 @@ def _product(
     """Quaternions (N, 4) of rotations by `second`, then by `first`."""
     w, x, y, z = first
     matrix = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    product: npt.NDArray[np.float64] = second.astype(np.float64) @ matrix.T
-    return product
+    return second.astype(np.float64) @ matrix.T

@@ -18,8 +18,7 @@ def rotations(quats: npt.NDArray[Number]) -> npt.NDArray[Number]:  # (M, 4) w, x
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
-    matrices: npt.NDArray[Number] = np.moveaxis(np.array(rows), 2, 0)
-    return matrices
+    return np.moveaxis(np.array(rows), 2, 0)
 
 
 def half_axes(
@@ -27,15 +26,13 @@ def half_axes(
     scales: npt.NDArray[Any],  # (M, 3)
 ) -> npt.NDArray[Number]:
     """Half axes (M, 3, 3) of ellipsoids, one in each column, of the higher precision of the two."""
-    axes: npt.NDArray[Number] = rotations(quats) * scales[:, None, :]
-    return axes
+    return rotations(quats) * scales[:, None, :]
 
 
 def covariances(quats: npt.NDArray[Number], scales: npt.NDArray[Any]) -> npt.NDArray[Number]:
     """Covariances (M, 3, 3) of Gaussians, R diag(scales^2) R^T, of what `half_axes` takes."""
     half = half_axes(quats, scales)
-    product: npt.NDArray[Number] = half @ half.transpose(0, 2, 1)
-    return product
+    return half @ half.transpose(0, 2, 1)
 
 
 def from_smallest_three(

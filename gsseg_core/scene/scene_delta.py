@@ -153,8 +153,7 @@ class SceneDelta:
 
 def _doubled(ids: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     ordered = np.sort(ids)
-    doubled: npt.NDArray[np.int64] = ordered[1:][ordered[1:] == ordered[:-1]]
-    return doubled
+    return ordered[1:][ordered[1:] == ordered[:-1]]
 
 
 def check_similarity(motion: Similarity, who: str) -> None:

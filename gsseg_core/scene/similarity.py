@@ -31,8 +31,7 @@ class Similarity:
 
     def points(self, points: npt.NDArray[Any]) -> npt.NDArray[np.float64]:  # (..., 3)
         """Map points (..., 3) from the first frame to the second."""
-        mapped: npt.NDArray[np.float64] = self.scale * (points @ self.rotation.T) + self.translation
-        return mapped
+        return self.scale * (points @ self.rotation.T) + self.translation
 
     def camera(self, camera: Camera) -> Camera:
         """Move a camera of the first frame to the second; what it sees of moved points is what it saw of the points."""

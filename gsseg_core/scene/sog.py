@@ -173,5 +173,4 @@ def _rest(meta: Any, labels: Pixels, load: Load) -> npt.NDArray[np.float32]:
     index = labels[:, 0].astype(np.int64) | labels[:, 1].astype(np.int64) << 8
     if index.max(initial=0) >= len(entries):
         raise UnfitError(f"names entry {index.max():,} of a palette of SH; expected at most {len(entries) - 1:,}")
-    values: npt.NDArray[np.float32] = _values(meta, entries.reshape(-1, 3)).reshape(entries.shape)[index]
-    return values
+    return _values(meta, entries.reshape(-1, 3)).reshape(entries.shape)[index]

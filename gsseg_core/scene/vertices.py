@@ -80,8 +80,7 @@ def pack_vertices(
             first = names.index("f_rest_0")
             # All of red comes first, then green, then blue.
             table[:, first : first + 3 * bands].reshape(n, 3, bands)[:] = rest.transpose(0, 2, 1)
-    vertices: npt.NDArray[np.void] = table.view([(name, np.float32) for name in names])[:, 0]
-    return vertices
+    return table.view([(name, np.float32) for name in names])[:, 0]
 
 
 def pack_in_blocks(count: int, pack: Callable[[slice], npt.NDArray[np.void]]) -> npt.NDArray[np.void]:
@@ -94,8 +93,7 @@ def pack_in_blocks(count: int, pack: Callable[[slice], npt.NDArray[np.void]]) ->
     for start in range(0, count, BLOCK):
         part = pack(slice(start, start + BLOCK)) if start else first
         table[start : start + BLOCK] = part.view(np.float32).reshape(len(part), -1)
-    vertices: npt.NDArray[np.void] = table.view(first.dtype)[:, 0]
-    return vertices
+    return table.view(first.dtype)[:, 0]
 
 
 def columns(vertices: npt.NDArray[np.void], names: tuple[str, ...]) -> npt.NDArray[np.float32]:  # (N,)
@@ -107,8 +105,7 @@ def columns(vertices: npt.NDArray[np.void], names: tuple[str, ...]) -> npt.NDArr
 
 def chosen(vertices: npt.NDArray[np.void], index: npt.NDArray[np.integer]) -> npt.NDArray[np.void]:  # (N,), (M,)
     """Take vertices, (M,), as plain bytes: NumPy takes records field after field, in ten times the time."""
-    taken: npt.NDArray[np.void] = np.take(vertices.view(f"V{vertices.itemsize}"), index).view(vertices.dtype)
-    return taken
+    return np.take(vertices.view(f"V{vertices.itemsize}"), index).view(vertices.dtype)
 
 
 def put(vertices: npt.NDArray[np.void], names: tuple[str, ...], values: npt.NDArray[np.floating]) -> None:
@@ -122,8 +119,7 @@ def logits(opacities: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
     with np.errstate(invalid="ignore"):  # There are NaN that are signalled when they are converted.
         given = np.asarray(opacities, np.float64)
     inside = np.clip(np.where((given >= 0) & (given <= 1), given, np.nan), _MARGIN, 1 - _MARGIN)
-    found: npt.NDArray[np.float64] = np.log(inside / (1 - inside))
-    return found
+    return np.log(inside / (1 - inside))
 
 
 def log_scales(scales: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:

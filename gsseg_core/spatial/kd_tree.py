@@ -47,8 +47,7 @@ def scaled(means: np.ndarray) -> np.ndarray:
     """Scale (N, 3) float32 into [-1, 1] by a power of two: nothing is rounded, and no distance can overflow."""
     points = np.asarray(means, np.float32)
     largest = max(points.max(initial=0), -points.min(initial=0))
-    scaled: np.ndarray = np.ldexp(points, -np.frexp(largest)[1])
-    return scaled
+    return np.ldexp(points, -np.frexp(largest)[1])
 
 
 _KNOWN: PerScene[Tree] = PerScene()
@@ -163,5 +162,4 @@ def gap(boxes: np.ndarray, node: int, box: np.ndarray | tuple[float, ...]) -> np
     dx = max(max(boxes[node, 0] - box[3], box[0] - boxes[node, 3]), np.float32(0))
     dy = max(max(boxes[node, 1] - box[4], box[1] - boxes[node, 4]), np.float32(0))
     dz = max(max(boxes[node, 2] - box[5], box[2] - boxes[node, 5]), np.float32(0))
-    squared: np.float32 = dx * dx + dy * dy + dz * dz
-    return squared
+    return dx * dx + dy * dy + dz * dz

@@ -116,8 +116,7 @@ def middle_of(points: np.ndarray, places: np.ndarray, first: int, last: int, box
 @nb.njit(inline="always")
 def _distance(points: np.ndarray, i: int, j: int) -> np.float32:
     dx, dy, dz = points[0, i] - points[0, j], points[1, i] - points[1, j], points[2, i] - points[2, j]
-    distance: np.float32 = np.sqrt(dx * dx + dy * dy + dz * dz)
-    return distance
+    return np.sqrt(dx * dx + dy * dy + dz * dz)
 
 
 @nb.njit(inline="always")
@@ -198,8 +197,7 @@ def _shorten(near: np.ndarray, found: int, k: int) -> np.float32:
             bits[kept] = bits[i]
             kept += 1
     bits[kept:k] = limit
-    largest: np.float32 = near[k - 1]
-    return largest
+    return near[k - 1]
 
 
 @called_by_kernels
@@ -209,8 +207,7 @@ def _smallest_of(near: np.ndarray, found: int, k: int) -> np.int32:
     for i in range(found):
         largest = max(largest, bits[i])
     near[found : LEAF * rows] = FAR
-    smallest: np.int32 = _smallest(bits, rows, k, np.int32(0), largest)
-    return smallest
+    return _smallest(bits, rows, k, np.int32(0), largest)
 
 
 @called_by_kernels

@@ -167,8 +167,7 @@ def share_seen(scene: GaussianScene, view: View, device: str = "cpu") -> np.ndar
     seen = operator.adjoint(drawn)[:, 0]
     full = np.zeros(len(scene), np.float32)
     full[operator.ids] = operator.footprints()
-    share: np.ndarray = np.minimum(np.divide(seen, full, out=np.zeros_like(seen), where=full > 0), 1)
-    return share
+    return np.minimum(np.divide(seen, full, out=np.zeros_like(seen), where=full > 0), 1)
 
 
 def _view(camera: Camera, drawn: np.ndarray, label: int) -> View:

@@ -93,8 +93,7 @@ class ViewModel:
     @cached_property
     def confidence(self) -> np.ndarray:
         """Largest probability of each Gaussian, (N,) float32; 0 where nothing is known."""
-        largest: np.ndarray = self.labelling.probabilities.max(axis=1)
-        return largest
+        return self.labelling.probabilities.max(axis=1)
 
     @property
     def labels_in_use(self) -> list[int]:
@@ -168,8 +167,7 @@ class ViewModel:
         by_class[out] = np.rint(probabilities[out] @ colors[: probabilities.shape[1]])
         # Light and shade stay, as in the overlays.
         grey = self._true_colors.mean(axis=1, keepdims=True, dtype=np.float32)
-        shaded: np.ndarray = np.rint(grey + FILL * (by_class - grey)).astype(np.uint8)
-        return shaded
+        return np.rint(grey + FILL * (by_class - grey)).astype(np.uint8)
 
     @property
     def _palette(self) -> np.ndarray:
@@ -180,8 +178,7 @@ class ViewModel:
 
     @cached_property
     def _true_colors(self) -> np.ndarray:
-        colors: np.ndarray = np.rint(self.scene.colors() * 255).astype(np.uint8)
-        return colors
+        return np.rint(self.scene.colors() * 255).astype(np.uint8)
 
     def _listed(self, label: int) -> int:
         if label not in self.labels_in_use:
@@ -195,8 +192,7 @@ def completed(probabilities: np.ndarray) -> np.ndarray:
     known = probabilities.max(axis=1) > 0
     missing = (probabilities == 0) & (known & (rest > SHARES_TOLERANCE))[:, None]
     share = rest / np.maximum(missing.sum(axis=1), 1)
-    out: np.ndarray = np.where(missing, share[:, None], probabilities).astype(np.float32)
-    return out
+    return np.where(missing, share[:, None], probabilities).astype(np.float32)
 
 
 def ramp(values: np.ndarray) -> np.ndarray:

@@ -88,5 +88,4 @@ class Picture:
     def draw(self, operator: ViewOperator) -> np.ndarray:
         """Render the picture by an operator of the scene, before a black background: (H, W, 3) uint8."""
         image = operator.without(~self.shown).render(self.colors.astype(np.float32) / 255)
-        drawn: np.ndarray = (image * 255 + 0.5).clip(0, 255).astype(np.uint8)
-        return drawn
+        return (image * 255 + 0.5).clip(0, 255).astype(np.uint8)

@@ -98,7 +98,7 @@ def aim_next(tiles: Tiles, e: int, last: int, left: float, top: float, lines: np
     if e + 1 == last:
         return 0
     prefetch(tiles.table, tiles.entries[min(e + AHEAD, last - 1)])
-    return aim(tiles.table, tiles.entries[e + 1], left, top, lines[(e + 1) % 2])  # type: ignore[no-any-return]
+    return aim(tiles.table, tiles.entries[e + 1], left, top, lines[(e + 1) % 2])
 
 
 @called_by_kernels(fastmath={"contract"}, error_model="numpy")

@@ -153,7 +153,7 @@ def _is_decided(values: np.ndarray, b: int, rays: np.ndarray, live: int) -> bool
         second, most = larger(second, smaller(most, value)), larger(most, value)
         known = add_scaled(known, value, np.float32(1))
     ahead = above(add_scaled(most, second, np.float32(-1)), load_row(rays, b), _ROUNDING)
-    return (ahead & above(known, nothing(), np.float32(0.5) + _ROUNDING) | ~live) & OPEN == OPEN  # type: ignore[no-any-return]
+    return (ahead & above(known, nothing(), np.float32(0.5) + _ROUNDING) | ~live) & OPEN == OPEN
 
 
 @called_by_kernels

@@ -44,5 +44,4 @@ def logits_of_bytes(scene: GaussianScene) -> npt.NDArray[np.float32]:
     No pixel shows the difference: alphas end at 0.99, and below 1/255 nothing is drawn.
     """
     opacities = scene.opacities.clip(1 / 255, 254 / 255)
-    logits: npt.NDArray[np.float32] = np.log(opacities / (1 - opacities))
-    return logits
+    return np.log(opacities / (1 - opacities))
