@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from room import DEPTH, SCALE, SHAPES, SIZES, THIN, Room
 
-from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.camera import Camera, pose_looking
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 OBJECTS, GROUND, HORIZON = 0.4, 0.38, 0.2  # shares of the Gaussians; the others float
@@ -101,10 +101,6 @@ def _camera(i: int, count: int, width: int, height: int) -> Camera:
     position = np.array([DISTANCE * np.cos(angle), DISTANCE * np.sin(angle), TURNS[i * len(TURNS) // count]])
     forward = np.array([0.0, 0.0, 0.3]) - position
     forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
+    pose = pose_looking(forward, np.array([0.0, 0, 1]), position)
     K = np.array([[0.75 * width, 0, width / 2], [0, 0.75 * width, height / 2], [0, 0, 1]])
     return Camera(f"view{i:03d}", width, height, K, pose)

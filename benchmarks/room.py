@@ -25,7 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.camera import Camera, pose_looking
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 SIZE = np.array([8.0, 6.0, 2.8])  # m
@@ -95,11 +95,7 @@ def _camera(i: int, count: int, width: int, height: int) -> Camera:
     position = SIZE / 2 + np.array([2.8 * np.cos(angle), 1.9 * np.sin(angle), 0.3])
     target = SIZE / 2 - 0.4 * (position - SIZE / 2) - [0, 0, 0.6]
     forward = (target - position) / np.linalg.norm(target - position)
-    right = np.cross(forward, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
+    pose = pose_looking(forward, np.array([0.0, 0, 1]), position)
     focal = 0.8 * width
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     return Camera(f"view{i:03d}", width, height, K, pose)

@@ -23,7 +23,7 @@ from gsseg_core.align.agreement import Shown, render
 from gsseg_core.align.settings import AlignSettings
 from gsseg_core.align.thinning import thinned
 from gsseg_core.progress import Progress, silent
-from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.camera import Camera, rigid_motion
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 _NAMES = "xyz"
@@ -65,13 +65,9 @@ class Convention:
         """Pose a camera as it was meant."""
         pose = camera.world_to_camera
         if self.inverted:
-            pose = np.eye(4)
-            pose[:3, :3] = camera.world_to_camera[:3, :3].T
-            pose[:3, 3] = camera.center
-        turned = np.eye(4)
-        turned[:3, :3] = self.camera_axes.T @ pose[:3, :3] @ self.world_axes.T
-        turned[:3, 3] = self.camera_axes.T @ pose[:3, 3]
-        return replace(camera, world_to_camera=turned)
+            pose = rigid_motion(pose[:3, :3].T, camera.center)
+        rotation = self.camera_axes.T @ pose[:3, :3] @ self.world_axes.T
+        return replace(camera, world_to_camera=rigid_motion(rotation, self.camera_axes.T @ pose[:3, 3]))
 
     @property
     def parts(self) -> list[str]:

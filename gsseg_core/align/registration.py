@@ -24,7 +24,7 @@ from gsseg_core.align.settings import AlignSettings
 from gsseg_core.data.photos import read_photo
 from gsseg_core.data.view import View, spread
 from gsseg_core.progress import Progress, silent
-from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.camera import Camera, pose_looking
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.similarity import Similarity
 
@@ -94,12 +94,7 @@ def virtual_cameras(scene: GaussianScene, like: Camera, count: int) -> Iterator[
         away, up = rng.normal(size=(2, 3))
         away /= np.linalg.norm(away)
         place = middle + shell * radius * away if shell else rng.uniform(low, high)
-        right = np.cross(away, up)
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3, :3] = right, np.cross(-away, right), -away
-        pose[:3, 3] = -pose[:3, :3] @ place
-        yield replace(like, world_to_camera=pose)
+        yield replace(like, world_to_camera=pose_looking(-away, -up, place))
 
 
 def locate(photos: Sequence[Photo], rendering: Features, settings: AlignSettings) -> dict[int, Located]:

@@ -11,11 +11,8 @@ from gsseg_core.scene.spherical_harmonics import C0, basis
 LAMP = np.array([-0.9, -1.1, 2.9])
 LAMP_COLOR, SKY_COLOR = np.array([1.06, 1.0, 0.90]), np.array([0.96, 1.0, 1.05])
 
-REACH = 0.25
-"""What is further away than this does not darken a place, m."""
-
-RAYS = 10
-"""To the sky from each place; half as many to the lamp."""
+REACH = 0.25  # m; what is farther away does not darken a place
+RAYS = 10  # to the sky from each place; half as many to the lamp
 
 
 def spread(count: int) -> np.ndarray:

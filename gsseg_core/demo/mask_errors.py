@@ -8,12 +8,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-MISSED, SWAPPED = 0.15, 0.10
-"""Probabilities that an object of a view is missed, and that it carries the label of another object of the view."""
-
-EDGE_PX = 3
-"""The outline of each object moves in or out by a whole number of px, all from 0 to this one as likely."""
-
+MISSED, SWAPPED = 0.15, 0.10  # probabilities that an object is missed, and that it gets the label of another one
+EDGE_PX = 3  # the outline of each object moves in or out by 0 to so many whole px, all as likely
 STREAMS = 4
 """Streams of random numbers that a view's map gets, so that one kind of error leaves the draws of the others alone."""
 

@@ -11,8 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-WALL = 0.005
-"""Thickness of a cup's wall and base, in metres."""
+WALL = 0.005  # m, thickness of a cup's wall and base
 
 
 @dataclass(frozen=True)

@@ -24,13 +24,11 @@ from gsseg_core.demo.solids import Cone, dot
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.json_files import write_json
 from gsseg_core.files.run_folder import staged_run
-from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.camera import Camera, pose_looking
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.spherical_harmonics import C0
 
-FLOATER = -1
-"""True label of a Gaussian that belongs to nothing."""
-
+FLOATER = -1  # true label of a Gaussian that belongs to nothing
 WIDTH, HEIGHT, FOCAL = 400, 300, 350.0  # px
 NUM_VIEWS = 36
 TEST_EVERY = 6
@@ -103,11 +101,7 @@ def _make_cameras() -> list[Camera]:
         radius, height = ((0.70, 0.28), (0.52, 0.62))[upper]
         position = target + np.array([radius * np.cos(angle), radius * np.sin(angle), height])
         forward = (target - position) / np.linalg.norm(target - position)
-        right = np.cross(forward, (0, 0, 1))
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3, :3] = right, np.cross(forward, right), forward
-        pose[:3, 3] = -pose[:3, :3] @ position
+        pose = pose_looking(forward, np.array([0.0, 0, 1]), position)
         K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
         cameras.append(Camera(f"{i:04d}", WIDTH, HEIGHT, K, pose))
     return cameras

@@ -21,8 +21,7 @@ from gsseg_core.scene.triangle_mesh import LONE, TriangleMesh
 from gsseg_core.scene.vertices import chosen
 from gsseg_core.segmentation import Segmentation
 
-TOGETHER = "objects"
-"""Stem of the file in which a format keeps the objects of all classes."""
+TOGETHER = "objects"  # stem of the file in which a format keeps the objects of all classes
 _PART = 1 << 15  # vertices that are copied at a time
 
 

@@ -26,9 +26,7 @@ from gsseg_core.segmentation import Segmentation
 HULL, SURFACE, POISSON = "hull", "surface", "poisson"
 KINDS = (HULL, SURFACE, POISSON)
 
-VOXELS = 64
-"""Of a surface, along the longest side of the object."""
-
+VOXELS = 64  # along the longest side of the object
 _MARGIN, _CLOSED, _SAMPLES, _AT_ONCE = 4, 2, 128, 1 << 14
 _ROOM = 16  # voxels around a Poisson surface, whose grid goes on with its other side
 

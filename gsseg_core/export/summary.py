@@ -25,8 +25,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_writers import DEFAULT, check_format, format_of
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 
-PACKAGES = ("gsseg", "numpy", "scipy", "numba")
-"""Those whose versions a report names."""
+PACKAGES = ("gsseg", "numpy", "scipy", "numba")  # those whose versions a report names
 
 
 @dataclass(frozen=True)

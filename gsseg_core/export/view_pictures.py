@@ -24,10 +24,8 @@ from gsseg_core.segmentation import Segmentation
 from gsseg_core.several_at_once import several_at_once
 
 _DIFFERENT = np.array([[0, 0, 0], [230, 40, 40]], np.uint8)
-SavePicture = Callable[[Path, np.ndarray, "str | None"], object]
-"""Writes a picture as `save_png` does, now or later."""
-_LONGEST_NAME = 255
-"""Bytes that file systems take as the name of a file."""
+SavePicture = Callable[[Path, np.ndarray, "str | None"], object]  # writes a picture as `save_png` does, now or later
+_LONGEST_NAME = 255  # bytes of the name of a file, at most, on all file systems
 
 
 def view_file_name(name: str, prefix: str = "") -> str:

@@ -28,17 +28,10 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.quaternions import rotations
 
-CELLS = 160
-"""Cells along the longer side of the view, at most."""
-
-FEATURE_WEIGHTS = (1.0, 0.3)
-"""Of colour and normal, each divided by its standard deviation over the view."""
-
-LEAST, MOST = 0.002, 0.7
-"""A region of a smaller share of the view is noise, and one of a larger share no object."""
-
-Pixel = tuple[int, int]
-"""Row and column."""
+CELLS = 160  # along the longer side of the view, at most
+FEATURE_WEIGHTS = (1.0, 0.3)  # of colour and normal, each divided by its standard deviation over the view
+LEAST, MOST = 0.002, 0.7  # shares of the view: a smaller region is noise, and a larger one no object
+Pixel = tuple[int, int]  # row and column
 
 
 class MergeTree(NamedTuple):

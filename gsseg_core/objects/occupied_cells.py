@@ -11,9 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
-OPAQUE = 0.1
-"""Opacity from which on a Gaussian is solid."""
-
+OPAQUE = 0.1  # opacity from which on a Gaussian is solid
 _MOST_PER_AXIS, _AT_ONCE = 64, 1 << 20
 
 

@@ -37,24 +37,13 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 
-FAR = 3.0
-"""Floaters are so many times farther away than 90 % of the weight."""
-
-TRIM = 0.005
-"""Share of the weight that the box leaves out on each side."""
-
-ENOUGH = 0.999
-"""A turn has to make the rectangle smaller than this part of it; else the axes stay."""
-
-SAMPLE = 2000
-"""An object of more Gaussians is judged by so many of them at most, taken at even steps; that bounds the time."""
-
-_TIED = 1e-9
-"""Areas and volumes that differ by less than this part of them differ by rounding."""
-
+FAR = 3.0  # what is so many times farther away than 90 % of the weight is a floater
+TRIM = 0.005  # share of the weight that the box leaves out on each side
+ENOUGH = 0.999  # a turn has to make the rectangle smaller than this part of it; else the axes stay
+SAMPLE = 2000  # so many Gaussians of an object are looked at, at most, taken at even steps: that bounds the time
+_TIED = 1e-9  # areas and volumes that differ by less than this part of them differ by rounding
 _STEPS, _PASSES, _SIDES = 50, 4, 3
-_SETTLED = 1e-3
-"""The median may move by this part of the largest distance in the last step: it only has to be inside the object."""
+_SETTLED = 1e-3  # the median may still move by this part of the largest distance: it only has to lie inside
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,11 +46,8 @@ from gsseg_core.text import quoted
 
 FORMAT = "gsseg-pick-1"
 
-FAR = 0.04
-"""Evidence against the object, in px, for what lies as far from its middle as its Gaussians do on average."""
-
-GRAPH = GraphSettings(strength=4.0)
-"""How a mask's word spreads: one view says little of each Gaussian, and nothing of most, so neighbours say more."""
+FAR = 0.04  # px of evidence against the object for what lies as far from its middle as its Gaussians do on average
+GRAPH = GraphSettings(strength=4.0)  # one view says little of each Gaussian, so its neighbours say more than usual
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,11 +210,7 @@ def _label_id(label: str, class_names: Mapping[int, str] | None) -> int:
     return int(label)
 
 
-def object_mask(
-    labels: np.ndarray,  # (H, W) int
-    label: int | None,
-    source: str,
-) -> np.ndarray:
+def object_mask(labels: np.ndarray, label: int | None, source: str) -> np.ndarray:  # (H, W) int
     """Make labels for `pick_mask` of the labels of an image, as `read_object_mask` does of a file's.
 
     `source` is what messages call the image.

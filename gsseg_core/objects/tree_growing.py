@@ -30,9 +30,7 @@ from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.objects.association import AssociationSettings
 from gsseg_core.objects.lifted_segments import Lifted, sums
 
-SEVERAL = 3
-"""Views that have to show a part or a whole."""
-
+SEVERAL = 3  # views that have to show a part or a whole
 _CELL, _MOST_CELLS = 8, 256  # Gaussians of a cell; cells of an object, of which a larger one has larger cells
 _ITSELF = 0.5  # IoU above which a segment is a region: it can be so of no other one beside it
 _STEPS = 10  # agreements are told apart by a tenth

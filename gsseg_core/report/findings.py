@@ -13,20 +13,15 @@ from gsseg_core.learn.mask_reliability import ViewCheck, largest_cells
 from gsseg_core.metrics import iou
 from gsseg_core.text import counted
 
-SHOWN = 1 / 2000
-"""A view shows a class that fills at least this share of its checked pixels; less is an edge's blur."""
-
-TRUSTED = 0.7
-"""The page warns of masks with which the other views agree in a smaller share of their pixels, ..."""
-KNOWN_CLASS = 0.5
-"""... and of classes whose IoU with the masks is smaller than this."""
+SHOWN = 1 / 2000  # of its checked pixels a class has at least in a view that shows it; less is an edge's blur
+TRUSTED = 0.7  # the page warns of masks with which the other views agree in a smaller share of their pixels, ...
+KNOWN_CLASS = 0.5  # ... and of classes whose IoU with the masks is smaller than this
 FEW_VIEWS = 3
 NO_OBJECTS = (
     "the masks name none, or contradict each other; expected ids from 1, as 0 is the background and 255 (in masks of "
     "16 bits 65535) unknown; detections of 8 bits are 0 to 255, not 0 and 1"
 )
-NOTED = 5
-"""Names in a warning, at most."""
+NOTED = 5  # names in a warning, at most
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,19 +21,13 @@ from gsseg_core.report.findings import Evidence
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.several_at_once import several_at_once
 
-PICTURE_PX = 480
-"""Views are shrunk to this many pixels a side."""
+PICTURE_PX = 480  # longest side of the views that are shown
 THUMBNAIL_PX = 128
-MARGIN = 0.25
-"""Around the object in a thumbnail, as a share of its size."""
+MARGIN = 0.25  # around the object in a thumbnail, as a share of its size
 SMALLEST_CROP_PX = 32
-ENOUGH = THUMBNAIL_PX**2
-"""Pixels of a class that fill its thumbnail: more of them show no more."""
-CUT = 0.3
-"""What a view in which the margin cuts an object counts, beside one that shows it whole."""
-UNSEEN = 0.5
-"""What a view counts whose image would have to be rendered, beside one whose image is at hand."""
-
+ENOUGH = THUMBNAIL_PX**2  # pixels of a class that fill its thumbnail: more of them show no more
+CUT = 0.3  # what a view in which the margin cuts an object counts, beside one that shows it whole
+UNSEEN = 0.5  # what a view counts whose image would have to be rendered, beside one whose image is at hand
 _AGREE, _DIFFER, _UNKNOWN = (40, 44, 52), (236, 72, 60), (128, 131, 138)
 
 

@@ -13,15 +13,10 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import UNOBSERVED, Segmentation
 
-MOST_GAUSSIANS = 60_000
-"""In the preview; 20 bytes each, a third more as text."""
-FEWEST_OF_CLASS = 200
-"""Gaussians of a class that the preview keeps before it thins the class out."""
-CORE = 0.01
-"""Share of the Gaussians at either end of each axis that does not count for where the scene lies."""
-LARGEST_GROWTH = 3.0
-"""So many times larger at most does a Gaussian become that stands for others."""
-
+MOST_GAUSSIANS = 60_000  # of the preview; 20 bytes each, a third more as text
+FEWEST_OF_CLASS = 200  # Gaussians of a class that are kept before the class is thinned out
+CORE = 0.01  # share of the Gaussians at either end of each axis that do not count for where the scene lies
+LARGEST_GROWTH = 3.0  # factor by which a Gaussian that stands for others becomes larger, at most
 RECORD = np.dtype(
     [
         ("position", "<u2", 3), ("label", "<u2"), ("quat", "i1", 4), ("scale", "u1", 3), ("opacity", "u1"),

@@ -18,17 +18,12 @@ from gsseg_core.report.preview import look_from, make_preview, up_of
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 
-LOOKS = 8
-"""Views from which the preview can be looked at."""
-POSTER_PX = 640
-"""Most px a side of the picture that is there until the preview is."""
-MOST_THUMBNAILS = 200
-"""Classes with a picture, those with the most Gaussians: the page should stay small."""
-MANY = 15
-"""More classes than this are listed in small rows, so that 40 fit on a screen."""
+LOOKS = 8  # views from which the preview can be looked at
+POSTER_PX = 640  # longest side of the picture that is there until the preview is
+MOST_THUMBNAILS = 200  # classes with a picture, those with the most Gaussians: the page should stay small
+MANY = 15  # more classes than this are listed in small rows, so that 40 fit on a screen
 BINS = 25
-MATRIX_CLASSES = 24
-"""The matrix shows this many of the classes that are confused most."""
+MATRIX_CLASSES = 24  # the matrix shows so many of the classes that are confused most
 PAIRS = 10
 WORST = 8
 

@@ -165,14 +165,30 @@ class Camera:
         return ""
 
 
+def rigid_motion(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> npt.NDArray[np.float64]:  # (3, 3), (3,)
+    """Put a rotation and a translation together, (4, 4)."""
+    motion = np.eye(4)
+    motion[:3, :3], motion[:3, 3] = rotation, translation
+    return motion
+
+
+def pose_looking(
+    forward: npt.NDArray[np.float64], up: npt.NDArray[np.float64], position: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """World-to-camera (4, 4) of a camera at a position (3,) that looks along a unit vector (3,); `up` (3,) is above."""
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return rigid_motion(rotation, -rotation @ position)
+
+
 def undistorted_camera(
     image: str,
     undistortion: Undistortion,
     world_to_lens: npt.NDArray[np.float64],  # (4, 4)
 ) -> Camera:
     """Make the camera of a pinhole view of an image that was taken by a lens from a pose."""
-    lens_to_view = np.eye(4)
-    lens_to_view[:3, :3] = np.reshape(undistortion.rotation, (3, 3)).T
+    lens_to_view = rigid_motion(np.reshape(undistortion.rotation, (3, 3)).T, np.zeros(3))
     name = f"{image}_{undistortion.face}" if undistortion.face else image
     with np.errstate(all="ignore"):  # A camera refuses what is NaN or too large.
         pose = lens_to_view @ world_to_lens

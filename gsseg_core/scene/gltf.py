@@ -18,6 +18,7 @@ from gsseg_core.errors import SceneFileError
 from gsseg_core.files.input_files import open_input, reason
 from gsseg_core.files.limits import LIMITS
 from gsseg_core.files.npz_files import UnfitError
+from gsseg_core.scene.camera import rigid_motion
 from gsseg_core.scene.moving import move
 from gsseg_core.scene.quaternions import rotations
 from gsseg_core.scene.scene_file import check_count, check_size, open_scene, size_of
@@ -207,7 +208,5 @@ def _matrix(node: Any) -> npt.NDArray[np.float64]:
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
     x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotations(np.array([[w, x, y, z]]))[0] * np.array(node.get("scale", (1, 1, 1)), np.float64)
-    matrix[:3, 3] = node.get("translation", (0, 0, 0))
-    return matrix
+    axes = rotations(np.array([[w, x, y, z]]))[0] * np.array(node.get("scale", (1, 1, 1)), np.float64)
+    return rigid_motion(axes, node.get("translation", (0, 0, 0)))

@@ -18,8 +18,7 @@ from gsseg_core.scene.scene_ids import with_ids
 from gsseg_core.scene.similarity import Similarity
 from gsseg_core.scene.vertices import MEANS, QUATS, SCALES, chosen, columns, put, rest_of
 
-IDENTITY = Similarity()
-"""The frame of the scene, and of a group that has not moved."""
+IDENTITY = Similarity()  # the frame of the scene, and of a group that has not moved
 
 
 def is_identity(frame: Similarity) -> bool:
@@ -43,11 +42,7 @@ def is_same(one: Similarity, other: Similarity) -> bool:
     )
 
 
-def moved_geometry(
-    scene: GaussianScene,
-    which: npt.NDArray[np.bool_],  # (N,)
-    frame: Similarity,
-) -> GaussianScene:
+def moved_geometry(scene: GaussianScene, which: npt.NDArray[np.bool_], frame: Similarity) -> GaussianScene:  # (N,)
     """Move some Gaussians from a frame to the one that it lies in; their vertices, and so colours, are not moved."""
     means, quats, scales = scene.means.copy(), scene.quats.copy(), scene.scales.copy()
     means[which] = _points(means[which], frame)

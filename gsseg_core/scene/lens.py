@@ -21,8 +21,7 @@ _PROFILE_STEPS = 4096
 _WIDEST_PERSPECTIVE = math.radians(89)
 _NEWTON_STEPS = 12
 _DIFFERENCE = 1e-6
-_CHECKED = 17
-"""Columns, and rows, of pixels whose rays are found to see whether a lens can be undone."""
+_CHECKED = 17  # columns, and rows, of pixels whose rays are found to see whether a lens can be undone
 _TOLERANCE_PX = 1e-3
 
 
@@ -132,10 +131,7 @@ class Lens:
         """Angle to the optical axis, in radians, up to which a ray lands the farther out the larger its angle is."""
         return float(_profile(self)[0][-1])
 
-    def project(
-        self,
-        rays: Floats,  # (..., 3)
-    ) -> Floats:
+    def project(self, rays: Floats) -> Floats:  # (..., 3)
         """Find the pixels (..., 2) in which rays of any length land; NaN for those beyond the lens's reach."""
         x, y, z = rays[..., 0], rays[..., 1], rays[..., 2]
         if self.model.projection is Projection.PANORAMA:
@@ -148,10 +144,7 @@ class Lens:
             landed = self._distorted(rays[..., :2] * scale[..., None])
         return np.where((angle <= self.reach)[..., None], landed * self.focal + self.principal, np.nan)
 
-    def rays(
-        self,
-        pixels: Floats,  # (..., 2)
-    ) -> Floats:
+    def rays(self, pixels: Floats) -> Floats:  # (..., 2)
         """Find the rays (..., 3) of length 1 that land in pixels, by Newton's method; NaN where none does."""
         if self.model.projection is Projection.PANORAMA:
             turn, fall = np.moveaxis((pixels / (self.width, self.height) - 0.5) * (2 * np.pi, np.pi), -1, 0)
@@ -178,10 +171,7 @@ class Lens:
         above, below = (ks[:3], ks[3:]) if self.model.rational else (ks[:4], [])
         return np.polyval([*above[::-1], 1.0], squared) / np.polyval([*below[::-1], 1.0], squared)
 
-    def _distorted(
-        self,
-        place: Floats,  # (..., 2)
-    ) -> Floats:
+    def _distorted(self, place: Floats) -> Floats:  # (..., 2)
         u, v = place[..., 0], place[..., 1]
         p1, p2, s1, s2 = (self._named.get(name, 0.0) for name in ("p1", "p2", "sx1", "sy1"))
         squared, q = u * u + v * v, self._radial(u * u + v * v)
@@ -189,10 +179,7 @@ class Lens:
         dv = 2 * p2 * u * v + p1 * (squared + 2 * v * v) + s2 * squared
         return np.stack([u * q + du, v * q + dv], axis=-1)
 
-    def _undistorted(
-        self,
-        wanted: Floats,  # (..., 2)
-    ) -> Floats:
+    def _undistorted(self, wanted: Floats) -> Floats:  # (..., 2)
         angles, radii = _profile(self)
         out = np.hypot(wanted[..., 0], wanted[..., 1])
         start = self._spread(np.interp(out, radii, angles))

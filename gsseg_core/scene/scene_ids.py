@@ -9,8 +9,7 @@ import numpy.typing as npt
 
 from gsseg_core.errors import SceneDeltaError, SceneValueError
 
-LOW, HIGH = "id_low", "id_high"
-"""Properties uint of a vertex: the lower and the upper half of its id."""
+LOW, HIGH = "id_low", "id_high"  # properties uint of a vertex: the lower and the upper half of its id
 
 
 def read_ids(vertices: npt.NDArray[np.void], source: str) -> npt.NDArray[np.int64] | None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.camera import Camera, rigid_motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,9 +35,8 @@ class Similarity:
 
     def camera(self, camera: Camera) -> Camera:
         """Move a camera of the first frame to the second; what it sees of moved points is what it saw of the points."""
-        pose = np.eye(4)
-        pose[:3, :3] = camera.world_to_camera[:3, :3] @ self.rotation.T
-        pose[:3, 3] = -pose[:3, :3] @ self.points(camera.center)
+        rotation = camera.world_to_camera[:3, :3] @ self.rotation.T
+        pose = rigid_motion(rotation, -rotation @ self.points(camera.center))
         return replace(camera, world_to_camera=pose)
 
     def after(self, first: Similarity) -> Similarity:

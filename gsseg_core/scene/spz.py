@@ -40,8 +40,7 @@ _SYSTEMS = (
 # Each direction in the axes of a PLY: right, down, front.
 _AXES = {"R": (1, 0, 0), "L": (-1, 0, 0), "D": (0, 1, 0), "U": (0, -1, 0), "F": (0, 0, 1), "B": (0, 0, -1)}
 
-Read = Callable[[int], bytes]
-"""Reads so many bytes of an attribute, or fewer where it ends."""
+Read = Callable[[int], bytes]  # reads so many bytes of an attribute, or fewer where it ends
 
 
 class _Header(NamedTuple):

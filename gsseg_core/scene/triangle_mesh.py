@@ -11,8 +11,7 @@ import numpy.typing as npt
 
 from gsseg_core.files.atomic import write_atomically
 
-LONE = "# gsseg\n"
-"""First line of an OBJ that belongs to no run."""
+LONE = "# gsseg\n"  # first line of an OBJ that belongs to no run
 
 
 class TriangleMesh(NamedTuple):

@@ -15,11 +15,8 @@ from gsseg_core.errors import IntrinsicsError, MaskSizeError
 from gsseg_core.files.input_files import check_pixels
 from gsseg_core.scene.lens import Lens, Projection
 
-WIDEST = math.radians(60)
-"""How far a pinhole view reaches to each side; beyond, pixels grow without bound."""
-GROWTH = (0.5, 2.0)
-"""Sizes that a view may have, as multiples of its image's; no real lens comes near."""
-
+WIDEST = math.radians(60)  # how far a pinhole view reaches to each side; beyond, pixels grow without bound
+GROWTH = (0.5, 2.0)  # sizes that a view may have, as multiples of its image's; no real lens comes near
 _AS_IT_IS = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _FACES = {
     "front": _AS_IT_IS,

@@ -22,11 +22,7 @@ MIXED = np.int32(-(2**31))  # stands for the label of a node whose points have s
 NOBODY = MIXED + 1  # the label of no point
 
 
-def class_distances(
-    neighbours: Neighbours,
-    labels: np.ndarray,  # (N,) int
-    num_classes: int,
-) -> np.ndarray:
+def class_distances(neighbours: Neighbours, labels: np.ndarray, num_classes: int) -> np.ndarray:  # (N,) int
     """Mean distance to the k nearest others of the same class, or to all of them if there are not as many: (N,).
 
     Returns

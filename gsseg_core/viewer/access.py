@@ -22,12 +22,8 @@ from urllib.parse import parse_qs, urlsplit
 from gsseg_core.errors import SettingsError
 from gsseg_core.text import printable
 
-PATIENCE = 5.0
-"""Most seconds to find out what the name of a host means."""
-
-MOST_TRIED = 1000
-"""Ports that are tried, one after the other."""
-
+PATIENCE = 5.0  # seconds to find out what the name of a host means, at most
+MOST_TRIED = 1000  # ports that are tried, one after the other
 _LOOPBACK_NAMES = ("localhost", "127.0.0.1", "[::1]")
 _HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(:[0-9]{1,5})?")
 
@@ -37,8 +33,7 @@ _WHY_NOT = {
     errno.EACCES: "that is not allowed; expected a port above 1023, see --port",
 }
 
-HeaderValues = Callable[[str], Sequence[str]]
-"""All values of a header in a request, by its name."""
+HeaderValues = Callable[[str], Sequence[str]]  # all values of a header in a request, by its name
 
 
 class Listener:

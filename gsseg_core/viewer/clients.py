@@ -19,21 +19,11 @@ from gsseg_core.viewer.server_frames import Frames
 from gsseg_core.viewer.splats import SplatNodes, Splats
 
 AUTO, BROWSER, SERVER = "auto", "browser", "server"
-DRAWN_BY = (AUTO, BROWSER, SERVER)
-"""Who draws: each browser, this program, or whoever is faster."""
-
-SLOW = 0.3
-"""Seconds more that splats may take a browser than a picture without them."""
-
-_TRIAL, _TRIAL_SIZE = 2500, 0.1
-"""Splats of the trial, and their standard deviation as a part of half the picture's height."""
-
-_FAINT = 2
-"""Opacity of the trial, of 255: it is drawn like all others, and hardly seen."""
-
-NOTICE: float | None = 8.0
-"""Seconds for which a browser is told why it gets images; None leaves that to whoever reads it."""
-
+DRAWN_BY = (AUTO, BROWSER, SERVER)  # who draws: each browser, this program, or whoever is faster
+SLOW = 0.3  # seconds more that splats may take a browser than a picture without them
+_TRIAL, _TRIAL_SIZE = 2500, 0.1  # splats of the trial, and their standard deviation in halves of the picture's height
+_FAINT = 2  # opacity of the trial, of 255: it is drawn like all others, and hardly seen
+NOTICE: float | None = 8.0  # seconds for which a browser is told why it gets images; None: until closed
 _PATIENCE = 60.0
 _SMALL = (48, 64)
 

@@ -20,8 +20,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED
 from gsseg_core.viewer.model import Labelling
 
-TRUST = 4.0
-"""A correction that sees the whole of a Gaussian weighs as much as so many times all that was learnt before."""
+TRUST = 4.0  # a correction that sees a whole Gaussian weighs so many times as much as all that was learnt before
 
 
 def disc(camera: Camera, column: float, row: float, radius: float, label: int) -> View:

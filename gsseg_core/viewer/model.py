@@ -20,12 +20,8 @@ from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 TRUE_COLOURS, BY_CLASS, BY_CONFIDENCE, BY_RELIABILITY = "true colours", "class", "confidence", "view reliability"
 MODES = (TRUE_COLOURS, BY_CLASS, BY_CONFIDENCE, BY_RELIABILITY)
 
-NO_CLASS = {UNOBSERVED: "(unobserved)", REMOVED: "(taken out by refinement)"}
-"""What the list of classes calls the labels that are no class."""
-
-NOTHING_KNOWN = (120, 120, 120)
-"""Colour of Gaussians without a value in the present mode."""
-
+NO_CLASS = {UNOBSERVED: "(unobserved)", REMOVED: "(taken out by refinement)"}  # names of labels that are no class
+NOTHING_KNOWN = (120, 120, 120)  # colour of Gaussians without a value in the present mode
 # From bad to good: dark red, orange, pale yellow, green, dark green; it can be told apart without seeing red and green,
 # since brightness rises to the middle and the ends differ in blue.
 _RAMP = np.array([(122, 1, 30), (230, 120, 40), (250, 230, 140), (90, 180, 140), (0, 90, 130)], np.float32)

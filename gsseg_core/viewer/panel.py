@@ -29,15 +29,9 @@ from gsseg_core.viewer.picture import BANDS
 from gsseg_core.viewer.state import ViewerState
 from gsseg_core.viewer.viewpoint import Viewpoint
 
-MOST_CLASSES, MOST_VIEWS = 5, 8
-"""Of the probabilities and votes that the answer to a click names."""
-
-LONGEST_NAME = 80
-"""Characters of a name; of a longer one, the first."""
-
-NOTICE: float | None = 10.0
-"""Seconds for which a browser is told of an error beside the answer; None leaves that to whoever reads it."""
-
+MOST_CLASSES, MOST_VIEWS = 5, 8  # of the probabilities and votes that the answer to a click names
+LONGEST_NAME = 80  # characters of a name; of a longer one, the first
+NOTICE: float | None = 10.0  # seconds for which a browser is told of an error beside the answer; None: until closed
 SWITCH, ONLY, REMOVE = "switch it on or off", "only this", "remove"
 REGION, DISC, ALIKE = "the whole region", "a disc", "all that looks alike there"
 _OFF = (73, 80, 87)

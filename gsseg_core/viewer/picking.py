@@ -10,7 +10,7 @@ import numpy as np
 from gsseg_core.data.view import View
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.camera import Camera, pose_looking
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 _WINDOW = 3
@@ -55,11 +55,7 @@ def pick(
         None where the ray meets nothing.
     """
     forward = np.asarray(direction, np.float64) / np.linalg.norm(direction)
-    right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
-    pose[:3, 3] = -pose[:3, :3] @ np.asarray(origin, np.float64)
+    pose = pose_looking(forward, np.eye(3)[np.argmin(np.abs(forward))], np.asarray(origin, np.float64))
     K = np.array([[focal, 0, _WINDOW / 2], [0, focal, _WINDOW / 2], [0, 0, 1]])
     operator = make_operator(scene, Camera("click", _WINDOW, _WINDOW, K, pose), device)
     if shown is not None:

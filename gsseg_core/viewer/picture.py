@@ -18,14 +18,9 @@ import numpy as np
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
-BANDS = 20
-"""Marks of the slider for confidence; nodes are cut there, as far as `MAX_NODES` allows."""
-
-MAX_NODES = 600
-"""A node takes three texels of one row of a texture, and WebGL 2 promises no more than 2,048."""
-
-Key = tuple[int, int]
-"""Label and band of a node."""
+BANDS = 20  # marks of the slider for confidence; nodes are cut there, as far as `MAX_NODES` allows
+MAX_NODES = 600  # a node takes three texels of one row of a texture, and WebGL 2 promises no more than 2,048
+Key = tuple[int, int]  # label and band of a node
 
 
 class Node(NamedTuple):

@@ -27,15 +27,9 @@ from websockets.typing import Data
 from gsseg_core.errors import SettingsError
 from gsseg_core.viewer.access import Listener
 
-MOST_BYTES = 2**20
-"""Of one message from a browser; the largest is a small picture."""
-
-LARGEST_WINDOW = 2**14
-"""Most pixels of a browser's picture, each way."""
-
-PATIENCE = 60.0
-"""Seconds for a browser to say what it wants, once it is connected, and to show that it is still there."""
-
+MOST_BYTES = 2**20  # of one message from a browser; the largest is a small picture
+LARGEST_WINDOW = 2**14  # pixels of a browser's picture, each way, at most
+PATIENCE = 60.0  # seconds for a browser to say what it wants once it is connected, and to show that it is still there
 _LARGEST_NUMBER, _LONGEST_TEXT = 1e9, 1000
 
 _HEARD = ("ViewerCameraMessage", "ScenePointerMessage", "GuiUpdateMessage", "GetRenderResponseMessage")

@@ -15,12 +15,8 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.viewer.picture import Picture
 from gsseg_core.viewer.viewpoint import camera_of
 
-FINE_ROWS, QUICK_ROWS = 720, 320
-"""Most rows of an image once nothing changes any more, and until then."""
-
-RESTS = 0.2
-"""Seconds without a change after which an image is drawn finely."""
-
+FINE_ROWS, QUICK_ROWS = 720, 320  # rows of an image, at most, once nothing changes any more, and until then
+RESTS = 0.2  # seconds without a change after which an image is drawn finely
 _QUALITY = 90
 
 

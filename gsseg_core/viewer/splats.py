@@ -11,8 +11,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.quaternions import covariances
 from gsseg_core.viewer.picture import Key, Node
 
-_LARGEST = 200.0
-"""The largest standard deviation is sent as this many units: its square fits a 16-bit float, and so do small ones."""
+_LARGEST = 200.0  # units of the largest standard deviation: its square fits a 16-bit float, and so do small ones
 
 
 class Splats:

@@ -23,8 +23,7 @@ from gsseg_core.viewer.server import start_server
 from gsseg_core.viewer.state import ViewerState
 from gsseg_core.viewer.viewpoint import Viewpoint, camera_of
 
-DRAWING_HEIGHT = 480
-"""Most rows of the image in which a correction is drawn; finer than the Gaussians is of no use."""
+DRAWING_HEIGHT = 480  # rows of the image in which a correction is drawn; finer than the Gaussians is of no use
 
 
 class Viewer:

@@ -10,7 +10,7 @@ from gsseg_core.data.view import View
 from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.export.view_pictures import background_image
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.camera import Camera, rigid_motion
 from gsseg_core.viewer.state import ViewerState
 
 _OVERLAY_DISTANCE = 0.02
@@ -87,8 +87,7 @@ def camera_of(client: viser.ClientHandle, most_rows: int | None = None) -> Camer
     height = seen.image_height if most_rows is None else min(seen.image_height, most_rows)
     width = max(round(height * seen.aspect), 1)
     focal = height / (2 * np.tan(seen.fov / 2))
-    pose: np.ndarray = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = vtf.SO3(seen.wxyz).as_matrix(), seen.position
+    pose: np.ndarray = rigid_motion(vtf.SO3(seen.wxyz).as_matrix(), seen.position)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     return Camera("viewer", width, height, K, np.linalg.inv(pose))
 

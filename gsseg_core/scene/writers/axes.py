@@ -15,9 +15,7 @@ import numpy.typing as npt
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.spherical_harmonics import basis
 
-HALF_TURN_X, HALF_TURN_Z = (1, -1, -1), (-1, -1, 1)
-"""Signs of x, y, z after half a turn about x or z."""
-
+HALF_TURN_X, HALF_TURN_Z = (1, -1, -1), (-1, -1, 1)  # signs of x, y, z after half a turn about x or z
 _GENERIC = np.array([[0.36, 0.48, 0.8]])
 """A unit direction in which none of the harmonics is zero."""
 

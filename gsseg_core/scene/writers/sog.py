@@ -19,9 +19,7 @@ from PIL import Image
 
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
-LARGEST_PALETTE = 1 << 16
-"""Entries of the palette of harmonics; a scene of no more Gaussians loses nothing by it."""
-
+LARGEST_PALETTE = 1 << 16  # entries of the palette of harmonics; a scene of no more Gaussians loses nothing by it
 _PER_ROW = 64  # entries of the palette of harmonics in a row of its image
 _COARSE, _STEPS = 256, 2  # clusters that the palette is divided into, and steps of k-means
 _AT_ONCE = 1 << 12
@@ -104,9 +102,7 @@ def _smallest_three(quats: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:  #
     return np.concatenate([coded, 252 + largest], axis=1).astype(np.uint8)
 
 
-def _palette(
-    values: npt.NDArray[np.float32],  # (N, D)
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
+def _palette(values: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:  # (N, D)
     """Entries (K, D) that stand for all values, and which of them stands for each, (N,).
 
     K-means of two levels: a few coarse clusters, and in each of them as many entries as fit its size. That compares

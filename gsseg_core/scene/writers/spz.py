@@ -13,8 +13,7 @@ from gsseg_core.errors import SceneValueError
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.writers.axes import HALF_TURN_X, logits_of_bytes, turned
 
-_LARGEST = 2**23 - 1
-"""Positions are numbers of 24 bits, of which so many are fractions as there is room for."""
+_LARGEST = 2**23 - 1  # positions are 24-bit numbers, with as many fractional bits as there is room for
 
 
 def write_spz(path: Path, scene: GaussianScene, run: str | None) -> None:

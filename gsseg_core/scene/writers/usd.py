@@ -23,11 +23,8 @@ from gsseg_core.scene.scene_writers import SceneObject
 from gsseg_core.scene.triangle_mesh import TriangleMesh
 from gsseg_core.text import one_line, printable
 
-TAXONOMY = "class"
-"""Of the semantic labels."""
-
-_REACH = 3.0
-"""Standard deviations of a Gaussian that count for the extent of an object."""
+TAXONOMY = "class"  # of the semantic labels
+_REACH = 3.0  # standard deviations of a Gaussian that count for the extent of an object
 
 
 def write_usd(path: Path, objects: Sequence[SceneObject], run: str | None) -> None:
