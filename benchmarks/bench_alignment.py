@@ -19,8 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsseg_core.align.alignment import Alignment
-from gsseg_core.align.conventions import AXIS_ROTATIONS, OPENGL, Convention
+from gsseg_core.align.conventions import AXIS_ROTATIONS, OPENGL, Alignment, Convention
 from gsseg_core.align.placing import find_alignment
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.errors import AlignmentError

@@ -22,7 +22,6 @@ from PIL import Image
 from scipy import ndimage
 
 from gsseg_core.align.settings import AlignSettings
-from gsseg_core.align.thinning import thinned
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.photos import read_photo
 from gsseg_core.data.view import View, spread
@@ -131,6 +130,22 @@ def agreement(
     disagrees, agrees = settings.photo_margins if photos else settings.mask_margins
     verdict = True if score - chance >= agrees else False if score - chance < disagrees else None
     return Agreement("photos" if photos else "masks", len(shown), score, chance, verdict)
+
+
+def thinned(scene: GaussianScene, most: int) -> GaussianScene:
+    """Draw `most` Gaussians of a scene at random, always the same, and make up for the others; fewer stay as they are.
+
+    Of N Gaussians, each of those drawn stands for k = N / most. It covers sqrt(k) times its area, and within it lets
+    through what sqrt(k) of its kind would let through one behind the other: 1 - (1 - opacity)^sqrt(k). Area alone would
+    blur, and opacity alone leave holes.
+    """
+    if len(scene) <= most:
+        return scene
+    part = scene.subset(np.sort(np.random.default_rng(0).permutation(len(scene))[:most]))
+    share = (len(scene) / most) ** 0.5
+    opacities = 1 - (1 - part.opacities.astype(np.float64)) ** share
+    below_one = np.minimum(opacities, np.nextafter(np.float32(1), np.float32(0))).astype(np.float32)
+    return replace(part, scales=part.scales * np.float32(share**0.5), opacities=below_one)
 
 
 def render(scene: GaussianScene, camera: Camera, device: str = "cpu") -> Rendered:

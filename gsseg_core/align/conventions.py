@@ -16,15 +16,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import permutations, product
+from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from gsseg_core.align.agreement import Shown, render
+from gsseg_core.align.agreement import Shown, render, thinned
 from gsseg_core.align.settings import AlignSettings
-from gsseg_core.align.thinning import thinned
 from gsseg_core.progress import Progress, silent
 from gsseg_core.scene.camera import Camera, rigid_motion
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.similarity import Similarity
 
 _NAMES = "xyz"
 _QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # about the optical axis
@@ -80,6 +82,43 @@ class Convention:
         if not np.array_equal(self.world_axes, np.eye(3)):
             parts.append(f"x, y, z of the cameras' world are {', '.join(_named(self.world_axes))} of the scene")
         return parts
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """Poses of a dataset's cameras in a scene: how they are to be understood, and then where their frame lies."""
+
+    convention: Convention = field(default_factory=Convention)  # how poses are to be understood
+    similarity: Similarity = field(default_factory=Similarity)  # from the frame that they are then in to the scene's
+
+    def camera(self, camera: Camera) -> Camera:
+        """Pose a camera of the dataset in the scene."""
+        return self.similarity.camera(self.convention.camera(camera))
+
+    @property
+    def parts(self) -> list[str]:
+        """What was found, for people; nothing where cameras are in the scene's frame as they are."""
+        found, parts = self.similarity, self.convention.parts
+        turn = Rotation.from_matrix(found.rotation).as_rotvec(degrees=True)
+        if abs(found.scale - 1) > 1e-9:
+            parts.append(f"scale {found.scale:.6g}")
+        if (angle := float(np.linalg.norm(turn))) > 1e-6:
+            axis = ", ".join(f"{part:.4f}" for part in turn / angle)
+            parts.append(f"rotation by {angle:.4g} degrees about ({axis})")
+        if np.abs(found.translation).max() > 1e-9:
+            parts.append(f"translation ({', '.join(f'{part:.6g}' for part in found.translation)})")
+        return parts
+
+    def as_dict(self) -> dict[str, Any]:
+        """Give it as `report.json` does; rotations and axes are 3 x 3, row by row."""
+        return {
+            "inverted": self.convention.inverted,
+            "world_axes": self.convention.world_axes.tolist(),
+            "camera_axes": self.convention.camera_axes.tolist(),
+            "scale": self.similarity.scale,
+            "rotation": self.similarity.rotation.tolist(),
+            "translation": self.similarity.translation.tolist(),
+        }
 
 
 def find_convention(

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsseg_core.align.agreement import Agreement, Shown, agreement, look_at
-from gsseg_core.align.alignment import Alignment
-from gsseg_core.align.conventions import find_convention
+from gsseg_core.align.conventions import Alignment, find_convention
 from gsseg_core.align.settings import AlignSettings
 from gsseg_core.data.camera_files import frame_of_training
 from gsseg_core.data.camera_formats.dataparser import DATAPARSER

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from gsseg_core.align.alignment import Alignment
+from gsseg_core.align.conventions import Alignment
 from gsseg_core.align.features import Extractor, matches
 from gsseg_core.align.registration import Photo
 from gsseg_core.align.settings import AlignSettings

@@ -17,8 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from gsseg_core.align.alignment import Alignment
-from gsseg_core.align.conventions import AXIS_ROTATIONS, Convention
+from gsseg_core.align.conventions import AXIS_ROTATIONS, Alignment, Convention
 from gsseg_core.align.features import Extractor, Features, at_most, matches
 from gsseg_core.align.settings import AlignSettings
 from gsseg_core.data.photos import read_photo

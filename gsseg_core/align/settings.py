@@ -15,7 +15,7 @@ class AlignSettings:
 
     views: int = 6  # that are compared with the scene, spread evenly over the dataset
     picture_px: int = 96  # longer side of the pictures that are compared, in px
-    gaussians: int = 1 << 17  # of which they are rendered, at most; see `gsseg_core.align.thinning`
+    gaussians: int = 1 << 17  # of which they are rendered, at most; see `gsseg_core.align.agreement.thinned`
     photo_margins: tuple[float, float] = (0.1, 0.35)  # where photos are compared; scores are 0 to 1
     mask_margins: tuple[float, float] = (0.03, 0.1)  # where masks are
     survivors: float = 0.25  # share of the conventions that go on to the next view, after each view

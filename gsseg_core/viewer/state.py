@@ -22,8 +22,7 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.scene_writers import SCENE_WRITERS, check_format
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 from gsseg_core.viewer.corrections import Corrections
-from gsseg_core.viewer.levels import at_level
-from gsseg_core.viewer.model import BY_RELIABILITY, MODES, ClassRow, Labelling, ViewModel, completed
+from gsseg_core.viewer.model import BY_RELIABILITY, MODES, ClassRow, Labelling, ViewModel, at_level, completed
 from gsseg_core.viewer.picking import ViewVotes
 from gsseg_core.viewer.picture import Picture, cut
 

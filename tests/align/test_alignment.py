@@ -15,13 +15,12 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from gsseg_core.align import conventions, placing
-from gsseg_core.align.agreement import Agreement, agreement, look_at, render
+from gsseg_core.align.agreement import Agreement, agreement, look_at, render, thinned
 from gsseg_core.align.conventions import AXIS_ROTATIONS, OPENGL, Convention
 from gsseg_core.align.features import Extractor, Features
 from gsseg_core.align.placing import Found, find_alignment, place
 from gsseg_core.align.registration import Located, Photo, fit_poses
 from gsseg_core.align.settings import AlignSettings
-from gsseg_core.align.thinning import thinned
 from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View, spread
