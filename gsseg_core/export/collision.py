@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.errors import SettingsError
-from gsseg_core.export.poisson_surface import Voxels, poisson_surface
+from gsseg_core.export.poisson_surface import Voxels, poisson_surface, sphere
 from gsseg_core.objects.occupied_cells import OPAQUE
 from gsseg_core.objects.oriented_boxes import without_floaters
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -147,12 +147,9 @@ def _filled(
 
 
 def _ball(count: int) -> npt.NDArray[np.float32]:
-    """Points (count, 3) spread evenly over the unit ball: on a Fibonacci spiral, at radii in a fixed random order."""
-    k = np.arange(count) + 0.5
-    z, turn = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
-    across, radius = np.sqrt(1 - z * z), (np.random.default_rng(0).permutation(k) / count) ** (1 / 3)
-    points = np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1) * radius[:, None]
-    return np.asarray(points, np.float32)
+    """Points (count, 3) spread evenly over the unit ball: directions that are, at radii in a fixed random order."""
+    radius = (np.random.default_rng(0).permutation(np.arange(count) + 0.5) / count) ** (1 / 3)
+    return (sphere(count) * radius[:, None]).astype(np.float32)
 
 
 _BALL = _ball(_SAMPLES)

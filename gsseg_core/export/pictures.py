@@ -129,7 +129,7 @@ def contact_sheet(images: Sequence[np.ndarray], captions: Sequence[str], columns
         Pictures in a row.
     """
     gap, text = 12, 14
-    images = [_shrunk(image) for image in images]
+    images = [shrunk(image, CELL_PX) for image in images]
     height, width = np.max([image.shape[:2] for image in images], axis=0).tolist()
     columns = min(columns, len(images))
     rows = -(-len(images) // columns)
@@ -200,12 +200,10 @@ def outline(labels: np.ndarray) -> np.ndarray:
     return border
 
 
-def _shrunk(image: np.ndarray) -> np.ndarray:  # (H, W, 3) uint8
-    """Shrink a picture so that neither side is longer than `CELL_PX`."""
-    if max(image.shape[:2]) <= CELL_PX:
-        return image
+def shrunk(image: np.ndarray, px: int) -> np.ndarray:  # (H, W, 3) uint8
+    """Shrink a picture so that neither side is longer than so many px."""
     picture = Image.fromarray(image)
-    picture.thumbnail((CELL_PX, CELL_PX), Image.Resampling.BOX)
+    picture.thumbnail((px, px), Image.Resampling.BOX)
     return np.asarray(picture)
 
 

@@ -95,7 +95,7 @@ def _normals(
     """Find unit normals (M, 3), outwards; 0 of a Gaussian that is seen from nowhere."""
     solid = (np.argwhere(voxels.filled) - voxels.margin + 0.5) * voxels.size + voxels.low
     cell, free = 1.5 * voxels.size, np.zeros(means.shape)
-    for direction in _sphere():
+    for direction in sphere(_DIRECTIONS):
         across = np.linalg.svd(direction[None])[2][1:]  # (2, 3)
         pixel, own = (np.floor(points @ across.T / cell).astype(np.int64) for points in (solid, means))
         pixel, own = pixel - pixel.min(axis=0), np.clip(own - pixel.min(axis=0), 0, np.ptp(pixel, axis=0))
@@ -124,10 +124,10 @@ def _potential(field: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:  # (3
     return fft.irfftn(solved, shape)
 
 
-def _sphere() -> npt.NDArray[np.float64]:
-    """Directions (D, 3) spread evenly, on a Fibonacci spiral."""
-    i = np.arange(_DIRECTIONS) + 0.5
-    z, turn = 1 - 2 * i / _DIRECTIONS, np.pi * (1 + 5**0.5) * i
+def sphere(count: int) -> npt.NDArray[np.float64]:
+    """Directions (count, 3) spread evenly, on a Fibonacci spiral."""
+    i = np.arange(count) + 0.5
+    z, turn = 1 - 2 * i / count, np.pi * (1 + 5**0.5) * i
     return np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
 
 

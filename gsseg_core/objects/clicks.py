@@ -35,21 +35,11 @@ Pixel = tuple[int, int]  # row and column
 
 
 class MergeTree(NamedTuple):
-    """Regions as they merge, n cells first and then one region per merge; the last is everything.
+    """Regions as they merge, n cells first and then one region per merge; the last is everything."""
 
-    Attributes
-    ----------
-    parent : (2 n - 1,) int64
-        What a region merges into; itself for the last.
-    price : (2 n - 1,) float64
-        Of a unit of border at which a region comes into being, never falling towards the root; 0 for cells.
-    size : (2 n - 1,) int64
-        Cells.
-    """
-
-    parent: np.ndarray
-    price: np.ndarray
-    size: np.ndarray
+    parent: np.ndarray  # (2 n - 1,) int64: what a region merges into; itself for the last
+    price: np.ndarray  # (2 n - 1,) float64: of a unit of border when it came into being, never falling; 0 for cells
+    size: np.ndarray  # (2 n - 1,) int64: cells
 
 
 def click_labels(

@@ -76,10 +76,6 @@ class Profiles:
         shape = (len(self), int(objects.max(initial=0)) + 1)
         return Profiles(sparse.coo_matrix((old.data, (old.row, objects[old.col])), shape=shape).tocsr())
 
-    def copy(self) -> Profiles:
-        """Return the same in memory of its own."""
-        return Profiles(self.weights.copy())
-
     def __len__(self) -> int:
         """Count the Gaussians, N."""
         return int(self._sum.shape[0])

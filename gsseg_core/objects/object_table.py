@@ -271,7 +271,7 @@ class ObjectTable:
         self._profiles.add(self._lifted[name], objects)
 
     def _fill(self) -> None:
-        self._profiles = self._forgotten.copy()
+        self._profiles = Profiles(self._forgotten.weights)
         for name, objects in self._objects.items():
             self._profiles.add(self._lifted[name], objects)
 

@@ -13,7 +13,7 @@ from PIL import Image
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.photos import read_photo
 from gsseg_core.data.view import View
-from gsseg_core.export.pictures import outline, overlay, shown_at
+from gsseg_core.export.pictures import outline, overlay, shown_at, shrunk
 from gsseg_core.export.view_pictures import Drawn, background_image
 from gsseg_core.learn.mask_reliability import ViewCheck
 from gsseg_core.raster.backends import make_operator
@@ -112,11 +112,9 @@ def thumbnails(
 
 def jpeg_uri(image: np.ndarray, largest: int) -> str:
     """Encode a picture (H, W, 3) uint8 as a data URI, shrunk so that neither side is longer than `largest` px."""
-    picture = Image.fromarray(image)
-    picture.thumbnail((largest, largest), Image.Resampling.BOX)
     buffer = BytesIO()
     # Thin lines in strong colours are what these pictures have to show; JPEG's usual subsampling smears them.
-    picture.save(buffer, "JPEG", quality=85, subsampling=0)
+    Image.fromarray(shrunk(image, largest)).save(buffer, "JPEG", quality=85, subsampling=0)
     return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 

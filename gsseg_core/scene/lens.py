@@ -95,17 +95,6 @@ class Lens:
     models of OpenCV and COLMAP, after Brown (1966), Weng et al. (1992) and Kannala & Brandt (2006). A panorama has the
     forward direction in its middle and covers 360 degrees across and 180 down.
 
-    Attributes
-    ----------
-    model : LensModel
-        One of `LENS_MODELS`.
-    width, height : int
-        Size of the image in pixels.
-    focal, principal : (float, float)
-        Focal lengths and principal point along x and y, in pixels; a panorama has neither.
-    coefficients : tuple of float
-        In the order of the model; those that are left out are 0.
-
     Raises
     ------
     IntrinsicsError
@@ -113,12 +102,12 @@ class Lens:
         circle around the middle of the image has its own ray. In the corners beyond it, that may be.
     """
 
-    model: LensModel
-    width: int
+    model: LensModel  # one of `LENS_MODELS`
+    width: int  # of the image, in pixels
     height: int
-    focal: tuple[float, float] = (1.0, 1.0)
-    principal: tuple[float, float] = (0.0, 0.0)
-    coefficients: tuple[float, ...] = ()
+    focal: tuple[float, float] = (1.0, 1.0)  # focal lengths along x and y, in pixels; a panorama has none
+    principal: tuple[float, float] = (0.0, 0.0)  # principal point, x and y in pixels; a panorama has none
+    coefficients: tuple[float, ...] = ()  # in the order of the model; those that are left out are 0
 
     def __post_init__(self) -> None:
         """Validate."""

@@ -78,25 +78,17 @@ class Neighbours:
         codes: CSRRows,  # N rows of K classes, float32 in [0, 1]
         counted: np.ndarray,  # (N,) bool
         num_classes: int,
-        wanted: np.ndarray | None = None,  # (N,) bool
     ) -> CSRRows:
-        """Mean code of those of the k nearest others that are counted, for all points or for those wanted.
-
-        Returns
-        -------
-        CSRRows
-            N rows; one without entries where there is no such neighbour, or the point is not wanted.
-        """
-        asked, means_of = self._asked(codes, counted, wanted)
+        """Mean codes of those of the k nearest others that are counted, N rows; one without entries if none is."""
+        asked, means_of = self._asked(codes, counted, np.ones(len(counted), bool))
         # A block at a time is written out in full, so that of all the codes only what is not zero is ever in memory.
         parts = []
-        for first in range(0, max(len(asked), 1), ROWS_AT_ONCE):
+        for first in range(0, len(asked), ROWS_AT_ONCE):
             places = asked[first : first + ROWS_AT_ONCE]
             out, rows = np.zeros((len(places), num_classes), np.float32), np.arange(len(places), dtype=np.int32)
             means_of(places, rows, out, np.zeros(len(places), bool))
             parts.append(CSRRows.from_dense(out))
-        order = self.tree.order
-        return CSRRows.vstack(parts).scattered(order[asked], len(order))
+        return CSRRows.vstack(parts).scattered(self.tree.order, len(asked))
 
     def average_into(
         self,
@@ -118,11 +110,11 @@ class Neighbours:
         return changed
 
     def _asked(
-        self, codes: CSRRows, counted: np.ndarray, wanted: np.ndarray | None
+        self, codes: CSRRows, counted: np.ndarray, wanted: np.ndarray
     ) -> tuple[np.ndarray, Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], None]]:
         """Find the places in the tree that are wanted, and prepare `average` for all but its last four arguments."""
         order = self.tree.order
-        selected = np.ones(len(order), bool) if wanted is None else wanted[order]
+        selected = wanted[order]
         # In the order of the tree, neighbours lie beside each other.
         ordered, counted = codes.take(order), counted[order]
         read = np.repeat(counted, np.diff(ordered.indptr))

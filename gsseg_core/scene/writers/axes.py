@@ -12,12 +12,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from gsseg_core.scene import spherical_harmonics
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.scene.spherical_harmonics import basis
 
 HALF_TURN_X, HALF_TURN_Z = (1, -1, -1), (-1, -1, 1)  # signs of x, y, z after half a turn about x or z
-_GENERIC = np.array([[0.36, 0.48, 0.8]])
-"""A unit direction in which none of the harmonics is zero."""
 
 
 class Turned(NamedTuple):
@@ -32,7 +30,7 @@ def turned(scene: GaussianScene, signs: tuple[int, int, int]) -> Turned:
     """Turn a scene by half a turn, whose `signs` are those of x, y, z after it."""
     xyz = np.array(signs, np.float32)
     degree = round(scene.sh.shape[1] ** 0.5) - 1
-    parity = np.sign(basis(_GENERIC * xyz, degree) / basis(_GENERIC, degree))[0]
+    parity = np.diag(spherical_harmonics.turned(np.diag(signs), degree)).astype(np.float32)
     return Turned(scene.means * xyz, scene.quats * np.array((1, *signs), np.float32), scene.sh * parity[:, None])
 
 
