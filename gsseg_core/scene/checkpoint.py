@@ -31,13 +31,7 @@ def is_checkpoint(head: bytes) -> bool:
 
 
 def read_checkpoint(path: Path, within: Path | None = None) -> ReadScene:
-    """Read the Gaussians of a checkpoint; nothing in it is executed (`weights_only`).
-
-    Raises
-    ------
-    SceneFileError
-        The file is missing, broken, of another program, or holds objects that only executing it would make.
-    """
+    """Read the Gaussians of a checkpoint; nothing in it is executed (`weights_only`)."""
     with open_scene(path, within, _EXPECTED) as file:
         with zipfile.ZipFile(file) as archive:
             if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):

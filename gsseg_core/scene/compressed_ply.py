@@ -24,13 +24,7 @@ def is_compressed_ply(head: bytes) -> bool:
 
 
 def read_compressed_ply(path: Path, within: Path | None = None) -> ReadScene:
-    """Read a compressed PLY, with or without extremes of colours and with or without SH.
-
-    Raises
-    ------
-    SceneFileError
-        The file is missing, truncated, or its elements do not fit each other.
-    """
+    """Read a compressed PLY, with or without extremes of colours and with or without SH."""
     elements = read_elements(path, within)
     chunks, vertices = elements.get("chunk"), elements.get("vertex")
     if chunks is None or vertices is None or not set(_PACKED).issubset(vertices.dtype.names or ()):

@@ -44,14 +44,7 @@ def is_gltf(head: bytes) -> bool:
 
 
 def read_gltf(path: Path, within: Path | None = None) -> ReadScene:
-    """Read all splats of a glTF scene into the axes of a PLY, node after node, each moved as its node says.
-
-    Raises
-    ------
-    SceneFileError
-        The file is missing or broken, holds no splats, needs an extension that is not read, or a node stretches its
-        axes differently.
-    """
+    """Read all splats of a glTF scene into the axes of a PLY, node after node, each moved as its node says."""
     with open_scene(path, within, _EXPECTED) as file:
         content = file.read()
         document, binary = _chunks(content) if content.startswith(b"glTF") else (content, None)

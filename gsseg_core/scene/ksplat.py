@@ -33,13 +33,7 @@ class _Section(NamedTuple):
 
 
 def read_ksplat(path: Path, within: Path | None = None) -> ReadScene:
-    """Read a `.ksplat` of version 0.1 and compression level 0 to 2.
-
-    Raises
-    ------
-    SceneFileError
-        The file is missing, truncated, of another version or level, or its counts do not fit each other.
-    """
+    """Read a `.ksplat` of version 0.1 and compression level 0 to 2."""
     with open_scene(path, within, "a .ksplat file") as file:
         content = file.read()
         check_size(len(content), _HEADER, "header")

@@ -21,8 +21,9 @@ class SceneFormat:
     """A format of scenes: what messages call it, its reader, the suffixes of its files, and what it keeps.
 
     The reader gets a file, and a folder below which that must lie, or None. It returns the Gaussians in the order of
-    the file, as vertices of a 3DGS PLY (`gsseg_core.scene.vertices.pack_vertices`). `marks` tells from the first bytes
-    of a file, whatever its suffix, that it is of this format; without it the suffix decides.
+    the file, as vertices of a 3DGS PLY (`gsseg_core.scene.vertices.pack_vertices`), and raises `SceneFileError` where
+    the file is missing, broken, of another version, or does not hold what its header says. `marks` tells from the first
+    bytes of a file, whatever its suffix, that it is of this format; without it the suffix decides.
     """
 
     name: str

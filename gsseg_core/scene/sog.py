@@ -42,14 +42,7 @@ def is_sog(head: bytes) -> bool:
 
 
 def read_sog(path: Path, within: Path | None = None) -> ReadScene:
-    """Read a SOG scene: a zip, the `meta.json` of a folder, or that folder.
-
-    Raises
-    ------
-    SceneFileError
-        A file is missing or broken, an image is too small for the count or larger than it needs to be, or a name leads
-        out of the folder.
-    """
+    """Read a SOG scene: a zip, the `meta.json` of a folder, or that folder."""
     if path.is_dir():
         path = path / _META
     with open_scene(path, within, _EXPECTED) as file:

@@ -14,13 +14,7 @@ RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), (
 
 
 def read_splat(path: Path, within: Path | None = None) -> ReadScene:
-    """Read a `.splat`: positions and scales as floats; colours, opacities and rotations w, x, y, z as bytes.
-
-    Raises
-    ------
-    SceneFileError
-        The file is missing, or its size is no multiple of 32 bytes.
-    """
+    """Read a `.splat`: positions and scales as floats; colours, opacities and rotations w, x, y, z as bytes."""
     with open_scene(path, within, "a .splat file") as file:
         content = file.read()
         if len(content) % RECORD.itemsize:

@@ -67,18 +67,13 @@ def read_spz(path: Path, within: Path | None = None) -> ReadScene:
 
     Those of the file are right, up, back unless it says others. SH of degree 4 are left out. Version 4 needs the
     package zstandard.
-
-    Raises
-    ------
-    SceneFileError
-        The file is missing or broken, holds more or less than its header says, or zstandard is not installed.
     """
     with open_scene(path, within, "an SPZ file") as file:
         return decode_spz(file, path)
 
 
 def decode_spz(file: Any, path: Path) -> ReadScene:
-    """Decode SPZ from an open binary file; raises what `read_spz` raises, or what `open_scene` takes for damage."""
+    """Decode SPZ from an open binary file; raises `SceneFileError`, or what `open_scene` takes for damage."""
     magic = file.read(4)
     file.seek(0)
     if magic.startswith(_GZIP):
