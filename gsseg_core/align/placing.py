@@ -136,12 +136,8 @@ def find_alignment(
     """Find where cameras are in a scene, from what their photos show or, without photos, their masks.
 
     First as they are, if photos tell, then by conventions, and at last, with photos, by a similarity. The first one is
-    taken in which photos and renderings lie upon each other, and where none is, the one that agrees best.
-
-    Raises
-    ------
-    AlignmentError
-        Nothing agrees.
+    taken in which photos and renderings lie upon each other, and where none is, the one that agrees best. Raises
+    `AlignmentError` where nothing agrees.
     """
     settings = settings or AlignSettings()
     shown = look_at(views, settings)

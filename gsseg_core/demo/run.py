@@ -18,13 +18,7 @@ from gsseg_core.text import counted, percent, seconds_table, table
 
 
 def run_demo(out: str | os.PathLike[str], *, seed: int = 0, progress: Progress = silent) -> str:
-    """Build the scene, run `segment`, `render` and `eval` on it, and say how well it went.
-
-    Returns
-    -------
-    str
-        Tables for the terminal.
-    """
+    """Build the scene, run `segment`, `render` and `eval` on it, and say in tables how well it went."""
     check_seed(seed)
     out = Path(out)
     watch = Stopwatch()

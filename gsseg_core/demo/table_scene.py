@@ -54,14 +54,8 @@ class DemoScene:
 def build_demo(folder: str | os.PathLike[str], seed: int = 0) -> DemoScene:
     """Write the demo scene to a folder as a dataset like any other.
 
-    The seed is that of the Gaussians' defects and of the errors in the masks; all else is always the same.
-
-    Raises
-    ------
-    PathTakenError
-        The folder holds other files of these names.
-    WriteError
-        The folder cannot be written to.
+    The seed is that of the Gaussians' defects and of the errors in the masks; all else is always the same. Raises
+    `PathTakenError` where the folder holds other files of these names, `WriteError` where it cannot be written to.
     """
     root = Path(folder)
     scene_rng, mask_rng = np.random.default_rng(seed).spawn(2)

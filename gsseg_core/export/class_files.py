@@ -114,14 +114,8 @@ def write_selection(
     """Write some Gaussians of a scene as one file, in which USD keeps the classes of these labels apart.
 
     Meshes to collide with go into the USD, or beside another file, as `<its stem>_<id>_<name>.obj`, where those of
-    other classes that an earlier call wrote go. If anything cannot be written, all files are as they were.
-
-    Raises
-    ------
-    EmptySceneError
-        None is chosen.
-    SettingsError, SceneValueError, WriteError
-        As `gsseg_core.scene.scene_writers.write_scene` does.
+    other classes that an earlier call wrote go. If anything cannot be written, all files are as they were. Raises
+    what `gsseg_core.scene.scene_writers.write_scene` does, and `EmptySceneError` where none is chosen.
     """
     part = scene.subset(chosen)
     if not SCENE_WRITERS[scene_format].together:

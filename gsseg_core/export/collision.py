@@ -45,18 +45,10 @@ def check_collision(kind: str | None) -> None:
 
 
 def collision_meshes(scene: GaussianScene, segmentation: Segmentation, kind: str) -> dict[int, TriangleMesh]:
-    """Make a mesh for every object of a segmentation.
+    """Make a mesh for every object of a segmentation, by class id, ascending; raises what `check_collision` does.
 
-    Returns
-    -------
-    dict of int to TriangleMesh
-        By class id, ascending; neither the background, which is around the objects, nor objects without an opaque
-        Gaussian or a volume.
-
-    Raises
-    ------
-    SettingsError
-        There is no such kind, or the library that makes it is not installed.
+    There is none for the background, which is around the objects, nor for objects without an opaque Gaussian or a
+    volume.
     """
     check_collision(kind)
     found = {

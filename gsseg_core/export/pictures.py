@@ -23,15 +23,11 @@ _LONGEST = 400  # characters of a name that are ever looked at; no picture has r
 
 @lru_cache(maxsize=8)
 def palette(num_classes: int) -> np.ndarray:
-    """Colours for labels, as different from each other as they can be.
+    """Colours for K labels, as different from each other as they can be: (K, 3) uint8, read-only.
 
-    Every colour is the one of a fixed set that lies farthest, in OKLab, from all the earlier ones, so the colours of a
-    smaller palette are the first ones of a larger one. Beyond about 1,500 classes they start to repeat.
-
-    Returns
-    -------
-    ndarray (K, 3) uint8, read-only
-        One for each of the K labels; row 0 is `BACKGROUND`.
+    Row 0 is `BACKGROUND`. Every other colour is the one of a fixed set that lies farthest, in OKLab, from all
+    earlier ones, so the colours of a smaller palette are the first ones of a larger one. Beyond about 1,500 classes
+    they start to repeat.
     """
     levels = np.arange(15, 256, 16)
     candidates = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -177,13 +173,7 @@ def legend(class_names: Mapping[int, str], colors: np.ndarray, counts: np.ndarra
 
 
 def save_png(path: str | Path, image: np.ndarray, run: str | None = None) -> None:
-    """Write a picture as PNG, atomically; `run` is the id of the run that it belongs to, for a text in the file.
-
-    Raises
-    ------
-    WriteError
-        The file cannot be written.
-    """
+    """Write a picture as PNG, atomically (`WriteError`); `run`, the id of a run, becomes a text in the file."""
     with write_atomically(path) as temporary:
         # Two fifths of the time of Pillow's own level, and files 10 to 20 % larger.
         Image.fromarray(image).save(temporary, format="PNG", compress_level=2, pnginfo=run_text(run))

@@ -103,12 +103,8 @@ def write_pictures(
 ) -> list[Path]:
     """Write overlays of some views, as `draw_views` gives them, a contact sheet of them, and the legend.
 
-    Pictures are written by `save`, which may do that later.
-
-    Returns
-    -------
-    list of pathlib.Path
-        `overlay_<stem>.png` ..., `contact_sheet.png`, `legend.png`; with the id of the `run` in them, if there is one.
+    Pictures are written by `save`, which may do that later. Their files are `overlay_<stem>.png` ...,
+    `contact_sheet.png` and `legend.png`, with the id of the `run` in them, if there is one.
     """
     folder = Path(folder)
     images, captions, paths = [], [], []

@@ -45,18 +45,11 @@ class Borders(NamedTuple):
 
 
 def depth_edges(scene: GaussianScene, operator: ViewOperator) -> DepthEdges:
-    """Find where the surface that a view sees ends, or has a crease.
+    """Find where the surface that a view, given by its operator, sees of a scene ends, or has a crease.
 
     With u the inverse depth, which is linear in the image wherever the surface is flat, the surface bends in direction
     d by f (u(p + d) + u(p - d) - 2 u(p)) / u(p), f being the focal length: positive on its far side where it ends, and
     in the crease where an object stands on something.
-
-    Parameters
-    ----------
-    scene : GaussianScene
-        N Gaussians.
-    operator : ViewOperator
-        Of the view.
     """
     depth = surface(scene, operator).depth
     grid = PixelGrid(0, -(-max(depth.shape) // _LONG_SIDE))

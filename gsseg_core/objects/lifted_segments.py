@@ -91,21 +91,9 @@ class Profiles:
         return self._sum
 
     def common(self, segments: Lifted, objects: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Tell how much of each segment of a view lies on each object.
+        """Tell how much of L segments of a view lies on each object, (L, K), and on known Gaussians, (L,), in px.
 
-        Parameters
-        ----------
-        segments : Lifted
-            L segments.
-        objects : (L,), optional
-            What these segments have been added as; then only what the other views say counts.
-
-        Returns
-        -------
-        common : (L, K) float64
-            In px.
-        known : (L,) float64
-            What lies on Gaussians of which anything is known, in px.
+        With `objects`, (L,), which these segments have been added as, only what the other views say counts.
         """
         profile = self.weights[segments.gaussians]
         if objects is not None:
@@ -117,14 +105,10 @@ class Profiles:
         return (segments.weights @ profile).toarray(), segments.weights @ (total > 0).astype(np.float64)
 
     def explain(self, segments: Lifted, objects: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Find the object of the largest IoU with each segment of a view; takes what `common` takes.
+        """Find the object of the largest IoU with each segment of a view, (L,), 0 where there is none.
 
-        Returns
-        -------
-        best : (L,) int64
-            Objects; 0 where there is none.
-        seen : (L,) float64
-            Share of each segment that lies on Gaussians of which anything is known.
+        Also returns the share of each segment that lies on Gaussians of which anything is known, (L,). Takes what
+        `common` takes.
         """
         common, known = self.common(segments, objects)
         overlap = np.nan_to_num(iou(common, known[:, None], common.sum(axis=0)))

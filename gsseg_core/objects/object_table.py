@@ -86,15 +86,9 @@ class ObjectTable:
     def add(self, view: View) -> bool:
         """Add a view for `solve`; one of a name that is there already replaces it.
 
-        Returns
-        -------
-        bool
-            Whether it has a mask and sees any Gaussian; if not, nothing has changed.
-
-        Raises
-        ------
-        MaskFormatError, MaskSizeError, UnknownLabelError
-            The mask is broken, of another size than the camera, or has ids beyond `MAX_LABEL`.
+        Tells whether it has a mask and sees any Gaussian; if not, nothing has changed. Raises `MaskFormatError`,
+        `MaskSizeError` or `UnknownLabelError` where the mask is broken, of another size than the camera, or has ids
+        beyond `MAX_LABEL`.
         """
         lifted = self._lift(view)
         if lifted is None:
@@ -107,15 +101,8 @@ class ObjectTable:
     def match(self, view: View) -> View:
         """Add a view, and give its ids the numbers of the objects so far; what nobody has seen yet is a new object.
 
-        Returns
-        -------
-        View
-            As `relabelled` does.
-
-        Raises
-        ------
-        MaskFormatError, MaskSizeError, UnknownLabelError
-            As `add` does, or there are too many objects. Nothing has changed.
+        Returns what `relabelled` does. Raises as `add` does, and where there are too many objects; then nothing has
+        changed.
         """
         undo = self.checkpoint()
         if not self.add(view):

@@ -136,17 +136,7 @@ def oriented_box(means: np.ndarray, covariances: np.ndarray, weights: np.ndarray
 
 
 def class_box(scene: GaussianScene, index: np.ndarray, confidence: np.ndarray) -> OrientedBox:
-    """Put a box around the Gaussians of one object.
-
-    Parameters
-    ----------
-    scene : GaussianScene
-        N Gaussians.
-    index : (M,) int
-        Those of the object; M is at least 1.
-    confidence : (M,) float
-        Probability, for each of these, that it is.
-    """
+    """Put a box around the Gaussians of one object, (M,) with M > 0, each with its probability to be of it, (M,)."""
     every = -(-len(index) // SAMPLE)
     index, confidence = index[::every], confidence[::every]
     shapes = covariances(scene.quats[index].astype(np.float64), scene.scales[index])

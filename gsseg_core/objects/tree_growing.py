@@ -185,11 +185,7 @@ def _cells(points: np.ndarray, size: float) -> np.ndarray:
 def _merge(shares: np.ndarray, segments: _Segments) -> tuple[list[_Region], np.ndarray]:
     """Merge regions (R, S), in every round those that agree with each other more than with any third.
 
-    Returns
-    -------
-    regions : list
-        All there were, parts before what is made of them.
-    shares : (len(regions), S)
+    Returns all regions that there were, parts before what is made of them, and the shares of each, (regions, S).
     """
     settings, regions, every = segments.settings, [_Region(row=row) for row in range(len(shares))], [shares]
     shares, at = shares.copy(), np.arange(len(shares))  # what is left, each in the place of its first region

@@ -77,12 +77,7 @@ def has_objects(report: Mapping[str, Any]) -> bool:
 def warnings_of(report: Mapping[str, Any], ious: np.ndarray | None) -> list[str]:
     """Say in sentences what about a run should make its user look twice, what weighs most first.
 
-    Parameters
-    ----------
-    report : mapping
-        What `report.json` holds.
-    ious : (K,) array or None
-        IoU of each class with the masks, in the order of the report, NaN where there is none.
+    `report` is what `report.json` holds; `ious` (K,) are those of the classes with the masks, NaN where there is none.
     """
     views, gaussians = report["views"], report["gaussians"]
     warnings = [] if has_objects(report) else [f"No Gaussian is part of an object: {NO_OBJECTS}."]

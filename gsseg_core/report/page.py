@@ -44,13 +44,7 @@ TEMPLATE = "page.html.j2"
 
 
 def write_report_page(path: str | os.PathLike[str], run: PageInputs) -> None:
-    """Write the page, atomically; its links to PLYs are relative to it.
-
-    Raises
-    ------
-    WriteError
-        The file cannot be written.
-    """
+    """Write the page, atomically (`WriteError`); its links to PLYs are relative to it."""
     page = report_page(run)
     with write_atomically(path) as temporary:
         temporary.write_text(page, encoding="utf-8")

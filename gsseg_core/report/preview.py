@@ -94,10 +94,7 @@ def make_preview(
 def look_from(cameras: Iterable[Camera], preview: Preview) -> list[dict[str, Any]]:
     """Describe cameras for the preview: where they are, what they look at, and how wide.
 
-    Returns
-    -------
-    list of dict
-        `name`; `eye` and `target` (3,), in scene units; `fov`, vertical, in radians.
+    Each has a `name`; `eye` and `target` (3,), in scene units; and `fov`, vertical, in radians.
     """
     low, high = preview.low, preview.high
     half = float(np.linalg.norm(preview.core[1] - preview.core[0])) / 2
@@ -152,14 +149,8 @@ def _contracted(means: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.nda
 def _draw(weights: np.ndarray, labels: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
     """Draw `most` of N without replacement, by weights (N,), the first few of each label (N,) before all.
 
-    By Efraimidis and Spirakis (2006): the largest of u^(1 / w).
-
-    Returns
-    -------
-    picked : (M,) int64
-        Which, ascending.
-    chance : (M,) float64
-        How likely each was to be drawn, in (0, 1].
+    By Efraimidis and Spirakis (2006): the largest of u^(1 / w). Returns which, (M,) int64, ascending, and how likely
+    each was to be drawn, (M,) float64 in (0, 1].
     """
     if len(weights) <= most:
         return np.arange(len(weights)), np.ones(len(weights))

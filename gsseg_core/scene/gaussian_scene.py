@@ -202,10 +202,7 @@ class GaussianScene:
     def ids(self) -> npt.NDArray[np.int64] | None:
         """Ids that stay while the scene changes, (N,) int64; None if its file has none, see docs/living_map.md.
 
-        Raises
-        ------
-        SceneValueError
-            They are no ids.
+        Raises `SceneValueError` where those of the file are no ids.
         """
         return read_ids(self.vertices, str(self.path or "scene"))
 

@@ -71,13 +71,7 @@ def joined(
     added: GaussianScene | None,
     ids: npt.NDArray[np.int64],  # (N',)
 ) -> GaussianScene:
-    """Append Gaussians to those that stay; from now on, the scene holds ids.
-
-    Raises
-    ------
-    SceneDeltaError
-        What is added has colours of a higher degree than the scene has room for.
-    """
+    """Append Gaussians to those that stay; from now on, the scene holds ids. Raises what `with_ids` does."""
     names = ("means", "quats", "scales", "opacities")
     parts: dict[str, list[npt.NDArray[Any]]] = {name: [getattr(scene, name)[stays]] for name in names}
     if added is not None:

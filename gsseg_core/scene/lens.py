@@ -49,10 +49,7 @@ class LensModel:
     def order(self, coefficients: Mapping[str, float]) -> tuple[float, ...]:
         """Put coefficients by name into the model's order; those that are not there are 0.
 
-        Raises
-        ------
-        IntrinsicsError
-            One that is not 0 is none of this model.
+        Raises `IntrinsicsError` where one that is not 0 is none of this model.
         """
         for name, value in coefficients.items():
             if value and name not in self.coefficients:

@@ -50,15 +50,7 @@ def read_vertices(path: str | os.PathLike[str], within: Path | None = None) -> n
 
 
 def read_elements(path: Path, within: Path | None = None) -> dict[str, npt.NDArray[np.void]]:
-    """Read all elements of a PLY by name, as `read_vertices` reads one; properties that are lists are objects.
-
-    Raises
-    ------
-    SceneFileError
-        The file is missing, truncated, or not a PLY.
-    PathNotAllowedError
-        The file lies outside `within`.
-    """
+    """Read all elements of a PLY by name, as `read_vertices` reads one; properties that are lists are objects."""
     return {element.name: _native(element.data) for element in _parse(path, within)}
 
 
@@ -128,15 +120,10 @@ def _least_bytes(prop: Any) -> int:
 
 
 def write_vertices(path: str | os.PathLike[str], vertices: npt.NDArray[Any], run: str | None = None) -> None:
-    """Write a structured array (N,) as the `vertex` element of a binary little-endian PLY, atomically.
+    """Write a structured array (N,) as the `vertex` element of a binary little-endian PLY, atomically (`WriteError`).
 
     The id of a run, if one is given, becomes the comment `gsseg_run <id>`. It stands below the line of the element:
     some viewers count on that being the third.
-
-    Raises
-    ------
-    WriteError
-        The file cannot be written; an earlier file at `path` stays whole.
     """
     comments = [] if run is None else [f"gsseg_run {run}"]
     ply = plyfile.PlyData([plyfile.PlyElement.describe(vertices, "vertex", comments=comments)], byte_order="<")

@@ -89,12 +89,8 @@ SCENE_FORMATS = [
 def find_format(path: Path, within: Path | None = None) -> SceneFormat | None:
     """Find the format of a file, or of a folder of SOG, by its first bytes or else by its suffix; None if unknown.
 
-    A file that cannot be opened is of the format of its suffix, whose reader says why.
-
-    Raises
-    ------
-    PathNotAllowedError
-        It lies outside `within`.
+    A file that cannot be opened is of the format of its suffix, whose reader says why; `PathNotAllowedError` if it lies
+    outside `within`.
     """
     name = path.name.lower()
     suited = [known for known in SCENE_FORMATS if name.endswith(known.suffixes)]

@@ -15,10 +15,7 @@ LOW, HIGH = "id_low", "id_high"  # properties uint of a vertex: the lower and th
 def read_ids(vertices: npt.NDArray[np.void], source: str) -> npt.NDArray[np.int64] | None:
     """Ids of Gaussians, (N,) int64; None where a scene has none.
 
-    Raises
-    ------
-    SceneValueError
-        Ids are no whole numbers from 0 below 2^63, or one is there twice.
+    Raises `SceneValueError` where ids are no whole numbers from 0 below 2^63, or one is there twice.
     """
     names = vertices.dtype.names or ()
     if LOW not in names or HIGH not in names:
@@ -40,10 +37,7 @@ def with_ids(
 ) -> npt.NDArray[np.void]:
     """Vertices with their ids, those that are added behind; properties that those lack are 0.
 
-    Raises
-    ------
-    SceneDeltaError
-        What is added has colours of a higher degree than the scene has room for.
+    Raises `SceneDeltaError` where what is added has colours of a higher degree than the scene has room for.
     """
     names = list(vertices.dtype.names or ())
     kinds: list[tuple[str, Any]] = [(name, vertices.dtype[name]) for name in names if name not in (LOW, HIGH)]

@@ -68,10 +68,7 @@ def check_format(name: str) -> None:
 def writer_of(name: str) -> Any:
     """Import the module that writes one of `SCENE_WRITERS`, and return its function; None where the scene does it.
 
-    Raises
-    ------
-    SettingsError
-        The library that it needs is not installed.
+    Raises `SettingsError` where the library that it needs is not installed.
     """
     writer = SCENE_WRITERS[name]
     if not writer.write:
@@ -88,10 +85,8 @@ def writer_of(name: str) -> Any:
 def format_of(path: str | os.PathLike[str], asked: str | None = None) -> str:
     """Name of the format for a file: what is asked for; else what its suffix says, and PLY if that says nothing.
 
-    Raises
-    ------
-    SettingsError
-        The suffix says another format than the one that is asked for, or one that gsseg reads only.
+    Raises `SettingsError` where the suffix says another format than the one that is asked for, or one that gsseg reads
+    only.
     """
     from gsseg_core.scene.scene_formats import SCENE_FORMATS  # `gsseg --help` does without.
 

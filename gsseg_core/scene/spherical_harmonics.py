@@ -20,10 +20,7 @@ C0 = sqrt(1 / (4 * pi))
 def basis(directions: npt.NDArray[np.floating], degree: int) -> npt.NDArray[np.float32]:  # (N, 3)
     """Evaluate all harmonics up to `degree`, 0 to 3, for unit vectors: (N, (degree + 1)^2) float32, band after band.
 
-    Raises
-    ------
-    SceneValueError
-        There are no such harmonics.
+    Raises `SceneValueError` for another degree.
     """
     if not 0 <= degree <= MAX_DEGREE:
         raise SceneValueError(f"spherical harmonics: degree is {degree}; expected 0 to {MAX_DEGREE}")

@@ -56,10 +56,7 @@ class Undistortion:
     ) -> npt.NDArray[Any]:
         """Take the nearest pixels of an image: (height, width, ...), `outside` where the image does not reach.
 
-        Raises
-        ------
-        MaskSizeError
-            The image has another size than those of the lens.
+        Raises `MaskSizeError` where the image has another size than those of the lens.
         """
         self._check_size(image)
         pixels = _nearest_pixels(self)
@@ -97,12 +94,8 @@ def undistortions(lens: Lens) -> tuple[Undistortion, ...]:
 
     The view keeps the focal length and the axis, so that the middle of the image stays as it is, and reaches as far as
     the middles of the image's sides, but no farther than `WIDEST`; COLMAP's and nerfstudio's trainers see scenes like
-    that. The faces of a panorama have as many pixels per radian in their middle as the panorama has.
-
-    Raises
-    ------
-    IntrinsicsError
-        A view would be too large, or of a size for which the lens must be a mistake.
+    that. The faces of a panorama have as many pixels per radian in their middle as the panorama has. Raises
+    `IntrinsicsError` where a view would be too large, or of a size for which the lens must be a mistake.
     """
     if lens.model.projection is Projection.PANORAMA:
         side = max(round(lens.width / math.pi), 1)

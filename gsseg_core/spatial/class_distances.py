@@ -23,13 +23,10 @@ NOBODY = MIXED + 1  # the label of no point
 
 
 def class_distances(neighbours: Neighbours, labels: np.ndarray, num_classes: int) -> np.ndarray:  # (N,) int
-    """Mean distance to the k nearest others of the same class, or to all of them if there are not as many: (N,).
+    """Mean distance to the k nearest others of the same class, or to all if there are not as many: (N,) float64.
 
-    Returns
-    -------
-    ndarray (N,) float64
-        In units of the scaled points. NaN where the label is not in 1 to `num_classes` - 1, and where a class has a
-        single member.
+    It is in units of the scaled points; NaN where the label is not in 1 to `num_classes` - 1, and where a class has a
+    single member.
     """
     tree, k = neighbours.tree, neighbours.k
     of_point = labels[tree.order].astype(np.int32)

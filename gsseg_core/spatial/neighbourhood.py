@@ -97,13 +97,7 @@ class Neighbours:
         counted: np.ndarray,  # (N,) bool
         wanted: np.ndarray,  # (N,) bool
     ) -> np.ndarray:
-        """Replace those rows that are wanted by mean codes, as `mean_codes` finds them, where there are any.
-
-        Returns
-        -------
-        ndarray (N,) bool
-            Which rows were replaced.
-        """
+        """Replace the rows wanted by mean codes, as in `mean_codes`, where there are any; tell which, (N,) bool."""
         asked, means_of = self._asked(codes, counted, wanted)
         changed = np.zeros(len(out), bool)
         means_of(asked, self.tree.order[asked], out, changed)

@@ -20,19 +20,10 @@ _TAIL = 1.0  # percent of them on each side that may lie outside, so that a far 
 
 
 def curve_order(means: np.ndarray) -> np.ndarray:
-    """Order Gaussians along the Z-order curve of Morton (1966); those in one cell stay in their order.
+    """Order Gaussians of means (N, 3) along the Z-order curve of Morton (1966): the index of each, (N,) int64.
 
-    Trainers leave them in nearly random order, so that each look at a neighbour waits for memory.
-
-    Parameters
-    ----------
-    means : (N, 3) float32
-        Centres, in any unit.
-
-    Returns
-    -------
-    (N,) int64
-        Index of each, first to last along the curve.
+    Those in one cell stay in their order. Trainers leave them in nearly random order, so that each look at a neighbour
+    waits for memory.
     """
     low, high = np.percentile(means[:: len(means) // _SAMPLE + 1], (_TAIL, 100 - _TAIL), axis=0)
     with np.errstate(over="ignore"):  # What is so far away is in the last cell.

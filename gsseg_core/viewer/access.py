@@ -143,10 +143,8 @@ class Listener:
 def listen(host: str = "127.0.0.1", port: int = 8080) -> Listener:
     """Listen at a name or address of this machine; if the port is taken, at the next one that is free.
 
-    Raises
-    ------
-    SettingsError
-        The host is not known or not this machine's, or no port is free or allowed. That takes ten seconds at most.
+    Raises `SettingsError` where the host is not known or not this machine's, or no port is free or allowed. That takes
+    ten seconds at most.
     """
     if not 0 < port < 2**16:
         raise SettingsError(f"port is {port}; expected 1 to 65535")

@@ -131,10 +131,7 @@ class ClientRenderers:
 def time_of_picture(client: viser.ClientHandle) -> float:
     """Seconds that a browser takes to draw what it has now, and to send a small image of that; NaN if it gives none.
 
-    Raises
-    ------
-    RuntimeError
-        The browser has left.
+    Raises `RuntimeError` where the browser has left.
     """
     for _ in range(2):  # The first may be without what has just been sent: splats are sorted beside the drawing.
         start = time.monotonic()

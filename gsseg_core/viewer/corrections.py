@@ -66,12 +66,7 @@ def looks_alike(
 ) -> View:
     """Draw the region of one colour and direction around a pixel, whatever its label; see `disc`.
 
-    Raises
-    ------
-    SettingsError
-        As `disc` does.
-    NoUsableViewsError
-        The pixel shows no Gaussian.
+    Also raises `NoUsableViewsError` where the pixel shows no Gaussian.
     """
     _check_inside(camera, column, row)
     return _view(camera, click_labels(scene, camera, [(int(row), int(column))], device=device) == 1, label)
@@ -106,10 +101,7 @@ class Corrections:
     def add(self, view: View) -> None:
         """Learn a correction. A view of a name that is there already is another correction all the same.
 
-        Raises
-        ------
-        NoUsableViewsError
-            Nothing was drawn on any Gaussian.
+        Raises `NoUsableViewsError` where nothing was drawn on any Gaussian.
         """
         camera = replace(view.camera, name=f"correction_{len(self.views):04d}")
         own = View.from_arrays(camera, view.read_labels())

@@ -31,13 +31,7 @@ class LearntFrom:
 
     @classmethod
     def read(cls, report: Path) -> LearntFrom:
-        """Read a report, if there is one.
-
-        Raises
-        ------
-        StateFileError
-            The file is there, but no report.
-        """
+        """Read a report, if there is one; `StateFileError` if the file is there and no report."""
         if not report.is_file():
             return cls()
         content: Any = read_json(report, StateFileError)

@@ -30,10 +30,7 @@ class LiveSource(Protocol):
     def wait(self, timeout: float) -> LiveUpdate | None:
         """Wait for the next class probabilities, `timeout` seconds at most; return None where nothing has changed.
 
-        Raises
-        ------
-        GssegError
-            The source cannot be asked now, and why; it may be asked again.
+        Raises `GssegError` where the source cannot be asked now, and why; it may be asked again.
         """
 
     def close(self) -> None:
@@ -43,12 +40,8 @@ class LiveSource(Protocol):
 def open_source(name: str, scene: GaussianScene) -> LiveSource:
     """Make the source of a name.
 
-    Raises
-    ------
-    SettingsError
-        There is none of this name, or what it needs is not installed.
-    GssegError
-        It cannot be used with this scene.
+    Raises `SettingsError` where there is none of this name, or what it needs is not installed; another `GssegError`
+    where it cannot be used with this scene.
     """
     found = next(iter(entry_points(group=GROUP, name=name)), None)
     if found is None:

@@ -51,18 +51,9 @@ Event = viser.GuiEvent[Any]
 
 
 class Panel:
-    """All widgets of a viewer, and the callbacks behind them.
+    """All widgets of a viewer, in viser's `gui`, and the callbacks behind them.
 
-    Parameters
-    ----------
-    gui : viser.GuiApi
-        Where the widgets go.
-    state : ViewerState
-        What they show and change.
-    viewpoint : Viewpoint
-        By which they move cameras.
-    live : bool
-        Whether there is a live source to tell about.
+    They show and change a state, and move cameras by a viewpoint; `live` says whether to tell of a live source.
     """
 
     def __init__(self, gui: viser.GuiApi, state: ViewerState, viewpoint: Viewpoint, live: bool) -> None:

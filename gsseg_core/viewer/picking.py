@@ -79,12 +79,7 @@ class ViewVotes:
     """Votes of every view for the labels of every Gaussian, not added up over the views.
 
     Takes 12 bytes per (Gaussian, label) pair of a view, and as long to make as a pass of a learner over all views.
-    Views without a mask do not vote.
-
-    Raises
-    ------
-    MaskFormatError, MaskSizeError, UnknownLabelError
-        A mask cannot be used.
+    Views without a mask do not vote; `MaskFormatError`, `MaskSizeError` or `UnknownLabelError` if one cannot be used.
     """
 
     def __init__(
@@ -112,17 +107,10 @@ class ViewVotes:
         return sorted(found, key=lambda vote: -vote.weight)
 
     def mean_reliability(self, reliability: Mapping[str, float]) -> np.ndarray:
-        """Average the reliability of the views that saw each Gaussian, weighed by how much of it each saw.
+        """Average the reliability of the views that saw each Gaussian, by how much of it each saw: (N,) float32.
 
-        Parameters
-        ----------
-        reliability : mapping from the name of a view to float
-            In [0, 1]; views that are not in it do not count.
-
-        Returns
-        -------
-        (N,) float32
-            In [0, 1]; NaN where no such view saw the Gaussian.
+        `reliability` is in [0, 1], by the name of a view; views that are not in it do not count. NaN where no view that
+        counts saw the Gaussian.
         """
         total, weight = np.zeros(self._num_gaussians), np.zeros(self._num_gaussians)
         for name, (ids, _, votes) in self._votes.items():

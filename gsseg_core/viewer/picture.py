@@ -34,11 +34,8 @@ class Node(NamedTuple):
 def cut(labels: np.ndarray, confidence: np.ndarray, max_nodes: int = MAX_NODES) -> dict[Key, np.ndarray]:
     """Cut a scene by label (N,) int32 and confidence (N,) float32, as finely as the number of nodes allows.
 
-    Returns
-    -------
-    dict of Key to (M,) int64
-        Members, ascending; every Gaussian is in exactly one node. Where there are more labels than nodes, the smallest
-        classes share the last one.
+    Returns the members of each node, (M,) int64 ascending; every Gaussian is in exactly one. Where there are more
+    labels than nodes, the smallest classes share the last one.
     """
     count = int(labels.max()) + 3  # labels begin at -2
     for bands in (BANDS, BANDS // 2, BANDS // 4, 1):

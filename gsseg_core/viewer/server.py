@@ -39,10 +39,7 @@ _HEARD = ("ViewerCameraMessage", "ScenePointerMessage", "GuiUpdateMessage", "Get
 def start_server(listener: Listener) -> viser.ViserServer:
     """Start viser's server on a listener, which has to stay open as long as the server runs.
 
-    Raises
-    ------
-    SettingsError
-        This version of viser does not let itself be guarded.
+    Raises `SettingsError` where this version of viser does not let itself be guarded.
     """
     # What is sent to a browser in the moment in which it leaves is nothing that people could mend.
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)

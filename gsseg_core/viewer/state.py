@@ -79,10 +79,7 @@ class ViewerState:
     def set_mode(self, mode: str, progress: Progress = silent) -> None:
         """Colour by something else; `progress` is told of the views where their votes have to be collected for it.
 
-        Raises
-        ------
-        SettingsError
-            There is no such mode, or it is the reliability of the views, and that is not known.
+        Raises `SettingsError` where there is no such mode, or it is the reliability of views and that is not known.
         """
         if mode not in MODES:
             raise SettingsError(f"colour by {mode!r}; expected one of {', '.join(MODES)}")
@@ -148,10 +145,7 @@ class ViewerState:
     def correct(self, view: View) -> int:
         """Learn what was drawn in a picture; return how many Gaussians that changed.
 
-        Raises
-        ------
-        NoUsableViewsError
-            Nothing was drawn on any Gaussian.
+        Raises `NoUsableViewsError` where nothing was drawn on any Gaussian.
         """
         with self._lock:
             before = self.model.labelling.labels

@@ -18,15 +18,7 @@ _MASK = "/mask"
 
 
 class Viewpoint:
-    """Moves the cameras of browsers; the first one looks from the first view, or at the scene from outside.
-
-    Parameters
-    ----------
-    server : viser.ViserServer
-        To which the browsers connect.
-    state : ViewerState
-        What they look at.
-    """
+    """Moves the cameras of browsers; at first they look from the first view, or at the scene from outside."""
 
     def __init__(self, server: viser.ViserServer, state: ViewerState) -> None:
         self._server, self._state = server, state
