@@ -208,7 +208,8 @@ class _Clusters(NamedTuple):
 
     def merged(self, target: np.ndarray) -> _Clusters:  # (C,): whom each one becomes
         number = np.unique(target, return_inverse=True)[1]
-        groups = _grouping(number)
+        # Ones that add up the rows of each cluster, (C', C).
+        groups = sparse.csr_matrix((np.ones(len(number), np.float32), (number, np.arange(len(number)))))
         touching, *borders = ((groups @ part @ groups.T).tocsr() for part in (self.touching, *self.borders))
         overlap, seen, hidden = (groups @ self.overlap).tocsr(), groups @ self.seen, groups @ self.hidden
         return _Clusters(number[self.of], overlap, seen, hidden, touching, Borders(*borders))
@@ -224,11 +225,6 @@ def _merged(
         if target is None:
             return clusters, votes
         clusters = clusters.merged(target)
-
-
-def _grouping(cluster: np.ndarray) -> sparse.csr_matrix:  # (n,)
-    """Matrix (C, n) of ones that adds up the rows of each cluster."""
-    return sparse.csr_matrix((np.ones(len(cluster), np.float32), (cluster, np.arange(len(cluster)))))
 
 
 class _Pairs(NamedTuple):

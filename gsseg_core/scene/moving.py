@@ -31,8 +31,7 @@ def move(
             _change_signs(vertices, np.diag(turn), names, np.diag(harmonics))
             return
         # A Gaussian is its own mirror image through its centre, so a mirror is half a turn of it.
-        rotation = _quaternion(turn if np.linalg.det(turn) > 0 else -turn)
-        put(vertices, QUATS, _product(rotation, columns(vertices, QUATS)))
+        put(vertices, QUATS, _rotated(columns(vertices, QUATS), turn if np.linalg.det(turn) > 0 else -turn))
         if names:
             rest = columns(vertices, names).reshape(len(vertices), 3, -1)
             rest[:] = rest @ harmonics.T.astype(np.float32)
@@ -59,19 +58,10 @@ def _change_signs(
     table *= signs
 
 
-def _quaternion(turn: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:  # (3, 3)
-    """Quaternion w, x, y, z of a rotation matrix."""
+def _rotated(quats: npt.NDArray[np.float32], turn: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Quaternions (N, 4) w, x, y, z of rotations by `quats` (N, 4), then by a matrix (3, 3)."""
     from scipy.spatial.transform import Rotation  # It takes a while to load, and few formats need it.
 
     x, y, z, w = Rotation.from_matrix(turn).as_quat()
-    return np.array([w, x, y, z])
-
-
-def _product(
-    first: npt.NDArray[np.float64],  # (4,) w, x, y, z
-    second: npt.NDArray[np.floating],  # (N, 4)
-) -> npt.NDArray[np.float64]:
-    """Quaternions (N, 4) of rotations by `second`, then by `first`."""
-    w, x, y, z = first
-    matrix = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    return second.astype(np.float64) @ matrix.T
+    product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    return quats.astype(np.float64) @ product.T

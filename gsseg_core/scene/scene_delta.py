@@ -95,7 +95,8 @@ class SceneDelta:
                 raise SceneDeltaError(
                     f"scene delta: {name} hold {clipped(numbers.tolist())}; expected whole numbers from 0"
                 )
-            if name != "added_groups" and len(doubled := _doubled(numbers)):
+            ordered = np.sort(numbers)
+            if name != "added_groups" and len(doubled := ordered[1:][ordered[1:] == ordered[:-1]]):
                 raise SceneDeltaError(f"scene delta: {name} hold {doubled[0]} twice; expected every id once")
         for move in self.moves:
             if not 0 <= move.group <= MAX_ID:
@@ -149,11 +150,6 @@ class SceneDelta:
             shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": (None, 3)}
             arrays = [file.expect(name, np.float32, (len(ids), *shape)) for name, shape in shapes.items()]
             return cls(revision, removed, GaussianScene.from_arrays(*arrays), ids, groups, moves)
-
-
-def _doubled(ids: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    ordered = np.sort(ids)
-    return ordered[1:][ordered[1:] == ordered[:-1]]
 
 
 def check_similarity(motion: Similarity, who: str) -> None:
