@@ -20,7 +20,7 @@ cluster are those of the cluster.
    segments together. Down to an agreement of 0.6 that is so whatever the segmenter does. Where then hardly any clusters
    that touch agree by 0.3 to 0.6, no object comes in parts, and merging goes on to one half only: small ones must not
    go to large ones.
-3. **The surface has its say where objects come in parts**, and merging begins again. With e the mean strength of the
+3. **Depth edges count where objects come in parts**, and merging begins again. With e the mean strength of the
    depth edges along the borders of C and D in all views, agreement counts exp(4 (0.75 - e)) times, as parts of one
    object meet on its surface and different objects do not. And the views tell where to stop. Let them show an object
    whole with the probability w, and merge neighbours with the probability m. Two objects are under one id, both whole,
@@ -174,9 +174,9 @@ def _merge(stack: _Stack, settings: AssociationSettings) -> tuple[np.ndarray, fl
     clusters, votes = _merged(single, stack.view, settings, sure, surface=0.0)
     doubted = votes.doubted(clusters.touching)
     split = _in_parts(doubted)
-    if split > 0:  # Begun again, so that the surface has its say from the first pair on.
+    if split > 0:  # Begun again, so that depth edges count from the first pair on.
         clusters, votes = _merged(single, stack.view, settings, sure, surface=split)
-    agreement = settings.agreement or votes.told_level(doubted)
+    agreement = settings.agreement or votes.merging_level(doubted)
     clusters, _ = _merged(clusters, stack.view, settings, agreement, surface=split)
     merged = np.zeros(len(stack.view), np.int64)
     merged[~stack.background] = clusters.of + 1
@@ -218,7 +218,7 @@ class _Clusters(NamedTuple):
 def _merged(
     clusters: _Clusters, view: np.ndarray, settings: AssociationSettings, level: float, surface: float
 ) -> tuple[_Clusters, _Votes]:
-    """Merge clusters down to a level, the surface having its say by so much, 0 to 1; also return the last votes."""
+    """Merge clusters down to a level, depth edges counting by `surface`, 0 to 1; also return the last votes."""
     while True:
         votes = _Votes.of(clusters, view, settings)
         target = _match(votes.pairs(clusters.borders, surface, level), len(clusters.seen), level)
@@ -261,7 +261,7 @@ class _Votes(NamedTuple):
     def pairs(self, borders: Borders, surface: float, level: float) -> _Pairs:
         """Compare all clusters that any id shows whole together, and that may agree by more than a level.
 
-        The surface has its say by so much, 0 to 1.
+        Depth edges count by `surface`, 0 to 1.
         """
         together = sparse.triu(self.whole @ self.whole.T, 1).tocoo()
         # No fewer views see both, or show each whole, than show both whole together.
@@ -270,7 +270,7 @@ class _Votes(NamedTuple):
         see, show = self._views_of_both(first, second)
         score = np.where(see >= self.settings.evidence, self._agreement(together.data[likely], see, show), 0)
         if surface > 0:
-            score *= _goes_on(borders, first, second) ** surface
+            score *= _surface_factor(borders, first, second) ** surface
         return _Pairs(first, second, score)
 
     def _agreement(self, together: np.ndarray, see: np.ndarray, show: np.ndarray) -> np.ndarray:
@@ -278,7 +278,7 @@ class _Votes(NamedTuple):
         return together / np.sqrt((see + doubt) * (show + doubt))
 
     def doubted(self, touching: sparse.csr_matrix) -> float:
-        """Tell which share of the clusters that touch, (C, C), may be parts of one object."""
+        """Share of the pairs of clusters that touch, (C, C), that may be parts of one object."""
         pairs = sparse.triu(touching, 1).tocoo()
         often = pairs.data >= _OFTEN
         first, second = pairs.row[often], pairs.col[often]
@@ -287,8 +287,8 @@ class _Votes(NamedTuple):
         doubted = self._agreement(together, see, show)[see > _OFTEN] > _DOUBTED
         return float(np.mean(doubted)) if len(doubted) else 0.0
 
-    def told_level(self, doubted: float) -> float:
-        """Agreement above which clusters are one object, by how often views show them whole and what `doubted` told."""
+    def merging_level(self, doubted: float) -> float:
+        """Agreement above which clusters are one object, by how often views show them whole and the share `doubted`."""
         seen = self.counts.sum(axis=1)
         known = seen >= _OFTEN
         if not known.any():
@@ -307,8 +307,8 @@ class _Votes(NamedTuple):
         return count
 
 
-def _goes_on(borders: Borders, first: np.ndarray, second: np.ndarray) -> np.ndarray:  # (P,), (P,)
-    """Tell how much more likely pairs of clusters are one object for what the surface does between them, (P,)."""
+def _surface_factor(borders: Borders, first: np.ndarray, second: np.ndarray) -> np.ndarray:  # (P,), (P,)
+    """Factors (P,) of the agreement of pairs of clusters: above 1 where few depth edges run along their border."""
     if not len(first):
         return np.ones(0)
     length, edges = (np.asarray(part[first, second], np.float64).ravel() for part in borders)
@@ -317,7 +317,7 @@ def _goes_on(borders: Borders, first: np.ndarray, second: np.ndarray) -> np.ndar
 
 
 def _in_parts(doubted: float) -> float:
-    """Tell by the share of clusters in doubt whether objects come in parts at all, 0 to 1."""
+    """How far the masks show objects in parts, 0 to 1, by the share of touching clusters that may be one object."""
     return min(doubted / _SPLIT, 1)
 
 

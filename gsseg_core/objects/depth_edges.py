@@ -1,7 +1,7 @@
 """Where the surface of a scene ends in a view, and how much of the border between two segments runs along such edges.
 
-Parts of one object meet on its surface; different objects meet where one hides the other, or stands on it. So the
-surface has a say in which segments are one object, wherever masks cut objects up.
+Parts of one object meet on its surface; different objects meet where one hides the other, or stands on it. So depth
+edges help to tell which segments are one object, wherever masks cut objects up.
 """
 
 from __future__ import annotations

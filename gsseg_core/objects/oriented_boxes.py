@@ -11,7 +11,7 @@ With weights w_i = opacity times probability of the class, centres x_i and covar
    smaller; and then, about each axis, the turn for which the rectangle around the points is smallest, until none makes
    the box smaller. One side of such a rectangle lies along an edge of the points' hull (Freeman and Shapira 1975). The
    axes of S alone say little of a cube or a round table. Points outside the 0.5 % and 99.5 % quantiles along the axes
-   of S have no say in this.
+   of S do not count for this.
 4. Sides: along an axis u a Gaussian reaches from u.x_i - s_i to u.x_i + s_i, where s_i^2 = u^T S_i u. The box begins
    where 0.5 % of the weight has begun, and ends where all but 0.5 % has ended.
 

@@ -1,8 +1,8 @@
 """Access to the viewer: opens the socket that it listens on, and decides which requests it answers.
 
-Every page that a browser shows may send requests to this machine and to its neighbours. So the viewer answers only
-those that were addressed to it by a name that is its own, which a page whose own name was made to point here is not,
-and that come from its own page. Where others than this machine's users can reach it, a token is asked for, too.
+Any page in a browser can send requests to this machine and its neighbours. So the viewer answers only requests whose
+Host is one of its own names, against DNS rebinding, and whose Origin is its own page, against requests across sites.
+Where others than this machine's users can reach it, a token is asked for, too.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Starts viser's server on a guarded socket, and drops messages that the viewer has no use for.
 
-viser checks neither who asks nor what a browser says. It takes its server from `websockets`, and that is the one place
-where both can be checked before viser sees it. Another version of viser may do so in another way; then nothing starts.
+viser checks neither who asks nor what a browser sends. It starts a server of the package `websockets`, and gets one
+that checks both first. Where another version of viser starts its server in another way, the viewer does not start.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ _CHECKS: dict[str, Callable[[Any], bool]] = {
 
 
 class _Connection(ServerConnection):
-    """A connection on which only what is understood is heard."""
+    """A connection that drops the messages for which `understood` is false."""
 
     async def recv(self, decode: bool | None = None) -> Data:  # type: ignore[override]
         while True:
