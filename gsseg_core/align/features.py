@@ -6,13 +6,17 @@ of that photo to a point of the scene.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from PIL import Image
 
 from gsseg_core.align.agreement import LUMINANCE
 from gsseg_core.align.settings import AlignSettings
+from gsseg_core.data.photos import read_photo
+from gsseg_core.data.view import View, spread
 from gsseg_core.errors import AlignmentError
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.depth import COVERED, colours_and_depth
@@ -28,6 +32,13 @@ class Features(NamedTuple):
     pixels: np.ndarray  # (M, 2) float64: column, row
     descriptors: np.ndarray  # (M, 128) float32, of length 1
     points: np.ndarray | None = None  # (M, 3) float64: in the scene
+
+
+class Photo(NamedTuple):
+    """A photo to be located: its camera as the dataset has it, shrunk to what is matched, and its features."""
+
+    camera: Camera
+    features: Features
 
 
 class Extractor:
@@ -53,10 +64,33 @@ class Extractor:
         described = np.asarray(descriptors.data, np.float32).reshape(len(pixels), _LENGTH)
         return Features(pixels, described / np.maximum(np.linalg.norm(described, axis=1, keepdims=True), 1e-6))
 
-    def rendering(self, scene: GaussianScene, camera: Camera, device: str = "cpu") -> Features:
-        """Render a scene, and find the features with their points; those at the edge of nothing are left out."""
-        image, left_over = colours_and_depth(scene, make_operator(scene, camera, device))
-        found = self.photo(image[..., :3] @ LUMINANCE)
+
+@dataclass(frozen=True, eq=False)
+class PhotosInScene:
+    """Photos of a dataset, and the scene whose renderings they are matched with."""
+
+    photos: list[Photo]
+    scene: GaussianScene
+    extractor: Extractor  # of the features of both
+    settings: AlignSettings
+    device: str  # that renders
+
+    @classmethod
+    def read(cls, views: Sequence[View], scene: GaussianScene, settings: AlignSettings, device: str) -> PhotosInScene:
+        """Read some photos, spread evenly over those that there are, with their features."""
+        photos, extractor = [], Extractor(settings)
+        for view in spread([view for view in views if view.image_path is not None], settings.photos):
+            taken = read_photo(view)
+            if taken is not None:
+                camera = at_most(view.camera, settings.photo_px)
+                grey = Image.fromarray(taken).convert("L").resize((camera.width, camera.height), Image.Resampling.BOX)
+                photos.append(Photo(camera, extractor.photo(np.asarray(grey, np.float32) / 255)))
+        return cls(photos, scene, extractor, settings, device)
+
+    def rendering(self, camera: Camera) -> Features:
+        """Render the scene, and find the features with their points; those at the edge of nothing are left out."""
+        image, left_over = colours_and_depth(self.scene, make_operator(self.scene, camera, self.device))
+        found = self.extractor.photo(image[..., :3] @ LUMINANCE)
         column, row = np.clip(found.pixels.astype(int), 0, (camera.width - 1, camera.height - 1)).T
         coverage = 1 - left_over[row, column]
         solid = coverage > COVERED

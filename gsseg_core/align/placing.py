@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gsseg_core.align.agreement import Agreement, Shown, agreement, look_at
 from gsseg_core.align.conventions import Alignment, find_convention
+from gsseg_core.align.features import PhotosInScene
 from gsseg_core.align.settings import AlignSettings
 from gsseg_core.data.camera_files import frame_of_training
 from gsseg_core.data.camera_formats.dataparser import DATAPARSER
 from gsseg_core.data.dataset import Dataset
-from gsseg_core.data.view import View, spread
+from gsseg_core.data.view import View
 from gsseg_core.errors import AlignmentError, CameraFileError
 from gsseg_core.files.input_files import is_there
 from gsseg_core.progress import Progress, silent
 from gsseg_core.scene.gaussian_scene import GaussianScene
-
-if TYPE_CHECKING:
-    from gsseg_core.align.features import Extractor
-    from gsseg_core.align.registration import Photo
 
 _CLOSE_PX = 1.0  # photos and renderings that are nearer than this are as they should be
 
@@ -139,27 +136,25 @@ def find_alignment(
     taken in which photos and renderings lie upon each other, and where none is, the one that agrees best. Raises
     `AlignmentError` where nothing agrees.
     """
-    settings = settings or AlignSettings()
-    shown = look_at(views, settings)
-    before = agreement(scene, shown, settings, device)
+    search = _Search(scene, views, settings or AlignSettings(), device)
+    before = agreement(scene, search.shown, search.settings, device)
     if before is None:
         raise AlignmentError(
             "alignment: no view has a photo or a mask; expected some, to see where cameras are by them"
         )
     photos = before.compared == "photos"
-    read = cache(partial(_read, views, settings))
     agreeing: list[Found] = []
     # Masks say less than photos do: on a shelf, regions may lie well enough from a wrong side, too.
     if before.agrees and photos:
-        as_they_are = _closer(scene, read, shown, Found(Alignment(), before, before), settings, device)
+        as_they_are = search.closer(Found(Alignment(), before, before))
         # Nothing was compared with it yet, and round a table other sides look alike.
         if as_they_are.offset_px is not None and as_they_are.offset_px <= _CLOSE_PX:
             return as_they_are
         agreeing.append(as_they_are)
-    alignment = Alignment(find_convention(scene, shown, settings, device, progress))
-    if (reached := _through(scene, shown, alignment, settings, device)).agrees:
-        by_convention = _closer(scene, read, shown, Found(alignment, reached, before), settings, device)
-        if by_convention.offset_px is None or by_convention.offset_px <= settings.reprojection_px:
+    alignment = Alignment(find_convention(scene, search.shown, search.settings, device, progress))
+    if (reached := search.through(alignment)).agrees:
+        by_convention = search.closer(Found(alignment, reached, before))
+        if by_convention.offset_px is None or by_convention.offset_px <= search.settings.reprojection_px:
             return by_convention
         agreeing.append(by_convention)
     if not photos:
@@ -168,82 +163,71 @@ def find_alignment(
             "views in images/, by which scale, rotation and translation can be found, too"
         )
     try:
-        agreeing.append(_registered(scene, read, shown, before, settings, device, progress))
+        agreeing.append(search.registered(before, progress))
     except AlignmentError:
         if not agreeing:
             raise
     return max(agreeing, key=lambda found: found.agreement.score)
 
 
-def _read(views: Sequence[View], settings: AlignSettings) -> tuple[Extractor, list[Photo]]:
-    """Read the photos that renderings are matched with, and what finds features in both."""
-    from gsseg_core.align.features import Extractor
-    from gsseg_core.align.registration import read_photos
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """A scene, and views whose cameras are looked for in it."""
 
-    extractor = Extractor(settings)
-    return extractor, read_photos(views, extractor, settings)
+    scene: GaussianScene
+    views: Sequence[View]
+    settings: AlignSettings
+    device: str
 
+    @cached_property
+    def shown(self) -> list[Shown]:
+        """What some of the views show."""
+        return look_at(self.views, self.settings)
 
-def _registered(
-    scene: GaussianScene,
-    read: Callable[[], tuple[Extractor, list[Photo]]],
-    shown: Sequence[Shown],
-    before: Agreement,
-    settings: AlignSettings,
-    device: str,
-    progress: Progress,
-) -> Found:
-    """Find a similarity by the photos."""
-    from gsseg_core.align.refinement import offset_px, refined
-    from gsseg_core.align.registration import candidates
+    @cached_property
+    def photos(self) -> PhotosInScene:
+        """Photos that renderings are matched with."""
+        return PhotosInScene.read(self.views, self.scene, self.settings, self.device)
 
-    extractor, photos = read()
-    for guess in candidates(scene, photos, extractor, settings, device, progress):
-        alignment = refined(scene, photos, guess, extractor, settings, device)
-        reached = _through(scene, shown, alignment, settings, device)
-        if reached.agrees:
-            progress("look for photos in the scene", settings.virtual_views, settings.virtual_views)
-            few = spread(photos, settings.views)
-            return Found(alignment, reached, before, offset_px(scene, few, alignment, extractor, settings, device))
-    raise AlignmentError(
-        f"alignment: no place in the scene looks as the {len(photos)} photos do; expected photos of this scene, with "
-        "structure, and poses that differ from the scene's by a convention, a scale, a rotation and a translation"
-    )
+    def registered(self, before: Agreement, progress: Progress) -> Found:
+        """Find a similarity by the photos."""
+        from gsseg_core.align.refinement import offset_px, refined
+        from gsseg_core.align.registration import candidates
 
+        for guess in candidates(self.photos, progress):
+            alignment = refined(self.photos, guess)
+            reached = self.through(alignment)
+            if reached.agrees:
+                count = self.settings.virtual_views
+                progress("look for photos in the scene", count, count)
+                return Found(alignment, reached, before, offset_px(self.photos, alignment))
+        raise AlignmentError(
+            f"alignment: no place in the scene looks as the {len(self.photos.photos)} photos do; expected photos of "
+            "this scene, with structure, and poses that differ from the scene's by a convention, a scale, a rotation "
+            "and a translation"
+        )
 
-def _closer(
-    scene: GaussianScene,
-    read: Callable[[], tuple[Extractor, list[Photo]]],
-    shown: Sequence[Shown],
-    found: Found,
-    settings: AlignSettings,
-    device: str,
-) -> Found:
-    """Fit what is about right to the photos, if there are any and they are not yet close to the renderings."""
-    if found.agreement.compared != "photos":
-        return found
-    from gsseg_core.align.refinement import offset_px, refined
+    def closer(self, found: Found) -> Found:
+        """Fit what is about right to the photos, if there are any and they are not yet close to the renderings."""
+        if found.agreement.compared != "photos":
+            return found
+        from gsseg_core.align.refinement import offset_px, refined
 
-    extractor, photos = read()
-    few = spread(photos, settings.views)
-    offset = offset_px(scene, few, found.alignment, extractor, settings, device)
-    if offset is None or offset <= _CLOSE_PX:
-        return replace(found, offset_px=offset)
-    alignment = refined(scene, photos, found.alignment, extractor, settings, device)
-    closer = offset_px(scene, few, alignment, extractor, settings, device)
-    if closer is None or closer >= offset:
-        return replace(found, offset_px=offset)
-    return Found(alignment, _through(scene, shown, alignment, settings, device), found.before, closer)
+        offset = offset_px(self.photos, found.alignment)
+        if offset is None or offset <= _CLOSE_PX:
+            return replace(found, offset_px=offset)
+        alignment = refined(self.photos, found.alignment)
+        closer = offset_px(self.photos, alignment)
+        if closer is None or closer >= offset:
+            return replace(found, offset_px=offset)
+        return Found(alignment, self.through(alignment), found.before, closer)
 
-
-def _through(
-    scene: GaussianScene, shown: Sequence[Shown], alignment: Alignment, settings: AlignSettings, device: str
-) -> Agreement:
-    """Compare a scene with views whose cameras are moved."""
-    moved = [replace(view, camera=alignment.camera(view.camera)) for view in shown]
-    compared = agreement(scene, moved, settings, device)
-    assert compared is not None  # since there are views
-    return compared
+    def through(self, alignment: Alignment) -> Agreement:
+        """Compare the scene with the views, of which there are some, after their cameras are moved."""
+        moved = [replace(view, camera=alignment.camera(view.camera)) for view in self.shown]
+        compared = agreement(self.scene, moved, self.settings, self.device)
+        assert compared is not None
+        return compared
 
 
 def _frame_of_training(

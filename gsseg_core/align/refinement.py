@@ -15,10 +15,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from gsseg_core.align.conventions import Alignment
-from gsseg_core.align.features import Extractor, matches
-from gsseg_core.align.registration import Photo
-from gsseg_core.align.settings import AlignSettings
-from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.align.features import Photo, PhotosInScene, matches
+from gsseg_core.data.view import spread
 from gsseg_core.scene.similarity import Similarity
 
 _SEARCH_PX = (40.0, 12.0, 6.0)  # how far from its place a feature is looked for, in each step
@@ -41,52 +39,29 @@ class _Ties(NamedTuple):
         return local[:, :2] / depth * self.lenses[:, :2] + self.lenses[:, 2:] - self.pixels
 
 
-def refined(
-    scene: GaussianScene,
-    photos: Sequence[Photo],
-    alignment: Alignment,
-    extractor: Extractor,
-    settings: AlignSettings,
-    device: str = "cpu",
-) -> Alignment:
+def refined(photos: PhotosInScene, alignment: Alignment) -> Alignment:
     """Fit the similarity of an alignment to all photos; where hardly anything matches, it is returned as it was."""
-    for step in range(settings.refinements):
-        within = _SEARCH_PX[min(step, len(_SEARCH_PX) - 1)]
-        ties = _ties(scene, photos, alignment, extractor, settings, within, device)
+    for step in range(photos.settings.refinements):
+        ties = _ties(photos, photos.photos, alignment, _SEARCH_PX[min(step, len(_SEARCH_PX) - 1)])
         if len(ties.pixels) < _LEAST:
             return alignment
         alignment = Alignment(alignment.convention, _fit(ties).inverse().after(alignment.similarity))
     return alignment
 
 
-def offset_px(
-    scene: GaussianScene,
-    photos: Sequence[Photo],
-    alignment: Alignment,
-    extractor: Extractor,
-    settings: AlignSettings,
-    device: str = "cpu",
-) -> float | None:
-    """How far photos and renderings are apart, in px of the photos as matched: median over the features of both."""
-    ties = _ties(scene, photos, alignment, extractor, settings, _SEARCH_PX[0], device)
+def offset_px(photos: PhotosInScene, alignment: Alignment) -> float | None:
+    """How far some photos and renderings are apart, in px of the photos as matched: median over features of both."""
+    ties = _ties(photos, spread(photos.photos, photos.settings.views), alignment, _SEARCH_PX[0])
     return float(np.median(np.linalg.norm(ties.errors(ties.points), axis=1))) if len(ties.pixels) >= _LEAST else None
 
 
-def _ties(
-    scene: GaussianScene,
-    photos: Sequence[Photo],
-    alignment: Alignment,
-    extractor: Extractor,
-    settings: AlignSettings,
-    within_px: float,
-    device: str,
-) -> _Ties:
-    """Match each photo with what the scene looks like from its camera."""
+def _ties(photos: PhotosInScene, some: Sequence[Photo], alignment: Alignment, within_px: float) -> _Ties:
+    """Match some of the photos with what the scene looks like from their cameras."""
     rows = []
-    for camera, features in photos:
+    for camera, features in some:
         moved = alignment.camera(camera)
-        rendering = extractor.rendering(scene, moved, device)
-        pairs = matches(features, rendering, settings.ratio, within_px)
+        rendering = photos.rendering(moved)
+        pairs = matches(features, rendering, photos.settings.ratio, within_px)
         if len(pairs) == 0 or rendering.points is None:
             continue
         pose = moved.world_to_camera

@@ -15,14 +15,11 @@ from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
-from PIL import Image
 
 from gsseg_core.align.conventions import AXIS_ROTATIONS, Alignment, Convention
-from gsseg_core.align.features import Extractor, Features, at_most, matches
+from gsseg_core.align.features import Features, Photo, PhotosInScene, matches
 from gsseg_core.align.settings import AlignSettings
-from gsseg_core.data.photos import read_photo
-from gsseg_core.data.view import View, spread
-from gsseg_core.progress import Progress, silent
+from gsseg_core.progress import Progress
 from gsseg_core.scene.camera import Camera, pose_looking
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.similarity import Similarity
@@ -32,13 +29,6 @@ _SOLID = 0.3  # opacity from which on a Gaussian counts for the size of the scen
 _TURN_DEGREES, _SHIFT = 5.0, 0.1  # by which located cameras may miss those of one similarity; of the extent of centres
 
 
-class Photo(NamedTuple):
-    """A photo to be located: its camera as the dataset has it, shrunk to what is matched, and its features."""
-
-    camera: Camera
-    features: Features
-
-
 class Located(NamedTuple):
     """A camera where its photo was found to be taken, and how many matches say so."""
 
@@ -46,40 +36,22 @@ class Located(NamedTuple):
     matches: int
 
 
-def read_photos(views: Sequence[View], extractor: Extractor, settings: AlignSettings) -> list[Photo]:
-    """Read some photos, spread evenly over those that there are, with their features."""
-    photos = []
-    for view in spread([view for view in views if view.image_path is not None], settings.photos):
-        taken = read_photo(view)
-        if taken is not None:
-            camera = at_most(view.camera, settings.photo_px)
-            grey = Image.fromarray(taken).convert("L").resize((camera.width, camera.height), Image.Resampling.BOX)
-            photos.append(Photo(camera, extractor.photo(np.asarray(grey, np.float32) / 255)))
-    return photos
-
-
-def candidates(
-    scene: GaussianScene,
-    photos: Sequence[Photo],
-    extractor: Extractor,
-    settings: AlignSettings,
-    device: str = "cpu",
-    progress: Progress = silent,
-) -> Iterator[Alignment]:
+def candidates(photos: PhotosInScene, progress: Progress) -> Iterator[Alignment]:
     """Guess alignments, each from other photos than the last; most guesses are right, to a few px."""
-    if len(photos) < 2:
+    if len(photos.photos) < 2:
         return
-    for done, camera in enumerate(virtual_cameras(scene, photos[0].camera, settings.virtual_views)):
-        progress("look for photos in the scene", done, settings.virtual_views)
-        found = locate(photos, extractor.rendering(scene, camera, device), settings)
+    count = photos.settings.virtual_views
+    for done, camera in enumerate(virtual_cameras(photos.scene, photos.photos[0].camera, count)):
+        progress("look for photos in the scene", done, count)
+        found = locate(photos.photos, photos.rendering(camera), photos.settings)
         for _ in range(2):  # from where the surest one was taken, the scene looks like it
             if not found:
                 break
             surest = max(found.values(), key=lambda located: located.matches)
-            found = locate(photos, extractor.rendering(scene, surest.camera, device), settings)
-        if len(found) > 1 and (guess := fit_poses(photos, found)) is not None:
+            found = locate(photos.photos, photos.rendering(surest.camera), photos.settings)
+        if len(found) > 1 and (guess := fit_poses(photos.photos, found)) is not None:
             yield guess
-    progress("look for photos in the scene", settings.virtual_views, settings.virtual_views)
+    progress("look for photos in the scene", count, count)
 
 
 def virtual_cameras(scene: GaussianScene, like: Camera, count: int) -> Iterator[Camera]:

@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 from gsseg_core.align import conventions, placing
 from gsseg_core.align.agreement import Agreement, agreement, look_at, render, thinned
 from gsseg_core.align.conventions import AXIS_ROTATIONS, OPENGL, Convention
-from gsseg_core.align.features import Extractor, Features
+from gsseg_core.align.features import Extractor, Features, Photo
 from gsseg_core.align.placing import Found, find_alignment, place
-from gsseg_core.align.registration import Located, Photo, fit_poses
+from gsseg_core.align.registration import Located, fit_poses
 from gsseg_core.align.settings import AlignSettings
 from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset
@@ -193,14 +193,14 @@ def test_a_table_seen_from_another_side_is_not_taken_for_right_because_it_looks_
 def test_where_photos_and_renderings_lie_upon_each_other_nowhere_what_agrees_best_is_taken(
     with_photos: Path, scene: GaussianScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(placing, "_closer", lambda *given: replace(given[3], offset_px=29.0))
+    monkeypatch.setattr(placing._Search, "closer", lambda _, found: replace(found, offset_px=29.0))
     asked = []
 
     def nowhere(*_: object) -> Found:
         asked.append(True)
         raise AlignmentError("no place looks as the photos do")
 
-    monkeypatch.setattr(placing, "_registered", nowhere)
+    monkeypatch.setattr(placing._Search, "registered", nowhere)
     found = find_alignment(scene, Dataset(with_photos).views(), replace(SETTINGS, survivors=0.01, picture_px=48))
     assert asked and found.alignment.parts == [] and found.offset_px == 29.0
 
