@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.errors import SettingsError
-from gsseg_core.export.poisson_surface import Voxels, poisson_surface, sphere
+from gsseg_core.export.poisson_surface import Ellipsoids, Voxels, poisson_surface, sphere
 from gsseg_core.objects.occupied_cells import OPAQUE
 from gsseg_core.objects.oriented_boxes import without_floaters
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -71,17 +71,15 @@ def collision_mesh(
         return None
     kept = index[without_floaters(scene.means[index].astype(np.float64), scene.opacities[index] * confidence[index])]
     make = {HULL: _hull, SURFACE: _surface, POISSON: _poisson}[kind]
-    return make(scene.means[kept], half_axes(scene.quats[kept], scene.scales[kept]))
+    return make(Ellipsoids(scene.means[kept], half_axes(scene.quats[kept], scene.scales[kept])))
 
 
-def _hull(
-    means: npt.NDArray[np.float32],  # (M, 3)
-    half_axes: npt.NDArray[np.float32],  # (M, 3, 3)
-) -> TriangleMesh | None:
+def _hull(solid: Ellipsoids) -> TriangleMesh | None:
     """Convex hull of the ends of all axes; None where they have no volume."""
     from scipy.spatial import ConvexHull, QhullError
 
-    ends = np.concatenate([means[:, None] + sign * half_axes.transpose(0, 2, 1) for sign in (1, -1)]).reshape(-1, 3)
+    axes = solid.half_axes.transpose(0, 2, 1)
+    ends = np.concatenate([solid.means[:, None] + sign * axes for sign in (1, -1)]).reshape(-1, 3)
     try:
         hull = ConvexHull(ends.astype(np.float64))
     except QhullError:
@@ -94,14 +92,11 @@ def _hull(
     return TriangleMesh(points.astype(np.float32), triangles, convex=True)
 
 
-def _surface(
-    means: npt.NDArray[np.float32],  # (M, 3)
-    half_axes: npt.NDArray[np.float32],  # (M, 3, 3)
-) -> TriangleMesh | None:
+def _surface(solid: Ellipsoids) -> TriangleMesh | None:
     """Watertight surface around ellipsoids; None where they have no extent."""
     from scipy import ndimage
 
-    voxels = _filled(means, half_axes)
+    voxels = _filled(solid)
     if voxels is None:
         return None
     filled = ndimage.binary_fill_holes(ndimage.binary_closing(voxels.filled, iterations=_CLOSED))
@@ -109,22 +104,16 @@ def _surface(
     return voxels.mesh(smooth, 0.5 * float(smooth.max()))
 
 
-def _poisson(
-    means: npt.NDArray[np.float32],  # (M, 3)
-    half_axes: npt.NDArray[np.float32],  # (M, 3, 3)
-) -> TriangleMesh | None:
+def _poisson(solid: Ellipsoids) -> TriangleMesh | None:
     """Poisson surface of ellipsoids, and where they have no inside, the surface around them."""
-    voxels = _filled(means, half_axes, _ROOM)
-    mesh = None if voxels is None else poisson_surface(means, half_axes, voxels)
-    return mesh or _surface(means, half_axes)
+    voxels = _filled(solid, _ROOM)
+    mesh = None if voxels is None else poisson_surface(solid, voxels)
+    return mesh or _surface(solid)
 
 
-def _filled(
-    means: npt.NDArray[np.float32],  # (M, 3)
-    half_axes: npt.NDArray[np.float32],  # (M, 3, 3)
-    margin: int = _MARGIN,
-) -> Voxels | None:
+def _filled(solid: Ellipsoids, margin: int = _MARGIN) -> Voxels | None:
     """Voxels that ellipsoids fill; None where they have no extent."""
+    means, half_axes = solid
     reach = np.linalg.norm(half_axes, axis=2)  # (M, 3): of an ellipsoid along x, y, z
     low, high = (means - reach).min(axis=0), (means + reach).max(axis=0)
     voxel = float((high - low).max()) / VOXELS

@@ -23,6 +23,13 @@ _APART = 1e-2  # of the range of values
 _HELD = 0.5  # share of the Gaussians that a surface holds, or it is none of theirs
 
 
+class Ellipsoids(NamedTuple):
+    """What an object is taken for: an ellipsoid of one standard deviation for each of its Gaussians."""
+
+    means: npt.NDArray[np.float32]  # (M, 3)
+    half_axes: npt.NDArray[np.float32]  # (M, 3, 3): one in each column
+
+
 class Voxels(NamedTuple):
     """What ellipsoids fill: middle of voxel i is low + (i - margin + 0.5) * size."""
 
@@ -45,18 +52,14 @@ class Voxels(NamedTuple):
         return TriangleMesh(points.astype(np.float32), triangles.astype(np.int32))
 
 
-def poisson_surface(
-    means: npt.NDArray[np.float32],  # (M, 3)
-    half_axes: npt.NDArray[np.float32],  # (M, 3, 3)
-    voxels: Voxels,
-) -> TriangleMesh | None:
+def poisson_surface(ellipsoids: Ellipsoids, voxels: Voxels) -> TriangleMesh | None:
     """Close a surface around ellipsoids; None where they have no inside, as a sheet that is seen from both sides.
 
     It goes through those ends of ellipsoids that point outwards.
     """
     from scipy import ndimage
 
-    normals = _normals(means, half_axes, voxels)
+    (means, half_axes), normals = ellipsoids, _normals(ellipsoids, voxels)
     seen = np.flatnonzero(np.abs(normals).max(axis=1) > 0)
     if not len(seen):
         return None
@@ -87,12 +90,9 @@ def poisson_surface(
     return voxels.mesh(np.where(solid, away, -away), 0.0)
 
 
-def _normals(
-    means: npt.NDArray[np.float32],  # (M, 3)
-    half_axes: npt.NDArray[np.float32],  # (M, 3, 3)
-    voxels: Voxels,
-) -> npt.NDArray[np.float64]:
+def _normals(ellipsoids: Ellipsoids, voxels: Voxels) -> npt.NDArray[np.float64]:
     """Find unit normals (M, 3), outwards; 0 of a Gaussian that is seen from nowhere."""
+    means, half_axes = ellipsoids
     solid = (np.argwhere(voxels.filled) - voxels.margin + 0.5) * voxels.size + voxels.low
     cell, free = 1.5 * voxels.size, np.zeros(means.shape)
     for direction in sphere(_DIRECTIONS):
