@@ -84,7 +84,7 @@ def look_at(
     device: str,
     view: View,
 ) -> Silhouette:
-    """Tell what a view shows, to carve objects by; if it is of the `asked` names, draw it on the way, into `drawn`."""
+    """Render what a view shows, to carve objects by; draw it into `drawn` on the way if its name is among `asked`."""
     operator, pictured = make_operator(scene, view.camera, device), view.name in asked
     nothing = np.empty((len(operator.ids), 0), np.float32)
     colors = scene.colors(view.camera.center, operator.ids) if pictured else nothing

@@ -14,8 +14,8 @@ cluster are those of the cluster.
    share O_Cb / V_Cv of an id grows from one half to nine tenths. Of the views that see both C and D, two averages are
    taken: the share in which one id shows both whole, and the share of that among those in which each is shown whole.
    Their geometric mean is the agreement of C and D. Parts of one object are shown whole together as often as the object
-   is; two objects only where both happen to be whole and have been merged as well. And that half of C went with D, as
-   where many neighbours are merged, says nothing.
+   is; two objects only where both happen to be whole and have been merged as well. A view in which half of C is merged
+   with D, as where many neighbours are, does not count.
 2. **Clusters merge**, the most agreed pairs first; what has merged is compared anew, with the evidence of all its
    segments together. Down to an agreement of 0.6 that is so whatever the segmenter does. Where then hardly any clusters
    that touch agree by 0.3 to 0.6, no object comes in parts, and merging goes on to one half only: small ones must not

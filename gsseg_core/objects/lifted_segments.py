@@ -91,7 +91,7 @@ class Profiles:
         return self._sum
 
     def common(self, segments: Lifted, objects: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Tell how much of L segments of a view lies on each object, (L, K), and on known Gaussians, (L,), in px.
+        """How much of L segments of a view lies on each object, (L, K), and on known Gaussians, (L,), in px.
 
         With `objects`, (L,), which these segments have been added as, only what the other views say counts.
         """

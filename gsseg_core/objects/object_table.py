@@ -21,7 +21,7 @@ from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
 
-_UNTOLD = 0.5  # granularity of the objects before all views were looked at together
+_EARLY_GRANULARITY = 0.5  # of the objects before all views were looked at together
 
 
 @dataclass(frozen=True)
@@ -149,11 +149,11 @@ class ObjectTable:
             self._fill()
 
     def sees(self, name: str) -> bool:
-        """Tell whether a view counts: it was not set aside."""
+        """Whether a view counts: it was not set aside."""
         return name in self._lifted
 
     def sees_any(self, view: View) -> bool:
-        """Tell whether a view has a mask and sees any Gaussian."""
+        """Whether a view has a mask and sees any Gaussian."""
         return self._lift(view) is not None
 
     def set_aside(self, view: View) -> None:
@@ -191,7 +191,7 @@ class ObjectTable:
         labels, probabilities = segmentation.labels, segmentation.probabilities
         # What refinement took out covers an object still.
         classes = np.where(labels == REMOVED, probabilities.argmax(axis=1), labels)
-        level = _UNTOLD if self._agreement is None else self._agreement
+        level = _EARLY_GRANULARITY if self._agreement is None else self._agreement
         tree = grow_tree(self.scene.means, classes, probabilities.shape[1], self._lifted, level, self.settings)
         return replace(segmentation, tree=tree)
 
@@ -210,7 +210,7 @@ class ObjectTable:
         return replace(View.from_arrays(view.camera, table[labels]), image_path=view.image_path)
 
     def alignment(self, name: str) -> Alignment:
-        """Tell which object each id of a view stands for, and how many ids do not fit."""
+        """Which object each id of a view stands for, and how many ids do not fit."""
         lifted, objects = self._lifted[name], self._objects[name]
         shown = objects[objects > 0]
         parts, _ = self._profiles.common(lifted)

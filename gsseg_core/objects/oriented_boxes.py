@@ -164,7 +164,7 @@ def object_boxes(scene: GaussianScene, result: Segmentation) -> dict[int, Orient
 
 
 def without_floaters(points: Array, weights: Array) -> npt.NDArray[np.bool_]:
-    """Tell which points (M, 3) are no farther than `FAR` times 90 % of their weight from the geometric median, (M,)."""
+    """Mark points (M, 3) that are no farther than `FAR` times 90 % of the weight from the geometric median, (M,)."""
     middle = weights @ points / weights.sum()
     distance = np.linalg.norm(points - middle, axis=1)
     for _ in range(_STEPS):

@@ -5,10 +5,10 @@ carries that to the Gaussians, W^T onehot(y) px of each; votes of several views 
 neighbours' answer along the graph of the scene (`gsseg_core.refine.label_propagation`): the back of a chair hangs
 together with its front, and the wall behind it with the wall beside it.
 
-Two things would make a mask flood rooms that no view shows. A thousandth of the light of a pixel comes from
-behind what it shows, and no pixel says otherwise of a Gaussian that is hidden so: its share of the votes is that of the
-object, whole. And where no vote is near, neighbours agree on whatever reaches them. So each Gaussian has a little
-evidence against the object besides what was seen, the more, the farther away it lies for the object's own size:
+Two things would let a mask spread to rooms that no view shows. A thousandth of the light of a pixel comes from
+Gaussians behind what it shows; no other pixel contradicts, so all votes for these are votes for the object. And where
+no vote is near, neighbours agree on whatever reaches them. So each Gaussian has a little evidence against the object
+besides what was seen, the more, the farther away it lies for the object's own size:
 
     FAR |x_i - c|^2 / R^2 px
 

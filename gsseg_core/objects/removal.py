@@ -38,7 +38,7 @@ def without_objects(scene: GaussianScene, segmentation: Segmentation, classes: C
 
 
 def left_without(scene: GaussianScene, segmentation: Segmentation, classes: Collection[int]) -> np.ndarray:
-    """Tell which Gaussians of a scene `without_objects` leaves, (N,) bool; it raises the same errors."""
+    """Mark the Gaussians of a scene that `without_objects` leaves, (N,) bool; raises the same errors."""
     segmentation.require(scene)
     gone = {k: segmentation.members(k) for k in classes}
     empty = [k for k, members in gone.items() if not members.any()]

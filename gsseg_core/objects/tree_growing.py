@@ -139,7 +139,7 @@ class _Segments:
         return regions * (counts / np.maximum(seen, 1e-9))[:, self.view], counts
 
     def showing(self, regions: Sequence[_Region], shares: np.ndarray) -> np.ndarray:
-        """Tell which views show a region as a segment, (R, views) bool, of all there are with their shares (R, S).
+        """Which views show each region as a segment, (R, views) bool, given the shares (R, S) of all regions.
 
         A segment is one region of those that hold each other: the one that fits it best, the larger one if both do.
         """

@@ -26,7 +26,7 @@ _PREFIXES = ("_model.gauss_params.", "_model.")  # of nerfstudio since 1.0, and 
 
 
 def is_checkpoint(head: bytes) -> bool:
-    """Tell by its first bytes a zip as `torch.save` writes it."""
+    """Whether a file begins as a zip of `torch.save`."""
     return head.startswith(b"PK\x03\x04") and b"data.pkl" in head[:256]
 
 

@@ -18,7 +18,7 @@ _SH_RANGE = 8.0  # coefficients lie within -4 and 4
 
 
 def is_compressed_ply(head: bytes) -> bool:
-    """Tell a compressed PLY by its header."""
+    """Whether a file begins with the header of a compressed PLY."""
     header = head.partition(b"end_header")[0]
     return head.startswith(b"ply") and b"element chunk " in header and b" packed_position" in header
 

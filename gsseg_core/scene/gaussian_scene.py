@@ -259,7 +259,7 @@ def _sh_names(vertices: npt.NDArray[np.void], source: str) -> tuple[str, ...]:
 
 
 def _all_within(vertices: npt.NDArray[np.void], most: float) -> bool:  # (N,)
-    """Tell of vertices that are floats side by side whether none is larger than `most`; of others say no."""
+    """Whether vertices are floats side by side of which none is larger than `most`."""
     plain = [(name, np.float32) for name in vertices.dtype.names or ()]
     if not vertices.flags.c_contiguous or vertices.dtype != np.dtype(plain):
         return False

@@ -39,7 +39,7 @@ _RIGID = 1e-4  # how far the axes of a node may be from equally long and at righ
 
 
 def is_gltf(head: bytes) -> bool:
-    """Tell GLB by its magic, and glTF as JSON by what every one must have."""
+    """Whether a file begins as GLB, or as JSON with what every glTF must have."""
     return head.startswith(b"glTF") or (head.lstrip()[:1] == b"{" and b'"asset"' in head and b'"meshes"' in head)
 
 

@@ -85,12 +85,12 @@ def _parse(path: Path, within: Path | None) -> Any:
 
 
 def is_ply(head: bytes) -> bool:
-    """Tell a PLY by its first bytes."""
+    """Whether a file begins as PLY."""
     return head.startswith((b"ply\n", b"ply\r"))
 
 
 def _is_text(file: BinaryIO) -> bool:
-    """Tell from its header whether a PLY is text; raises `ValueError` if the file is too short for its counts."""
+    """Whether a PLY is text, by its header; raises `ValueError` if the file is too short for its counts."""
     head = file.read(_MAX_HEADER)
     if not is_ply(head):
         raise ValueError(f"begins with {head[:24]!r}, not with 'ply'" if head else "is empty")

@@ -27,7 +27,7 @@ def read_3dgs(path: Path, within: Path | None = None) -> ReadScene:
 
 
 def is_mip_splatting(head: bytes) -> bool:
-    """Tell by its header a PLY of Mip-Splatting whose 3D filter is not fused."""
+    """Whether a file begins with the header of a PLY of Mip-Splatting whose 3D filter is not fused."""
     return b"filter_3D" in _properties(head)
 
 
@@ -55,7 +55,7 @@ def read_mip_splatting(path: Path, within: Path | None = None) -> ReadScene:
 
 
 def is_2dgs(head: bytes) -> bool:
-    """Tell by its header a PLY of 2DGS, whose Gaussians are discs: they have two scales."""
+    """Whether a file begins with the header of a PLY of 2DGS, whose Gaussians are discs: they have two scales."""
     properties = _properties(head)
     return {b"scale_0", b"scale_1", b"rot_3"}.issubset(properties) and b"scale_2" not in properties
 

@@ -135,7 +135,7 @@ def read_scene(path: str | os.PathLike[str], within: Path | None = None) -> Read
 
 
 def scene_hint(path: Path) -> str:
-    """Tell where a scene lies, if a folder or nothing was found in its place."""
+    """Hint at where a scene lies, if a folder or nothing was found in its place."""
     if path.is_dir():
         # Trainers write point_cloud/iteration_30000/point_cloud.ply; the one of most steps is wanted.
         trained = sorted(path.glob("point_cloud/iteration_*"), key=lambda folder: (len(folder.name), folder.name))

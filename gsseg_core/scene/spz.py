@@ -58,7 +58,7 @@ class _Header(NamedTuple):
 
 
 def is_spz(head: bytes) -> bool:
-    """Tell an SPZ file by its first bytes; what is gzipped and no SPZ is refused by its reader."""
+    """Whether a file begins as SPZ does; the reader refuses what is gzipped and no SPZ."""
     return head.startswith((_MAGIC, _GZIP))
 
 

@@ -54,7 +54,7 @@ def class_distances(neighbours: Neighbours, labels: np.ndarray, num_classes: int
 
 
 def _to_be_found(tree: Tree, labels: np.ndarray, before: Found, k: int) -> np.ndarray:
-    """Tell which distances may be others than before, (n,) bool."""
+    """Mark the distances that may have changed, (n,) bool."""
     moved = labels != before.labels
     wanted: np.ndarray = moved & (labels > 0)
     if not moved.any():

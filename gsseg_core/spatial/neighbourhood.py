@@ -204,7 +204,7 @@ def _add(codes: CSRRows, counted: np.ndarray, start: int, lanes: int, sums: np.n
 
 @kernel(parallel=True)
 def nodes_without(counted: np.ndarray, leaves: int) -> np.ndarray:  # (n,) bool, by place
-    """Tell of which nodes no point counts, (2 L,) int32: 1 for these, 0 for others."""
+    """Mark the nodes of which no point counts, (2 L,) int32: 1 for these, 0 for others."""
     without = np.ones(2 * leaves, np.int32)
     for leaf in nb.prange(leaves):
         first, last = leaf_range(leaf, leaves, len(counted))

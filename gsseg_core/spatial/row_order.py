@@ -44,7 +44,7 @@ def _spread(number: np.ndarray) -> np.ndarray:
 
 
 def inverse(order: np.ndarray) -> np.ndarray:  # (N,) int64
-    """Tell which place each index has in an order, (N,) int64."""
+    """Place of each index in an order, (N,) int64."""
     places = np.empty_like(order)
     places[order] = np.arange(len(order))
     return places

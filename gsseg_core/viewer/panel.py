@@ -276,7 +276,7 @@ class Panel:
 
     @contextmanager
     def telling(self, client: viser.ClientHandle | None) -> Iterator[None]:
-        """Tell the browser of errors that its user can do something about."""
+        """Show errors that the user can do something about in the browser."""
         try:
             yield
         except GssegError as error:
