@@ -77,40 +77,19 @@ class Placed:
 
 def place(
     scene: GaussianScene,
-    dataset: Dataset,
+    dataset: Dataset,  # with photos or masks where these are needed
     *,
-    align: bool = False,
-    check: bool = False,
+    align: bool = False,  # find where the cameras are; else they stay where they are
+    check: bool = False,  # compare the scene with a few views
     dataparser: str | os.PathLike[str] | None = None,
     device: str = "cpu",
     progress: Progress = silent,
 ) -> Placed:
     """Put the cameras of a dataset where they are in a scene.
 
-    Parameters
-    ----------
-    scene : GaussianScene
-        The scene.
-    dataset : Dataset
-        Its views, with photos or masks where these are needed.
-    align : bool
-        Find where the cameras are; else they stay where they are.
-    check : bool
-        Compare the scene with a few views.
-    dataparser : path, optional
-        nerfstudio's `dataparser_transforms.json`, which lies beside the trained config. If it lies beside the scene or
-        in the dataset, it is found.
-    device : str
-        As for `make_operator`.
-    progress : Progress
-        Told how far it is.
-
-    Raises
-    ------
-    AlignmentError
-        It cannot be found where the cameras are.
-    CameraFileError, PoseError
-        The file of nerfstudio is broken, or says nothing of cameras of this format.
+    `dataparser` is nerfstudio's `dataparser_transforms.json`, which lies beside the trained config. If it lies beside
+    the scene or in the dataset, it is found. Raises `AlignmentError` where it cannot be found where the cameras are;
+    `CameraFileError` or `PoseError` if that file is broken, or says nothing of cameras of this format.
     """
     settings, file = AlignSettings(), None
     if found := _frame_of_training(scene, dataset, dataparser):

@@ -48,24 +48,15 @@ def palette(num_classes: int) -> np.ndarray:
     return colors
 
 
-def overlay(image: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.ndarray:
+def overlay(
+    image: np.ndarray,  # (H, W, 3) uint8: what was seen
+    labels: np.ndarray,  # (H, W) int: of each pixel, all below K
+    colors: np.ndarray,  # (K, 3) uint8: `palette(K)`
+) -> np.ndarray:
     """Lay labels over an image: tinted areas, and a thin line in the label's full colour along every class border.
 
-    Background (0) and unknown (negative) pixels keep the image, a little greyed.
-
-    Parameters
-    ----------
-    image : ndarray (H, W, 3) uint8
-        What was seen.
-    labels : array (H, W) of int
-        Label of each pixel; every one below K.
-    colors : ndarray (K, 3) uint8
-        `palette(K)`.
-
-    Raises
-    ------
-    ValueError
-        Labels are of another size, or have no colour: a kernel would read beyond the arrays.
+    Background (0) and unknown (negative) pixels keep the image, a little greyed. Raises `ValueError` where labels are
+    of another size, or have no colour: a kernel would read beyond the arrays.
     """
     largest = int(labels.max(initial=0))
     if labels.shape != image.shape[:2] or largest >= len(colors):
@@ -112,17 +103,9 @@ def shown_at(px: int, image: np.ndarray, *labels: np.ndarray) -> tuple[np.ndarra
 
 
 def contact_sheet(images: Sequence[np.ndarray], captions: Sequence[str], columns: int) -> np.ndarray:
-    """Lay pictures out in rows, each with its caption below it.
+    """Lay pictures out in rows of so many, (H, W, 3) uint8 each, at least one, with their captions below.
 
-    Parameters
-    ----------
-    images : sequence of ndarray (H, W, 3) uint8
-        One or more pictures, shrunk to `CELL_PX` a side at most; smaller ones are centred in cells of the largest
-        one's size.
-    captions : sequence of str
-        One for each picture.
-    columns : int
-        Pictures in a row.
+    They are shrunk to `CELL_PX` a side at most; smaller ones are centred in cells of the largest one's size.
     """
     gap, text = 12, 14
     images = [shrunk(image, CELL_PX) for image in images]
@@ -141,16 +124,9 @@ def contact_sheet(images: Sequence[np.ndarray], captions: Sequence[str], columns
 
 
 def legend(class_names: Mapping[int, str], colors: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Draw one line a class: its colour, label, name and count, in as many columns of even length as it takes.
+    """Draw one line a class, in the order given, in as many columns of even length as it takes.
 
-    Parameters
-    ----------
-    class_names : mapping from label to name
-        What to show, in the order given.
-    colors : ndarray (K, 3) uint8
-        `palette(K)`.
-    counts : array (K,) of int
-        What to write behind each name, such as the number of Gaussians.
+    It has the class's colour of (K, 3) uint8, label, name, and count of (K,), such as the number of Gaussians.
     """
     margin, line, font = 16, 26, ImageFont.load_default(15)
     entries = [(str(k), _shorten(name, font, 260), f"{counts[k]:,}") for k, name in class_names.items()]

@@ -136,24 +136,13 @@ def write_overview(
 
 
 def draw_worst_views(
-    images_of: Callable[[View], np.ndarray], views: Mapping[str, View], checks: Sequence[ViewCheck], count: int = WORST,
-    device: str = "cpu",
-) -> np.ndarray:  # fmt: skip
-    """Draw the worst views: the mask, what the other views predict, and in red where the two differ; (H, W, 3) uint8.
-
-    Parameters
-    ----------
-    images_of : function of a View
-        Gives the colours of the scene from there, (H, W, 3) uint8.
-    views : mapping from name to View
-        At least those that were checked.
-    checks : sequence of ViewCheck
-        Of all views, or of some, with what was predicted; at least one.
-    count : int
-        Views at most, one a row.
-    device : str
-        Where images are made: on the CPU, two at once.
-    """
+    images_of: Callable[[View], np.ndarray],  # gives the colours of the scene from a view, (H, W, 3) uint8
+    views: Mapping[str, View],  # at least those that were checked
+    checks: Sequence[ViewCheck],  # of all views, or of some, with what was predicted; at least one
+    count: int = WORST,  # views at most, one a row
+    device: str = "cpu",  # where images are made: on the CPU, two at once
+) -> np.ndarray:
+    """Draw the worst views: the mask, what other views predict, and in red where the two differ; (H, W, 3) uint8."""
     colors = palette(len(checks[0].counts))
 
     def draw(check: ViewCheck) -> list[np.ndarray]:

@@ -108,21 +108,11 @@ class Association(NamedTuple):
 
 
 def associate(views: Mapping[str, Lifted], settings: AssociationSettings | None = None) -> Association:
-    """Find the objects that the segments of all views show.
+    """Find the objects that the segments of all views show, numbered from 1 on, the largest first.
 
-    Time and memory grow with the number of pairs of segments that share a Gaussian or are neighbours of the same
-    segment, not with the square of all: n segments, each seen by o others, take O(n o^2) products.
-
-    Parameters
-    ----------
-    views : mapping from name to Lifted
-        In any order; the names only break ties.
-    settings : AssociationSettings, optional
-
-    Returns
-    -------
-    Association
-        Objects have numbers from 1 on, the largest first.
+    Views may come in any order; their names only break ties. Time and memory grow with the number of pairs of segments
+    that share a Gaussian or are neighbours of the same segment, not with the square of all: n segments, each seen by o
+    others, take O(n o^2) products.
     """
     settings = settings or AssociationSettings()
     names = sorted(views)

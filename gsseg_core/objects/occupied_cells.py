@@ -16,27 +16,15 @@ _MOST_PER_AXIS, _AT_ONCE = 64, 1 << 20
 
 
 def occupied_cells(
-    means: npt.NDArray[np.floating],  # (N, 3)
-    half_axes: npt.NDArray[np.floating],  # (N, 3, 3) one in each column
-    size: float,
-    low: float,
-    high: float,
+    means: npt.NDArray[np.floating],  # (N, 3): of the ellipsoids, z being up; all in one unit
+    half_axes: npt.NDArray[np.floating],  # (N, 3, 3): one in each column
+    size: float,  # side of a cell
+    low: float,  # what lies lower does not count
+    high: float,  # what lies higher does not count
 ) -> npt.NDArray[np.float32]:
-    """Find the cells, squares of a size along x and y from the origin on, that ellipsoids stand above.
+    """Find the cells, squares of a size along x and y from the origin on, that ellipsoids stand above, (M, 3).
 
-    Parameters
-    ----------
-    means, half_axes : ndarray
-        Of the ellipsoids, z being up; all in one unit.
-    size : float
-        Side of a cell.
-    low, high : float
-        What lies below the one or above the other does not count.
-
-    Returns
-    -------
-    (M, 3) float32
-        Of each cell its middle, and the lowest height between the two at which it is occupied; by cell, x before y.
+    Of each cell the middle, and the lowest height between the two at which it is occupied; by cell, x before y.
     """
     keys, heights = [np.empty((0, 2), np.int64)], [np.empty(0)]
     for points in _samples(np.asarray(means, np.float64), np.asarray(half_axes, np.float64), size):

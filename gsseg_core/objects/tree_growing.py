@@ -55,30 +55,14 @@ class _Region:
 
 
 def grow_tree(
-    means: np.ndarray,
-    classes: np.ndarray,
-    num_classes: int,
-    views: Mapping[str, Lifted],
-    level: float,
-    settings: AssociationSettings | None = None,
+    means: np.ndarray,  # (N, 3) float32: where the Gaussians are
+    classes: np.ndarray,  # (N,) int: object of each; 0 is the background, which has no parts, and below 0 is none
+    num_classes: int,  # largest object that there may be, and one more for the background
+    views: Mapping[str, Lifted],  # in any order; the names only break ties
+    level: float,  # agreement down to which segments were put together, the granularity of the objects
+    settings: AssociationSettings | None = None,  # what of a view counts how much
 ) -> ObjectTree:
-    """Find the parts of objects, and the wholes that they make.
-
-    Parameters
-    ----------
-    means : (N, 3) float32
-        Where the Gaussians are.
-    classes : (N,) int
-        Object of each; 0 is the background, which has no parts, and below 0 is none.
-    num_classes : int
-        Largest object that there may be, and one more for the background.
-    views : mapping from name to Lifted
-        In any order; the names only break ties.
-    level : float
-        Agreement down to which segments were put together, the granularity of the objects.
-    settings : AssociationSettings, optional
-        What of a view counts how much.
-    """
+    """Find the parts of objects, and the wholes that they make."""
     segments = _Segments.of(views, len(means), settings or AssociationSettings())
     objects = [_Region(row=k) for k in range(num_classes)]
     places = np.where(classes >= 0, 0, -1)  # among the leaves of its object

@@ -24,21 +24,10 @@ TRUST = 4.0  # a correction that sees a whole Gaussian weighs so many times as m
 
 
 def disc(camera: Camera, column: float, row: float, radius: float, label: int) -> View:
-    """Draw a disc: a view that says `label` there, and nothing anywhere else.
+    """Draw a disc in a camera's picture, in pixels: a view that says `label` there, and nothing anywhere else.
 
-    Parameters
-    ----------
-    camera : Camera
-        Of the picture that was drawn in.
-    column, row, radius : float
-        In pixels; at least the pixel of the middle is drawn.
-    label : int
-        What is there.
-
-    Raises
-    ------
-    SettingsError
-        The middle is not in the picture, or the label is no class.
+    At least the pixel of the middle is drawn. Raises `SettingsError` where that is not in the picture, or the label is
+    no class.
     """
     _check_inside(camera, column, row)
     x, y = np.arange(camera.width) + 0.5, np.arange(camera.height)[:, None] + 0.5
@@ -123,14 +112,9 @@ class Corrections:
         return True
 
     def apply(self, before: Labelling, names: Mapping[int, str] | None = None) -> Labelling:
-        """Combine a labelling with the corrections.
+        """Combine a labelling of the same scene with the corrections; it stays where none has seen a Gaussian.
 
-        Parameters
-        ----------
-        before : Labelling
-            Of the same scene; where no correction has seen a Gaussian, it stays.
-        names : mapping from id to name, optional
-            Of classes that only the corrections have.
+        `names` are those of classes that only the corrections have.
         """
         if not self.views:
             return before

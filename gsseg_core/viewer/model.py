@@ -50,16 +50,9 @@ class Labelling(NamedTuple):
 
 
 def at_level(objects: Labelling, tree: ObjectTree, granularity: float) -> Labelling:
-    """Label the nodes of a level without gaps.
+    """Label the nodes of a tree at a level without gaps; at its own level, the objects come back as they are.
 
-    Parameters
-    ----------
-    objects : Labelling
-        Its first classes are those of the tree; others, which were added in the viewer, are on every level.
-    tree : ObjectTree
-        Of the same scene.
-    granularity : float
-        Where to cut it; at its own level, the objects come back as they are.
+    Their first classes are those of the tree; others, which were added in the viewer, are on every level.
     """
     if granularity == tree.level:
         return objects

@@ -25,34 +25,17 @@ class Picked(NamedTuple):
 
 def pick(
     scene: GaussianScene,
-    origin: np.ndarray,  # (3,)
-    direction: np.ndarray,  # (3,)
-    shown: np.ndarray | None = None,  # (N,) bool
+    origin: np.ndarray,  # (3,): of the ray, in the world
+    direction: np.ndarray,  # (3,): of any length but zero
+    shown: np.ndarray | None = None,  # (N,) bool: look through all others
     *,
-    focal: float = 1000.0,
+    focal: float = 1000.0,  # of the image that was clicked, in px: Gaussians are widened by a third of one of these
     device: str = "cpu",
 ) -> Picked | None:
-    """Follow a ray into the scene, to the Gaussian that makes most of what is seen there.
+    """Follow a ray into the scene, to the Gaussian that makes most of what is seen there; None where it meets nothing.
 
     The ray is the middle of a camera of a few pixels, so that a Gaussian counts by the weight with which it is drawn,
     and one that is hidden by others does not count.
-
-    Parameters
-    ----------
-    scene : GaussianScene
-        N Gaussians.
-    origin, direction : (3,)
-        Of the ray, in the world; the direction of any length but zero.
-    shown : (N,) bool, optional
-        Look through all others.
-    focal : float
-        Focal length of the image that was clicked, in pixels: Gaussians are widened by a third of such a pixel, as in
-        the image.
-
-    Returns
-    -------
-    Picked or None
-        None where the ray meets nothing.
     """
     forward = np.asarray(direction, np.float64) / np.linalg.norm(direction)
     pose = pose_looking(forward, np.eye(3)[np.argmin(np.abs(forward))], np.asarray(origin, np.float64))

@@ -28,37 +28,17 @@ from gsseg_core.viewer.picture import Picture, cut
 
 
 class ViewerState:
-    """A segmentation, how it is shown, and its corrections; safe to change from several threads.
-
-    Attributes
-    ----------
-    model : ViewModel
-        What is shown.
-    views : tuple of View
-        Those that the segmentation was learnt from.
-    reliability : dict from the name of a view to float
-        How far each can be trusted, in [0, 1], as far as that is known.
-    device : str
-        Where clicks and corrections are rendered.
-    corrections : Corrections
-        What people drew.
-    added_names : dict of int to str
-        Classes that were added in the viewer.
-    objects : Labelling
-        The classes with their corrections, of which the model shows a level.
-    granularity : float
-        That level, where there is a tree.
-    stale : threading.Event
-        Set by every change: what browsers show is out of date.
-    """
+    """A segmentation, how it is shown, and its corrections; safe to change from several threads."""
 
     def __init__(self, model: ViewModel, views: Sequence[View], reliability: Mapping[str, float], device: str) -> None:
-        self.model, self.views, self.reliability, self.device = model, tuple(views), dict(reliability), device
-        self.corrections = Corrections(model.scene, device=device)
-        self.added_names: dict[int, str] = {}
-        self.stale = threading.Event()
-        self.objects = self._learnt = model.labelling
-        self.granularity = model.tree.level if model.tree else 0.0
+        self.model, self.device = model, device  # what is shown; where clicks and corrections are rendered
+        self.views = tuple(views)  # those that the segmentation was learnt from
+        self.reliability = dict(reliability)  # how far each can be trusted, in [0, 1], as far as that is known, by name
+        self.corrections = Corrections(model.scene, device=device)  # what people drew
+        self.added_names: dict[int, str] = {}  # of classes that were added in the viewer
+        self.stale = threading.Event()  # set by every change: what browsers show is out of date
+        self.objects = self._learnt = model.labelling  # the classes with their corrections, ...
+        self.granularity = model.tree.level if model.tree else 0.0  # ... of which the model shows this level of a tree
         self._view_votes: ViewVotes | None = None
         self._view_votes_lock = threading.Lock()
         self._lock = threading.RLock()
