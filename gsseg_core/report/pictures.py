@@ -89,10 +89,8 @@ def thumbnails(
 ) -> dict[int, tuple[str, np.ndarray]]:
     """Cut classes out of the views that show them best, outlined in their colours (K, 3), several views at once.
 
-    Returns
-    -------
-    dict of int to (str, (THUMBNAIL_PX, THUMBNAIL_PX, 3) uint8)
-        For each of the classes that some view shows: the view's name, and the picture.
+    Returns, for each of the classes that some view shows, the view's name and the picture, (px, px, 3) uint8 with px
+    being `THUMBNAIL_PX`.
     """
     chosen: dict[int, list[int]] = {}
     best = _best_views(evidence, images, len(colors))

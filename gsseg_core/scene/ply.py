@@ -23,17 +23,10 @@ _MAX_HEADER = 1 << 20
 def read_vertices(path: str | os.PathLike[str], within: Path | None = None) -> npt.NDArray[np.void]:
     """Read the `vertex` element of a PLY file, ascii or binary of either byte order; others are ignored.
 
-    With `within`, the file must lie below that folder, links followed. The structured array (N,) has one field per
-    property in the file's order and type, native byte order, in memory.
-
-    Raises
-    ------
-    SceneFileError
-        The file is missing, truncated, not a PLY, or has no `vertex` element.
-    ScenePropertyError
-        A vertex property is a list.
-    PathNotAllowedError
-        The file lies outside `within`.
+    The structured array (N,) has one field per property in the file's order and type, native byte order, in memory.
+    Raises `SceneFileError` where the file is missing, truncated, not a PLY, or has no `vertex` element,
+    `ScenePropertyError` where a vertex property is a list, `PathNotAllowedError` where the file does not lie below
+    `within`, links followed.
     """
     path = Path(path)
     ply = _parse(path, within)

@@ -19,14 +19,8 @@ from gsseg_core.text import clipped
 def open_scene(path: Path, within: Path | None, expected: str) -> Iterator[BufferedReader]:
     """Open a file that should be `expected`, such as "an SPZ file"; damage that shows in the body is its damage.
 
-    With `within`, it must lie below that folder, links followed.
-
-    Raises
-    ------
-    SceneFileError
-        The file is missing, damaged, or the body raised `UnfitError`, whose message says what was found and expected.
-    PathNotAllowedError
-        It lies outside `within`.
+    Raises `SceneFileError` where the file is missing, damaged, or the body raised `UnfitError`, whose message says what
+    was found and expected; `PathNotAllowedError` where it does not lie below `within`, links followed.
     """
     try:
         file = open_input(path, within)

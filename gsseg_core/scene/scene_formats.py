@@ -110,14 +110,8 @@ def find_format(path: Path, within: Path | None = None) -> SceneFormat | None:
 def read_scene(path: str | os.PathLike[str], within: Path | None = None) -> ReadScene:
     """Read a scene of any of `SCENE_FORMATS`: its Gaussians in the order of the file, as vertices of a 3DGS PLY.
 
-    With `within`, the file must lie below that folder, links followed.
-
-    Raises
-    ------
-    SceneFileError, ScenePropertyError
-        The file is missing or broken; see the reader of its format.
-    PathNotAllowedError
-        It lies outside `within`.
+    Raises `SceneFileError` or `ScenePropertyError` where the file is missing or broken, `PathNotAllowedError` where it
+    does not lie below `within`, links followed.
     """
     path = Path(path)
     suited = find_format(path, within)

@@ -37,24 +37,14 @@ HeaderValues = Callable[[str], Sequence[str]]  # all values of a header in a req
 
 
 class Listener:
-    """Listens on a socket that was opened for a host as the user gave it, and checks requests; close it at last.
-
-    Attributes
-    ----------
-    socket : socket
-        It listens.
-    port : int
-        Its port.
-    everywhere : bool
-        Whether it listens at all addresses of this machine.
-    token : str or None
-        What a browser must show; None where only this machine can connect.
-    """
+    """Listens on a socket that was opened for a host as the user gave it, and checks requests; close it at last."""
 
     def __init__(self, opened: socket.socket, host: str) -> None:
+        self.socket, self._host = opened, host
         address, self.port = opened.getsockname()[:2]
         ip = ipaddress.ip_address(address.partition("%")[0])
-        self.socket, self._host, self.everywhere = opened, host, ip.is_unspecified
+        self.everywhere = ip.is_unspecified  # whether it listens at all addresses of this machine
+        # What a browser must show; None where only this machine can connect.
         self.token = None if ip.is_loopback else secrets.token_urlsafe(16)
 
     def __enter__(self) -> Listener:

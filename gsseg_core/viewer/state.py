@@ -149,17 +149,10 @@ class ViewerState:
     def selection(self, scene_format: str, collision: str | None = None) -> tuple[str, bytes]:
         """Write what is shown in a format of `gsseg_core.scene.scene_writers.SCENE_WRITERS`: a file name and its bytes.
 
-        With `collision`, one of `gsseg_core.export.collision.KINDS`, a USD has a mesh of each object, too.
-
-        Raises
-        ------
-        EmptySceneError
-            Nothing is shown.
-        SettingsError
-            There is no such format or kind of mesh, the library that makes it is not installed, or the format holds
-            no meshes.
-        SceneValueError
-            The format cannot hold what is shown.
+        With `collision`, one of `gsseg_core.export.collision.KINDS`, a USD has a mesh of each object, too. Raises
+        `EmptySceneError` where nothing is shown; `SettingsError` where there is no such format or kind of mesh, the
+        library that makes it is not installed, or the format holds no meshes; `SceneValueError` where the format cannot
+        hold what is shown.
         """
         check_format(scene_format)
         check_collision(collision)

@@ -27,41 +27,20 @@ DRAWING_HEIGHT = 480  # rows of the image in which a correction is drawn; finer 
 
 
 class Viewer:
-    """Shows a segmentation to browsers, and lets people correct it.
+    """Shows a segmentation to browsers at a `url`, and lets people correct it.
 
-    Parameters
-    ----------
-    model, views, reliability, device
-        What to show, and what is known of it, as in `ViewerState`; the server draws on the device, too.
-    source : LiveSource, optional
-        Class probabilities that change while the viewer runs.
-    listener : Listener, optional
-        Where to listen, and who is answered; it is closed with the viewer. By default, what `listen` gives.
-    draw : str
-        Who draws: 'browser'; 'server', this program, which sends images; or 'auto', the browser if it is fast.
-
-    Attributes
-    ----------
-    state : ViewerState
-        What is shown, and its corrections.
-    url : str
-        Where to look.
-
-    Raises
-    ------
-    SettingsError
-        `draw` is none of these, no port is free, or viser is of an unknown version.
+    Raises `SettingsError` where no port is free, or viser is of an unknown version.
     """
 
     def __init__(
         self,
-        model: ViewModel,
+        model: ViewModel,  # what to show, and what is known of it, as in `ViewerState`
         views: Sequence[View] = (),
         reliability: Mapping[str, float] | None = None,
-        source: LiveSource | None = None,
+        source: LiveSource | None = None,  # of class probabilities that change while the viewer runs
         *,
-        listener: Listener | None = None,
-        draw: str = AUTO,
+        listener: Listener | None = None,  # where to listen, closed with the viewer; by default, what `listen` gives
+        draw: str = AUTO,  # who draws: one of `DRAWN_BY`
         device: str = "cpu",
     ) -> None:
         if draw not in DRAWN_BY:
