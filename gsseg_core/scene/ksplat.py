@@ -57,9 +57,8 @@ def read_ksplat(path: Path, within: Path | None = None) -> ReadScene:
 
 
 def _section(content: bytes, place: int) -> _Section:
-    count, capacity, size, buckets, block, bucket_bytes = struct.unpack_from("<4IfH", content, place)
-    scale_range, _, full, partial, degree = struct.unpack_from("<4IH", content, place + 24)
-    section = _Section(count, capacity, size, buckets, block, bucket_bytes, scale_range, full, partial, degree)
+    section = _Section(*struct.unpack_from("<4IfH2xI4x2IH", content, place))
+    count, capacity, degree = section.gaussians, section.capacity, section.degree
     if degree >= len(_SH_COUNTS) or count > capacity:
         raise UnfitError(f"has a section of {count:,} in {capacity:,} and SH degree {degree}; expected degree 0 to 3")
     return section

@@ -74,12 +74,12 @@ def read_spz(path: Path, within: Path | None = None) -> ReadScene:
 
 def decode_spz(file: Any, path: Path) -> ReadScene:
     """Decode SPZ from an open binary file; raises `SceneFileError`, or what `open_scene` takes for damage."""
-    magic = file.read(4)
+    magic, length = file.read(4), file.seek(0, 2)
     file.seek(0)
     if magic.startswith(_GZIP):
-        header, system, readers = _inflate(file)
+        header, system, readers = _inflate(file, length)
     elif magic == _MAGIC:
-        header, system, readers = _streams(file, path)
+        header, system, readers = _streams(file, length, path)
     else:
         raise ValueError("it starts neither with NGSP nor as gzip does")
     count, (*before, of_sh) = header.gaussians, header.sizes
@@ -128,16 +128,13 @@ def _rows(read: Read, count: int, size: int) -> npt.NDArray[np.uint8]:
     return np.frombuffer(content, np.uint8).reshape(count, size)
 
 
-def _inflate(file: Any) -> tuple[_Header, str, Iterator[Read]]:
+def _inflate(file: Any, length: int) -> tuple[_Header, str, Iterator[Read]]:
     """Inflate what gzip packed, versions 1 to 3: readers of attributes, each to be read before the next is taken."""
     stream = gzip.GzipFile(fileobj=file)
     header = _header(stream.read(_HEADER.size))
     if header.version > 3:
         raise UnfitError(f"is SPZ of version {header.version} under gzip; expected 1 to 3")
-    _check_packed(header, file.seek(0, 2))
-    file.seek(0)
-    stream = gzip.GzipFile(fileobj=file)
-    stream.read(_HEADER.size)
+    _check_packed(header, length)
     if header.flags & _EXTENSIONS:
         raise UnfitError("has extensions under gzip; expected them in version 4 alone")
 
@@ -149,7 +146,7 @@ def _inflate(file: Any) -> tuple[_Header, str, Iterator[Read]]:
     return header, "RUB", readers()
 
 
-def _streams(file: BufferedReader, path: Path) -> tuple[_Header, str, Iterator[Read]]:
+def _streams(file: BufferedReader, length: int, path: Path) -> tuple[_Header, str, Iterator[Read]]:
     """Take the streams of version 4 apart, as `_inflate` does; those of no bytes are left out of the file."""
     try:
         from zstandard import ZstdDecompressor, ZstdError
@@ -167,9 +164,7 @@ def _streams(file: BufferedReader, path: Path) -> tuple[_Header, str, Iterator[R
     system = _axes_said(file.read(table - _HEADER_4)) if header.flags & _EXTENSIONS else "RUB"
     file.seek(table)
     sizes = struct.unpack(f"<{2 * count}Q", file.read(16 * count))
-    place = file.tell()
-    _check_packed(header, file.seek(0, 2))
-    file.seek(place)
+    _check_packed(header, length)
     if list(sizes[1::2]) != wanted:
         raise UnfitError(f"has streams of {sizes[1::2]} bytes; expected {wanted} for its Gaussians")
 
@@ -179,10 +174,9 @@ def _streams(file: BufferedReader, path: Path) -> tuple[_Header, str, Iterator[R
 
         def read(count: int) -> bytes:
             try:
-                found: bytes = stream.read(count)
+                return stream.read(count)
             except ZstdError as error:
                 raise ValueError(str(error)) from error
-            return found
 
         return read
 
