@@ -35,6 +35,8 @@ from gsseg_core.scene.vertices import (
     rest_of,
 )
 
+ACTIVATED = ("means", "quats", "scales", "opacities")  # arrays of a scene, a row for each Gaussian
+
 # Logits and log scales beyond these change nothing that can be seen, but the activated values would leave (0, 1), or
 # their squares the range of float32.
 _ANY = float(np.finfo(np.float32).max)
@@ -188,10 +190,8 @@ class GaussianScene:
         picked = np.arange(len(self))[index].reshape(-1)
         if picked.size == 0:
             raise EmptySceneError(f"{self.path or 'scene'}: none of its {len(self)} Gaussians is in the subset")
-        arrays = ("means", "quats", "scales", "opacities")
-        return replace(
-            self, vertices=chosen(self.vertices, picked), **{name: getattr(self, name)[picked] for name in arrays}
-        )
+        arrays: dict[str, Any] = {name: getattr(self, name)[picked] for name in ACTIVATED}
+        return replace(self, **arrays, vertices=chosen(self.vertices, picked))
 
     @property
     def sh_degree(self) -> int:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.scene import spherical_harmonics
-from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import ACTIVATED, GaussianScene
 from gsseg_core.scene.scene_ids import with_ids
 from gsseg_core.scene.similarity import Similarity
 from gsseg_core.scene.vertices import MEANS, QUATS, SCALES, chosen, columns, put, rest_of
@@ -72,10 +72,9 @@ def joined(
     ids: npt.NDArray[np.int64],  # (N',)
 ) -> GaussianScene:
     """Append Gaussians to those that stay; from now on, the scene holds ids. Raises what `with_ids` does."""
-    names = ("means", "quats", "scales", "opacities")
-    parts: dict[str, list[npt.NDArray[Any]]] = {name: [getattr(scene, name)[stays]] for name in names}
+    parts: dict[str, list[npt.NDArray[Any]]] = {name: [getattr(scene, name)[stays]] for name in ACTIVATED}
     if added is not None:
-        for name in names:
+        for name in ACTIVATED:
             parts[name].append(getattr(added, name))
     vertices = with_ids(chosen(scene.vertices, np.flatnonzero(stays)), None if added is None else added.vertices, ids)
     arrays: dict[str, Any] = {name: np.concatenate(part) for name, part in parts.items()}

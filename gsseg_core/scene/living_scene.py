@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.errors import EmptySceneError, SceneDeltaError
-from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import ACTIVATED, GaussianScene
 from gsseg_core.scene.group_frames import IDENTITY, is_identity, joined, moved_geometry, moved_scene, relation
 from gsseg_core.scene.scene_delta import SceneDelta
 from gsseg_core.scene.scene_ids import with_ids
@@ -183,7 +183,7 @@ class LivingScene:
         """Gaussians in the frame of a group: those of groups that have not moved against it, exactly as given."""
         of, local = self.groups[places], self.local
         # Nobody asks for colours here, and vertices are four fifths of a scene.
-        arrays = {name: getattr(local, name)[places] for name in ("means", "quats", "scales", "opacities")}
+        arrays = {name: getattr(local, name)[places] for name in ACTIVATED}
         part = replace(local, **arrays, vertices=local.vertices[:0])
         for other in np.unique(of).tolist():
             apart = relation(self.frames[group], self.frames[other])
@@ -197,9 +197,7 @@ class LivingScene:
         frames: Mapping[int, Similarity], changed: npt.NDArray[np.bool_],  # (N,)
     ) -> GaussianScene:  # fmt: skip
         """Put the Gaussians that changed where the frames of their groups have them; the rest stay as they are."""
-        arrays: dict[str, Any] = {
-            name: getattr(scene, name).copy() for name in ("means", "quats", "scales", "opacities", "vertices")
-        }
+        arrays: dict[str, Any] = {name: getattr(scene, name).copy() for name in (*ACTIVATED, "vertices")}
         for group in np.unique(groups[changed]).tolist():
             here = changed & (groups == group)
             part = local.subset(here)

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from gsseg_core.errors import EmptySceneError, SceneDeltaError, SceneValueError
 from gsseg_core.files.limits import LIMITS
 from gsseg_core.files.npz_files import UnfitError, open_arrays, read_json_header, whole_number, write_npz
-from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import ACTIVATED, GaussianScene
 from gsseg_core.scene.similarity import Similarity
 from gsseg_core.text import clipped, quoted
 
@@ -21,7 +21,7 @@ FORMAT = "gsseg-delta-1"
 MAX_ID = 2**63 - 1
 
 _ORTHONORMAL = 1e-6  # Rotations that were once float32 are off by less.
-_ARRAYS = ("means", "quats", "scales", "opacities", "sh")
+_ARRAYS = (*ACTIVATED, "sh")
 
 
 def _no_ids() -> npt.NDArray[np.int64]:

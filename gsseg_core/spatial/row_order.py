@@ -9,7 +9,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.kernels.compiler import kernel
-from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import ACTIVATED, GaussianScene
 from gsseg_core.simd import prefetch
 
 _CELLS = 1 << 10  # along each axis: three numbers of ten bits make one of thirty
@@ -52,8 +52,10 @@ def inverse(order: np.ndarray) -> np.ndarray:  # (N,) int64
 
 def reordered(scene: GaussianScene, order: np.ndarray) -> GaussianScene:
     """Give a scene whose Gaussian i is Gaussian order[i], (N,) int64, of this one, as `GaussianScene.subset` does."""
-    names, records = ("means", "quats", "scales", "opacities"), scene.vertices
-    arrays: dict[str, Any] = {name: take_rows(getattr(scene, name).reshape(len(scene), -1), order) for name in names}
+    records = scene.vertices
+    arrays: dict[str, Any] = {
+        name: take_rows(getattr(scene, name).reshape(len(scene), -1), order) for name in ACTIVATED
+    }
     arrays["opacities"] = arrays["opacities"][:, 0]
     if records.itemsize % 4 or not records.flags.c_contiguous:
         return replace(scene.subset(order), **arrays)
