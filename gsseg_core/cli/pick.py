@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", required=True, action="append", metavar="STEM", dest="views", help=view)
     mask = "label image of the view, or masks of another program, as COCO: all that is not 0 is the object"
     parser.add_argument("--mask", required=True, action="append", metavar="PATH", dest="masks", help=mask)
-    label = "the object is this label alone, an id or the name that another program's masks have"
+    label = "the object is this label alone: an id, or the name of a class"
     parser.add_argument("--label", help=label)
     parser.add_argument("--out", required=True, metavar="DIR", help="gets object.ply, pick.npz, pick.png and next.png")
     add_format(parser.add_argument, DEFAULT)
@@ -47,6 +47,7 @@ def run(options: argparse.Namespace) -> int:
     """Pick, and say what was written."""
     from gsseg_core.align.placing import place
     from gsseg_core.data.dataset import Dataset
+    from gsseg_core.data.mask_formats.place import view_of
     from gsseg_core.data.view import View, spread
     from gsseg_core.errors import NoUsableViewsError
     from gsseg_core.export.collision import check_collision, collision_mesh
@@ -60,6 +61,7 @@ def run(options: argparse.Namespace) -> int:
 
     dataset = Dataset(options.data)
     names = [camera.name for camera in dataset.cameras]
+    options.views = [view_of(view, names) or view for view in options.views]
     for view in options.views:
         if view not in names:
             raise SettingsError(f"{options.data}: has no view {view!r}; expected a stem such as {min(names)!r}")
@@ -80,8 +82,9 @@ def run(options: argparse.Namespace) -> int:
         )
     cameras = dict(zip(names, placed.dataset.cameras, strict=True))
     with staged_run(out, "pick", places=(file, "object.obj", "pick.npz", "pick.png", "next.png")) as run:
+        known = dataset.class_names if options.label and not options.label.isdecimal() else None
         views = [
-            View.from_arrays(cameras[name], read_object_mask(mask, cameras[name], options.label))
+            View.from_arrays(cameras[name], read_object_mask(mask, cameras[name], options.label, known))
             for name, mask in zip(options.views, options.masks, strict=True)
         ]
         picked = pick_masks(scene, views, device=options.device)

@@ -16,6 +16,7 @@ from gsseg_core.data.camera_formats.table import CAMERA_FORMATS
 from gsseg_core.data.label_images import mask_header
 from gsseg_core.data.mask_files import mask_files, masks_below
 from gsseg_core.data.mask_formats.place import SUPERVISES
+from gsseg_core.data.mask_formats.table import open_masks
 from gsseg_core.errors import GssegError
 from gsseg_core.files.input_files import READABLE_IMAGES
 
@@ -28,7 +29,7 @@ _FOREIGN_CAMERAS = {
 _MASKS = READABLE_IMAGES | {".npy", ".npz", ".json"}
 _MORE = "docs/masks.md has all forms"
 _DEPTH = 3
-_MOST_FOLDERS = 200
+_MOST_FOLDERS, _MOST_FILES = 200, 20
 
 
 def camera_hint(folder: Path) -> str:
@@ -63,13 +64,15 @@ def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
     if classes:
         wrong = f"{labels}/ has a folder for each class, such as {classes[0].name}/"
         return f"{looked}, but {wrong}: make one for each view, {labels}/{stem}/<class id>.png ({_MORE})"
-    others = [(len(_masks(mask_files, path, stems)), path) for path in _folders(root) if path != root / labels]
-    count, folder = max(others, key=lambda found: found[0], default=(0, root))
+    others = [path for path in (*_folders(root), *_annotations(root)) if path != root / labels]
+    counts = [(len(_masks(mask_files, path, stems)) or _count_foreign(path, stems), path) for path in others]
+    count, place = max(counts, key=lambda found: found[0], default=(0, root))
     if count:
-        if (more := len(_masks(masks_below, folder.parent, stems))) > count and folder.parent != root:
-            count, folder = more, folder.parent
-        name = os.path.relpath(folder, root)
-        return f"{looked}, found {count} masks of these names in {name}/: type --labels {shlex.quote(name)}"
+        if (more := len(_masks(masks_below, place.parent, stems))) > count and place.parent != root:
+            count, place = more, place.parent
+        name = os.path.relpath(place, root)
+        where = name + "/" * place.is_dir()
+        return f"{looked}, found {count} masks of these names in {where}: type --labels {shlex.quote(name)}"
     if not (root / labels).is_dir():
         photos = [path.name for path in _folders(root) if _stems(path) & set(stems)]
         hint = f" ({photos[0]}/ holds photos; a 2D segmenter makes masks of them)" if photos else ""
@@ -120,6 +123,21 @@ def _masks(finder: Callable[..., dict[str, Path]], folder: Path, stems: Collecti
         if images:
             mask_header(images[0])
         return [path for path in found if path.is_file() or _has_detections(path)]
+    return []
+
+
+def _count_foreign(place: Path, stems: Collection[str]) -> int:
+    """Count the masks of the given stems that another program wrote."""
+    with suppress(GssegError, OSError):
+        masks = open_masks(place, stems)
+        return 0 if masks is None else len(masks.views)
+    return 0
+
+
+def _annotations(root: Path) -> list[Path]:
+    """List the files in a folder that may hold the masks of all views."""
+    with suppress(OSError):
+        return sorted(path for path in root.iterdir() if path.suffix.lower() in (".json", ".xml"))[:_MOST_FILES]
     return []
 
 

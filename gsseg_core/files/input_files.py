@@ -28,7 +28,7 @@ OPENED = "/proc/self/fd"
 READABLE_IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 """Suffixes of images that `open_image` reads."""
 
-IMAGE_SUFFIXES = READABLE_IMAGES | {".exr", ".heic"}
+IMAGE_SUFFIXES = READABLE_IMAGES | {".avif", ".dng", ".exr", ".heic", ".heif", ".jxl", ".ppm"}
 """Suffixes that an image may have in the list of a camera file; what else follows a dot belongs to its name."""
 
 _KINDS = {

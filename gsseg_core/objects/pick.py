@@ -166,7 +166,12 @@ def pick_clicks(
     return pick_mask(scene, View.from_arrays(camera, labels), device=device)
 
 
-def read_object_mask(path: str | os.PathLike[str], camera: Camera, label: str | int | None = None) -> np.ndarray:
+def read_object_mask(
+    path: str | os.PathLike[str],
+    camera: Camera,
+    label: str | int | None = None,
+    class_names: Mapping[int, str] | None = None,
+) -> np.ndarray:
     """Read a drawn mask of a view, or one label of it, as labels for `pick_mask`.
 
     Parameters
@@ -177,7 +182,9 @@ def read_object_mask(path: str | os.PathLike[str], camera: Camera, label: str | 
     camera : Camera
         Of the view. The mask is drawn on the image as it was taken, of its size or the same larger or smaller.
     label : int or str, optional
-        The object's: an id, or the name of a class of another program; by default all but 0.
+        The object's: an id, or the name of a class; by default all but 0.
+    class_names : mapping from id to name, optional
+        Names of what label images hold; masks of other programs bring their own.
 
     Returns
     -------
@@ -191,7 +198,7 @@ def read_object_mask(path: str | os.PathLike[str], camera: Camera, label: str | 
     SettingsError
         There is no such class.
     """
-    path, names = Path(path), None
+    path, names = Path(path), class_names
     masks = None if path.suffix.lower() == ".png" else open_masks(path, [camera.image])
     if masks is None:
         path = masks_below(path, [camera.image]).get(camera.image, path) if path.is_dir() else path

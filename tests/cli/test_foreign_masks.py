@@ -101,7 +101,7 @@ def test_an_object_is_picked_by_the_mask_of_another_program(place: Path, name: s
     data = place / "data"
     start = ["pick", str(data / "scene.ply"), "--data", str(data), "--view", "view0", "--quiet"]
     label = "1" if name in mask_writers.NAMELESS else NAMES[1]
-    for out, given, wanted in (("own", data / "labels/view0.png", "1"), ("other", mask, label)):
+    for out, given, wanted in (("own", data / "labels/view0.png", NAMES[1]), ("other", mask, label)):
         assert main([*start, "--mask", str(given), "--label", wanted, "--out", str(place / out)]) == 0
     own, other = (np.load(place / out / "pick.npz")["ids"] for out in ("own", "other"))
     assert len(own) and np.array_equal(own, other)

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import mask_writers
 import numpy as np
 import pytest
 from PIL import Image
@@ -49,6 +50,16 @@ def test_masks_in_a_folder_of_another_name_are_found_and_the_option_that_is_told
     (folder,) = typed(error, "--labels")
     assert main(["segment", f"{data}/scene.ply", "--data", str(data), "--out", f"{data}/../out", "--quiet",
                  "--labels", folder]) == 0  # fmt: skip
+
+
+@pytest.mark.parametrize("place", ["", "annotations"])
+def test_annotations_of_another_program_are_found(data: Path, capsys: pytest.CaptureFixture[str], place: str) -> None:
+    labels = {path.stem: np.array(Image.open(path)) for path in (data / "labels").iterdir()}
+    shutil.rmtree(data / "labels")
+    (data / place).mkdir(exist_ok=True)
+    mask_writers.coco(data / place, labels, {0: "background", 1: "mug", 2: "cup", 3: "box"})
+    (folder,) = typed(error_of(capsys, data), "--labels")
+    assert folder == (place or "annotations.json")
 
 
 def test_masks_in_several_folders_are_found_together(data: Path, capsys: pytest.CaptureFixture[str]) -> None:

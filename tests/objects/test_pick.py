@@ -121,6 +121,7 @@ def test_drawn_masks_are_read_black_and_white_or_by_label(tmp_path: Path) -> Non
     assert read_object_mask(tmp_path / "labels.png", small, 5).tolist() == [[0, 1, 0, -1]]
     with pytest.raises(MaskFormatError, match="expected pixels with the label 7"):
         read_object_mask(tmp_path / "labels.png", small, 7)
+    assert read_object_mask(tmp_path / "labels.png", small, "cup", {3: "box", 5: "cup"}).tolist() == [[0, 1, 0, -1]]
     with pytest.raises(SettingsError, match="label is 'cup'; expected a number"):
         read_object_mask(tmp_path / "labels.png", small, "cup")
     with pytest.raises(MaskSizeError, match="for an image of 4 x 1 pixels"):
