@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from gsseg_core.align.placing import Placed, place
 from gsseg_core.data.dataset import Dataset
-from gsseg_core.data.hints import mask_hint
+from gsseg_core.data.hints import FRAME_HINT, mask_hint
 from gsseg_core.data.label_images import GLOBAL, PER_VIEW, write_mask
 from gsseg_core.data.view import QUALITIES, View, spread
 from gsseg_core.errors import NoUsableViewsError, SettingsError
@@ -33,7 +33,7 @@ from gsseg_core.files.json_files import write_json
 from gsseg_core.files.run_folder import StagedRun, staged_run
 from gsseg_core.files.write_behind import WriteBehind, writing_behind
 from gsseg_core.learn.calibrate import Calibration, calibrate
-from gsseg_core.learn.learner import NO_MASK, Learner
+from gsseg_core.learn.learner import NO_MASK, SEES_NOTHING, Learner
 from gsseg_core.learn.mask_reliability import MaskChecker, ViewCheck, compare_mask, reliability_report, shown_views
 from gsseg_core.learn.prepared_views import default_budget
 from gsseg_core.learn.registry import make_learner
@@ -278,8 +278,9 @@ def _learn(
         try:
             learner.fit(progress)
         except NoUsableViewsError as error:
-            blank, names = set(learner.rejected.values()) == {NO_MASK}, [view.camera.image for view in inputs.train]
-            hint = mask_hint(inputs.root, settings.labels, names) if blank else ""
+            why, names = set(learner.rejected.values()), [view.camera.image for view in inputs.train]
+            hint = FRAME_HINT if why == {SEES_NOTHING} else ""
+            hint = mask_hint(inputs.root, settings.labels, names) if why == {NO_MASK} else hint
             raise NoUsableViewsError(f"{inputs.root}: {error}{hint}") from error
     return learner
 

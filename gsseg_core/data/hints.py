@@ -26,6 +26,10 @@ _FOREIGN_CAMERAS = {
     "poses_bounds.npy": "it is LLFF's: run nerfstudio's ns-process-data, or COLMAP, on the photos",
     "database.db": "it is COLMAP's database without a model: run `colmap mapper`, and give the folder with its sparse/",
 }
+FRAME_HINT = (
+    "; cameras and scene may be in different frames: try --align, or gsseg doctor DATASET --scene SCENE. Or all of the "
+    "scene is nearer to the cameras than 0.01 of its units, where nothing is drawn"
+)
 _MASKS = READABLE_IMAGES | {".npy", ".npz", ".json"}
 _MORE = "docs/masks.md has all forms"
 _DEPTH = 3

@@ -63,6 +63,11 @@ def name_class(name: str) -> Callable[[Path], object]:
     return lambda place: (place / "data/classes.json").write_text(json.dumps({"1": name, "2": "cup", "3": "box"}))
 
 
+def turn_away(cameras: list[dict[str, object]]) -> None:
+    for camera in cameras:  # axes of OpenGL, as nobody says
+        camera["rotation"] = (np.array(camera["rotation"]) * (1, -1, -1)).tolist()
+
+
 def mask(size: tuple[int, ...], value: int = 0) -> Callable[[Path], None]:
     return lambda place: Image.fromarray(np.full(size, value, np.uint8)).save(place / "data/labels/view1.png")
 
@@ -96,6 +101,11 @@ BAD_INPUT: dict[str, tuple[Callable[[Path], object], str]] = {
     "mask RGB": (mask((48, 64, 3)), "view1.png"),
     "mask label unknown": (mask((48, 64), 9), "view1.png"),
     "mask broken": (lambda place: (place / "data/labels/view1.png").write_bytes(b"\x89PNG"), "view1.png"),
+    "cameras that look elsewhere": (
+        lambda place: edit_json(place / "data/cameras.json", turn_away),
+        "data: no view to learn from (4 sees no Gaussian); expected posed views with label images; cameras and scene "
+        "may be in different frames: try --align",
+    ),
     "no mask at all": (remove_masks, "data: no view to learn from (4 no mask)"),
 }  # fmt: skip
 
