@@ -77,6 +77,8 @@ def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
         name = os.path.relpath(place, root)
         where = name + "/" * place.is_dir()
         return f"{looked}, found {count} masks of these names in {where}: type --labels {shlex.quote(name)}"
+    if (root / labels).is_symlink() and not (root / labels).exists():
+        return f"{looked}, but {labels} is a link to {os.readlink(root / labels)}, which does not exist"
     if not (root / labels).is_dir():
         photos = [path.name for path in _folders(root) if _stems(path) & set(stems)]
         hint = f" ({photos[0]}/ holds photos; a 2D segmenter makes masks of them)" if photos else ""

@@ -76,7 +76,8 @@ def mask_header(path: str | os.PathLike[str], within: Path | None = None) -> Mas
         raise MaskFormatError(f"{path}: cannot be read ({reason(error)}); expected a label image") from error
     kind, depth, width, height = png_header(header, str(path))
     if kind != "palette" and (kind != "gray" or depth not in (8, 16)):
-        fix = "; a photo is no mask, and of ids drawn in colours save the ids themselves" if "RGB" in kind else ""
+        colours = "of ids drawn in colours save the ids themselves (a palette made for each image numbers them anew)"
+        fix = f"; a photo is no mask, and {colours}" if "RGB" in kind else ""
         raise MaskFormatError(
             f"{path}: is {kind} of {depth} bits per channel; expected a one-channel 8- or 16-bit PNG of labels{fix}"
         )

@@ -69,6 +69,11 @@ def test_masks_in_several_folders_are_found_together(data: Path, capsys: pytest.
     assert "found 4 masks of these names in masks/: type --labels masks" in error_of(capsys, data)
 
 
+def a_broken_link(data: Path) -> None:
+    shutil.rmtree(data / "labels")
+    (data / "labels").symlink_to("../unmounted")
+
+
 def photos(data: Path) -> None:
     shutil.rmtree(data / "labels")
     (data / "images").mkdir()
@@ -114,6 +119,7 @@ def emptied(data: Path) -> None:
         (by_class, "labels/ has a folder for each class, such as 1/: make one for each view, labels/view"),
         (other_detections, "labels/ holds names such as view0_objects: rename them"),
         (emptied, "labels/ holds no mask"),
+        (a_broken_link, "labels is a link to ../unmounted, which does not exist"),
         (lambda data: shutil.rmtree(data / "labels"), "there is no folder labels/"),
     ],
 )
