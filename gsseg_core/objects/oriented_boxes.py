@@ -93,23 +93,12 @@ class OrientedBox:
         return {name: _rounded(value) for name, value in {**vars(self), "axes": self.axes.T}.items()}
 
 
-def oriented_box(means: np.ndarray, covariances: np.ndarray, weights: np.ndarray) -> OrientedBox:
-    """Put a box around some Gaussians; the module says how.
-
-    Parameters
-    ----------
-    means : (M, 3) float
-        Their centres; M is at least 1.
-    covariances : (M, 3, 3) float
-        Their shapes, in squared units.
-    weights : (M,) float
-        What each counts, from 0; if all are 0, all count the same.
-
-    Raises
-    ------
-    SceneValueError
-        There is no Gaussian, or the shapes do not go together.
-    """
+def oriented_box(
+    means: np.ndarray,  # (M, 3): centres of the Gaussians, at least one
+    covariances: np.ndarray,  # (M, 3, 3): in squared units
+    weights: np.ndarray,  # (M,): what each counts, from 0; if all are 0, all count the same
+) -> OrientedBox:
+    """Put a box around some Gaussians; the module says how. Raises `SceneValueError` for other shapes, or none."""
     count = len(means)
     shapes = (np.shape(means), np.shape(covariances), np.shape(weights))
     if count == 0 or shapes != ((count, 3), (count, 3, 3), (count,)):

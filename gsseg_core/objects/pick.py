@@ -74,12 +74,8 @@ class Pick:
         """Find the camera whose mask would tell most: where the most of what is in doubt is seen, in px.
 
         In doubt is how far a membership m may be off, its standard deviation sqrt(m (1 - m)), as far as it was guessed
-        from neighbours and not seen: s / (s + e), with e the evidence and s the strength of the neighbours.
-
-        Raises
-        ------
-        SettingsError
-            There are no cameras.
+        from neighbours and not seen: s / (s + e), with e the evidence and s the strength of the neighbours. Raises
+        `SettingsError` where there are no cameras.
         """
         if not cameras:
             raise SettingsError("found no camera to choose from; expected a view that has no mask yet")
@@ -88,13 +84,7 @@ class Pick:
         return int(np.argmax([make_operator(scene, camera, device).render(doubt).sum() for camera in cameras]))
 
     def save(self, path: str | os.PathLike[str], run: str | None = None) -> None:
-        """Write `ids`, `membership`, and the scene's digest and the `run` in the header, as one npz, atomically.
-
-        Raises
-        ------
-        WriteError
-            The file cannot be written; an earlier one is unchanged.
-        """
+        """Write ids and membership, with the scene's digest and the run, as one npz, atomically (`WriteError`)."""
         header = {"format": FORMAT, "scene": self.scene_digest, **({} if run is None else {"run": run})}
         write_npz(path, header, ids=self.ids, membership=self.membership)
 
@@ -155,12 +145,7 @@ def pick_clicks(
 ) -> Pick:
     """Pick the object around one click or several in a view, leaving out what clicks say is not of it.
 
-    Parameters are those of `gsseg_core.objects.clicks.click_labels`.
-
-    Raises
-    ------
-    SettingsError, NoUsableViewsError
-        As `click_labels` and `pick_mask` do.
+    Parameters are those of `gsseg_core.objects.clicks.click_labels`, errors those of it and of `pick_mask`.
     """
     labels = click_labels(scene, camera, inside, outside, device=device)
     return pick_mask(scene, View.from_arrays(camera, labels), device=device)

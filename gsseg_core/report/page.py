@@ -24,9 +24,8 @@ from gsseg_core.text import percent, printable
 if TYPE_CHECKING:
     from jinja2 import Environment
 
+# Sections that are made beside each other, before the others, which choose views by what these have rendered.
 FIRST = ("preview", "views-shown")
-"""Sections that are made beside each other, before the others, which choose views by what these have rendered."""
-
 SECTIONS: Mapping[str, tuple[str, Callable[[PageInputs], sections.Content | None]]] = {
     "preview": ("In 3D", sections.preview),
     "views-shown": ("Masks beside predictions", sections.views_shown),
@@ -38,8 +37,6 @@ SECTIONS: Mapping[str, tuple[str, Callable[[PageInputs], sections.Content | None
     "settings": ("Settings and versions", lambda run: run.report),
 }
 """Sections of the page by anchor: title, and what is handed to the macro of that name; None leaves the section out."""
-
-
 TEMPLATE = "page.html.j2"
 
 
