@@ -22,6 +22,7 @@ from gsseg_core.live.session import LiveSession
 from gsseg_core.progress import Stopwatch
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_ros.conversions import stamp_message, stamp_ns
 from gsseg_ros.errors import InvalidRequestError, MissingFileError, NoSceneError, NotActiveError
 from gsseg_ros.node.jobs import JobSlot, Requests
 from gsseg_ros.node.masks.label_space import LabelSpace, NewNames
@@ -89,7 +90,7 @@ class Workspace:
         self._now = now
         self._session: LiveSession | None = None
         self._lock = threading.Lock()
-        self._revision = 0
+        self._revision = self._clock = self._stamp = 0
 
     @property
     def has_scene(self) -> bool:
@@ -290,7 +291,10 @@ class Workspace:
         """Give a run its number and stamp, once it has what it goes by: to be long at work makes it no older."""
         with self._lock:
             self._revision += 1
-            run.stamp, run.revision, run.dropped = self._now(), self._revision, Counter(self.dropped)
+            now = stamp_ns(self._now())
+            # By its stamp a cloud is told from those of other runs, also while a simulator is paused.
+            self._clock, self._stamp = now, self._stamp + 1 if now == self._clock else now
+            run.stamp, run.revision, run.dropped = stamp_message(self._stamp), self._revision, Counter(self.dropped)
 
     def holds(self, run: Run) -> bool:
         """Whether a run is still valid: nothing was replaced, nor the node deactivated, since it began."""

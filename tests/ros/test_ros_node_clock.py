@@ -15,6 +15,7 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import PointCloud2
 
 from gsseg_ros.conversions import stamp_message, stamp_ns
 
@@ -67,6 +68,15 @@ def test_without_a_clock_there_are_diagnostics_and_they_and_the_log_say_so(robot
 def test_without_a_clock_masks_are_fused_all_the_same(robot: Robot) -> None:
     robot.done("reset")
     robot.fuse(clean_views(2))
+
+
+def test_while_the_clock_stands_still_every_run_has_a_stamp_of_its_own(robot: Robot) -> None:
+    robot.done("reset")
+    robot.fuse(clean_views(1))
+    headers = [robot.done("segment").report.header for _ in range(3)]
+    assert len({stamp_ns(header.stamp) for header in headers}) == 3
+    (cloud,) = robot.latched((PointCloud2, "cloud"))
+    assert cloud.header == headers[-1]
 
 
 def test_after_the_clock_is_set_back_no_pose_of_before_is_taken_for_a_new_one(robot: Robot, clock: Any) -> None:
