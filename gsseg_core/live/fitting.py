@@ -55,7 +55,11 @@ def check_names_of(dataset: Dataset, names: Mapping[int, str]) -> None:
     check_same_names(called, names, dataset.root, "the session that is to learn from it", ClassesFileError)
 
 
-def names_with(dataset: Dataset, names: Mapping[int, str]) -> dict[int, str]:
-    """Add the names of a dataset's classes to those of a session, in whose place no name that is made up comes."""
+def names_with(dataset: Dataset, names: Mapping[int, str], *, fused: bool) -> dict[int, str]:
+    """Add the names of a dataset's classes to those of a session, in whose place no name that is made up comes.
+
+    Raises as `check_names_of` does, where views are `fused`: these may have come while the dataset was learnt from.
+    """
+    check_names_of(dataset, names if fused else {})
     found = dataset.class_names
     return {**names, **{k: name for k, name in found.items() if k not in names or name != class_name({}, k)}}

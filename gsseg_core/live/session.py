@@ -219,7 +219,7 @@ class LiveSession:
             if era is not self._era:
                 raise NoUsableViewsError("all views were forgotten while they were learnt from; nothing was learnt")
             if dataset is not None and not self._declared:
-                self._names = names_with(dataset, self._names)
+                self._names = names_with(dataset, self._names, fused=self.num_fused > 0)
             self._live.grow(num_classes)
             outcome = replace(outcome, learnt=self._carried(outcome.learnt, scene))
             self._learnt = outcome.learnt

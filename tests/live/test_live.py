@@ -220,6 +220,19 @@ def test_a_folder_that_calls_classes_otherwise_is_not_learnt_from(tmp_path: Path
     assert told.class_names == NAMES  # Names that are made up take the place of none.
 
 
+def test_a_folder_whose_names_masks_contradict_that_come_while_it_is_learnt_from_is_not_learnt(tmp_path: Path) -> None:
+    named, session = Dataset(write_dataset(tmp_path / "named")), LiveSession(SCENE)
+
+    def masks_come(stage: str, done: int, total: int, loss: float) -> None:
+        if not session.num_fused:
+            session.number_classes({1: "chair"})
+            fed(session)
+
+    with pytest.raises(ClassesFileError, match=f"named: calls class 1 '{NAMES[1]}'; expected 'chair'"):
+        session.learn("votes", named, report=masks_come)
+    assert session.learnt is None and session.class_names[1] == "chair"
+
+
 @pytest.mark.parametrize("stage", ["observe", "em"])
 def test_learning_that_is_stopped_changes_nothing(stage: str) -> None:
     class StoppedError(Exception):

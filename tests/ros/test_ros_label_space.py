@@ -134,11 +134,11 @@ def test_names_that_come_with_a_mask_go_before_all_others() -> None:
     assert node.space.ignored(names) == {1}
 
 
-def test_classes_are_found_anew_after_a_reset_or_a_saved_state() -> None:
+def test_a_label_stays_that_of_its_name_where_a_dataset_or_a_saved_state_numbers_classes_otherwise() -> None:
     node = Node()
     node.space.hear({1: "chair"})
     assert node.classes([1]) == [1]
-    node.session._names, node.session._era = {0: "background", 1: "cup", 2: "chair"}, object()
+    node.session._names = {0: "background", 1: "cup", 2: "chair"}
     assert node.classes([1]) == [2]
 
 

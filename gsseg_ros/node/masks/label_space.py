@@ -63,7 +63,6 @@ class LabelSpace:
         known = dict.fromkeys(class_names)
         self.classes = dict(enumerate(known | dict.fromkeys(made))) if class_names else {}
         self.heard: dict[int, str] | None = None
-        self._kept: tuple[tuple[object, object], dict[int, int]] | None = None
 
     def hear(self, names: Mapping[int, str]) -> bool:
         """Take in the names of labels, and return whether they are news."""
@@ -107,10 +106,7 @@ class LabelSpace:
             return seen.relabelled(self._numbered(new_names, session, source, say, keep_numbers=False), source)
         if self.heard is None and self._new_names is None:
             return seen
-        key, kept = (session.era, self.heard), self._kept
-        if kept is None or kept[0][0] is not key[0] or kept[0][1] is not key[1]:
-            kept = self._kept = (key, self._ids(session, source, say))
-        return seen.relabelled(kept[1], source)
+        return seen.relabelled(self._ids(session, source, say), source)
 
     def ignored(self, names: Mapping[int, str]) -> set[int]:
         """Labels whose pixels become unknown."""
