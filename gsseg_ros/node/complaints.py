@@ -13,7 +13,7 @@ MISSING = {role: f"no data on {role}" for role in ("mask", "camera_info", "depth
 """Kinds of complaint: an input that is silent."""
 
 REFUSED_POSE, TIME_JUMP, CLOCK, LIVE, OTHER = "refused pose", "time set back", "no clock", "overlay or objects", "other"
-OBSTACLES, SCENE_DELTA = "obstacles", "scene delta"
+OBSTACLES, SCENE_DELTA, NAMESAKES = "obstacles", "scene delta", "other nodes of this name"
 REFUSED_LABELS, DETECTIONS_TYPE = "refused label_info", "type of detections"
 
 REASONS = (
@@ -24,7 +24,9 @@ REASONS = (
 )  # fmt: skip
 """Kinds of complaint: why a mask became no view."""
 
-_OTHER_KINDS = (REFUSED_POSE, TIME_JUMP, CLOCK, LIVE, OBSTACLES, SCENE_DELTA, REFUSED_LABELS, DETECTIONS_TYPE, OTHER)
+_OTHER_KINDS = (
+    REFUSED_POSE, TIME_JUMP, CLOCK, LIVE, OBSTACLES, SCENE_DELTA, NAMESAKES, REFUSED_LABELS, DETECTIONS_TYPE, OTHER,
+)  # fmt: skip
 KINDS = frozenset((*MISSING.values(), *REASONS, *_OTHER_KINDS))
 
 

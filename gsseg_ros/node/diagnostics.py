@@ -9,7 +9,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from gsseg_core.live.results import SCENE_CHANGED
 from gsseg_core.text import counted
-from gsseg_ros.node.complaints import CLOCK, MISSING, PERIOD, TIME_JUMP, Complaints
+from gsseg_ros.node.complaints import CLOCK, MISSING, NAMESAKES, PERIOD, TIME_JUMP, Complaints
 from gsseg_ros.node.inputs import Inputs
 from gsseg_ros.node.workspace import Workspace
 
@@ -64,6 +64,17 @@ def missing_inputs(inputs: Inputs) -> dict[str, str]:
     return complaints
 
 
+def namesakes(inputs: Inputs) -> str:
+    """Say that other nodes have this node's name, and what to do; empty if none has."""
+    if (others := inputs.namesakes) < 1:
+        return ""
+    found = counted(others, "other node has", "other nodes have")
+    return (
+        f"{found} this node's name: a request is worked on by each, and answered by the first; expected names of their "
+        "own (--ros-args -r __node:=... or __ns:=...), or, of one that was killed, to be forgotten within a minute"
+    )
+
+
 def why_dropped(inputs: Inputs, reason: str) -> str:
     """Explain why masks are dropped before they are fused, and what to check; empty for other reasons."""
     came = "with their stamp came, neither in time nor late"
@@ -89,13 +100,15 @@ def why_dropped(inputs: Inputs, reason: str) -> str:
 
 
 def complain(complaints: Complaints, inputs: Inputs | None, clock_problem: str) -> None:
-    """Warn in the log of missing inputs and lost masks; call it once a second."""
+    """Warn in the log of missing inputs, lost masks and other nodes of this name; call it once a second."""
     if clock_problem and complaints.due(CLOCK):
         complaints.add(CLOCK, clock_problem)
     if inputs is not None:
         for role, line in missing_inputs(inputs).items():
             if complaints.due(MISSING[role]):
                 complaints.add(MISSING[role], line)
+        if (others := namesakes(inputs)) and complaints.due(NAMESAKES):
+            complaints.add(NAMESAKES, others)
         _complain_of_losses(complaints, inputs)
     complaints.flush()
 
@@ -155,8 +168,8 @@ def diagnostic_array(
     """Make the message for `/diagnostics`.
 
     Its level is OK while masks are fused; WARN if something is amiss that may cost views: not active, no scene, no
-    clock, silent inputs, refused poses, a tenth or more of the masks of the last ten seconds refused; ERROR if all of
-    these masks were refused, three at least.
+    clock, silent inputs, refused poses, a tenth or more of the masks of the last ten seconds refused, another node of
+    this name; ERROR if all of these masks were refused, three at least.
     """
     recent = _recent(inputs) if inputs is not None else Counter[str]()
     level, message = _verdict(workspace, inputs, recent, clock_problem)
@@ -204,6 +217,8 @@ def _verdict(
     complaints = missing_inputs(inputs)
     if complaints:
         return DiagnosticStatus.WARN, next(iter(complaints.values()))
+    if others := namesakes(inputs):
+        return DiagnosticStatus.WARN, others
     return DiagnosticStatus.OK, "fusing"
 
 

@@ -182,6 +182,11 @@ class Inputs:
         """Count the publishers of an input."""
         return int(self._node.count_publishers(topic))
 
+    @property
+    def namesakes(self) -> int:
+        """Number of other nodes with this node's name: each works on its requests, whoever answers first."""
+        return self.publishers_of("~/transition_event") - 1
+
     def _detections_of(self, camera: CameraStreams, settings: Settings) -> DetectionsInput:
         """Make the input of detections; their type, and so whether a mask belongs to them, turns out later."""
         topic = self._node.resolve_topic_name(camera.topic(settings.detections_topic))

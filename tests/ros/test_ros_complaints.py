@@ -156,7 +156,7 @@ class Hears:
             dropped=Counter(), gated=Counter(), rejected=Counter(), accepted=0, explained={},
             worker=SimpleNamespace(dropped=0, waiting=0), arrivals={}, roles={}, tf=None,
             lost={"/mask": 7, "/pose": 0}, policies={"/mask": "best effort, volatile"},
-            last_refusal=(-100.0, ""), refused_poses=0, logged=Counter(),
+            last_refusal=(-100.0, ""), refused_poses=0, logged=Counter(), namesakes=0,
             counted=deque([(steady.seconds, Counter())]),
         )  # fmt: skip
         self.lines: list[str] = []
@@ -243,6 +243,17 @@ def test_every_way_to_lose_a_mask_is_in_the_verdict_and_in_the_log(
         hears.verdict()
     assert [line.split(" because ")[0] for line in hears.lines] == ["5 masks were dropped", "10 masks were dropped"]
     assert all(said in line for line in hears.lines)
+
+
+def test_another_node_of_this_name_is_in_the_verdict_and_now_and_then_in_the_log(steady: Steady, hears: Hears) -> None:
+    hears.inputs.namesakes = 1
+    for _ in range(6):
+        level, message = hears.verdict()
+        steady.seconds += 1
+    assert level == DiagnosticStatus.WARN and hears.lines == [message, message]
+    assert message.startswith("1 other node has this node's name: a request is worked on by each, and answered by the")
+    hears.inputs.namesakes = 0
+    assert hears.verdict() == (DiagnosticStatus.OK, "fusing")
 
 
 def test_refused_poses_explain_masks_without_a_pose(steady: Steady, hears: Hears) -> None:

@@ -18,6 +18,7 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import State
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from sensor_msgs.msg import Image
 
@@ -126,6 +127,15 @@ def test_diagnostics_tell_what_there_is(ros: Ros, parameters: dict[str, Any], ro
 
     robot.wait_for_status(fuses, "a status that says so")
     assert all(len(array.status) == 1 for array in robot.received_status)
+
+
+def test_another_node_of_its_name_is_known_until_it_goes(ros: Ros, node: SegmentNode) -> None:
+    assert node.trigger_configure() == node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    assert node.inputs is not None and node.inputs.namesakes == 0
+    other = LifecycleNode(node.get_name(), context=ros.context, use_global_arguments=False)
+    ros.wait_until(lambda: node.inputs.namesakes == 1, "the other node")
+    other.destroy_node()
+    ros.wait_until(lambda: node.inputs.namesakes == 0, "the end of the other node")
 
 
 def test_the_log_says_which_input_is_missing_and_what_to_check(silent: Robot) -> None:
