@@ -168,8 +168,8 @@ def diagnostic_array(
     """Make the message for `/diagnostics`.
 
     Its level is OK while masks are fused; WARN if something is amiss that may cost views: not active, no scene, no
-    clock, silent inputs, refused poses, a tenth or more of the masks of the last ten seconds refused, another node of
-    this name; ERROR if all of these masks were refused, three at least.
+    clock, silent inputs, refused poses or scene changes, another node of this name, a tenth or more of the masks of the
+    last ten seconds refused; ERROR if all of these masks were refused, three at least.
     """
     recent = _recent(inputs) if inputs is not None else Counter[str]()
     level, message = _verdict(workspace, inputs, recent, clock_problem)
@@ -211,9 +211,9 @@ def _verdict(
     if refused and refused >= WARN_SHARE * recent.total():
         all_refused = refused == recent.total() >= ERROR_COUNT
         return DiagnosticStatus.ERROR if all_refused else DiagnosticStatus.WARN, _refusals(inputs, recent)
-    refused_at, why = inputs.last_refusal
-    if time.monotonic() - refused_at < PERIOD:
-        return DiagnosticStatus.WARN, why
+    for refused_at, why in (inputs.last_refusal, workspace.refused_change):
+        if time.monotonic() - refused_at < PERIOD:
+            return DiagnosticStatus.WARN, why
     complaints = missing_inputs(inputs)
     if complaints:
         return DiagnosticStatus.WARN, next(iter(complaints.values()))

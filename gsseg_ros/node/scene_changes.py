@@ -87,7 +87,9 @@ class SceneChanges:
             self.workspace.changes["refused"] += 1
             # What was not foreseen is logged with its traceback, too.
             why = str(error) if isinstance(error, GssegError) else explain(self.node, error)
-            self._complain(f"topic scene_delta: {why.removeprefix('scene delta: ')}")
+            message = f"topic scene_delta: {why.removeprefix('scene delta: ')}"
+            self.workspace.refused_change = (time.monotonic(), message)
+            self._complain(message)
 
     @answered
     @in_turn

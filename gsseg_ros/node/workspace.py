@@ -75,6 +75,8 @@ class Workspace:
         Masks that never came to be views, by reason, since the scene was loaded or reset.
     changes : Counter of str
         Changes of the scene that were made and refused, and the views that they left, lifted anew, and did not find.
+    refused_change : (float, str)
+        When the last message of the topic scene_delta was refused (s, `time.monotonic`), and why.
     """
 
     def __init__(self, settings: Settings, now: Callable[[], Time]) -> None:
@@ -87,6 +89,7 @@ class Workspace:
         self.last_job = "none"
         self.dropped: Counter[str] = Counter()
         self.changes: Counter[str] = Counter()
+        self.refused_change = (float("-inf"), "")
         self._now = now
         self._session: LiveSession | None = None
         self._lock = threading.Lock()

@@ -159,6 +159,7 @@ class Hears:
             last_refusal=(-100.0, ""), refused_poses=0, logged=Counter(), namesakes=0,
             counted=deque([(steady.seconds, Counter())]),
         )  # fmt: skip
+        self.refused_change = (-100.0, "")
         self.lines: list[str] = []
         self._complaints = Complaints(self.lines.append, steady)
 
@@ -166,7 +167,12 @@ class Hears:
         scene = type("Scene", (list,), {"path": "scene.ply"})()
         session = SimpleNamespace(learnt=None, scene=scene, class_names={}, has_codes=False, num_fused=0, num_views=0)
         workspace: Any = SimpleNamespace(
-            active=True, has_scene=True, last_job="none", session=session, changes=Counter()
+            active=True,
+            has_scene=True,
+            last_job="none",
+            session=session,
+            changes=Counter(),
+            refused_change=self.refused_change,
         )
         (status,) = diagnostics.diagnostic_array("gsseg", workspace, self.inputs, Time().to_msg(), clock_problem).status
         diagnostics.complain(self._complaints, self.inputs, clock_problem)
@@ -243,6 +249,13 @@ def test_every_way_to_lose_a_mask_is_in_the_verdict_and_in_the_log(
         hears.verdict()
     assert [line.split(" because ")[0] for line in hears.lines] == ["5 masks were dropped", "10 masks were dropped"]
     assert all(said in line for line in hears.lines)
+
+
+def test_a_refused_change_of_the_scene_is_in_the_verdict_for_five_seconds(steady: Steady, hears: Hears) -> None:
+    hears.refused_change = (steady.seconds, "topic scene_delta: its revision is 9; expected 8")
+    assert hears.verdict() == (DiagnosticStatus.WARN, hears.refused_change[1])
+    steady.seconds += 5
+    assert hears.verdict() == (DiagnosticStatus.OK, "fusing")
 
 
 def test_another_node_of_this_name_is_in_the_verdict_and_now_and_then_in_the_log(steady: Steady, hears: Hears) -> None:

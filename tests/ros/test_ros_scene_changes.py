@@ -231,6 +231,7 @@ def test_a_delta_out_of_turn_is_complained_of_once_and_changes_nothing(
         "topic scene_delta: its revision is 9; expected 8, as the scene is at 7"
     )
     assert here.node.workspace.changes["refused"] == 1 and len(session.scene) == len(SCENE) - 2
+    assert here.node.workspace.refused_change[1] == said[0]
     np.testing.assert_array_equal(votes(session), as_refused(session))
 
 
