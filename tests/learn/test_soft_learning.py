@@ -172,6 +172,16 @@ def test_partial_masks_learn_far_better_than_absence_taken_for_background(name: 
     assert mean_iou(told) > mean_iou(learnt(name, views)) - 0.08
 
 
+def test_em_goes_on_with_partial_masks_until_no_step_changes_labels() -> None:
+    """Few of their pixels name a class, so that each step gains little of a lot."""
+    views = [partial(view, 1 + i % 3) for i, view in enumerate(wrong_views(12))]
+    stopped, settled = (
+        taught(EMLearner(SCENE, NUM_CLASSES, settings), views).fit().codes_.argmax(axis=1)
+        for settings in (EMSettings(), EMSettings(tolerance=1e-3, max_steps=60))
+    )
+    assert (stopped != settled).mean() < 0.01
+
+
 def test_honest_doubt_teaches_more_than_its_argmax() -> None:
     """A quarter of the objects get a wrong first choice; the segmenter says how sure it is of it."""
     rng, soft, hard = np.random.default_rng(0), [], []

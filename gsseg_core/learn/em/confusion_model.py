@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsseg_core.data.label_evidence import LabelEvidence
+from gsseg_core.data.label_images import UNKNOWN
 
 PART_PRIOR = 3000.0
 """Weight of the prior on how a class's pixels under one word divide between rejected regions and the rest, in px.
@@ -23,19 +24,21 @@ class ErrorModel:
     confusion: np.ndarray  # (K, W) float32: R_v; rows are true classes, columns the words seen; rows sum to 1
     pseudo_counts: np.ndarray  # (T,) float64: a_v, px added to the count of the correct word of each class that has one
     outliers: float  # share of pixels labelled by chance
-    num_pixels: int  # with a label that is informative
+    areas: np.ndarray  # (L,) px with each label
 
     @classmethod
-    def without_errors(cls, evidence: LabelEvidence, num_classes: int, outliers: float, num_pixels: int) -> ErrorModel:
+    def without_errors(
+        cls, evidence: LabelEvidence, num_classes: int, outliers: float, areas: np.ndarray
+    ) -> ErrorModel:  # (L,)
         """Make the model of a segmenter whose labels are all correct."""
         confusion = np.zeros((num_classes, len(evidence.vocabulary)), np.float32)
         correct = evidence.correct_words(num_classes)
         confusion[correct] = 1.0
-        return cls(evidence, confusion, np.zeros(len(correct[0])), outliers, num_pixels)
+        return cls(evidence, confusion, np.zeros(len(correct[0])), outliers, areas)
 
     @classmethod
     def from_counts(
-        cls, evidence: LabelEvidence, counts: np.ndarray, prior: float, outliers: float, num_pixels: int
+        cls, evidence: LabelEvidence, counts: np.ndarray, prior: float, outliers: float, areas: np.ndarray
     ) -> ErrorModel:
         """Estimate a model from counts of predicted classes under each label, (K, L) px."""
         if evidence.word_plausibility is not None:
@@ -43,9 +46,19 @@ class ErrorModel:
             counts = counts[:, evidence.informative] @ (shares / shares.sum(axis=1, keepdims=True))
         pseudo_counts = prior * counts[evidence.correct_words(len(counts))[0]].sum(axis=1)
         uniform = np.full(counts.shape, 1.0 / len(evidence.vocabulary), np.float32)
-        model = cls(evidence, uniform, pseudo_counts, outliers, num_pixels)
+        model = cls(evidence, uniform, pseudo_counts, outliers, areas)
         model.m_step(counts)
         return model
+
+    @property
+    def num_pixels(self) -> int:
+        """Pixels with a label that is informative."""
+        return int(self.areas[self.evidence.informative].sum())
+
+    @property
+    def named_pixels(self) -> int:
+        """Those of them whose label says which class, not only which ones it is not."""
+        return int(self.areas[self.evidence.informative & (self.evidence.named() != UNKNOWN)].sum())
 
     @property
     def classes(self) -> np.ndarray:

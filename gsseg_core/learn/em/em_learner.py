@@ -62,7 +62,8 @@ class EMSettings:
     max_steps : int
         Steps at most; scikit-learn's `max_iter`.
     tolerance : float
-        Stop with a step that gains less than this, in nats per labelled pixel; scikit-learn's `tol`.
+        Stop with a step that gains less than this, in nats per labelled pixel; scikit-learn's `tol`. Where only a share
+        s of the pixels names a class, as in partial masks, each step gains less of more: with less than s^2 of this.
     errors : bool
         Learn a confusion matrix for each view; without, every mask is taken to be right.
     refits : int
@@ -175,9 +176,7 @@ class EMLearner(Learner):
         self._begin()
         self._last_step = None
         votes, tick = CSRRows.from_dense(self._votes), partial(progress, "em", 0, settings.max_steps)
-        rejected: dict[str, np.ndarray] = {}
-        if settings.rejects_regions:
-            votes, rejected = self._reject_regions(votes, tick)
+        votes, rejected = self._reject_regions(votes, tick) if settings.rejects_regions else (votes, {})
         resolved = resolved_votes(votes, self._possible())
         self.observed_ = np.diff(resolved.indptr) > 0
         resolved, prior = resolved.united(self._spatial_prior(resolved))
@@ -188,6 +187,7 @@ class EMLearner(Learner):
         self.history_ = history = list[float]()
         models = self._initial_error_models(votes, rejected, tick)
         pixels = sum(model.num_pixels for model in models.values())
+        named = sum(model.named_pixels for model in models.values())
         self.rounds_ = rounds = [0]
         while len(history) < settings.max_steps:
             tick = partial(progress, "em", len(history), settings.max_steps)
@@ -197,7 +197,7 @@ class EMLearner(Learner):
             history.append((float(log_prior) + log_likelihood) / pixels)
             rounds[-1] += 1
             last_round = len(rounds) > settings.refits or not settings.errors
-            tolerance = settings.tolerance * (1 if last_round else REFIT_FACTOR) * pixels
+            tolerance = settings.tolerance * (1 if last_round else REFIT_FACTOR) * named**2 / pixels
             small = kernels.predicted_gain(codes, gradient, prior.data) < tolerance
             self.converged_ = small and last_round
             if self.converged_ or len(history) == settings.max_steps:
@@ -334,12 +334,11 @@ class EMLearner(Learner):
         def estimate(name: str, observation: Observation) -> ErrorModel:
             evidence, outliers = observation.evidence, settings.outliers
             if not settings.errors:
-                return ErrorModel.without_errors(evidence, self.num_classes, outliers, observation.num_pixels)
+                return ErrorModel.without_errors(evidence, self.num_classes, outliers, observation.areas)
             if name in rejected:
                 evidence = evidence.without_names(rejected[name])
-            pixels = int(observation.areas[evidence.informative].sum())
             counts = on_device.leave_one_out_counts(here, observation, possible, evidence, settings.majority)
-            return ErrorModel.from_counts(evidence, counts, settings.error_prior, outliers, pixels)
+            return ErrorModel.from_counts(evidence, counts, settings.error_prior, outliers, observation.areas)
 
         models = dict(self._of_each(estimate, names, tick))
         return {name: models[name] for name in (self.views if names is None else names) if name in models}
