@@ -321,15 +321,16 @@ def _write(
         images = ViewImages(scene, settings.device, drawn.values())
         shown = [drawn[view.name] for view in inputs.pictured]
         evidence, pictures = _picture(run, inputs, assessment, result, level, shown, images, behind)
-    report = RunReport.of(
-        scene, exported, run=run.id, views=assessment.report, settings=settings.as_dict(), seconds=watch.seconds,
-        objective=assessment.objective, calibration=assessment.calibration.as_dict(), prepared_views=assessment.memory,
-        ids=inputs.objects and inputs.objects.summary(result), masks=inputs.masks, frame=inputs.frame,
-        files={k: str(path.relative_to(folder)) for k, path in files.items()},
-        meshes={k: f"classes/{mesh_file_name(k, exported.class_names[k])}" for k in meshes},
-        pictures=[str(path.relative_to(folder)) for path in pictures],
-    )  # fmt: skip
     with watch.stage("report page"):
+        report = RunReport.of(
+            scene, exported, run=run.id, views=assessment.report, settings=settings.as_dict(), seconds=watch.seconds,
+            objective=assessment.objective, calibration=assessment.calibration.as_dict(), frame=inputs.frame,
+            prepared_views=assessment.memory, masks=inputs.masks,
+            ids=inputs.objects and inputs.objects.summary(result),
+            files={k: str(path.relative_to(folder)) for k, path in files.items()},
+            meshes={k: f"classes/{mesh_file_name(k, exported.class_names[k])}" for k in meshes},
+            pictures=[str(path.relative_to(folder)) for path in pictures],
+        )  # fmt: skip
         told = report if level is result else replace(report, classes=class_table(scene, result))
         write_report_page(folder / "report.html", PageInputs(told.as_dict(), scene, result, evidence, images))
     return replace(report, page="report.html", seconds=watch.seconds)
