@@ -47,6 +47,7 @@ class Bench(NamedTuple):
     name: str
     scene: GaussianScene
     data: Dataset
+    wrong: Dataset  # the same with wrong masks
 
 
 def main() -> None:
@@ -63,10 +64,11 @@ def main() -> None:
 def benches(folder: Path, data: Path) -> Iterator[Bench]:
     """Build the demo scene in a folder; open the others that are there."""
     scene = build_demo(folder).scene
-    yield Bench("demo", scene, Dataset(folder, "labels_true"))
+    yield Bench("demo", scene, Dataset(folder, "labels_true"), Dataset(folder))
     for name in SCENES:
         if (data / name).is_dir():
-            yield Bench(name, GaussianScene.load(data / name / "scene.ply"), Dataset(data / name))
+            scene = GaussianScene.load(data / name / "scene.ply")
+            yield Bench(name, scene, Dataset(data / name), Dataset(data / name, "labels_noisy"))
         else:
             print(f"{data / name}: not there, and so not measured")
 
@@ -74,6 +76,7 @@ def benches(folder: Path, data: Path) -> Iterator[Bench]:
 def measure(bench: Bench, seeds: int) -> Iterator[list[str]]:
     """Learn from all kinds of masks; one row of the table for each."""
     train, classes = bench.data.views("train"), [k for k in bench.data.class_names if k]
+    wrong = {view.name: view for view in bench.wrong.views("train")}
     pairs = [doubted(train, bench.data.num_classes, np.random.default_rng(seed)) for seed in range(seeds)]
     rngs = [np.random.default_rng(seed) for seed in range(seeds)]
     drawn = [[(view, looked_for(classes, rng)) for view in train] for rng in rngs]
@@ -86,6 +89,10 @@ def measure(bench: Bench, seeds: int) -> Iterator[list[str]]:
         ],
         "**a third of the classes, `supervised`**": [
             [View.from_arrays(view.camera, kept(view, ids), supervised=ids) for view, ids in draw] for draw in drawn
+        ],
+        "**a third of the classes, `supervised`**, of wrong masks": [
+            [View.from_arrays(view.camera, kept(wrong[view.name], ids), supervised=ids) for view, ids in draw]
+            for draw in drawn
         ],
     }
     for kind, draws in kinds.items():
