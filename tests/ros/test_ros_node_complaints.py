@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import re
 from array import array
 from collections.abc import Iterator
@@ -135,6 +136,8 @@ def test_another_node_of_its_name_is_known_until_it_goes(ros: Ros, node: Segment
     other = LifecycleNode(node.get_name(), context=ros.context, use_global_arguments=False)
     ros.wait_until(lambda: node.inputs.namesakes == 1, "the other node")
     other.destroy_node()
+    del other  # rclpy keeps the publisher of a node's transitions for as long as there is the node.
+    gc.collect()
     ros.wait_until(lambda: node.inputs.namesakes == 0, "the end of the other node")
 
 
