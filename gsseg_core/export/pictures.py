@@ -168,6 +168,8 @@ def outline(labels: np.ndarray) -> np.ndarray:
 
 def shrunk(image: np.ndarray, px: int) -> np.ndarray:  # (H, W, 3) uint8
     """Shrink a picture so that neither side is longer than so many px."""
+    if max(image.shape[:2]) <= px:
+        return image
     picture = Image.fromarray(image)
     picture.thumbnail((px, px), Image.Resampling.BOX)
     return np.asarray(picture)

@@ -38,10 +38,8 @@ class NodeExecutor(Executor):
         """Start the next callback that is due within so many seconds."""
         try:
             self._pool.submit(self._run, self.wait_for_ready_callbacks(timeout_sec)[0])
-        except (TimeoutException, ShutdownException, ExternalShutdownException):
-            pass
-        except InvalidHandle:  # A topic was taken away in this moment; the next time it is not asked for any more.
-            pass
+        except (TimeoutException, ShutdownException, ExternalShutdownException, InvalidHandle):
+            pass  # The last where a topic was taken away in this moment: the next time it is not asked for any more.
         except Exception as error:
             self._log.error(describe(error))
 

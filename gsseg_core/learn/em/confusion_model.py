@@ -28,8 +28,8 @@ class ErrorModel:
 
     @classmethod
     def without_errors(
-        cls, evidence: LabelEvidence, num_classes: int, outliers: float, areas: np.ndarray
-    ) -> ErrorModel:  # (L,)
+        cls, evidence: LabelEvidence, num_classes: int, outliers: float, areas: np.ndarray  # (L,) px
+    ) -> ErrorModel:  # fmt: skip
         """Make the model of a segmenter whose labels are all correct."""
         confusion = np.zeros((num_classes, len(evidence.vocabulary)), np.float32)
         correct = evidence.correct_words(num_classes)
@@ -38,8 +38,8 @@ class ErrorModel:
 
     @classmethod
     def from_counts(
-        cls, evidence: LabelEvidence, counts: np.ndarray, prior: float, outliers: float, areas: np.ndarray
-    ) -> ErrorModel:
+        cls, evidence: LabelEvidence, counts: np.ndarray, prior: float, outliers: float, areas: np.ndarray  # (L,) px
+    ) -> ErrorModel:  # fmt: skip
         """Estimate a model from counts of predicted classes under each label, (K, L) px."""
         if evidence.word_plausibility is not None:
             shares = evidence.word_plausibility[evidence.informative]
