@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -17,7 +18,6 @@ from gsseg_core.data.object_tree import ObjectTree, check_granularity
 from gsseg_core.data.view import spread
 from gsseg_core.errors import SettingsError, StateMismatchError
 from gsseg_core.files.npz_files import (
-    NpzArrays,
     UnfitError,
     check_shares,
     class_names_of,
@@ -37,7 +37,7 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import neighbours_of
 from gsseg_core.spatial.row_order import take_rows
-from gsseg_core.text import clipped, quoted
+from gsseg_core.text import clipped
 
 T = TypeVar("T")
 
@@ -45,8 +45,8 @@ UNOBSERVED, REMOVED = -1, -2
 """Labels of Gaussians that no view spoke for, and of those that the filter took out."""
 
 FORMAT = "gsseg-segmentation-1"
-TREE_ARRAYS = ("parents", "agreement", "leaves")
-"""Of an `ObjectTree`, in the file of a segmentation."""
+
+_FIRST_ONE = threading.Lock()  # of several threads that ask for what is blended, one computes it
 
 
 class LabelMap(NamedTuple):
@@ -300,12 +300,12 @@ class Segmentation:
 
     def label_map(self, operator: ViewOperator) -> np.ndarray:
         """Class of every pixel of a view, (H, W) int32: those of `render`, without the confidence."""
-        codes, shows_background = self._blended
+        codes, shows_background = self._codes_to_blend()
         return np.asarray(self.class_ids[operator.strongest(codes, len(self.class_names), shows_background).classes])
 
     def label_map_beside(self, operator: ViewOperator, others: np.ndarray) -> tuple[np.ndarray, Blended]:
         """Do the same, and blend in one pass what else Gaussians carry, (M, C) of the operator's `ids`, as colours."""
-        codes, shows_background = self._blended
+        codes, shows_background = self._codes_to_blend()
         found = operator.strongest(codes, len(self.class_names), shows_background, beside=others)
         assert found.beside is not None
         return self.class_ids[found.classes], found.beside
@@ -315,11 +315,15 @@ class Segmentation:
 
         `gsseg_core.learn.temperature.tempered` at `temperature` makes probabilities of them.
         """
-        codes, shows_background = self._blended
+        codes, shows_background = self._codes_to_blend()
         image, left_over = operator.blend_rows(codes, len(self.class_names))
         if shows_background:
             image[..., 0] += left_over
         return image
+
+    def _codes_to_blend(self) -> tuple[CSRRows, bool]:
+        with _FIRST_ONE:
+            return self._blended
 
     @cached_property
     def _blended(self) -> tuple[CSRRows, bool]:
@@ -343,7 +347,7 @@ class Segmentation:
         arrays = {name: getattr(self, name) for name in names}
         if self.tree is not None:
             header["granularity"] = self.tree.level
-            arrays |= {f"tree_{name}": getattr(self.tree, name) for name in TREE_ARRAYS}
+            arrays |= self.tree.arrays()
         write_npz(path, header, **arrays, **({} if self.ids is None else {"ids": self.ids}))
 
     @classmethod
@@ -382,18 +386,5 @@ class Segmentation:
                 raise UnfitError("array class_ids holds other ids than class_names of its header; expected the same")
             check_shares("probabilities", probabilities)
             check_shares("learnt", learnt)
-            tree = _read_tree(file, header, n, k)
+            tree = ObjectTree.read(file, header, n, k)
         return cls(labels, probabilities, names, scene.digest, clustered, learnt, temperature, scene.ids, tree)
-
-
-def _read_tree(file: NpzArrays, header: dict[str, Any], num_gaussians: int, num_classes: int) -> ObjectTree | None:
-    """Read the tree of a segmentation, if it has one."""
-    if "tree_parents" not in file.names:
-        return None
-    parents = file.expect("tree_parents", np.int32, (None,))
-    agreement = file.expect("tree_agreement", np.float32, (len(parents),))
-    leaves = file.expect("tree_leaves", np.int32, (num_gaussians,))
-    level = header.get("granularity")
-    if type(level) is not float:
-        raise UnfitError(f"granularity is {quoted(level)}; expected a number in (0, 1)")
-    return ObjectTree(parents, agreement, leaves, num_classes, level)

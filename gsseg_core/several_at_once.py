@@ -8,8 +8,9 @@ takes the memory of a view. On a GPU the rest of the work is such work, so there
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import TypeVar
 
 import numba
@@ -42,6 +43,18 @@ def several_at_once(work: Callable[[T], R], items: Iterable[T], device: str = "c
         finally:
             for future in begun:
                 future.cancel()
+
+
+@contextmanager
+def meanwhile(work: Callable[[], object], device: str) -> Iterator[None]:
+    """Do something beside what the body has a GPU do, and be done with it at its end; with none, it is left undone."""
+    if device == "cpu" or not kernels_run_beside_each_other():
+        yield
+        return
+    with ThreadPoolExecutor(1, "gsseg-beside") as beside:
+        done = beside.submit(work)
+        yield
+        done.result()
 
 
 def _with_threads(few: int, made: R, usual: int) -> Generator[R, None, None]:

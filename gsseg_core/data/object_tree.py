@@ -18,7 +18,8 @@ import numpy as np
 
 from gsseg_core.data.class_names import class_name
 from gsseg_core.errors import SettingsError
-from gsseg_core.files.npz_files import UnfitError
+from gsseg_core.files.npz_files import NpzArrays, UnfitError
+from gsseg_core.text import quoted
 
 PART, OBJECT, WHOLE = "part", "object", "whole"
 """What a node can be."""
@@ -54,6 +55,23 @@ class ObjectTree:
             raise UnfitError("a whole of the tree holds no two objects at its level")
         if ((self.leaves < -1) | (self.leaves >= m)).any() or (kinds[self.leaves[self.leaves >= 0]] < 0).any():
             raise UnfitError("leaves of the tree are no parts or objects of it")
+
+    @classmethod
+    def read(cls, file: NpzArrays, header: dict[str, Any], num_gaussians: int, num_classes: int) -> ObjectTree | None:
+        """Read the tree of a segmentation from its file, if it has one; `UnfitError` unless it is one."""
+        if "tree_parents" not in file.names:
+            return None
+        parents = file.expect("tree_parents", np.int32, (None,))
+        agreement = file.expect("tree_agreement", np.float32, (len(parents),))
+        leaves = file.expect("tree_leaves", np.int32, (num_gaussians,))
+        level = header.get("granularity")
+        if type(level) is not float:
+            raise UnfitError(f"granularity is {quoted(level)}; expected a number in (0, 1)")
+        return cls(parents, agreement, leaves, num_classes, level)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Name its arrays as `read` finds them; the level is `granularity` in the header."""
+        return {f"tree_{name}": getattr(self, name) for name in ("parents", "agreement", "leaves")}
 
     def __len__(self) -> int:
         """Count the nodes, M."""

@@ -21,8 +21,8 @@ from gsseg_core.learn.learner_state import State
 from gsseg_core.learn.prepared_views import PreparedViews, default_budget
 from gsseg_core.progress import Progress as Progress
 from gsseg_core.progress import silent as silent
-from gsseg_core.raster.backends import make_operator
-from gsseg_core.raster.observation import Observation, PairVotes
+from gsseg_core.raster.backends import make_operator, vote_total
+from gsseg_core.raster.observation import Observation
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import PixelGrid, Strongest
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -134,13 +134,14 @@ class Learner(ABC):
 
     def observe_all(self, views: Sequence[View], progress: Progress = silent) -> None:
         """Add views, as `observe` does; the error that one of them raises ends it."""
-        with closing(several_at_once(self._opened, views, self.device)) as opened:
+        opened = closing(several_at_once(self._opened, views, self.device))
+        with opened as each, vote_total(self._votes, self.device) as total:
             for done, view in enumerate(views):
                 progress("observe", done, len(views))
                 if self.memory_budget == 0:
                     self.observe(view)
                 else:
-                    self._add(view, next(opened))
+                    self._add(view, next(each), total)
         progress("observe", len(views), len(views))
 
     def retract(self, name: str) -> None:
@@ -295,24 +296,23 @@ class Learner(ABC):
         if not operator.vote(*self._used_labels(seen, operator), self._votes, UNITS, sign):
             raise UnusableViewError(SEES_NOTHING)
 
-    def _opened(self, view: View) -> tuple[Observation, PairVotes] | UnusableViewError:
+    def _opened(self, view: View) -> Observation | UnusableViewError:
         """Prepare a view that is new; what is wrong with it is returned."""
         try:
             return self._open(view)
         except UnusableViewError as why:
             return why
 
-    def _add(self, view: View, opened: tuple[Observation, PairVotes] | UnusableViewError | None) -> bool:
-        """Count a view, and add its votes if it is prepared, or say why it cannot be used."""
+    def _add(self, view: View, opened: Observation | UnusableViewError | None, total: Any = None) -> bool:
+        """Count a view, and add its votes if it is prepared, to a total if there is one; or say why it is of no use."""
         if isinstance(opened, UnusableViewError):
             self.rejected[view.name] = str(opened)
             return False
         if opened is not None:
             if view.name in self.views:
                 self.retract(view.name)
-            observation, votes = opened
-            observation.vote(self._votes, UNITS, own=votes)
-            self._prepared.keep(view.name, observation)
+            opened.vote(self._votes if total is None else total, UNITS)
+            self._prepared.keep(view.name, opened)
         self.rejected.pop(view.name, None)
         self.views[view.name] = view
         return True
@@ -336,12 +336,11 @@ class Learner(ABC):
                 tick()
                 yield name, next(made)
 
-    def _open(self, view: View) -> tuple[Observation, PairVotes]:
+    def _open(self, view: View) -> Observation:
         observation = self._prepare(view, self._read(view))
-        votes = observation.pair_votes()
-        if not len(votes.ids):
+        if not observation.num_pairs:
             raise UnusableViewError(SEES_NOTHING)
-        return observation, votes
+        return observation
 
     def _read(self, view: View) -> SeenLabels:
         if not view.has_mask:

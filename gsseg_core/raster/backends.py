@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import importlib
 import re
+from contextlib import AbstractContextManager
 from types import ModuleType
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
 
 from gsseg_core.errors import SettingsError
 
@@ -77,6 +80,15 @@ def free_memory_on(device: str) -> int | None:
     """Tell how many bytes for views are free on a device, None where the system does not say; raises the same."""
     free: int | None = _module_of(device).free_memory_on(device)
     return free
+
+
+def vote_total(votes: np.ndarray, device: str) -> AbstractContextManager[Any]:
+    """Give what the observations of many views on a device can `vote` for, in place of votes, (N, K) int64.
+
+    These have their votes once the context is left.
+    """
+    total: AbstractContextManager[Any] = _module_of(device).vote_total(votes, device)
+    return total
 
 
 def _module_of(device: str) -> ModuleType:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
@@ -42,23 +42,6 @@ class ViewPairs(NamedTuple):
     labels: np.ndarray
 
 
-class PairVotes(NamedTuple):
-    """The same with their votes, on the CPU: what is added to the votes of other views.
-
-    Attributes
-    ----------
-    ids : (M,) int32
-    start : (M + 1,) int64
-    labels : (P,) int32
-    votes : (P,) float32
-    """
-
-    ids: np.ndarray
-    start: np.ndarray
-    labels: np.ndarray
-    votes: np.ndarray
-
-
 class Observation(ABC):
     """A view with its mask: W cut down, in each pixel, to the label that was seen there.
 
@@ -82,6 +65,11 @@ class Observation(ABC):
     @abstractmethod
     def nbytes(self) -> int:
         """Memory that it holds, in bytes."""
+
+    @property
+    def num_pairs(self) -> int:
+        """P; without any, its pixels with a label see no Gaussian."""
+        return len(self.labels)
 
     @property
     def num_pixels(self) -> int:
@@ -120,17 +108,12 @@ class Observation(ABC):
     def votes(self) -> np.ndarray:
         """Sum of weights of each pair, the entries of W^T onehot(y) that are not zero: (P,) float32, in px."""
 
-    def pair_votes(self) -> PairVotes:
-        """Return the pairs with their votes; those that lie on a GPU are copied."""
-        return PairVotes(self.ids, self.start, self.labels, self.votes())
+    def vote(self, total: Any, units: float, sign: int = 1) -> None:
+        """Add the votes to those of other views, or take them away, in whole units.
 
-    def vote(self, total: np.ndarray, units: float, sign: int = 1, own: PairVotes | None = None) -> None:
-        """Add the votes to those of other views, (N, K) int64, or take them away, in whole units.
-
-        They are taken from the view's own `pair_votes`, unless these are at hand.
+        They are an (N, K) int64 array, or what `gsseg_core.raster.backends.vote_total` has in place of it.
         """
-        ids, start, labels, votes = own or self.pair_votes()
-        add_votes(total, ids, start, labels, self.evidence.votes, votes, units, sign)
+        add_votes(total, self.ids, self.start, self.labels, self.evidence.votes, self.votes(), units, sign)
 
     def shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares:
         """Share one vote per labelled pixel, times its weight, among the Gaussians that made it.

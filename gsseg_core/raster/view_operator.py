@@ -9,6 +9,7 @@ import numpy as np
 
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.errors import MaskSizeError, SceneValueError, SettingsError
+from gsseg_core.raster.objects_alone import ObjectsAlone
 from gsseg_core.raster.observation import Observation
 from gsseg_core.raster.view_renderer import ViewRenderer
 
@@ -159,6 +160,10 @@ class ViewOperator(ViewRenderer):
     def _adjoint(self, residual: np.ndarray) -> np.ndarray: ...
 
     @abstractmethod
+    def objects_alone(self, labels: np.ndarray) -> ObjectsAlone:
+        """Choose the Gaussians that belong to an object, those of labels (N,) int32 above 0, each object by itself."""
+
+    @abstractmethod
     def _weights(self, pixel: tuple[int, int] | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """List pixels and places in `ids`, both (P,) int32, and weights, (P,) float32, nearest first in each pixel."""
 
@@ -170,7 +175,7 @@ class ViewOperator(ViewRenderer):
     ) -> bool:
         observation = self.observe(labels, evidence)
         observation.vote(total, units, sign)
-        return len(observation.ids) > 0
+        return observation.num_pairs > 0
 
     def _check_size(self, image: np.ndarray, dimensions: int) -> None:
         height, width = self.camera.height, self.camera.width

@@ -27,9 +27,9 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from gsseg_core.errors import MaskSizeError
-from gsseg_core.raster.cpu.objects_alone import ObjectsAlone
-from gsseg_core.raster.cpu.tile_operator import TileOperator
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.depth import BEHIND, depths, surface
+from gsseg_core.raster.objects_alone import ObjectsAlone
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -46,10 +46,9 @@ T = TypeVar("T")
 class Silhouette(NamedTuple):
     """What a view shows, to cut objects by."""
 
-    camera: Camera
+    operator: ViewOperator  # of the scene from there
     labels: np.ndarray  # (H, W) int32: class of each pixel, negative where unknown
     depth: np.ndarray  # (H, W) float32: of the scene's surface, scene units; infinite where there is none
-    operator: TileOperator | None = None  # of the same scene from there, where there is one already
 
     @classmethod
     def of(
@@ -68,7 +67,7 @@ class Silhouette(NamedTuple):
                 f"view '{camera.name}': labels have shape {labels.shape}; expected ({camera.height}, {camera.width})"
             )
         depth = surface(scene, operator).depth if depth is None else depth
-        return cls(camera, labels.astype(np.int32), depth, operator if isinstance(operator, TileOperator) else None)
+        return cls(operator, labels.astype(np.int32), depth)
 
 
 def kept_shares(
@@ -93,7 +92,7 @@ def kept_shares(
     look : function of a view
         Tells what it shows. It may be called in several threads at once.
     device : str
-        Where `look` renders: on the CPU, two views at once.
+        Where `look` renders, and where what is beyond the memory for views is projected again.
     steps : int
         How often to go through them, at least 1.
 
@@ -104,7 +103,7 @@ def kept_shares(
     """
     labels = np.ascontiguousarray(labels, np.int32)
     go, kept, stay = np.zeros(len(scene)), np.ones(len(scene)), np.zeros(len(scene))
-    known = _ObjectViews(scene, labels)
+    known = _ObjectViews(scene, labels, device)
     for shown, alone, reasons in several_at_once(partial(_look, scene, labels, look), views, device):
         known.add(shown, alone)
         go[alone.ids] += reasons
@@ -125,11 +124,10 @@ def _look(
     scene: GaussianScene, labels: np.ndarray, look: Callable[[T], Silhouette], view: T
 ) -> tuple[_Shown, ObjectsAlone, np.ndarray]:
     """Tell what a view shows, which objects are in it, and what speaks there against each Gaussian in its object."""
-    camera, seen, depth, operator = look(view)
-    operator = operator or TileOperator.of(scene, camera)  # on the CPU, which alone tells reasons
+    operator, seen, depth = look(view)
     alone = operator.objects_alone(labels)
-    reasons = alone.reasons_to_go(depths(scene, camera, alone.ids), seen, depth * np.float32(BEHIND))
-    return _Shown(camera, seen), alone, reasons
+    reasons = alone.reasons_to_go(depths(scene, operator.camera, alone.ids), seen, depth * np.float32(BEHIND))
+    return _Shown(operator.camera, seen), alone, reasons
 
 
 def _reasons_to_stay(
@@ -152,8 +150,8 @@ class _Shown(NamedTuple):
 class _ObjectViews:
     """Views with the objects in them, of which those that do not fit into memory are projected again each time."""
 
-    def __init__(self, scene: GaussianScene, labels: np.ndarray) -> None:  # (N,) int32
-        self._scene, self._labels = scene, labels
+    def __init__(self, scene: GaussianScene, labels: np.ndarray, device: str) -> None:  # (N,) int32
+        self._scene, self._labels, self._device = scene, labels, device
         self._shown: list[_Shown] = []
         self._kept: dict[int, ObjectsAlone] = {}
 
@@ -168,7 +166,7 @@ class _ObjectViews:
 
     def __getitem__(self, number: int) -> tuple[_Shown, ObjectsAlone]:
         shown, alone = self._shown[number], self._kept.get(number)
-        return shown, alone or TileOperator.of(self._scene, shown.camera).objects_alone(self._labels)
+        return shown, alone or make_operator(self._scene, shown.camera, self._device).objects_alone(self._labels)
 
 
 def carve(

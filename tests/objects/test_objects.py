@@ -34,7 +34,7 @@ from gsseg_core.errors import EmptySceneError, MaskSizeError, SettingsError
 from gsseg_core.export.class_files import export_classes
 from gsseg_core.objects.removal import without_objects
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.raster.cpu.objects_alone import ObjectsAlone
+from gsseg_core.raster.cpu.objects_alone import TileObjects
 from gsseg_core.raster.depth import BEHIND, depths, surface
 from gsseg_core.refine import silhouette_carving
 from gsseg_core.refine.settings import UNREFINED, RefineSettings
@@ -84,20 +84,18 @@ def with_fringe() -> tuple[GaussianScene, np.ndarray, np.ndarray]:
 def slow_shares(scene: GaussianScene, labels: np.ndarray, views: list[Silhouette], steps: int) -> np.ndarray:
     """Readable twin of `kept_shares`: each Gaussian's alpha is the weight that it has when it is alone."""
     kept = np.ones(len(scene))
-    alphas = [
-        np.stack([1 - make_operator(scene.subset([i]), view.camera).transmittance() for i in range(len(scene))])
-        for view in views
-    ]
+    each, cameras = [scene.subset([i]) for i in range(len(scene))], [view.operator.camera for view in views]
+    alphas = [np.stack([1 - make_operator(one, camera).transmittance() for one in each]) for camera in cameras]
     for _ in range(steps):
         stay, go = np.zeros(len(scene)), np.zeros(len(scene))
-        for view, alpha in zip(views, alphas, strict=True):
+        for view, camera, alpha in zip(views, cameras, alphas, strict=True):
             for k in range(1, labels.max() + 1):
                 members = np.flatnonzero(labels == k)
                 through = np.prod(1 - kept[members, None, None] * alpha[members], axis=0)
                 need = through / (1 - through + 1e-3) * (view.labels == k)
                 excess = (view.labels != k) & (view.labels >= 0)
                 for i in members:
-                    shows = excess & (depths(scene, view.camera)[i] <= BEHIND * view.depth)
+                    shows = excess & (depths(scene, camera)[i] <= BEHIND * view.depth)
                     stay[i] += (alpha[i] * need).sum()
                     go[i] += (alpha[i] * shows).sum()
         kept = np.where(go > 0, np.clip(kept * stay / np.maximum(go, 1e-30), 0.01, 1), kept)
@@ -149,24 +147,24 @@ def test_views_that_do_not_fit_into_memory_are_projected_anew_and_change_nothing
     np.testing.assert_array_equal(carve(scene, labels, silhouettes()), out)
 
 
-def test_who_looks_at_a_view_projects_and_weighs_it_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_looks_at_a_view_weighs_it_too(monkeypatch: pytest.MonkeyPatch) -> None:
     """One thread after the other would wait for the caller's, where what renders the views is no CPU."""
     scene, labels, _ = with_fringe()
     expected = carve(scene, labels, silhouettes())
     monkeypatch.setattr("gsseg_core.several_at_once.numba.get_num_threads", lambda: 2)
     looked: list[int] = []
     weighed: list[int] = []
-    weigh = ObjectsAlone.reasons_to_go
+    weigh = TileObjects.reasons_to_go
 
-    def weigh_here(alone: ObjectsAlone, *asked: np.ndarray) -> np.ndarray:
+    def weigh_here(alone: TileObjects, *asked: np.ndarray) -> np.ndarray:
         weighed.append(threading.get_ident())
         return weigh(alone, *asked)
 
     def look(shown: Silhouette) -> Silhouette:
         looked.append(threading.get_ident())
-        return shown._replace(operator=None)
+        return shown
 
-    monkeypatch.setattr(ObjectsAlone, "reasons_to_go", weigh_here)
+    monkeypatch.setattr(TileObjects, "reasons_to_go", weigh_here)
     np.testing.assert_array_equal(silhouette_carving.carve(scene, labels, silhouettes(), look), expected)
     assert sorted(looked) == sorted(weighed) and threading.get_ident() not in weighed
 
@@ -215,7 +213,7 @@ def test_a_rigid_motion_carves_the_same() -> None:
     )
     there = []
     for view in silhouettes():
-        c = view.camera
+        c = view.operator.camera
         camera = Camera(c.name, c.width, c.height, c.K, c.world_to_camera @ np.linalg.inv(motion))
         there.append(Silhouette.of(moved, make_operator(moved, camera), view.labels))
     assert (carve(moved, labels, there) != carve(scene, labels, silhouettes())).sum() <= 2

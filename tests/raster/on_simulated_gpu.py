@@ -5,6 +5,9 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 import torch
@@ -14,8 +17,11 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.learn.em import em_cpu_kernels, em_gpu_kernels
 from gsseg_core.learn.learner import UNITS
-from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.backends import make_operator, vote_total
+from gsseg_core.raster.depth import depths
+from gsseg_core.raster.gpu import gpu_operator
 from gsseg_core.raster.gpu.gpu_operator import GPUOperator
+from gsseg_core.raster.gpu.tensors import RowTensors
 from gsseg_core.raster.observation import Observation
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import PixelGrid
@@ -110,6 +116,55 @@ def test_votes_and_shares_are_those_of_the_cpu(weighted: bool) -> None:
     np.testing.assert_allclose(pairs[1], pairs[0], rtol=1e-4, atol=1e-3)
     np.testing.assert_allclose(shares[1].rest, shares[0].rest, rtol=1e-4, atol=1e-3)
     assert shares[1].log_likelihood == pytest.approx(shares[0].log_likelihood, rel=1e-5)
+
+
+@pytest.mark.parametrize("fits", [True, False])
+def test_votes_of_many_views_are_summed_where_they_lie_and_end_on_the_cpu(
+    fits: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not fits:
+        monkeypatch.setattr(gpu_operator, "free_memory_on", lambda device: 1)
+    prototypes = (np.unique(MASK, return_inverse=True)[1].reshape(MASK.shape) - 1).astype(np.int32)
+    evidence = LabelEvidence(np.arange(3, dtype=np.int32), RNG.random((prototypes.max() + 1, 3), np.float32))
+    views = [(random_mask(5, WIDTH, HEIGHT, range(CLASSES)), None), (prototypes, evidence)]
+    ours, theirs = (np.full((len(SCENE), CLASSES), 7) for _ in range(2))
+    cpu, gpu = operators()
+    with vote_total(theirs, "cuda") as total:
+        assert isinstance(total, torch.Tensor) == fits
+        for mask, means in views:
+            gpu.observe(mask, means).vote(total, UNITS)
+    for mask, means in views:
+        cpu.observe(mask, means).vote(ours, UNITS)
+    np.testing.assert_allclose(theirs, ours, atol=1e-5 * UNITS)
+    with vote_total(theirs, "cuda") as total:
+        for mask, means in views:
+            gpu.observe(mask, means).vote(total, UNITS, -1)
+    assert (theirs == 7).all()
+
+
+def test_objects_alone_have_the_reasons_of_the_cpu() -> None:
+    labels = RNG.integers(-1, 4, len(SCENE)).astype(np.int32)
+    shown = RNG.integers(-1, 4, (HEIGHT, WIDTH)).astype(np.int32)
+    limit = RNG.choice(np.float32([2, 4, np.inf]), (HEIGHT, WIDTH))
+    kept, asked = RNG.random(len(SCENE), np.float32), RNG.random(len(SCENE)) < 0.5
+    reasons = []
+    for operator in operators():
+        alone, both = operator.objects_alone(labels), np.zeros((2, len(SCENE)))
+        both[0, alone.ids] = alone.reasons_to_go(depths(SCENE, CAMERA, alone.ids), shown, limit)
+        both[1, alone.ids] = alone.reasons_to_stay(kept[alone.ids], asked[alone.ids], shown)
+        assert (labels[alone.ids] > 0).all()
+        reasons.append(both)
+    assert (reasons[0] > 0).any(axis=1).all()
+    np.testing.assert_allclose(reasons[1], reasons[0], rtol=1e-4, atol=1e-3)
+
+
+def test_rows_are_copied_once_and_forgotten_with_the_last_of_them() -> None:
+    device, codes = torch.device("cpu"), CSRRows.from_dense(some_codes())
+    copy = weakref.ref(RowTensors.kept(codes, device).data)
+    assert RowTensors.kept(codes, device).data is copy()
+    del codes
+    gc.collect()
+    assert copy() is None
 
 
 def test_nothing_seen_is_no_pairs() -> None:

@@ -92,7 +92,7 @@ def prepare(
             if digest is not None and view.mask_path is not None and digest_of(view.mask_path) != digest:
                 raise NotHereError(str(view.mask_path))
             try:
-                shard._prepared.keep(view.name, shard._open(view)[0])
+                shard._prepared.keep(view.name, shard._open(view))
                 shard.views[view.name] = view
             except UnusableViewError as why:
                 shard.rejected[view.name] = str(why)

@@ -45,7 +45,8 @@ from gsseg_core.raster.observation import Observation, ViewPairs, VoteShares
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import PixelGrid, Strongest, ViewRenderer
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.spatial.neighbourhood import neighbours_of
+from gsseg_core.several_at_once import meanwhile
+from gsseg_core.spatial.neighbourhood import find_neighbours, neighbours_of
 
 REFIT_FACTOR = 4  # error models are re-estimated once a step gains less than this many times the tolerance
 
@@ -176,7 +177,8 @@ class EMLearner(Learner):
         self._begin()
         self._last_step = None
         votes, tick = CSRRows.from_dense(self._votes), partial(progress, "em", 0, settings.max_steps)
-        votes, rejected = self._reject_regions(votes, tick) if settings.rejects_regions else (votes, {})
+        with meanwhile(partial(find_neighbours, self.scene, settings.prior_k), self.device):
+            votes, rejected = self._reject_regions(votes, tick) if settings.rejects_regions else (votes, {})
         resolved = resolved_votes(votes, self._possible())
         self.observed_ = np.diff(resolved.indptr) > 0
         resolved, prior = resolved.united(self._spatial_prior(resolved))
@@ -233,9 +235,7 @@ class EMLearner(Learner):
         codes, of, background, operator = self._without(view, wanted is not None)
         return operator.strongest(codes, self.num_classes, background, grid, of, wanted=wanted)
 
-    def _without(
-        self, view: View, only_labelled: bool
-    ) -> tuple[CSRRows, np.ndarray | None, bool, ViewRenderer]:  # fmt: skip
+    def _without(self, view: View, only_labelled: bool) -> tuple[CSRRows, np.ndarray | None, bool, ViewRenderer]:
         """Take the last step of `fit` once more, without a view's mask: codes, and what to blend them with.
 
         If only its labelled pixels count, what they see is at hand, and the codes are those of these Gaussians, whose

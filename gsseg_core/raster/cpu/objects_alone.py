@@ -1,4 +1,4 @@
-"""The objects of a view, each as if it stood there alone: what speaks for and against each Gaussian in its object."""
+"""The objects of a view, each as if it stood there alone, on the CPU."""
 
 from __future__ import annotations
 
@@ -8,30 +8,20 @@ import numpy as np
 
 from gsseg_core.raster.cpu import silhouette_kernels
 from gsseg_core.raster.cpu.tiling import Tiles
+from gsseg_core.raster.objects_alone import ObjectsAlone
 from gsseg_core.spatial.row_order import take_rows
 
 
 @dataclass(frozen=True, eq=False)
-class ObjectsAlone:
-    """The Gaussians of a view that belong to an object; the others take neither time nor memory.
-
-    Attributes
-    ----------
-    ids : (M,) int32
-        Those that reach a tile, as indices in the scene, in the order in which tiles meet them: what one tile needs
-        lies close together.
-    labels : (M,) int32
-        Object of each, above 0.
-    tiles : Tiles
-        Of these alone, without what is told by Gaussian.
-    """
+class TileObjects(ObjectsAlone):
+    """They come in the order in which tiles meet them: what one tile needs lies close together."""
 
     ids: np.ndarray
-    labels: np.ndarray
-    tiles: Tiles
+    labels: np.ndarray  # (M,) int32: object of each, above 0
+    tiles: Tiles  # of these alone, without what is told by Gaussian
 
     @classmethod
-    def of(cls, ids: np.ndarray, tiles: Tiles, labels: np.ndarray) -> ObjectsAlone:
+    def of(cls, ids: np.ndarray, tiles: Tiles, labels: np.ndarray) -> TileObjects:
         """Choose them among the Gaussians of a view, `ids` (M',), by the labels (N,) int32 of the whole scene."""
         start, entries, rows = silhouette_kernels.choose(tiles.start, tiles.entries, labels[ids])
         ids, none = ids[rows], np.empty(0, np.int32)
@@ -46,45 +36,13 @@ class ObjectsAlone:
         return sum(array.nbytes for array in (self.ids, self.labels, *self.tiles[4:]))
 
     def reasons_to_go(self, depths: np.ndarray, shown: np.ndarray, hidden_from: np.ndarray) -> np.ndarray:
-        """Weigh what speaks against each Gaussian in its object, were the object alone in the view.
-
-        Parameters
-        ----------
-        depths : (M,) float32
-            Depth of each Gaussian, in scene units.
-        shown : (H, W) int32
-            Object that the view shows in each pixel, negative where unknown.
-        hidden_from : (H, W) float32
-            Depth from which on the pixel hides a Gaussian.
-
-        Returns
-        -------
-        (M,) float64
-            Sum of alpha, in px, over the pixels that show another object and do not hide the Gaussian.
-        """
+        """Weigh what speaks against each Gaussian in its object."""
         go = np.zeros(len(self.tiles.entries), np.float32)
         silhouette_kernels.reasons_to_go(self.tiles, self.labels, depths, shown, hidden_from, go)
         return np.bincount(self.tiles.entries, go, len(self.ids))
 
     def reasons_to_stay(self, kept: np.ndarray, asked: np.ndarray, shown: np.ndarray) -> np.ndarray:
-        """Weigh what speaks for each Gaussian in its object k, were the object alone in the view.
-
-        Parameters
-        ----------
-        kept : (M,) float32
-            Share of each Gaussian that its object keeps, by which its alphas are multiplied.
-        asked : (M,) bool
-            Whose reasons are wanted; those of all others are 0. Only the blocks of pixels that these reach are looked
-            at.
-        shown : (H, W) int32
-            As `reasons_to_go` takes it.
-
-        Returns
-        -------
-        (M,) float64
-            Sum of alpha T_k / (1 - T_k), in px, over the pixels that show the object, whose transmittance is T_k; as
-            good as 0 where the object lets no light through.
-        """
+        """Weigh what speaks for each Gaussian in its object."""
         stay, count = np.zeros(len(self.tiles.entries), np.float32), int(self.labels.max(initial=0)) + 1
         silhouette_kernels.reasons_to_stay(self.tiles, self.labels, count, kept, asked, shown, stay)
         return np.bincount(self.tiles.entries, stay, len(self.ids))

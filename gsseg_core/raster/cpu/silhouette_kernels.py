@@ -12,7 +12,7 @@ from gsseg_core.raster.cpu.splat import WIDTH, aim, alpha_of
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
 from gsseg_core.simd import add_product, add_scaled, first_bit, load_row, nothing, prefetch, store_row, sum_row
 
-_ROUNDING = np.float32(1e-3)  # of 1 - T, below which a pixel is as good as empty
+ROUNDING = np.float32(1e-3)  # of 1 - T, below which a pixel is as good as empty
 _UNKNOWN, _MIXED = np.int32(-1), np.int32(-2)  # in place of the one label that a block or a tile shows
 
 _FAST = {"contract", "reassoc", "nnan", "nsz"}
@@ -205,4 +205,4 @@ def _weigh(
             slot = _slot_of(seen[b, i], slots)
             if slot >= 0:
                 n = slot * TILE + b
-                need[n, i] = through[n, i] / (np.float32(1) - through[n, i] + _ROUNDING)
+                need[n, i] = through[n, i] / (np.float32(1) - through[n, i] + ROUNDING)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,11 @@ from gsseg_core.raster.constants import CHANNELS, CHUNKS
 from gsseg_core.raster.cpu import label_pairs, products
 from gsseg_core.raster.cpu.entry_votes import add_entry_votes
 from gsseg_core.raster.cpu.lifting import Lifted
-from gsseg_core.raster.cpu.objects_alone import ObjectsAlone
+from gsseg_core.raster.cpu.objects_alone import TileObjects
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_OPACITY, WIDTH
 from gsseg_core.raster.cpu.tiling import TILE, Tiles, assign
+from gsseg_core.raster.objects_alone import ObjectsAlone
 from gsseg_core.raster.observation import Observation, VoteShares
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import Blended, PixelGrid, Strongest
@@ -53,8 +55,8 @@ class TileOperator(ViewOperator):
         return areas
 
     def objects_alone(self, labels: np.ndarray) -> ObjectsAlone:
-        """Choose the Gaussians that belong to an object, those of labels (N,) int32 above 0, each object by itself."""
-        return ObjectsAlone.of(self.ids, self._tiles, labels)
+        """Choose the Gaussians that belong to an object."""
+        return TileObjects.of(self.ids, self._tiles, labels)
 
     def _without(self, hidden: np.ndarray) -> TileOperator:
         other, table = copy.copy(self), self._tiles.table.copy()
@@ -127,6 +129,12 @@ def view_operator(scene: GaussianScene, camera: Camera, device: str) -> TileOper
     """Make the operator of a view on the CPU, the only device of this name."""
     del device
     return TileOperator.of(scene, camera)
+
+
+def vote_total(votes: np.ndarray, device: str) -> AbstractContextManager[np.ndarray]:
+    """Have observations vote for these at once."""
+    del device
+    return nullcontext(votes)
 
 
 class TileObservation(Observation):

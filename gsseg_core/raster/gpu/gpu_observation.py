@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,8 +13,8 @@ from gsseg_core.raster.gpu import label_sharing as kernels
 from gsseg_core.raster.gpu.blending import THREADS
 from gsseg_core.raster.gpu.device import launch, on_device, to_cpu
 from gsseg_core.raster.gpu.projection import TileTensors
-from gsseg_core.raster.gpu.tensors import PairTensors, starts
-from gsseg_core.raster.observation import Observation, PairVotes, VoteShares
+from gsseg_core.raster.gpu.tensors import PairTensors, RowTensors, starts
+from gsseg_core.raster.observation import Observation, VoteShares
 from gsseg_core.raster.view_renderer import ViewRenderer
 from gsseg_core.scene.camera import Camera
 
@@ -127,9 +127,21 @@ class GPUObservation(Observation):
         """Weights summed by pair, (P,) float32."""
         return to_cpu(self.own_votes)
 
-    def pair_votes(self) -> PairVotes:
-        """Copy the pairs with their votes from the GPU."""
-        return PairVotes(*map(to_cpu, (*self.pairs, self.own_votes)))
+    @property
+    def num_pairs(self) -> int:
+        """P, of which nothing is copied."""
+        return len(self.own_votes)
+
+    def vote(self, total: Any, units: float, sign: int = 1) -> None:
+        """Add the votes to those of other views, or take them away, where these are."""
+        if isinstance(total, np.ndarray):
+            super().vote(total, units, sign)
+            return
+        label_votes = RowTensors.of(self.evidence.votes, total.device)
+        launch(
+            kernels.add_votes, -(-len(self.pairs.ids) // 128), 128, total, *self.pairs, self.own_votes, *label_votes,
+            float(units), sign,
+        )  # fmt: skip
 
     def votes_by_label(self) -> np.ndarray:
         """Sum of the votes of each label, (L,) float64."""

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,8 +18,10 @@ from gsseg_core.raster.cpu.tiling import TILE
 from gsseg_core.raster.gpu import blending
 from gsseg_core.raster.gpu.device import find_gpu, launch, on_device, to_cpu
 from gsseg_core.raster.gpu.gpu_observation import GPUObservation
+from gsseg_core.raster.gpu.objects_alone import GPUObjects
 from gsseg_core.raster.gpu.projection import TileTensors, project
 from gsseg_core.raster.gpu.tensors import RowTensors
+from gsseg_core.raster.objects_alone import ObjectsAlone
 from gsseg_core.raster.observation import Observation
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import Blended, PixelGrid, Strongest
@@ -92,7 +97,7 @@ class GPUOperator(ViewOperator):
         self, codes: CSRRows | RowTensors, num_classes: int, of: np.ndarray | torch.Tensor | None
     ) -> torch.Tensor:
         """Write codes of `ids` out by class on the GPU, (M, K); `of` as in `blend_rows`. Both may be there already."""
-        rows = RowTensors.of(codes, self._device) if isinstance(codes, CSRRows) else codes
+        rows = RowTensors.kept(codes, self._device) if isinstance(codes, CSRRows) else codes
         ids = self.tiles.ids.long()
         if of is not None:
             of = on_device(of, self._device) if isinstance(of, np.ndarray) else of
@@ -165,6 +170,10 @@ class GPUOperator(ViewOperator):
         before = torch.cat([torch.ones_like(behind[:, :1]), behind], dim=1)[:, :-1]
         return alpha * before * (before >= T_MIN)
 
+    def objects_alone(self, labels: np.ndarray) -> ObjectsAlone:
+        """Choose the Gaussians that belong to an object."""
+        return GPUObjects.of(self.tiles, labels)
+
     def _observe(self, labels: np.ndarray, weights: np.ndarray | None) -> Observation:
         return GPUObservation(self, self.tiles, labels, weights)
 
@@ -176,6 +185,20 @@ def _to_cpu(image: torch.Tensor, left_over: torch.Tensor) -> Blended:  # (K, H, 
 def view_operator(scene: GaussianScene, camera: Camera, device: str) -> GPUOperator:
     """Make the operator of a view on a GPU."""
     return GPUOperator(camera, len(scene), project(scene, camera, find_gpu(device)))
+
+
+@contextmanager
+def vote_total(votes: np.ndarray, device: str) -> Iterator[Any]:
+    """Give votes on the GPU that are added to these at last; where they are too many for it, these."""
+    free = free_memory_on(device)
+    if free is not None and 4 * votes.nbytes > free:
+        yield votes
+        return
+    total = torch.zeros(votes.shape, dtype=torch.int64, device=find_gpu(device))
+    try:
+        yield total
+    finally:
+        votes += to_cpu(total)
 
 
 def free_memory_on(device: str) -> int | None:

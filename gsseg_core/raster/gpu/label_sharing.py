@@ -87,7 +87,7 @@ def list_labels(
 
 
 @called_by_kernels
-def _add_units(sums: np.ndarray, place: int, pixels: Any) -> None:
+def add_units(sums: np.ndarray, place: int, pixels: Any) -> None:
     """Add px to a sum; to none, where two kernels disagree by a rounding on whether a weight is zero."""
     if pixels > 0 and place >= 0:
         cuda.atomic.add(sums, place, np.int64(np.float64(min(pixels, _MOST)) * UNITS + 0.5))
@@ -131,11 +131,11 @@ def lift(
                 weight = weighed[e, position]
                 if weight > 0:
                     if slot_of[position] != current:
-                        _add_units(sums, place + current, total)
+                        add_units(sums, place + current, total)
                         current, total = slot_of[position], _NOTHING
                     total += weight
                     hit |= counts[position] > 0
-            _add_units(sums, place + current, total)
+            add_units(sums, place + current, total)
             if hit:
                 reached[first + e] = 1
 
@@ -198,7 +198,7 @@ def share(
         logs[tile, t] = counts * math.log(max(p, _TINY))
         inverse = counts / p if p > _TINY else _NOTHING
         if ray * inverse > 0:
-            _add_units(left_over, label_start[tile] + slot, ray * inverse)
+            add_units(left_over, label_start[tile] + slot, ray * inverse)
     ray = np.float32(1) if inverse > 0 else _NOTHING
     e = t // PARTS
     for first in range(start[tile], start[tile + 1], BATCH):
@@ -220,8 +220,23 @@ def share(
                         if weight > 0:
                             if slot_of[position] != current:
                                 if total > 0:
-                                    _add_units(sums, pair[place + current], total)
+                                    add_units(sums, pair[place + current], total)
                                 current, total = slot_of[position], _NOTHING
                             total += weight
             if total > 0:
-                _add_units(sums, pair[place + current], total)
+                add_units(sums, pair[place + current], total)
+
+
+@gpu_kernel
+def add_votes(
+    total: np.ndarray, ids: np.ndarray, start: np.ndarray, labels: np.ndarray, votes: np.ndarray,  # (N, K) added to
+    indptr: np.ndarray, classes: np.ndarray, of_labels: np.ndarray,  # L rows: what a pixel of each label votes
+    units: float, sign: int,
+) -> None:  # fmt: skip
+    """Add the votes of one Gaussian to those of other views; see `raster.observation.add_votes`."""
+    m = cuda.grid(1)
+    if m < ids.shape[0]:
+        for s in range(start[m], start[m + 1]):
+            for j in range(indptr[labels[s]], indptr[labels[s] + 1]):
+                added = np.int64(round(np.float64(votes[s]) * of_labels[j] * units))
+                total[ids[m], classes[j]] += sign * added

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import weakref
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +24,17 @@ class RowTensors(NamedTuple):
     def of(cls, rows: CSRRows, device: torch.device) -> RowTensors:
         """Copy rows to a GPU."""
         return cls(*(on_device(array, device) for array in (rows.indptr, rows.indices.view(np.int32), rows.data)))
+
+    @classmethod
+    def kept(cls, rows: CSRRows, device: torch.device) -> RowTensors:
+        """Do the same, and keep the copy of what was asked for last, as long as it is there: views are blended in turn.
+
+        Rows that are kept must not change.
+        """
+        with _COPYING:
+            if device not in _LAST or _LAST[device][0]() is not rows.data:
+                _LAST[device] = weakref.ref(rows.data, _forget), cls.of(rows, device)
+            return _LAST[device][1]
 
     def with_data(self, data: torch.Tensor) -> RowTensors:
         """Replace the entries and keep where they stand."""
@@ -46,6 +59,16 @@ class RowTensors(NamedTuple):
         """List the entries of some rows, which are to begin at `indptr`."""
         shift = torch.repeat_interleave(self.indptr[ids.long()] - indptr[:-1], indptr.diff())
         return shift + torch.arange(len(shift), device=ids.device)
+
+
+_LAST: dict[torch.device, tuple[weakref.ref[np.ndarray], RowTensors]] = {}
+_COPYING = threading.RLock()  # a thread that makes a copy may free what another is of
+
+
+def _forget(gone: weakref.ref[np.ndarray]) -> None:
+    with _COPYING:
+        for device in [device for device, (rows, _) in _LAST.items() if rows is gone]:
+            del _LAST[device]
 
 
 class PairTensors(NamedTuple):
