@@ -39,7 +39,7 @@ from gsseg_core.learn.prepared_views import default_budget
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.objects.object_table import ObjectTable, find_objects
 from gsseg_core.progress import Progress, Stopwatch, silent
-from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, spread_if_scarce
+from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, list_if_scarce, spread_if_scarce
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.report.findings import Evidence
 from gsseg_core.report.page import load_templates, write_report_page
@@ -189,8 +189,7 @@ def segment(
         settings = replace(settings, graph=graph_settings, learner_settings=getattr(fitted, "settings", None))
         del fitted  # Its votes take as much memory as all that follows.
         with watch.stage("refine"):
-            if settings.graph:
-                codes = spread_if_scarce(inputs.scene, codes, evidence)
+            codes = spread_if_scarce(inputs.scene, codes, evidence) if settings.graph else codes
             result = Segmentation.from_codes(inputs.scene, codes, inputs.class_names, settings.refine, copy=False)
             del codes
         drawn: dict[str, Drawn] = {}
@@ -275,6 +274,8 @@ def _learn(
         )  # fmt: skip
         learner.observe_all([view.smaller(QUALITIES[settings.quality]) for view in inputs.train], progress)
     with watch.stage("learn"):
+        if settings.graph:
+            list_if_scarce(inputs.scene, learner.evidence(), settings.refine.k)
         try:
             learner.fit(progress)
         except NoUsableViewsError as error:

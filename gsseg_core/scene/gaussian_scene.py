@@ -228,8 +228,11 @@ class GaussianScene:
     @cached_property
     def digest(self) -> str:
         """SHA-256 (hex) of the geometry: positions, opacities, scales and rotations as stored, not colours."""
-        geometry = columns(self.vertices, MEANS + OPACITY + SCALES + QUATS)
-        return hashlib.sha256(np.ascontiguousarray(geometry, "<f4").data).hexdigest()
+        digest = hashlib.sha256()
+        for start in range(0, len(self), BLOCK):
+            geometry = columns(self.vertices[start : start + BLOCK], MEANS + OPACITY + SCALES + QUATS)
+            digest.update(np.ascontiguousarray(geometry, "<f4").data)
+        return digest.hexdigest()
 
     def colors(
         self, camera_center: npt.ArrayLike | None = None, ids: npt.NDArray[np.integer] | None = None

@@ -20,7 +20,8 @@ from gsseg_core.kernels.compiler import kernel
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 from gsseg_core.spatial.kd_tree import Tree, scaled, tree_of
-from gsseg_core.spatial.knn import CHUNK, nearest
+from gsseg_core.spatial.knn import Lists, nearest
+from gsseg_core.spatial.neighbourhood import take_lists
 
 _PARTS = 16  # of many numbers, that are counted beside each other
 _HALF = 16  # bits of a float32
@@ -39,22 +40,22 @@ class Graph:
     weights: np.ndarray  # (E,) float32: p_ij, which sum to 1 over the neighbours of a Gaussian
 
     @classmethod
-    def build(cls, means: np.ndarray, colors: np.ndarray, k: int = NEIGHBOURS, tree: Tree | None = None) -> Graph:
+    def build(
+        cls, means: np.ndarray, colors: np.ndarray, k: int = NEIGHBOURS, tree: Tree | None = None,
+        lists: Lists | None = None,
+    ) -> Graph:  # fmt: skip
         """Link points, (N, 3) float32 as their colours are, with their k nearest others, or with all there are.
 
-        The tree, if one is at hand, is that of the scaled points.
+        The tree, if one is at hand, is that of the scaled points, and the lists are those of all of them.
         """
         if len(means) < 2:
             return cls(k, np.arange(len(means), dtype=np.int32), np.zeros(len(means) + 1, np.int64),
                        np.empty(0, np.int32), np.empty(0, np.float32))  # fmt: skip
         tree, num = tree or Tree.build(scaled(means)), min(k, len(means) - 1)
         # A thousand points in one place are all tied: without a limit, each would have a thousand neighbours.
-        most = 2 * num
-        radii, _, counts, room = nearest(tree, np.arange(len(means), dtype=np.int32), num, most)
-        lengths = np.add.reduceat(counts, np.arange(0, len(means), CHUNK))
-        lists = (room[CHUNK * most * chunk :][:length] for chunk, length in enumerate(lengths.tolist()))
-        indptr, indices = starts(counts), np.concatenate(list(lists))
-        del room
+        lists = lists or nearest(tree, np.arange(len(means), dtype=np.int32), num, num)[2]
+        radii, indptr, indices = lists.radii, starts(lists.counts), lists.joined()
+        del lists
         contrast = _compare(np.ascontiguousarray(colors[tree.order], np.float32), indptr, indices)
         # Painted scenes have areas of one colour; where there is only one, it tells nothing.
         typical = _median(contrast) or float(contrast.mean()) or 1.0
@@ -69,7 +70,8 @@ def graph_of(scene: GaussianScene, k: int = NEIGHBOURS) -> Graph:
     """Neighbour graph of a scene, built once and kept with it."""
 
     def build() -> Graph:
-        return Graph.build(scene.means, scene.colors(), k, tree_of(scene) if len(scene) else None)
+        tree = tree_of(scene) if len(scene) else None
+        return Graph.build(scene.means, scene.colors(), k, tree, take_lists(scene, k))
 
     return _KNOWN.of(scene, build, lambda known: known.k == k)
 

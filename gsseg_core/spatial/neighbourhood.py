@@ -44,7 +44,7 @@ class Found(NamedTuple):
         return cls(np.zeros(count, np.int32), np.full(count, np.nan, np.float32), np.full(count, np.nan))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Neighbours:
     """How far the k nearest others of points are."""
 
@@ -52,6 +52,8 @@ class Neighbours:
     tree: Tree  # the points, all arrays here being in its order
     radii: np.ndarray  # (N,) float32: squared distance to the k-th nearest other, NaN where nobody has asked for it
     distances: np.ndarray  # (N,) float64: mean distance to the k nearest others, both in units of the scaled points
+    listed: int = 0  # of the nearest, how many are to be listed once all points are looked for
+    lists: knn.Lists | None = field(default=None, repr=False)  # these
     by_class: list[Found] = field(default_factory=list, repr=False)  # What `class_distances` found last, if anything.
     _looking: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
@@ -70,7 +72,10 @@ class Neighbours:
             missing = np.isnan(self.radii)
             places = np.flatnonzero(missing if wanted is None else missing & wanted).astype(np.int32)
             if len(places):
-                self.radii[places], self.distances[places] = knn.nearest(self.tree, places, self.k, 0)[:2]
+                listed = self.listed if len(places) == len(missing) and self.listed < self.k else 0
+                found = knn.nearest(self.tree, places, self.k, listed)
+                self.radii[places], self.distances[places] = found[:2]
+                self.lists, self.listed = (found[2] if listed else self.lists), 0
         return self
 
     def mean_codes(
@@ -130,6 +135,21 @@ def neighbours_of(scene: GaussianScene, k: int) -> Neighbours | None:
         return None
     k = min(k, len(scene) - 1)
     return _KNOWN.of(scene, lambda: Neighbours.among(scene.means, k, tree_of(scene)), lambda known: known.k == k)
+
+
+def list_nearest(scene: GaussianScene, k: int, listed: int) -> None:
+    """Have so many of the nearest Gaussians listed on the way when all are looked for, for `take_lists` to give."""
+    if (neighbours := neighbours_of(scene, k)) is not None:
+        neighbours.listed = listed
+
+
+def take_lists(scene: GaussianScene, listed: int) -> knn.Lists | None:
+    """Give the lists of a scene's Gaussians, if there are any of this length, and keep them no longer."""
+    known = _KNOWN.known(scene)
+    if known is None or known.lists is None or known.lists.most != 2 * listed:
+        return None
+    lists, known.lists = known.lists, None
+    return lists
 
 
 def find_neighbours(scene: GaussianScene, k: int) -> None:

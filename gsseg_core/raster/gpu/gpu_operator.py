@@ -202,6 +202,8 @@ def vote_total(votes: np.ndarray, device: str) -> Iterator[Any]:
 
 
 def free_memory_on(device: str) -> int | None:
-    """Bytes that are free on a GPU; where it is simulated, as many as a small one has."""
+    """Bytes that are free on a GPU, or that PyTorch keeps for what comes; of a simulated one, as a small one has."""
     gpu = find_gpu(device)
-    return torch.cuda.mem_get_info(gpu)[0] if gpu.type == "cuda" else 1 << 30
+    if gpu.type != "cuda":
+        return 1 << 30
+    return torch.cuda.mem_get_info(gpu)[0] + torch.cuda.memory_reserved(gpu) - torch.cuda.memory_allocated(gpu)
