@@ -51,6 +51,7 @@ from gsseg_core.segmentation import Segmentation
 from gsseg_core.spatial.row_order import curve_order, inverse, reordered
 
 if TYPE_CHECKING:
+    import numpy as np
     from distributed import Client
 
 PICTURED_VIEWS = 12  # views that `segment` draws, spread evenly over the dataset
@@ -61,6 +62,8 @@ class Inputs:
     """What a run learns from."""
 
     scene: GaussianScene
+    digest: str  # of the scene as it is in its file
+    places: np.ndarray | None  # (N,) int64 in this scene of the Gaussians in that order; None where it is the same
     root: Path  # of the dataset
     train: list[View]
     looked_at: list[View]  # of these, to carve objects by
@@ -68,7 +71,7 @@ class Inputs:
     class_names: Mapping[int, str]  # of classes as they are learnt, numbered without gaps
     class_ids: tuple[int, ...] | None  # of these classes in the dataset; None where the classes are objects
     frame: Mapping[str, Any]  # `frame` in `report.json`
-    masks: Mapping[str, Any] | None = None  # `masks` in `report.json`
+    masks: Mapping[str, Any] | None  # `masks` in `report.json`
     objects: ObjectTable | None = None  # which the ids of the views were found to be
 
 
@@ -175,8 +178,7 @@ def segment(
                 )
             with watch.stage("load"):
                 # Workers find the scene in files of their own, in the order that it has there.
-                order = curve_order(scene.means) if client is None else None
-                inputs = _inputs(scene if order is None else reordered(scene, order), placed, settings)
+                inputs = _inputs(scene, curve_order(scene.means) if client is None else None, placed, settings)
                 del scene
             if settings.ids == PER_VIEW:
                 with watch.stage("associate"):
@@ -205,10 +207,6 @@ def segment(
         with watch.stage("refine"):
             result = result.calibrated(assessment.calibration.temperature)
             result = inputs.objects.with_tree(result) if inputs.objects else result
-            if order is not None:
-                places = inverse(order)
-                inputs = replace(inputs, scene=reordered(inputs.scene, places))
-                result = result.in_order_of(inputs.scene, places)
         with ExitStack() as writing:
             behind = writing.enter_context(writing_behind())
             report = _write(run, inputs, assessment, result, drawn, settings, watch, behind)
@@ -227,21 +225,22 @@ def _connect(scheduler: str | None, workers: ExitStack) -> Client | None:
     return workers.enter_context(connected(scheduler))
 
 
-def _inputs(scene: GaussianScene, placed: Placed, settings: RunSettings) -> Inputs:
-    """List the views to learn from and to draw, whose classes are numbered without gaps."""
+def _inputs(scene: GaussianScene, order: np.ndarray | None, placed: Placed, settings: RunSettings) -> Inputs:
+    """List the views to learn from and to draw, with classes numbered without gaps; bring the scene into an order."""
     dataset = placed.dataset
     # Ids that are a view's own are no classes; objects take their place.
     class_ids = None if settings.ids == PER_VIEW else dataset.class_ids
-    if class_ids is not None:
-        dataset = dataset.numbered()
+    dataset = dataset if class_ids is None else dataset.numbered()
     train = spread(dataset.views("train"), settings.views)
     # Views that carving looks at anyway, unless there are few.
     looked_at = spread(train, settings.refine.carve_views)
     enough = settings.refine.carve and len(looked_at) >= PICTURED_VIEWS
     pictured = spread(looked_at if enough else dataset.views("all"), PICTURED_VIEWS)
-    names = {} if class_ids is None else dataset.class_names
-    frame, masks = placed.as_dict(), dataset.describe_masks()
-    return Inputs(scene, dataset.root, train, looked_at, pictured, names, class_ids, frame, masks)
+    ordered, places = (scene, None) if order is None else (reordered(scene, order), inverse(order))
+    return Inputs(
+        ordered, scene.digest, places, dataset.root, train, looked_at, pictured,
+        {} if class_ids is None else dataset.class_names, class_ids, placed.as_dict(), dataset.describe_masks(),
+    )  # fmt: skip
 
 
 def _ids(dataset: Dataset, settings: RunSettings) -> str:
@@ -258,9 +257,9 @@ def _ids(dataset: Dataset, settings: RunSettings) -> str:
 
 def _associate(inputs: Inputs, device: str, progress: Progress) -> Inputs:
     """Find which ids of the views are the same object, and number the objects."""
-    found = find_objects(inputs.scene, inputs.train, device=device, progress=progress)
-    train = [found.relabelled(view) for view in inputs.train]
-    return replace(inputs, train=train, class_names=found.class_names, objects=found)
+    objects = find_objects(inputs.scene, inputs.train, device=device, progress=progress)
+    train = [objects.relabelled(view) for view in inputs.train]
+    return replace(inputs, train=train, class_names=objects.class_names, objects=objects)
 
 
 def _learn(
@@ -314,10 +313,11 @@ def _write(
         behind(load_templates)
         if level is not result:
             run.claim(settings.places(level.class_names, inputs.pictured))
-        behind(named.save, folder / "segmentation.npz", run.id)
+        in_file = named if inputs.places is None else named.in_order_of(inputs.digest, inputs.places)
+        behind(in_file.save, folder / "segmentation.npz", run.id)
         meshes = collision_meshes(scene, exported, settings.collision) if settings.collision else {}
         files = class_paths(exported, folder / "classes", settings.scene_format)
-        behind(write_classes, scene, exported, folder / "classes", run.id, settings.scene_format, meshes)
+        behind(write_classes, scene, exported, folder / "classes", run.id, settings.scene_format, meshes, inputs.places)
     with watch.stage("pictures"):
         images = ViewImages(scene, settings.device, drawn.values())
         shown = [drawn[view.name] for view in inputs.pictured]
@@ -327,7 +327,7 @@ def _write(
             scene, exported, run=run.id, views=assessment.report, settings=settings.as_dict(), seconds=watch.seconds,
             objective=assessment.objective, calibration=assessment.calibration.as_dict(), frame=inputs.frame,
             prepared_views=assessment.memory, masks=inputs.masks,
-            ids=inputs.objects and inputs.objects.summary(result),
+            ids=inputs.objects and inputs.objects.summary(result), digest=inputs.digest,
             files={k: str(path.relative_to(folder)) for k, path in files.items()},
             meshes={k: f"classes/{mesh_file_name(k, exported.class_names[k])}" for k in meshes},
             pictures=[str(path.relative_to(folder)) for path in pictures],
@@ -345,8 +345,8 @@ def _picture(
     views, folder, checks = assessment.views, run.folder / "pictures", list(assessment.checks or ())
     if assessment.checks is None:  # What is compared then is drawn in full size.
         views = {view.name: view for view in inputs.train if view.name in views}
-        compared = [drawn for drawn in shown if drawn.view.name in views]
-        checks = [compare_mask(views[drawn.view.name], drawn.labels, result.num_classes) for drawn in compared]
+        named = [(one, views[one.view.name]) for one in shown if one.view.name in views]
+        checks = [compare_mask(view, one.labels, result.num_classes) for one, view in named]
     save = partial(behind, save_png)
     if level is not result:  # What is compared with the masks are objects, as they are.
         shown = draw_views(inputs.scene, level, inputs.pictured, device=images.device)

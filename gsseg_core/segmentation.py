@@ -240,15 +240,16 @@ class Segmentation:
             return result
         return replace(result, probabilities=self.probabilities[:, order], learnt=self.learnt[:, order])
 
-    def in_order_of(self, scene: GaussianScene, places: np.ndarray) -> Segmentation:
-        """Give the result for the same Gaussians in the order of another scene: places (N,) of these in this one."""
+    def in_order_of(self, digest: str, places: np.ndarray) -> Segmentation:
+        """Give the result for the Gaussians in the order of the scene of a digest: places (N,) of these in this one."""
         learnt = np.cumsum(self.clustered)[places] - 1  # rows, of those that were clustered
         clustered = self.clustered[places]
         tree = self.tree and replace(self.tree, leaves=self.tree.leaves[places])
         probabilities = take_rows(np.ascontiguousarray(self.probabilities), places)
         return replace(
             self, labels=self.labels[places], probabilities=probabilities, clustered=clustered,
-            learnt=self.learnt[learnt[clustered]], scene_digest=scene.digest, ids=scene.ids, tree=tree,
+            learnt=self.learnt[learnt[clustered]], scene_digest=digest, tree=tree,
+            ids=None if self.ids is None else self.ids[places],
         )  # fmt: skip
 
     @cached_property

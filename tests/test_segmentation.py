@@ -172,7 +172,7 @@ def test_a_result_in_the_order_of_another_scene_says_the_same_of_each_gaussian()
     result = replace(result, tree=tree)
     places = np.random.default_rng(0).permutation(len(SCENE))
     other = SCENE.subset(places)
-    moved = result.in_order_of(other, places)
+    moved = result.in_order_of(other.digest, places)
     assert result.clustered.any() and moved.scene_digest == other.digest
     for name in ("labels", "probabilities", "clustered", "confidence"):
         np.testing.assert_array_equal(getattr(moved, name), getattr(result, name)[places])
@@ -180,7 +180,7 @@ def test_a_result_in_the_order_of_another_scene_says_the_same_of_each_gaussian()
     np.testing.assert_array_equal(result.blend(operators[0]), moved.blend(operators[1]))
     assert moved.tree is not None
     np.testing.assert_array_equal(moved.tree.leaves, tree.leaves[places])
-    back = moved.in_order_of(SCENE, np.argsort(places))
+    back = moved.in_order_of(SCENE.digest, np.argsort(places))
     np.testing.assert_array_equal(back.learnt, result.learnt)
 
 

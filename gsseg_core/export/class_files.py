@@ -20,6 +20,7 @@ from gsseg_core.scene.scene_writers import DEFAULT, SCENE_WRITERS, SceneObject, 
 from gsseg_core.scene.triangle_mesh import LONE, TriangleMesh
 from gsseg_core.scene.vertices import chosen
 from gsseg_core.segmentation import Segmentation
+from gsseg_core.spatial.row_order import take_rows_into
 
 TOGETHER = "objects"  # stem of the file in which a format keeps the objects of all classes
 _PART = 1 << 15  # vertices that are copied at a time
@@ -82,23 +83,29 @@ def write_classes(
     run: str,
     scene_format: str,
     meshes: Mapping[int, TriangleMesh],
+    order: np.ndarray | None = None,  # (N,) int64
 ) -> dict[int, Path]:
-    """Write the files of `export_classes` into a folder of a run with this id, with these meshes to collide with."""
+    """Write the files of `export_classes` into a folder of a run with this id, with these meshes to collide with.
+
+    Gaussians are written in their order, or in another one.
+    """
     confidence, names = segmentation.confidence, segmentation.class_names
+    order = np.arange(len(scene)) if order is None else order
+    labels = segmentation.labels[order]
+    members = {k: order[np.flatnonzero(labels == k)] for k in np.unique(labels[labels >= 0]).tolist()}
     paths = class_paths(segmentation, folder, scene_format)
     for k, mesh in meshes.items():
         mesh.save(folder / mesh_file_name(k, names[k]), run)
     if SCENE_WRITERS[scene_format].together:
         if paths:
-            objects = _objects(scene, segmentation.labels, names, meshes)
+            objects = _objects(scene, members, names, meshes)
             write_objects(objects, next(iter(paths.values())), scene_format, run)
         return paths
     for k, path in paths.items():
-        members = segmentation.labels == k
         if scene_format == DEFAULT:
-            write_vertices(path, _with_confidence(scene.vertices, np.flatnonzero(members), k, confidence), run)
+            write_vertices(path, _with_confidence(scene.vertices, members[k], k, confidence), run)
         else:
-            write_scene(scene.subset(members), path, scene_format, run)
+            write_scene(scene.subset(members[k]), path, scene_format, run)
     return paths
 
 
@@ -129,7 +136,8 @@ def write_selection(
             _remove_mesh(places[k])
         return
     labels = labels[chosen]
-    objects = _objects(part, labels, class_names, meshes)
+    members = {k: np.flatnonzero(labels == k) for k in np.unique(labels[labels >= 0]).tolist()}
+    objects = _objects(part, members, class_names, meshes)
     if (labels < 0).any():
         objects.append(SceneObject(part.subset(labels < 0)))
     write_objects(objects, path, scene_format)
@@ -147,13 +155,12 @@ def _remove_mesh(path: Path) -> None:
 
 def _objects(
     scene: GaussianScene,
-    labels: np.ndarray,  # (N,) int
+    members: Mapping[int, np.ndarray],  # (M,) int64 of each class
     class_names: Mapping[int, str],
     meshes: Mapping[int, TriangleMesh],
 ) -> list[SceneObject]:
     """All classes that have Gaussians, as objects of one file."""
-    present = np.unique(labels[labels >= 0]).tolist()
-    return [SceneObject(scene.subset(labels == k), k, class_names[k], meshes.get(k)) for k in present]
+    return [SceneObject(scene.subset(ids), k, class_names[k], meshes.get(k)) for k, ids in members.items()]
 
 
 def class_paths(segmentation: Segmentation, folder: Path, scene_format: str) -> dict[int, Path]:
@@ -198,6 +205,10 @@ def _with_confidence(vertices: np.ndarray, ids: np.ndarray, label: int, confiden
     # Row by row as bytes: property by property takes several times as long. In parts, so that there is one copy.
     rows = out.view(np.uint8).reshape(len(out), -1)[:, : kept.itemsize]
     out["label"], out["confidence"] = label, confidence[ids]
+    if kept.itemsize == vertices.itemsize and kept.itemsize % 4 == 0 and vertices.flags.c_contiguous:
+        into, table = (array.view(np.float32).reshape(len(array), -1) for array in (out, vertices))
+        take_rows_into(into, table, ids)
+        return out
     if kept.itemsize < vertices.itemsize:
         vertices, ids = repack_fields(chosen(vertices, ids)[names]), np.arange(len(ids))
     for first in range(0, len(ids), _PART):

@@ -119,14 +119,15 @@ class RunReport:
         meshes: Mapping[int, str] | None = None,
         objective: Sequence[float] = (),
         pictures: Sequence[str] = (),
+        digest: str | None = None,
         **others: Any,
     ) -> RunReport:
-        """Report a segmentation of a scene; `others` are fields.
+        """Report a segmentation of a scene, whose file has another digest if its order is another; `others` are fields.
 
         `files` and `meshes` are the file of each class, and of the mesh to collide with it, where there is one.
         """
         return cls(
-            scene={"path": str(scene.path), "gaussians": len(scene), "digest": scene.digest},
+            scene={"path": str(scene.path), "gaussians": len(scene), "digest": digest or scene.digest},
             objective=objective,
             gaussians=gaussian_counts(result),
             classes=class_table(scene, result, files, meshes),

@@ -64,10 +64,17 @@ def reordered(scene: GaussianScene, order: np.ndarray) -> GaussianScene:
     return replace(scene, vertices=vertices, **arrays)
 
 
-@kernel(parallel=True)
 def take_rows(table: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """Copy some rows, (M',), of a table (M, K) of 32 bits; several times as fast as NumPy where they lie anywhere."""
-    out, last = np.empty((chosen.shape[0], table.shape[1]), table.dtype), chosen.shape[0] - 1
+    out = np.empty((len(chosen), table.shape[1]), table.dtype)
+    take_rows_into(out, table, chosen)
+    return out
+
+
+@kernel(parallel=True)
+def take_rows_into(out: np.ndarray, table: np.ndarray, chosen: np.ndarray) -> None:
+    """Do the same into the first K columns of a table."""
+    last = chosen.shape[0] - 1
     for m in nb.prange(chosen.shape[0]):
         later = table[chosen[min(m + _AHEAD, last)]]
         for j in range(0, table.shape[1], _LINE):
@@ -75,4 +82,3 @@ def take_rows(table: np.ndarray, chosen: np.ndarray) -> np.ndarray:
         row, copy = table[chosen[m]], out[m]
         for j in range(row.shape[0]):
             copy[j] = row[j]
-    return out
