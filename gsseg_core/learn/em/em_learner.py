@@ -9,7 +9,8 @@ label y in view v given class k:
   sum of w_v[p, i] / p_v(y | p) over the pixels p of label y. q * gradient are the expected counts, in px. Not all
   pixels are gone through, and some count for others (`block_weights`).
 - `m_step` sets q_i to normalise(q_i gradient_i + prior_i), the exact maximiser of the usual lower bound, so J never
-  falls. prior_i is `prior_weight` times the mean of the votes' probabilities over the nearest Gaussians.
+  falls. prior_i is `prior_weight` times the mean of the votes' probabilities over the nearest Gaussians
+  (`spatial_prior`), and where masks vote against classes it is taken once more, from the probabilities.
 - `predicted_gain` is the slope of J along the step. J is concave, so no step gains more; fitting ends with the first
   step that cannot gain `tolerance`.
 - `_refit_error_models` re-estimates each view's confusion matrix from probabilities that leave this view out, since
@@ -40,13 +41,14 @@ from gsseg_core.learn.em.boundary_alignment import align_boundaries, reach
 from gsseg_core.learn.em.confusion_model import ErrorModel
 from gsseg_core.learn.em.pair_kernels import codes_without, kernels_on
 from gsseg_core.learn.em.rejected_regions import find_rejected, split_regions
+from gsseg_core.learn.em.spatial_prior import spatial_prior, with_prior
 from gsseg_core.learn.learner import VOTE_UNIT, Learner, Progress, silent
 from gsseg_core.raster.observation import Observation, ViewPairs, VoteShares
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import PixelGrid, Strongest, ViewRenderer
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.several_at_once import meanwhile
-from gsseg_core.spatial.neighbourhood import find_neighbours, neighbours_of
+from gsseg_core.spatial.neighbourhood import find_neighbours
 
 REFIT_FACTOR = 4  # error models are re-estimated once a step gains less than this many times the tolerance
 
@@ -180,10 +182,10 @@ class EMLearner(Learner):
         with meanwhile(partial(find_neighbours, self.scene, settings.prior_k), self.device):
             votes, rejected = self._reject_regions(votes, tick) if settings.rejects_regions else (votes, {})
         resolved = resolved_votes(votes, self._possible())
-        self.observed_ = np.diff(resolved.indptr) > 0
+        some_against, self.observed_ = resolved is not votes, np.diff(resolved.indptr) > 0
         resolved, prior = resolved.united(self._spatial_prior(resolved))
         # The votes are the first step; with the prior added, J is finite from the start. What is zero now is zero after
-        # every step, so the pattern of the probabilities stays.
+        # every step, so the pattern of the probabilities stays, unless the prior is taken anew.
         codes = resolved.with_data(resolved.data.astype(np.float32) * np.float32(VOTE_UNIT) + prior.data).normalised()
         counted = prior.data > 0
         self.history_ = history = list[float]()
@@ -209,6 +211,9 @@ class EMLearner(Learner):
             elif small:
                 self._refit_error_models(codes, gradient, prior.data, models, tick)
                 rounds.append(0)
+                if some_against:  # Then votes were a poor guess of what the neighbours are; EM knows better by now.
+                    codes, gradient, prior = with_prior(codes, gradient, self._spatial_prior(codes))
+                    counted = prior.data > 0
             kernels.m_step(codes, gradient, prior.data)
             if self.converged_:
                 break
@@ -389,11 +394,7 @@ class EMLearner(Learner):
             pass
         return models
 
-    def _spatial_prior(self, votes: CSRRows) -> CSRRows:
-        """Mean probabilities of the nearest observed Gaussians times the prior weight; empty rows where none was."""
-        neighbours = neighbours_of(self.scene, self.settings.prior_k)
-        if neighbours is None or self.settings.prior_weight == 0:
-            return CSRRows(np.zeros_like(votes.indptr), np.empty(0, np.uint32), np.empty(0, np.float32))
-        codes = votes.with_data(votes.data.astype(np.float32) * np.float32(VOTE_UNIT)).normalised()
-        mean = neighbours.mean_codes(codes, self.observed_, self.num_classes).normalised()
-        return mean.with_data(np.float32(self.settings.prior_weight) * mean.data)
+    def _spatial_prior(self, of: CSRRows) -> CSRRows:
+        """Prior of all Gaussians, by the votes or the probabilities of their neighbours."""
+        settings = self.settings
+        return spatial_prior(of, self.observed_, self.scene, settings.prior_k, settings.prior_weight, self.num_classes)

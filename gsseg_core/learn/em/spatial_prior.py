@@ -1,0 +1,45 @@
+"""Spatial prior of EM: objects are continuous in space, so a Gaussian is likely what its nearest neighbours are.
+
+What these are, the votes tell at first. With masks of some classes only, they tell it badly: each mask votes against
+the classes that it looked for and did not show. Where one is wrong about an object, and few others looked for that,
+more may speak against the right class than for it; the class is dropped, with the Gaussian's neighbours as with itself,
+and stays at zero in every step. Once EM has all but converged, it knows better than they do, and the prior is taken
+from its probabilities; by it, a class that some of the neighbours have kept comes back to the others.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsseg_core.csr_rows import CSRRows
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.spatial.neighbourhood import neighbours_of
+
+
+def spatial_prior(
+    shares: CSRRows, observed: np.ndarray, scene: GaussianScene, k: int, weight: float, num_classes: int
+) -> CSRRows:
+    """Mean probabilities of the k nearest observed Gaussians times a weight; empty rows where none was.
+
+    Parameters
+    ----------
+    shares : CSRRows
+        Of each class, N rows, in any unit: votes of at least 0, or probabilities.
+    observed : (N,) bool
+    """
+    neighbours = neighbours_of(scene, k)
+    if neighbours is None or weight == 0:
+        return CSRRows(np.zeros_like(shares.indptr), np.empty(0, np.uint32), np.empty(0, np.float32))
+    mean = neighbours.mean_codes(shares.with_data(shares.data.astype(np.float32)).normalised(), observed, num_classes)
+    mean = mean.normalised()
+    return mean.with_data(np.float32(weight) * mean.data)
+
+
+def with_prior(codes: CSRRows, gradient: np.ndarray, prior: CSRRows) -> tuple[CSRRows, np.ndarray, CSRRows]:
+    """Give codes and their gradient, (Z,), another prior: all in a pattern that has the classes of either.
+
+    What was not there is zero. The next M-step adds the prior to it, and from then on it has a share of its own.
+    """
+    gradient = codes.with_data(gradient).united(prior)[0].data
+    codes, prior = codes.united(prior)
+    return codes, gradient, prior
