@@ -32,7 +32,7 @@ from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import Blended
 from gsseg_core.refine.knn_filter import cluster_in_place, statistical_filter
 from gsseg_core.refine.settings import RefineSettings
-from gsseg_core.refine.silhouette_carving import Silhouette, carve
+from gsseg_core.refine.silhouette_carving import Silhouette, carve, looked_from
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import neighbours_of
@@ -288,8 +288,8 @@ class Segmentation:
         self.require(scene)
 
         def look(camera: Camera) -> Silhouette:
-            operator = make_operator(scene, camera, device)
-            return Silhouette.of(scene, operator, self.label_map(operator))
+            operator = make_operator(scene, looked_from(camera), device)
+            return Silhouette.of(scene, operator, self.label_map(operator), view=camera)
 
         return self.carved_by(scene, spread(cameras, num_views), look, device)
 

@@ -18,7 +18,7 @@ from gsseg_core.learn.mask_reliability import WORST, ViewCheck, worst_views
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.depth import surface_of, with_depths
 from gsseg_core.raster.view_operator import ViewOperator
-from gsseg_core.refine.silhouette_carving import Silhouette
+from gsseg_core.refine.silhouette_carving import Silhouette, looked_from
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.several_at_once import several_at_once
@@ -84,14 +84,18 @@ def look_at(
     device: str,
     view: View,
 ) -> Silhouette:
-    """Render what a view shows, to carve objects by; draw it into `drawn` on the way if its name is among `asked`."""
-    operator, pictured = make_operator(scene, view.camera, device), view.name in asked
+    """Render what a view shows, to carve objects by; draw it into `drawn` on the way if its name is among `asked`.
+
+    What is drawn is as large as the view.
+    """
+    pictured = view.name in asked
+    operator = make_operator(scene, view.camera if pictured else looked_from(view.camera), device)
     nothing = np.empty((len(operator.ids), 0), np.float32)
     colors = scene.colors(view.camera.center, operator.ids) if pictured else nothing
     labels, (image, left_over) = segmentation.label_map_beside(operator, with_depths(scene, operator, colors))
     if pictured:
         drawn[view.name] = Drawn.of(view, labels, as_pixels(image[..., :3]), segmentation.num_classes)
-    return Silhouette.of(scene, operator, labels, surface_of(image[..., -1], left_over).depth)
+    return Silhouette.of(scene, operator, labels, surface_of(image[..., -1], left_over).depth, view.camera)
 
 
 def write_pictures(

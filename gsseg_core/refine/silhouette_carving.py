@@ -20,6 +20,7 @@ Gaussian is all there is, it stays although it sticks out. One that never sticks
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from functools import partial
 from typing import NamedTuple, TypeVar
@@ -31,7 +32,7 @@ from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.depth import BEHIND, depths, surface
 from gsseg_core.raster.objects_alone import ObjectsAlone
 from gsseg_core.raster.view_operator import ViewOperator
-from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.camera import Camera, smaller_camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.several_at_once import several_at_once
 
@@ -40,7 +41,19 @@ KEPT = 0.4  # least share with which a Gaussian stays with its object, of the la
 _LEAST = np.float32(0.01)  # of a share, so that a Gaussian may come back
 _MEMORY = 2 << 30  # bytes of projected views that are kept between the steps; others are projected anew
 
+ENOUGH = 1 << 16  # px that a view tells as much by, about, as by more: see `looked_from`
+
 T = TypeVar("T")
+
+
+def looked_from(camera: Camera) -> Camera:
+    """Make the camera that a view is looked at from: the same, or with every so manieth pixel, but `ENOUGH` of them.
+
+    On held-out views of all development scenes, two and three times as many pixels along each side carve objects that
+    are no better, and half as many are worse by .2 to .3 points of visible IoU.
+    """
+    step = math.isqrt(max(camera.width * camera.height // ENOUGH, 1))
+    return smaller_camera(camera, step) if step > 1 else camera
 
 
 class Silhouette(NamedTuple):
@@ -49,12 +62,16 @@ class Silhouette(NamedTuple):
     operator: ViewOperator  # of the scene from there
     labels: np.ndarray  # (H, W) int32: class of each pixel, negative where unknown
     depth: np.ndarray  # (H, W) float32: of the scene's surface, scene units; infinite where there is none
+    stands_for: float = 1.0  # px of the view, each of these
 
     @classmethod
     def of(
-        cls, scene: GaussianScene, operator: ViewOperator, labels: np.ndarray, depth: np.ndarray | None = None
-    ) -> Silhouette:
+        cls, scene: GaussianScene, operator: ViewOperator, labels: np.ndarray, depth: np.ndarray | None = None,
+        view: Camera | None = None,
+    ) -> Silhouette:  # fmt: skip
         """Put a label map (H, W) int32 and the depth of the scene together, which is rendered unless it is at hand.
+
+        If the operator is `looked_from` a view, its pixels count as much as those of the view.
 
         Raises
         ------
@@ -67,7 +84,8 @@ class Silhouette(NamedTuple):
                 f"view '{camera.name}': labels have shape {labels.shape}; expected ({camera.height}, {camera.width})"
             )
         depth = surface(scene, operator).depth if depth is None else depth
-        return cls(operator, labels.astype(np.int32), depth)
+        stands_for = 1.0 if view is None else view.width * view.height / labels.size
+        return cls(operator, labels.astype(np.int32), depth, stands_for)
 
 
 def kept_shares(
@@ -124,10 +142,10 @@ def _look(
     scene: GaussianScene, labels: np.ndarray, look: Callable[[T], Silhouette], view: T
 ) -> tuple[_Shown, ObjectsAlone, np.ndarray]:
     """Tell what a view shows, which objects are in it, and what speaks there against each Gaussian in its object."""
-    operator, seen, depth = look(view)
+    operator, seen, depth, stands_for = look(view)
     alone = operator.objects_alone(labels)
     reasons = alone.reasons_to_go(depths(scene, operator.camera, alone.ids), seen, depth * np.float32(BEHIND))
-    return _Shown(operator.camera, seen), alone, reasons
+    return _Shown(operator.camera, seen, stands_for), alone, stands_for * reasons
 
 
 def _reasons_to_stay(
@@ -137,7 +155,7 @@ def _reasons_to_stay(
     shown, alone = views[number]
     wanted = asked[alone.ids]
     reasons = alone.reasons_to_stay(shares[alone.ids], wanted, shown.labels)
-    return alone.ids[wanted], reasons[wanted]
+    return alone.ids[wanted], shown.stands_for * reasons[wanted]
 
 
 class _Shown(NamedTuple):
@@ -145,6 +163,7 @@ class _Shown(NamedTuple):
 
     camera: Camera
     labels: np.ndarray  # (H, W) int32
+    stands_for: float
 
 
 class _ObjectViews:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numba as nb
@@ -38,7 +39,7 @@ from gsseg_core.raster.cpu.objects_alone import TileObjects
 from gsseg_core.raster.depth import BEHIND, depths, surface
 from gsseg_core.refine import silhouette_carving
 from gsseg_core.refine.settings import UNREFINED, RefineSettings
-from gsseg_core.refine.silhouette_carving import Silhouette, kept_shares, sticking_out
+from gsseg_core.refine.silhouette_carving import Silhouette, kept_shares, looked_from, sticking_out
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
@@ -167,6 +168,27 @@ def test_who_looks_at_a_view_weighs_it_too(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(TileObjects, "reasons_to_go", weigh_here)
     np.testing.assert_array_equal(silhouette_carving.carve(scene, labels, silhouettes(), look), expected)
     assert sorted(looked) == sorted(weighed) and threading.get_ident() not in weighed
+
+
+def test_large_views_are_looked_at_with_fewer_pixels_that_count_for_as_many() -> None:
+    camera = look_at("above", np.array([0.1, 0.1, 3.5]), 120, 90, 125.0)
+    assert looked_from(camera) is camera
+    large = replace(camera, width=1200, height=900, K=np.diag([10.0, 10, 1]) @ camera.K)
+    small = looked_from(large)
+    assert (small.width, small.height) == (300, 225)
+    np.testing.assert_allclose(small.world_to_camera, large.world_to_camera)
+    shown = Silhouette.of(SCENE, make_operator(SCENE, small), true_labels(SCENE, TRUTH, small), view=large)
+    assert shown.stands_for == 16
+
+
+def test_a_view_with_a_quarter_of_the_pixels_weighs_as_much() -> None:
+    scene, labels, _ = with_fringe()
+    views = silhouettes()
+    alone = shares_of(scene, labels, views[:1], steps=1)
+    heavier = [views[0]._replace(stands_for=3.0), *views[1:]]
+    repeated = [views[0], views[0], *views]
+    np.testing.assert_allclose(shares_of(scene, labels, heavier, 1), shares_of(scene, labels, repeated, 1), rtol=1e-5)
+    np.testing.assert_allclose(shares_of(scene, labels, heavier[:1], steps=1), alone, rtol=1e-5)
 
 
 def test_an_object_of_one_gaussian_that_sticks_out_stays() -> None:
