@@ -175,10 +175,10 @@ def test_large_views_are_looked_at_with_fewer_pixels_that_count_for_as_many() ->
     assert looked_from(camera) is camera
     large = replace(camera, width=1200, height=900, K=np.diag([10.0, 10, 1]) @ camera.K)
     small = looked_from(large)
-    assert (small.width, small.height) == (300, 225)
+    assert (small.width, small.height) == (600, 450)
     np.testing.assert_allclose(small.world_to_camera, large.world_to_camera)
     shown = Silhouette.of(SCENE, make_operator(SCENE, small), true_labels(SCENE, TRUTH, small), view=large)
-    assert shown.stands_for == 16
+    assert shown.stands_for == 4
 
 
 def test_a_view_with_a_quarter_of_the_pixels_weighs_as_much() -> None:
