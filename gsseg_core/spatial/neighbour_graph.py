@@ -59,7 +59,7 @@ class Graph:
         contrast = _compare(np.ascontiguousarray(colors[tree.order], np.float32), indptr, indices)
         # Painted scenes have areas of one colour; where there is only one, it tells nothing.
         typical = _median(contrast) or float(contrast.mean()) or 1.0
-        weights = _weigh(tree.points, radii, contrast / np.float32(typical), indptr, indices)
+        weights = _weigh(tree.points, radii, contrast, np.float32(typical), indptr, indices)
         return cls(k, tree.order, indptr, indices, weights)
 
 
@@ -114,7 +114,7 @@ def _count_halves(bits: np.ndarray) -> np.ndarray:  # (E,) int32, not negative
 @kernel(parallel=True)
 def _weigh(
     points: np.ndarray, radii: np.ndarray,  # (3, n), (n,) squared distance to the k-th neighbour
-    contrast: np.ndarray,  # (E,) difference of the colours, in units of a typical one
+    contrast: np.ndarray, typical: np.float32,  # (E,) difference of the colours; a typical one
     indptr: np.ndarray, indices: np.ndarray,  # (n + 1,), (E,)
 ) -> np.ndarray:  # fmt: skip
     """Weights p_ij of the edges, (E,) float32."""
@@ -125,7 +125,8 @@ def _weigh(
             j = indices[e]
             dx, dy, dz = points[0, i] - points[0, j], points[1, i] - points[1, j], points[2, i] - points[2, j]
             spacing = max(np.sqrt(radii[i]) * np.sqrt(radii[j]), np.finfo(np.float32).tiny)
-            exponent = -(dx * dx + dy * dy + dz * dz) / spacing - contrast[e] * contrast[e] / 2
+            apart = contrast[e] / typical
+            exponent = -(dx * dx + dy * dy + dz * dz) / spacing - apart * apart / 2
             weights[e] = max(np.exp(exponent), np.float32(1e-9))  # however different, it is better than none
             total += weights[e]
         for e in range(indptr[i], indptr[i + 1]):
