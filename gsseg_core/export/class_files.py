@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.lib.recfunctions import repack_fields
@@ -15,7 +16,7 @@ from gsseg_core.export.collision import check_collision, collision_meshes
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.run_folder import staged_run
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.scene.ply import write_vertices
+from gsseg_core.scene.ply import write_parts
 from gsseg_core.scene.scene_writers import DEFAULT, SCENE_WRITERS, SceneObject, check_format, write_objects, write_scene
 from gsseg_core.scene.triangle_mesh import LONE, TriangleMesh
 from gsseg_core.scene.vertices import chosen
@@ -23,7 +24,7 @@ from gsseg_core.segmentation import Segmentation
 from gsseg_core.spatial.row_order import take_rows_into
 
 TOGETHER = "objects"  # stem of the file in which a format keeps the objects of all classes
-_PART = 1 << 15  # vertices that are copied at a time
+_PART = 1 << 15  # vertices that are copied and written at a time
 
 
 def export_classes(
@@ -103,7 +104,7 @@ def write_classes(
         return paths
     for k, path in paths.items():
         if scene_format == DEFAULT:
-            write_vertices(path, _with_confidence(scene.vertices, members[k], k, confidence), run)
+            write_parts(path, len(members[k]), *_with_confidence(scene.vertices, members[k], k, confidence), run)
         else:
             write_scene(scene.subset(members[k]), path, scene_format, run)
     return paths
@@ -197,21 +198,34 @@ def _stem(label: int, name: str) -> str:
     return f"{label}_{re.sub(r'[^0-9A-Za-z._-]+', '_', name)[:100].strip('._') or 'class'}"
 
 
-def _with_confidence(vertices: np.ndarray, ids: np.ndarray, label: int, confidence: np.ndarray) -> np.ndarray:
-    """Take some (M,) of the vertices (N,), with properties `label` (int32) and `confidence` (N,); earlier ones go."""
+def _with_confidence(
+    vertices: np.ndarray,
+    ids: np.ndarray,
+    label: int,
+    confidence: np.ndarray,  # (N,) records, (M,), (N,)
+) -> tuple[np.dtype[Any], Iterator[np.ndarray]]:
+    """Take some of the vertices with properties `label` (int32) and `confidence`; earlier ones go: what kind, in parts.
+
+    A part is to be written before the next one is asked for.
+    """
     names = [name for name in vertices.dtype.names or () if name not in ("label", "confidence")]
     kept = repack_fields(vertices[:0][names])
-    out = np.empty(len(ids), [*kept.dtype.descr, ("label", "<i4"), ("confidence", "<f4")])
-    # Row by row as bytes: property by property takes several times as long. In parts, so that there is one copy.
-    rows = out.view(np.uint8).reshape(len(out), -1)[:, : kept.itemsize]
-    out["label"], out["confidence"] = label, confidence[ids]
-    if kept.itemsize == vertices.itemsize and kept.itemsize % 4 == 0 and vertices.flags.c_contiguous:
-        into, table = (array.view(np.float32).reshape(len(array), -1) for array in (out, vertices))
-        take_rows_into(into, table, ids)
-        return out
-    if kept.itemsize < vertices.itemsize:
-        vertices, ids = repack_fields(chosen(vertices, ids)[names]), np.arange(len(ids))
-    for first in range(0, len(ids), _PART):
-        part = chosen(vertices, ids[first : first + _PART])
-        rows[first : first + _PART] = part.view(np.uint8).reshape(len(part), -1)
-    return out
+    kind = np.dtype([*kept.dtype.descr, ("label", "<i4"), ("confidence", "<f4")])
+    as_numbers = kept.itemsize == vertices.itemsize and kept.itemsize % 4 == 0 and vertices.flags.c_contiguous
+
+    def parts() -> Iterator[np.ndarray]:
+        room = np.empty(min(len(ids), _PART), kind)
+        for first in range(0, len(ids), _PART):
+            some = ids[first : first + _PART]
+            out = room[: len(some)]
+            if as_numbers:  # That need not be any: they are only copied.
+                into, table = (array.view(np.float32).reshape(len(array), -1) for array in (out, vertices))
+                take_rows_into(into, table, some)
+            else:  # As bytes: property by property takes several times as long.
+                part = repack_fields(chosen(vertices, some)[names])
+                rows = out.view(np.uint8).reshape(len(out), -1)
+                rows[:, : kept.itemsize] = part.view(np.uint8).reshape(len(part), -1)
+            out["label"], out["confidence"] = label, confidence[some]
+            yield out
+
+    return kind, parts()

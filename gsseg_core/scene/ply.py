@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -118,7 +119,18 @@ def write_vertices(path: str | os.PathLike[str], vertices: npt.NDArray[Any], run
     The id of a run, if one is given, becomes the comment `gsseg_run <id>`. It stands below the line of the element:
     some viewers count on that being the third.
     """
+    write_parts(path, len(vertices), vertices.dtype, [vertices], run)
+
+
+def write_parts(
+    path: str | os.PathLike[str], count: int, dtype: np.dtype[Any], parts: Iterable[npt.NDArray[Any]], run: str | None
+) -> None:  # fmt: skip
+    """Do the same with so many vertices that come in parts, so that they need not be in memory together."""
     comments = [] if run is None else [f"gsseg_run {run}"]
-    ply = plyfile.PlyData([plyfile.PlyElement.describe(vertices, "vertex", comments=comments)], byte_order="<")
-    with write_atomically(path) as temporary:
-        ply.write(str(temporary))
+    # An array that nobody touches takes no memory.
+    element = plyfile.PlyElement.describe(np.empty(count, dtype), "vertex", comments=comments)
+    header = plyfile.PlyData([element], byte_order="<").header
+    with write_atomically(path) as temporary, open(temporary, "wb") as file:
+        file.write(f"{header}\n".encode("ascii"))
+        for part in parts:
+            file.write(part.astype(element.dtype("<"), copy=False).data)

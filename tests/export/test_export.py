@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -71,16 +72,16 @@ def test_a_failed_export_leaves_the_earlier_folder_whole(
 ) -> None:
     folder = tmp_path / "classes"
     export_classes(SCENE, only(1), folder)
-    before, write = contents(folder), export.write_vertices
+    before, write = contents(folder), export.write_parts
     written: list[Path] = []
 
-    def fails_at_the_third(path: Path, vertices: np.ndarray, run: str) -> None:
+    def fails_at_the_third(path: Path, *what: Any) -> None:
         written.append(path)
         if len(written) == 3:
             raise error
-        write(path, vertices, run)
+        write(path, *what)
 
-    monkeypatch.setattr(export, "write_vertices", fails_at_the_third)
+    monkeypatch.setattr(export, "write_parts", fails_at_the_third)
     with pytest.raises(type(error)):
         export_classes(SCENE, RESULT, folder)
     assert contents(folder) == before and list(tmp_path.iterdir()) == [folder]
