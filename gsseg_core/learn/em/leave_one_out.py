@@ -42,19 +42,22 @@ def _subtract_votes(total: CSRRows, pairs: ViewPairs, own: np.ndarray, label_vot
     indptr, classes, data = total
     ids, start, labels = pairs
     for m in nb.prange(ids.shape[0]):
-        row, seen = slice(indptr[ids[m]], indptr[ids[m] + 1]), slice(start[m], start[m + 1])
-        _subtract_row(classes[row], data[row], labels[seen], own[seen], label_votes)
+        _subtract_row(
+            classes, data, indptr[ids[m]], indptr[ids[m] + 1], labels, own, start[m], start[m + 1], label_votes
+        )
 
 
 @called_by_kernels
 def _subtract_row(
-    classes: np.ndarray, total: np.ndarray, labels: np.ndarray, own: np.ndarray, label_votes: CSRRows
-) -> None:
+    classes: np.ndarray, total: np.ndarray, first: int, last: int,  # of these, the row of one Gaussian
+    labels: np.ndarray, own: np.ndarray, begin: int, end: int,  # of these, its pairs
+    label_votes: CSRRows,
+) -> None:  # fmt: skip
     """Subtract one view's votes from the row of one Gaussian, rounded as when they were added."""
     indptr, vote_classes, votes = label_votes
-    for s in range(labels.shape[0]):
+    for s in range(begin, end):
         for j in range(indptr[labels[s]], indptr[labels[s] + 1]):
-            for z in range(classes.shape[0]):
+            for z in range(first, last):
                 if classes[z] == vote_classes[j]:
                     total[z] -= vote_units(own[s], votes[j], UNITS)
 
@@ -94,8 +97,7 @@ def _count(
             first, count = indptr[ids[m]], indptr[ids[m] + 1] - indptr[ids[m]]
             for z in range(count):
                 which[z], remaining[z] = classes[first + z], data[first + z]
-            seen = slice(start[m], start[m + 1])
-            _subtract_row(which[:count], remaining[:count], labels[seen], own[seen], label_votes)
+            _subtract_row(which, remaining, 0, count, labels, own, start[m], start[m + 1], label_votes)
             least = np.int64(0)
             for z in range(count):
                 least = min(least, remaining[z])
