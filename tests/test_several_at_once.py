@@ -10,7 +10,7 @@ import pytest
 from patience import PATIENCE
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.several_at_once import several_at_once
+from gsseg_core.several_at_once import meanwhile, several_at_once
 
 
 @pytest.fixture(autouse=True)
@@ -114,3 +114,18 @@ def test_kernels_of_two_threads_give_the_same_bits() -> None:
     found = list(several_at_once(lambda array: CSRRows.from_dense(array).normalised().data, arrays))
     assert all(map(np.array_equal, found, expected))
     assert nb.get_num_threads() >= 1
+
+
+def test_what_is_done_meanwhile_is_done_at_the_end_and_its_error_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsseg_core.several_at_once.kernels_run_beside_each_other", lambda: True)
+    done: list[int] = []
+    with meanwhile(lambda: done.append(threading.get_ident()), "cuda"):
+        pass
+    assert len(done) == 1 and done[0] != threading.get_ident()
+    with pytest.raises(ZeroDivisionError), meanwhile(lambda: 1 // 0, "cuda"):
+        pass
+
+
+def test_without_a_gpu_nothing_is_done_meanwhile() -> None:
+    with meanwhile(lambda: pytest.fail("the body has all cores at work"), "cpu"):
+        pass

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,22 @@ def test_every_class_is_a_valid_ply_of_exactly_its_gaussians(tmp_path: Path) -> 
         assert (part.vertices["label"] == k).all()
         np.testing.assert_array_equal(part.vertices["confidence"], RESULT.confidence[mine])
     assert list(tmp_path.iterdir()) == [tmp_path / "classes"]
+
+
+@pytest.mark.parametrize("scene_format", ["ply", "splat"])
+def test_classes_of_a_scene_in_another_order_are_written_in_that_of_its_file(tmp_path: Path, scene_format: str) -> None:
+    expected = contents_of(export_classes(SCENE, RESULT, tmp_path / "file", scene_format))
+    order = np.random.default_rng(0).permutation(len(SCENE))
+    scene, places = SCENE.subset(order), np.argsort(order)
+    result = RESULT.in_order_of(scene.digest, order)
+    (tmp_path / "other").mkdir()
+    written = export.write_classes(scene, result, tmp_path / "other", "run", scene_format, {}, places)
+    assert contents_of(written) == expected
+
+
+def contents_of(paths: dict[int, Path]) -> dict[int, bytes]:
+    """What the files of classes hold, but for the run that they name."""
+    return {k: re.sub(rb"(?<=gsseg_run )\S+", b"", path.read_bytes()) for k, path in paths.items()}
 
 
 def test_no_ply_of_an_earlier_export_remains(tmp_path: Path) -> None:

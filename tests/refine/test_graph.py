@@ -11,8 +11,10 @@ from hypothesis import strategies as st
 from gsseg_core.data.view import View
 from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.learn.em.em_learner import EMLearner
-from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, propagate, spread_if_scarce
+from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, list_if_scarce, propagate, spread_if_scarce
+from gsseg_core.spatial import neighbour_graph
 from gsseg_core.spatial.neighbour_graph import Graph, _median, graph_of
+from gsseg_core.spatial.neighbourhood import find_neighbours, take_lists
 
 FEW = GraphSettings(k=4, steps=60)
 
@@ -139,6 +141,26 @@ def test_the_graph_of_a_scene_is_built_once() -> None:
     scene, _ = small_scenes.balls_on_a_table()
     assert graph_of(scene, 5) is graph_of(scene, 5)
     assert graph_of(scene, 6).k == 6
+
+
+def test_the_graph_takes_what_was_listed_when_all_neighbours_were_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, _ = small_scenes.balls_on_a_table()
+    expected = graph_of(small_scenes.balls_on_a_table()[0])
+    list_if_scarce(scene, np.zeros(len(scene)), 30)
+    find_neighbours(scene, 30)
+    monkeypatch.setattr(neighbour_graph, "nearest", lambda *searched: pytest.fail("the points were searched again"))
+    found = graph_of(scene)
+    for name in ("order", "indptr", "indices", "weights"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    assert take_lists(scene, found.k) is None, "they are kept no longer"
+
+
+def test_lists_of_another_length_are_none_for_the_graph() -> None:
+    scene, _ = small_scenes.balls_on_a_table()
+    list_if_scarce(scene, np.zeros(len(scene)), 30)
+    find_neighbours(scene, 30)
+    assert take_lists(scene, 5) is None
+    assert graph_of(scene, 5).indptr[-1] >= 5 * len(scene)
 
 
 def test_where_hardly_anything_is_scarce_codes_stay_and_no_graph_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
