@@ -61,7 +61,8 @@ def reordered(scene: GaussianScene, order: np.ndarray) -> GaussianScene:
         return replace(scene.subset(order), **arrays)
     # As numbers that they need not be: they are only copied.
     vertices = np.empty_like(records)
-    take_rows_into(*(each.view(np.float32).reshape(len(scene), -1) for each in (vertices, records)), order)
+    out, table = (each.view(np.float32).reshape(len(scene), -1) for each in (vertices, records))
+    take_rows_into(out, table, order)
     return replace(scene, vertices=vertices, **arrays)
 
 
