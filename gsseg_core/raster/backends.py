@@ -8,11 +8,11 @@ from contextlib import AbstractContextManager
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-
 from gsseg_core.errors import SettingsError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from gsseg_core.raster.view_operator import ViewOperator
     from gsseg_core.scene.camera import Camera
     from gsseg_core.scene.gaussian_scene import GaussianScene
