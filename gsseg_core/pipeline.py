@@ -257,9 +257,9 @@ def _ids(dataset: Dataset, settings: RunSettings) -> str:
 
 def _associate(inputs: Inputs, device: str, progress: Progress) -> Inputs:
     """Find which ids of the views are the same object, and number the objects."""
-    objects = find_objects(inputs.scene, inputs.train, device=device, progress=progress)
-    train = [objects.relabelled(view) for view in inputs.train]
-    return replace(inputs, train=train, class_names=objects.class_names, objects=objects)
+    found = find_objects(inputs.scene, inputs.train, device=device, progress=progress)
+    train = [found.relabelled(view) for view in inputs.train]
+    return replace(inputs, train=train, class_names=found.class_names, objects=found)
 
 
 def _learn(
@@ -345,8 +345,8 @@ def _picture(
     views, folder, checks = assessment.views, run.folder / "pictures", list(assessment.checks or ())
     if assessment.checks is None:  # What is compared then is drawn in full size.
         views = {view.name: view for view in inputs.train if view.name in views}
-        named = [(one, views[one.view.name]) for one in shown if one.view.name in views]
-        checks = [compare_mask(view, one.labels, result.num_classes) for one, view in named]
+        compared = [drawn for drawn in shown if drawn.view.name in views]
+        checks = [compare_mask(views[drawn.view.name], drawn.labels, result.num_classes) for drawn in compared]
     save = partial(behind, save_png)
     if level is not result:  # What is compared with the masks are objects, as they are.
         shown = draw_views(inputs.scene, level, inputs.pictured, device=images.device)

@@ -92,8 +92,7 @@ def write_classes(
     """
     confidence, names = segmentation.confidence, segmentation.class_names
     order = np.arange(len(scene)) if order is None else order
-    labels = segmentation.labels[order]
-    members = {k: order[np.flatnonzero(labels == k)] for k in np.unique(labels[labels >= 0]).tolist()}
+    members = {k: order[ids] for k, ids in _members(segmentation.labels[order]).items()}
     paths = class_paths(segmentation, folder, scene_format)
     for k, mesh in meshes.items():
         mesh.save(folder / mesh_file_name(k, names[k]), run)
@@ -137,8 +136,7 @@ def write_selection(
             _remove_mesh(places[k])
         return
     labels = labels[chosen]
-    members = {k: np.flatnonzero(labels == k) for k in np.unique(labels[labels >= 0]).tolist()}
-    objects = _objects(part, members, class_names, meshes)
+    objects = _objects(part, _members(labels), class_names, meshes)
     if (labels < 0).any():
         objects.append(SceneObject(part.subset(labels < 0)))
     write_objects(objects, path, scene_format)
@@ -152,6 +150,11 @@ def _remove_mesh(path: Path) -> None:
                 is_ours = file.readline(len(LONE)) == LONE
             if is_ours:
                 path.unlink()
+
+
+def _members(labels: np.ndarray) -> dict[int, np.ndarray]:  # (N,) int
+    """List the Gaussians of each class that has any, (M,) int64."""
+    return {k: np.flatnonzero(labels == k) for k in np.unique(labels[labels >= 0]).tolist()}
 
 
 def _objects(
@@ -199,10 +202,10 @@ def _stem(label: int, name: str) -> str:
 
 
 def _with_confidence(
-    vertices: np.ndarray,
-    ids: np.ndarray,
+    vertices: np.ndarray,  # (N,) records
+    ids: np.ndarray,  # (M,)
     label: int,
-    confidence: np.ndarray,  # (N,) records, (M,), (N,)
+    confidence: np.ndarray,  # (N,)
 ) -> tuple[np.dtype[Any], Iterator[np.ndarray]]:
     """Take some of the vertices with properties `label` (int32) and `confidence`; earlier ones go: what kind, in parts.
 

@@ -47,7 +47,7 @@ T = TypeVar("T")
 
 
 def looked_from(camera: Camera) -> Camera:
-    """Make the camera that a view is looked at from: the same, or with every so manieth pixel, but `ENOUGH` of them.
+    """Make the camera that a view is looked at from: the same, or one of fewer pixels, of which `ENOUGH` are left.
 
     docs/clean_objects.md has what more and fewer pixels are worth.
     """
