@@ -193,6 +193,9 @@ which others hid a part, show in full, and so do those just under a neighbour's 
   silhouettes in 24 train views, unless the object would have holes without them. The silhouettes are those of the label
   maps that the segmentation itself renders, so errors of single masks carve nothing away; no retraining. What no view
   reaches stays, and no object goes as a whole. Where objects touch, it may take a little of the object itself.
+  Large views that are not drawn anyway are looked at with 131,072 pixels, about as many as the views of the scenes here
+  have: on held-out views, two or three times as many along each side changed visible IoU by 0.1 points and less, save
+  for kitchen_table from true masks (+0.4); 0.85 of them cost up to 0.3 points from wrong masks, 0.7 of them up to 1.1.
 
 Carving takes two steps ([method.md](method.md#refinement)). All shares move at once and overshoot, so that five, as
 there were, are no better on held-out views, and take two and a half times the CPU time: 0.93 s against 0.39 s on the

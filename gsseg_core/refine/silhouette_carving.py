@@ -32,7 +32,7 @@ from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.depth import BEHIND, depths, surface
 from gsseg_core.raster.objects_alone import ObjectsAlone
 from gsseg_core.raster.view_operator import ViewOperator
-from gsseg_core.scene.camera import Camera, smaller_camera
+from gsseg_core.scene.camera import Camera, resized_camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.several_at_once import several_at_once
 
@@ -47,12 +47,14 @@ T = TypeVar("T")
 
 
 def looked_from(camera: Camera) -> Camera:
-    """Make the camera that a view is looked at from: the same, or one of fewer pixels, of which `ENOUGH` are left.
+    """Make the camera that a view is looked at from: the same, or one of `ENOUGH` px, about, if that has more.
 
     docs/clean_objects.md has what more and fewer pixels are worth.
     """
-    step = math.isqrt(max(camera.width * camera.height // ENOUGH, 1))
-    return smaller_camera(camera, step) if step > 1 else camera
+    scale = math.sqrt(ENOUGH / (camera.width * camera.height))
+    if scale >= 1:
+        return camera
+    return resized_camera(camera, math.ceil(scale * camera.width), math.ceil(scale * camera.height))
 
 
 class Silhouette(NamedTuple):

@@ -211,3 +211,9 @@ def smaller_camera(camera: Camera, step: int) -> Camera:
         principal=((camera.cx + aside) / step, (camera.cy + aside) / step),
     )  # fmt: skip
     return replace(camera, width=width, height=height, K=small.K, undistortion=small)
+
+
+def resized_camera(camera: Camera, width: int, height: int) -> Camera:
+    """Make the camera that shows the same in so many pixels; they are not those of any mask."""
+    scale = np.diag([width / camera.width, height / camera.height, 1])
+    return replace(camera, width=width, height=height, K=scale @ camera.K, undistortion=None)
