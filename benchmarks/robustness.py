@@ -94,14 +94,6 @@ class Bench:
         return replace(REALISTIC, missed_label=self.missed_label)
 
 
-@dataclass(frozen=True)
-class Run:
-    """What one learner made of some views: mIoU in the test views, and the seconds that it took to learn."""
-
-    miou: float
-    seconds: float
-
-
 def main() -> int:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -147,17 +139,15 @@ def open_benches(folder: Path, real: Path, quick: bool) -> Iterator[Bench]:
         yield Bench("real scene", scene, data, train, test, 53, STRENGTHS, fewer, None, given)
 
 
-def learn(bench: Bench, views: Sequence[View], names: Sequence[str] = LEARNERS) -> dict[str, Run]:
-    """Learn from views with each of these learners, and score rendered label maps of the test views."""
-    runs = {}
+def learn(bench: Bench, views: Sequence[View], names: Sequence[str] = LEARNERS) -> dict[str, float]:
+    """Learn from views with each of these learners: mIoU of rendered label maps of the test views."""
+    mious = {}
     for name in names:
-        start = time.perf_counter()
         learner = taught(name, bench, views)
         codes = hard_votes(learner.codes_, 0.0) if name == HARD else learner.codes_
-        seconds = time.perf_counter() - start
         result = Segmentation.from_codes(bench.scene, codes, bench.data.class_names)
-        runs[name] = Run(score(result, bench.scene, bench.test).mean_iou, seconds)
-    return runs
+        mious[name] = score(result, bench.scene, bench.test).mean_iou
+    return mious
 
 
 def taught(name: str, bench: Bench, views: Sequence[View], num_classes: int | None = None) -> Learner:
@@ -177,16 +167,16 @@ def right_share(views: Sequence[View], truth: Sequence[View]) -> list[float]:
     return [float((a.read_labels() == b.read_labels()).mean()) for a, b in zip(views, truth, strict=True)]
 
 
-def tell(bench: Bench, what: str, runs: Mapping[str, Run]) -> None:
+def tell(bench: Bench, what: str, mious: Mapping[str, float]) -> None:
     """Print what has just been measured."""
-    print(f"{bench.name}, {what}: " + ", ".join(f"{name} {run.miou:.4f}" for name, run in runs.items()), flush=True)
+    print(f"{bench.name}, {what}: " + ", ".join(f"{name} {miou:.4f}" for name, miou in mious.items()), flush=True)
 
 
 # The bar
 
 
 def measure_bar(benches: Sequence[Bench]) -> str:
-    """Measure what realistic errors cost each learner, how long each takes, and then what each error costs alone."""
+    """Measure what realistic errors cost each learner, and then what each error costs alone."""
     rows, alone = [], []
     for bench in benches:
         clean = learn(bench, bench.train, (*LEARNERS, STILL))
@@ -198,25 +188,21 @@ def measure_bar(benches: Sequence[Bench]) -> str:
             some = LEARNERS if title == first else (EM, PLAIN, VOTES, HARD)
             wrong = learn(bench, views, (*some, STILL))
             tell(bench, f"wrong masks {title}", wrong)
-            rows += [
-                [
-                    f"{bench.name}, {title}", name, points(clean[name].miou), points(run.miou),
-                    f"{lost(clean[name], run):.1f}", f"{clean[name].seconds:.1f}", f"{run.seconds:.1f}",
-                ]
-                for name, run in wrong.items()
-            ]  # fmt: skip
+            for name, miou in wrong.items():
+                figures = points(clean[name]), points(miou), lost(clean[name], miou)
+                rows.append([f"{bench.name}, {title}", name, *figures])
         alone += [[bench.name, *row] for row in measure_parts(bench, clean)]
-    header = ["masks", "learner", "true masks: mIoU", "wrong masks: mIoU", "points lost", "true: s", "wrong: s"]
+    header = ["masks", "learner", "true masks: mIoU", "wrong masks: mIoU", "points lost"]
     parts = ["scene", "error", "right pixels", EM, "points lost", STILL, PLAIN, VOTES]
     return BAR.format(table=markdown(header, rows), parts=markdown(parts, alone))
 
 
-def lost(clean: Run, wrong: Run) -> float:
+def lost(clean: float, wrong: float) -> str:
     """Tell how many points of mIoU wrong masks cost; no -0.0."""
-    return round(100 * (clean.miou - wrong.miou), 1) + 0.0
+    return f"{round(100 * (clean - wrong), 1) + 0.0:.1f}"
 
 
-def measure_parts(bench: Bench, clean: Mapping[str, Run]) -> Iterator[list[str]]:
+def measure_parts(bench: Bench, clean: Mapping[str, float]) -> Iterator[list[str]]:
     """Measure each part of the realistic errors alone."""
     whole = bench.realistic
     none = replace(whole, missed=0.0, swapped=0.0, edge_px=0)
@@ -230,16 +216,11 @@ def measure_parts(bench: Bench, clean: Mapping[str, Run]) -> Iterator[list[str]]
     }
     for title, errors in parts.items():
         views = corrupt_views(bench.train, 0, errors)
-        runs = learn(bench, views, (EM, STILL, PLAIN, VOTES))
-        tell(bench, title, runs)
-        share = np.mean(right_share(views, bench.train))
-        yield [
-            title,
-            points(share),
-            points(runs[EM].miou),
-            f"{lost(clean[EM], runs[EM]):.1f}",
-            *(points(runs[name].miou) for name in (STILL, PLAIN, VOTES)),
-        ]
+        mious = learn(bench, views, (EM, STILL, PLAIN, VOTES))
+        tell(bench, title, mious)
+        others = (points(mious[name]) for name in (STILL, PLAIN, VOTES))
+        share = float(np.mean(right_share(views, bench.train)))
+        yield [title, points(share), points(mious[EM]), lost(clean[EM], mious[EM]), *others]
 
 
 # Curves
@@ -255,43 +236,31 @@ def measure_curves(benches: Sequence[Bench], pictures: Path, aside: Path) -> str
         tell(bench, "curves, true masks", clean)
         rows = [curve_row("no errors", 0.0, 1.0, clean)]
         curves: dict[str, dict[str, list[tuple[float, float]]]] = {}
-        spent: dict[str, list[float]] = {name: [run.seconds] for name, run in clean.items()}
         for kind in STRONGEST:
-            curves[kind] = {name: [(0.0, run.miou)] for name, run in clean.items()}
+            curves[kind] = {name: [(0.0, miou)] for name, miou in clean.items()}
             for strength in bench.strengths:
                 errors = errors_at(kind, strength, missed_label=bench.missed_label, depth=depth)
                 views = corrupt_views(train, 0, *errors)
                 names = [name for name in LEARNERS if name != GRADIENT or strength in bench.gradient_strengths]
-                runs = learn(bench, views, names)
-                tell(bench, f"{kind} {strength:g}", runs)
-                rows.append(curve_row(kind, strength, float(np.mean(right_share(views, train))), runs))
-                for name, run in runs.items():
-                    curves[kind][name].append((strength, run.miou))
-                    spent[name].append(run.seconds)
+                mious = learn(bench, views, names)
+                tell(bench, f"{kind} {strength:g}", mious)
+                rows.append(curve_row(kind, strength, float(np.mean(right_share(views, train))), mious))
+                for name, miou in mious.items():
+                    curves[kind][name].append((strength, miou))
         plot = f"robustness_{bench.name.split()[0]}.svg"
         draw_panels(pictures / plot, curves, Axis("strength", 0, 1, 0.25), Axis("mIoU", 0, 1, 0.25))
         aside.mkdir(exist_ok=True)
-        (aside / f"robustness_{bench.name.split()[0]}.json").write_text(json.dumps({"mIoU": curves, "seconds": spent}))
-        seconds = {name: float(np.median(values)) for name, values in spent.items()}
+        (aside / f"robustness_{bench.name.split()[0]}.json").write_text(json.dumps({"mIoU": curves}))
         table = markdown(["error", "strength", "right pixels", *LEARNERS], rows)
-        texts.append(
-            CURVES.format(
-                title=bench.name.capitalize(),
-                views=len(train),
-                tests=len(bench.test),
-                plot=plot,
-                table=table,
-                seconds=markdown(list(seconds), [[f"{value:.1f}" for value in seconds.values()]]),
-                ratio=f"{seconds[EM] / seconds[PLAIN]:.1f}",
-            )
-        )
+        title = bench.name.capitalize()
+        texts.append(CURVES.format(title=title, views=len(train), tests=len(bench.test), plot=plot, table=table))
     kinds = markdown(["error", "strength 1"], [[kind, meaning] for kind, meaning in STRONGEST.items()])
     return f"## mIoU by kind and strength of error\n\n{kinds}\n\n" + "\n".join(texts)
 
 
-def curve_row(kind: str, strength: float, right: float, runs: Mapping[str, Run]) -> list[str]:
+def curve_row(kind: str, strength: float, right: float, mious: Mapping[str, float]) -> list[str]:
     """One line of the table."""
-    scores = [points(runs[name].miou) if name in runs else "" for name in LEARNERS]
+    scores = [points(mious[name]) if name in mious else "" for name in LEARNERS]
     return [kind, f"{strength:g}", points(right), *scores]
 
 
@@ -308,9 +277,7 @@ def measure_reliability(benches: Sequence[Bench], pictures: Path, aside: Path) -
         views = with_bad_frames(bench, 0)
         learner = taught(EM, bench, views)
         assert isinstance(learner, EMLearner)
-        start = time.perf_counter()
         checks = check_views(learner)
-        seconds = time.perf_counter() - start
         told = np.array([check.reliability for check in checks])
         true = np.array(right_share(views, bench.train))
         many = round(BAD_SHARE * len(views))
@@ -319,7 +286,6 @@ def measure_reliability(benches: Sequence[Bench], pictures: Path, aside: Path) -
         rows.append([
             bench.name, str(len(views)), f"{spearmanr(told, true).statistic:.3f}", f"{found} of {many}",
             f"{100 * error.mean():+.1f}", f"{100 * abs(error).mean():.1f}", f"{100 * abs(error).max():.1f}",
-            f"{seconds:.1f}",
         ])  # fmt: skip
         print(f"{bench.name}, reliability: {rows[-1]}", flush=True)
         plots[bench.name] = {"views": list(zip(true.tolist(), told.tolist(), strict=True))}
@@ -329,7 +295,7 @@ def measure_reliability(benches: Sequence[Bench], pictures: Path, aside: Path) -
         save_small(folder / "worst_views.png", draw_worst_views(images.rendered, learner.views, checks, 2))
     share = Axis("true share of right pixels", 0, 1, 0.25)
     draw_panels(pictures / "reliability.svg", plots, share, replace(share, name="reliability"), lines=False)
-    header = ["scene", "views", "rank correlation", "worst found", "bias", "mean error", "largest error", "seconds"]
+    header = ["scene", "views", "rank correlation", "worst found", "bias", "mean error", "largest error"]
     return RELIABILITY.format(table=markdown(header, rows))
 
 

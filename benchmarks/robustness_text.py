@@ -12,14 +12,14 @@ at a strength from 0 to 1. Learners see the wrong masks of train views only; ren
 scored against the true ones, without refinement (mIoU, as in [results.md](results.md)). "FlashSplat's rule" is votes
 made hard, on the same operator from the same views. The demo scene is the one of `make demo-local`: 30 views of 400 x
 300, 9 objects and a background, which missed objects become. The real one is Replica `apartment_0`: 105 views of 320 x
-320, 40 objects and no background; missed objects become what fills most of the view. One draw of errors per row.
+320, 40 objects and no background; missed objects become what fills most of the view. One draw of errors per row. What
+learning takes is in [BENCHMARK.md](../BENCHMARK.md); five scenes, one strength each, are in [regret.md](regret.md).
 """
 
 BAR = """## A quarter of the objects wrong
 
 15 % of the objects missed in every view and 10 % under another id of the view, edges off by up to 3 px; all train
-views. "As they came" are the wrong masks that lie beside the real scene; the others are drawn anew. Seconds are of
-learning, with the reading and preparing of the views.
+views. "As they came" are the wrong masks that lie beside the real scene; the others are drawn anew.
 
 {table}
 
@@ -37,11 +37,6 @@ Learnt from {views} views, scored on {tests}. Empty: not measured, since the gra
 ![mIoU by kind and strength of error](pictures/{plot})
 
 {table}
-
-Seconds of learning, median over all of these, with the reading and preparing of the views. Error models take {ratio}
-times the time of `em` without them.
-
-{seconds}
 """
 
 RELIABILITY = """## Which masks to trust
@@ -53,7 +48,7 @@ objects or more, all ids passed on, half of the objects missed or more, or the m
 beside its image.
 
 "Worst found": of the fifth of the views with the fewest right pixels, how many are among the fifth of the least
-reliable. Errors are of the reliability against the true share of right pixels, in points. Seconds are of the check.
+reliable. Errors are of the reliability against the true share of right pixels, in points.
 
 {table}
 
