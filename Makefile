@@ -29,9 +29,7 @@ export PIP_NO_COMPILE = 0
 # Both builders of the messages obey it; without it one of them compiles file after file.
 export CMAKE_BUILD_PARALLEL_LEVEL ?= $(shell nproc 2>/dev/null || echo 1)
 
-# Beside each other, threads of kernels that wait for work must leave the cores to the others: twice as fast. Those of
-# NumPy's matrix products cannot be told to, so there is one.
-run-tests run-fast-tests: export OMP_WAIT_POLICY = passive
+# Beside each other, threads of NumPy's matrix products that wait would take the cores from others, so there is one.
 run-tests run-fast-tests: export OPENBLAS_NUM_THREADS = 1
 # One thread for each worker's kernels takes a tenth less of the processor; `make test` runs with all threads.
 run-fast-tests: export NUMBA_NUM_THREADS = 1

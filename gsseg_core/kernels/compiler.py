@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from typing import Any, TypeVar, overload
 
@@ -9,6 +10,10 @@ import numba
 from numba.core.dispatcher import Dispatcher
 
 from gsseg_core.kernels import kernel_cache as _kernel_cache  # noqa: F401 - before any kernel is defined
+
+# Before the first kernel loads OpenMP: threads of kernels that wait for others must not spin. Where other programs use
+# the cores, too, those would wait for them: observing a view takes four to six times as long then.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 F = TypeVar("F", bound=Callable[..., object])
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -112,3 +115,18 @@ def test_numba_of_a_version_that_was_not_tried_compiles_in_its_own_way(
     made = other.kernel(parallel=True)(load().outer.py_func)(XS)
     assert np.array_equal(made, np.diff((2.5 * (XS + 1) - 1) ** 2))
     assert len(with_code) > 5  # wrappers of both loops, and all that they call
+
+
+@pytest.mark.parametrize(("told", "policy"), [({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "active"}, "ACTIVE")])
+def test_threads_that_wait_for_others_sleep_unless_the_user_says_otherwise(told: dict[str, str], policy: str) -> None:
+    program = (
+        "import numba, numpy as np; from gsseg_core.spatial.row_order import take_rows;"
+        "take_rows(np.zeros((9, 2)), np.arange(9)); print(numba.threading_layer())"
+    )
+    given = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    environment = {**given, "OMP_DISPLAY_ENV": "true", **told}
+    run = [sys.executable, "-c", program]
+    done = subprocess.run(run, env=environment, capture_output=True, text=True, check=True)
+    if done.stdout.strip() != "omp":
+        pytest.skip(f"threads are of numba's layer {done.stdout.strip()}, not of OpenMP")
+    assert f"OMP_WAIT_POLICY = '{policy}'" in done.stderr
