@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -20,6 +21,7 @@ from gsseg_core.objects.tree_growing import grow_tree
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
+from gsseg_core.several_at_once import several_at_once
 
 _EARLY_GRANULARITY = 0.5  # of the objects before all views were looked at together
 
@@ -90,13 +92,15 @@ class ObjectTable:
         `MaskSizeError` or `UnknownLabelError` where the mask is broken, of another size than the camera, or has ids
         beyond `MAX_LABEL`.
         """
-        lifted = self._lift(view)
-        if lifted is None:
-            return False
-        if view.name in self.views:
-            self.remove(view.name)
-        self.views[view.name], self._lifted[view.name] = replace(view, class_names=None), lifted
-        return True
+        return self._add(view, self._lift(view))
+
+    def add_all(self, views: Sequence[View], progress: Progress = silent) -> None:
+        """Add views, as `add` does; the error that one of them raises ends it."""
+        with closing(several_at_once(self._lift, views, self.device)) as lifted:
+            for done, view in enumerate(views):
+                progress("lift", done, len(views))
+                self._add(view, next(lifted))
+        progress("lift", len(views), len(views))
 
     def match(self, view: View) -> View:
         """Add a view, and give its ids the numbers of the objects so far; what nobody has seen yet is a new object.
@@ -252,6 +256,14 @@ class ObjectTable:
             return None
         return Lifted.of(observation, self.settings.kept).bordered(self.scene, operator, labels)
 
+    def _add(self, view: View, lifted: Lifted | None) -> bool:
+        if lifted is None:
+            return False
+        if view.name in self.views:
+            self.remove(view.name)
+        self.views[view.name], self._lifted[view.name] = replace(view, class_names=None), lifted
+        return True
+
     def _give(self, name: str, objects: np.ndarray) -> None:
         self._objects[name] = objects.astype(np.int32)
         self._largest = max(self._largest, int(objects.max(initial=0)))
@@ -304,9 +316,6 @@ def find_objects(
 ) -> ObjectTable:
     """Find the objects of all views whose masks can be used."""
     table = ObjectTable(scene, settings, device=device)
-    for done, view in enumerate(views):
-        progress("lift", done, len(views))
-        table.add(view)
-    progress("lift", len(views), len(views))
+    table.add_all(views, progress)
     table.solve(progress)
     return table

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import bench_ids
@@ -179,6 +180,17 @@ def test_no_view_one_view_and_views_without_evidence_are_no_special_case() -> No
     assert not table.add(View.from_arrays(away, np.ones((48, 64), np.int32)))
     assert table.add(empty) and table.solve().changed == [empty.name] and table.num_objects == 0
     assert (table.relabelled(unknown).read_labels() == UNKNOWN).all()
+
+
+def test_views_that_are_added_all_at_once_show_what_they_show_one_by_one() -> None:
+    views = [*map(shuffled, VIEWS), View(replace(VIEWS[0].camera, name="without a mask"))]
+    at_once, one_by_one = ObjectTable(SCENE), ObjectTable(SCENE)
+    at_once.add_all(views)
+    assert [one_by_one.add(view) for view in views] == [True] * len(VIEWS) + [False]
+    assert at_once.solve().changed == one_by_one.solve().changed
+    for view in views[:-1]:
+        first, second = (table.relabelled(view).read_labels() for table in (at_once, one_by_one))
+        np.testing.assert_array_equal(first, second)
 
 
 def test_a_view_of_which_labelled_pixels_see_no_gaussian_is_not_taken() -> None:
