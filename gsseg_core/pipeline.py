@@ -39,7 +39,7 @@ from gsseg_core.learn.prepared_views import default_budget
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.objects.object_table import ObjectTable, find_objects
 from gsseg_core.progress import Progress, Stopwatch, silent
-from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, list_if_scarce, spread_if_scarce
+from gsseg_core.refine.label_propagation import GraphSettings, propagate, scarce_evidence
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.report.findings import Evidence
 from gsseg_core.report.page import load_templates, write_report_page
@@ -48,6 +48,7 @@ from gsseg_core.report.sections import PageInputs
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_writers import DEFAULT as DEFAULT_FORMAT
 from gsseg_core.segmentation import Segmentation
+from gsseg_core.spatial.neighbour_graph import graph_of
 from gsseg_core.spatial.row_order import curve_order, inverse, reordered
 
 if TYPE_CHECKING:
@@ -184,14 +185,14 @@ def segment(
                 with watch.stage("associate"):
                     inputs = _associate(inputs, device, progress)
             run.claim(settings.places(inputs.class_names, inputs.pictured))
-            fitted = _learn(inputs, settings, client, watch, progress)
+            fitted, evidence = _learn(inputs, settings, client, watch, progress)
             assessment = _assess(fitted, inputs.class_names, watch, progress)
-        codes, evidence = fitted.codes_, fitted.evidence()
-        graph_settings = settings.graph if is_scarce(evidence) else None
+        codes, graph_settings = fitted.codes_, None if evidence is None else settings.graph
         settings = replace(settings, graph=graph_settings, learner_settings=getattr(fitted, "settings", None))
         del fitted  # Its votes take as much memory as all that follows.
         with watch.stage("refine"):
-            codes = spread_if_scarce(inputs.scene, codes, evidence) if settings.graph else codes
+            if evidence is not None:
+                codes = propagate(graph_of(inputs.scene), codes, evidence)
             result = Segmentation.from_codes(inputs.scene, codes, inputs.class_names, settings.refine, copy=False)
             del codes
         drawn: dict[str, Drawn] = {}
@@ -264,8 +265,8 @@ def _associate(inputs: Inputs, device: str, progress: Progress) -> Inputs:
 
 def _learn(
     inputs: Inputs, settings: RunSettings, client: Client | None, watch: Stopwatch, progress: Progress
-) -> Learner:
-    """Fit the learner that the settings name to the train views."""
+) -> tuple[Learner, np.ndarray | None]:
+    """Fit the learner that the settings name to the train views; beside it, (N,) px, evidence to spread codes by."""
     with watch.stage("observe"):
         learner = make_learner(
             settings.learner, inputs.scene, max(inputs.class_names) + 1, seed=settings.seed, device=settings.device,
@@ -273,8 +274,7 @@ def _learn(
         )  # fmt: skip
         learner.observe_all([view.smaller(QUALITIES[settings.quality]) for view in inputs.train], progress)
     with watch.stage("learn"):
-        if settings.graph:
-            list_if_scarce(inputs.scene, learner.evidence(), settings.refine.k)
+        evidence = scarce_evidence(inputs.scene, learner.evidence(), settings.refine.k) if settings.graph else None
         try:
             learner.fit(progress)
         except NoUsableViewsError as error:
@@ -282,7 +282,7 @@ def _learn(
             hint = FRAME_HINT if why == {SEES_NOTHING} else ""
             hint = mask_hint(inputs.root, settings.labels, names) if why == {NO_MASK} else hint
             raise NoUsableViewsError(f"{inputs.root}: {error}{hint}") from error
-    return learner
+    return learner, evidence
 
 
 def _assess(learner: Learner, class_names: Mapping[int, str], watch: Stopwatch, progress: Progress) -> Assessment:

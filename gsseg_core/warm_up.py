@@ -27,13 +27,14 @@ from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.objects.clicks import merge_tree
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu.occlusion import ray_ends
-from gsseg_core.refine.label_propagation import spread_if_scarce
+from gsseg_core.refine.label_propagation import propagate
 from gsseg_core.refine.settings import PAPER
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.harmonics_kernel import seen_colors
 from gsseg_core.scene.spherical_harmonics import basis
 from gsseg_core.segmentation import Segmentation
+from gsseg_core.spatial.neighbour_graph import graph_of
 from gsseg_core.spatial.row_order import curve_order, reordered
 
 FIRST_RUN = "compiling kernels, about a minute on two cores; only the first run after installing does this"
@@ -161,7 +162,7 @@ def refine_something(device: str = "cpu") -> None:
     merge_tree(labels[..., None])  # as for points in a view
     share = np.clip(0.5 + scene.means[:, 0], 0.05, 0.95)  # Unsure in the middle, where neighbours decide.
     codes = np.stack([1 - share, share], axis=1).astype(np.float32)
-    spread_if_scarce(scene, codes, np.zeros(len(codes)))
+    propagate(graph_of(scene), codes, np.zeros(len(codes)))
     result = Segmentation.from_codes(scene, codes, {0: "left", 1: "right"}, PAPER).carved(scene, [camera])
     operator = make_operator(scene, camera, device)
     result.render(operator)

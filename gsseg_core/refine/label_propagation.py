@@ -25,7 +25,7 @@ from gsseg_core.kernels.compiler import kernel
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.simd import LANES, add_scaled, apart, divided, empty_rows, load_row, nothing, prefetch, store_row
 from gsseg_core.spatial.knn import CHUNK
-from gsseg_core.spatial.neighbour_graph import NEIGHBOURS, Graph, graph_of
+from gsseg_core.spatial.neighbour_graph import NEIGHBOURS, Graph
 from gsseg_core.spatial.neighbourhood import list_nearest
 
 SETTLED = np.float32(1e-3)
@@ -63,15 +63,12 @@ def is_scarce(evidence: np.ndarray) -> bool:  # (N,) px
     return len(evidence) > 0 and float((evidence < GraphSettings.strength).mean()) > SCARCE
 
 
-def spread_if_scarce(scene: GaussianScene, codes: np.ndarray, evidence: np.ndarray) -> np.ndarray:  # (N, K), (N,) px
-    """Spread codes as `propagate` does, on the graph of a scene; the very same array where evidence is not scarce."""
-    return propagate(graph_of(scene), codes, evidence) if is_scarce(evidence) else codes
-
-
-def list_if_scarce(scene: GaussianScene, evidence: np.ndarray, k: int) -> None:  # (N,) px
-    """Have what the graph links found on the way where evidence is scarce, once the k nearest of all are looked for."""
-    if is_scarce(evidence):
-        list_nearest(scene, k, GraphSettings.k)
+def scarce_evidence(scene: GaussianScene, evidence: np.ndarray, k: int) -> np.ndarray | None:  # (N,) px
+    """Give evidence to `propagate` by, if it is scarce; then whoever looks for all k nearest lists the graph's, too."""
+    if not is_scarce(evidence):
+        return None
+    list_nearest(scene, k, GraphSettings.k)
+    return evidence
 
 
 def propagate(

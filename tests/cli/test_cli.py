@@ -17,6 +17,7 @@ from small_scenes import look_at, many_classes, write_dataset
 from gsseg_core.cli.arguments import build_parser
 from gsseg_core.cli.main import main
 from gsseg_core.data.label_images import read_mask, write_mask
+from gsseg_core.learn.learner import Learner
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 
@@ -88,6 +89,18 @@ def test_the_other_learners_and_settings_can_be_chosen(place: Path, learner: str
     assert report["views"]["used"] == 2 and report["gaussians"]["removed"] == 0
     assert report["settings"]["learner"] == learner
     assert report["settings"]["refine"]["k"] == 9 and report["settings"]["refine"]["beta"] == 0.5
+
+
+def test_what_was_seen_of_each_gaussian_is_summed_once_and_only_for_the_graph(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Learner] = []
+    evidence = Learner.evidence
+    monkeypatch.setattr(Learner, "evidence", lambda learner: asked.append(learner) or evidence(learner))
+    assert main(segment(place, "--learner", "votes")) == 0
+    assert len(asked) == 1
+    assert main(segment(place, "--learner", "votes", "--no-graph")) == 0
+    assert len(asked) == 1
 
 
 def test_views_without_use_are_skipped_and_counted(place: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from gsseg_core.data.view import View
 from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.learn.em.em_learner import EMLearner
-from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, list_if_scarce, propagate, spread_if_scarce
+from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, propagate, scarce_evidence
 from gsseg_core.spatial import neighbour_graph
 from gsseg_core.spatial.neighbour_graph import Graph, _median, graph_of
 from gsseg_core.spatial.neighbourhood import find_neighbours, take_lists
@@ -146,7 +146,7 @@ def test_the_graph_of_a_scene_is_built_once() -> None:
 def test_the_graph_takes_what_was_listed_when_all_neighbours_were_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, _ = small_scenes.balls_on_a_table()
     expected = graph_of(small_scenes.balls_on_a_table()[0])
-    list_if_scarce(scene, np.zeros(len(scene)), 30)
+    assert scarce_evidence(scene, np.zeros(len(scene)), 30) is not None
     find_neighbours(scene, 30)
     monkeypatch.setattr(neighbour_graph, "nearest", lambda *searched: pytest.fail("the points were searched again"))
     found = graph_of(scene)
@@ -157,26 +157,20 @@ def test_the_graph_takes_what_was_listed_when_all_neighbours_were_looked_for(mon
 
 def test_lists_of_another_length_are_none_for_the_graph() -> None:
     scene, _ = small_scenes.balls_on_a_table()
-    list_if_scarce(scene, np.zeros(len(scene)), 30)
+    assert scarce_evidence(scene, np.zeros(len(scene)), 30) is not None
     find_neighbours(scene, 30)
     assert take_lists(scene, 5) is None
     assert graph_of(scene, 5).indptr[-1] >= 5 * len(scene)
 
 
-def test_where_hardly_anything_is_scarce_codes_stay_and_no_graph_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_evidence_is_scarce_where_more_than_a_sixth_was_seen_with_less_than_a_pixel() -> None:
     scene, _ = small_scenes.balls_on_a_table()
-    codes, evidence = some_codes(count=len(scene))
-    evidence[:] = 2.0
-    evidence[: len(scene) // 7] = 0
-    assert not is_scarce(evidence)
-    monkeypatch.setattr(
-        "gsseg_core.refine.label_propagation.graph_of", lambda scene: pytest.fail("the graph was asked for")
-    )
-    assert spread_if_scarce(scene, codes, evidence) is codes
-    monkeypatch.undo()
-    evidence[: len(scene) // 5] = 0
-    assert is_scarce(evidence)
-    np.testing.assert_array_equal(spread_if_scarce(scene, codes, evidence), propagate(graph_of(scene), codes, evidence))
+    evidence = np.full(600, 2.0)
+    assert not is_scarce(evidence[:0])
+    evidence[:100] = 0
+    assert scarce_evidence(scene, evidence, 30) is None
+    evidence[100] = 0.9
+    assert scarce_evidence(scene, evidence, 30) is evidence
 
 
 def test_wrong_settings_and_shapes_are_refused() -> None:
