@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsseg_core.data.label_evidence import is_resolved
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.raster.observation import Observation
@@ -88,7 +89,8 @@ class GradientLearner(Learner):
     def fit(self, progress: Progress = silent) -> GradientLearner:
         """Run all epochs."""
         settings = self.settings
-        self._begin()
+        self._require_views()
+        self.observed_ = is_resolved(self._votes, self._possible())
         codes = torch.zeros((len(self.scene), self.num_classes), requires_grad=True)
         optimiser = torch.optim.Adam([codes], lr=settings.rate)
         steps = settings.epochs * len(self.views)

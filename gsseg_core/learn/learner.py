@@ -7,12 +7,12 @@ import threading
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing, suppress
+from contextlib import closing, nullcontext
 from typing import Any, TypeVar
 
 import numpy as np
 
-from gsseg_core.data.label_evidence import impute_probabilities, is_resolved
+from gsseg_core.data.label_evidence import impute_probabilities
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
@@ -94,8 +94,7 @@ class Learner(ABC):
         memory_budget = default_budget(device) if memory_budget is None else memory_budget
         if memory_budget < 0:
             raise SettingsError(f"memory_budget is {memory_budget} bytes; expected at least 0")
-        self.scene, self.num_classes, self.device = scene, num_classes, device
-        self.memory_budget = memory_budget
+        self.scene, self.num_classes, self.device, self.memory_budget = scene, num_classes, device, memory_budget
         self.views: dict[str, View] = {}
         self.rejected: dict[str, str] = {}
         self.history_: list[float] = []
@@ -126,19 +125,20 @@ class Learner(ABC):
         """
         if self.memory_budget == 0 and view.name not in self.views:
             try:
-                self._vote(view, 1)
+                sees = self._lift(view, self._read_usable(view), 1)
             except UnusableViewError as why:
                 return self._add(view, why)
-            return self._add(view, None)
+            return self._add(view, None if sees else UnusableViewError(SEES_NOTHING))
         return self._add(view, self._opened(view))
 
     def observe_all(self, views: Sequence[View], progress: Progress = silent) -> None:
         """Add views, as `observe` does; the error that one of them raises ends it."""
+        at_once = self.memory_budget == 0  # Then each view votes as it is lifted, and nothing is kept of it.
         opened = closing(several_at_once(self._opened, views, self.device))
-        with opened as each, vote_total(self._votes, self.device) as total:
+        with opened as each, nullcontext() if at_once else vote_total(self._votes, self.device) as total:
             for done, view in enumerate(views):
                 progress("observe", done, len(views))
-                if self.memory_budget == 0:
+                if at_once:
                     self.observe(view)
                 else:
                     self._add(view, next(each), total)
@@ -158,8 +158,7 @@ class Learner(ABC):
         if observation is not None:
             observation.vote(self._votes, UNITS, -1)
         else:
-            with suppress(UnusableViewError):  # It was moved to where it sees nothing.
-                self._vote(self.views[name], -1)
+            self._lift(self.views[name], self._read(self.views[name]), -1)
         self.forget(name)
 
     def forget(self, name: str) -> None:
@@ -167,11 +166,11 @@ class Learner(ABC):
         del self.views[name]
         self._prepared.drop(name)
 
-    def grow(self, num_classes: int) -> None:
-        """Have at least this many classes."""
-        if num_classes > self.num_classes:
-            self._votes = np.pad(self._votes, ((0, 0), (0, num_classes - self.num_classes)))
-            self.num_classes = num_classes
+    def resize(self, num_classes: int) -> None:
+        """Have this many classes; votes for classes that are no more are gone."""
+        if num_classes != self.num_classes:
+            added = max(num_classes - self.num_classes, 0)
+            self._votes, self.num_classes = np.pad(self._votes[:, :num_classes], ((0, 0), (0, added))), num_classes
 
     @property
     def loss(self) -> float:
@@ -281,7 +280,7 @@ class Learner(ABC):
         """Return a view with its mask, prepared; it is kept, in memory as far as the budget goes."""
         observation = self._prepared.get(name)
         if observation is None:
-            observation = self._prepare(self.views[name], self.views[name].read_seen())
+            observation = self._prepare(self.views[name], self._read(self.views[name]))
             self._prepared.keep(name, observation)
         return observation
 
@@ -289,12 +288,10 @@ class Learner(ABC):
         """Tell how many bytes of prepared views are kept, in memory and in the temporary file."""
         return self._prepared.nbytes
 
-    def _vote(self, view: View, sign: int) -> None:
-        """Add a view's votes, or take them away, and keep nothing of it."""
-        seen = self._read(view)
+    def _lift(self, view: View, seen: SeenLabels, sign: int) -> bool:
+        """Add a view's votes, or take them away, and keep nothing of it; tell whether it sees any Gaussian."""
         operator = self._operator_of(view)
-        if not operator.vote(*self._used_labels(seen, operator), self._votes, UNITS, sign):
-            raise UnusableViewError(SEES_NOTHING)
+        return operator.vote(*self._used_labels(seen, operator), self._votes, UNITS, sign)
 
     def _opened(self, view: View) -> Observation | UnusableViewError:
         """Prepare a view that is new; what is wrong with it is returned."""
@@ -337,14 +334,22 @@ class Learner(ABC):
                 yield name, next(made)
 
     def _open(self, view: View) -> Observation:
-        observation = self._prepare(view, self._read(view))
+        observation = self._prepare(view, self._read_usable(view))
         if not observation.num_pairs:
             raise UnusableViewError(SEES_NOTHING)
         return observation
 
-    def _read(self, view: View) -> SeenLabels:
+    def _read_usable(self, view: View) -> SeenLabels:
+        """Read the mask of a view that is new; raise `UnusableViewError` where it tells nothing."""
         if not view.has_mask:
             raise UnusableViewError(NO_MASK)
+        seen = self._read(view)
+        if not (seen.labels >= 0).any():
+            raise UnusableViewError(ALL_UNKNOWN)
+        return seen
+
+    def _read(self, view: View) -> SeenLabels:
+        """Read a mask; raise `UnknownLabelError` where it has labels beyond the classes, which have no votes."""
         seen = view.read_seen()
         largest = int(seen.labels.max()) if seen.evidence is None else seen.evidence.largest
         if largest >= self.num_classes:
@@ -352,8 +357,6 @@ class Learner(ABC):
                 f"{view.source}: mask holds the label {largest}; expected at most "
                 f"{self.num_classes - 1}, since there are {self.num_classes} classes"
             )
-        if not (seen.labels >= 0).any():
-            raise UnusableViewError(ALL_UNKNOWN)
         return seen
 
     def _operator_of(self, view: View) -> ViewOperator:
@@ -367,12 +370,11 @@ class Learner(ABC):
         """Turn a mask into the labels that are learnt from; here, as they are."""
         return seen
 
-    def _begin(self) -> None:
-        """Set `observed_`; without a view there is nothing to learn from."""
+    def _require_views(self) -> None:
+        """Raise `NoUsableViewsError` where there is no view to learn from."""
         if not self.views:
             reasons = ", ".join(f"{count} {why}" for why, count in self.reject_summary().items()) or "none was given"
             raise NoUsableViewsError(f"no view to learn from ({reasons}); expected posed views with label images")
-        self.observed_ = is_resolved(self._votes, self._possible())
 
     def _finish(self) -> None:
         """Clear codes without evidence, and impute those of Gaussians with votes only against classes."""

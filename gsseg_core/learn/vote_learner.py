@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
 from gsseg_core.data.view import View
-from gsseg_core.learn.learner import Learner, Progress, UnusableViewError, silent
+from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.scene.camera import Camera
 
 
@@ -22,7 +21,7 @@ class VoteLearner(Learner):
 
     def fit(self, progress: Progress = silent) -> VoteLearner:
         """Normalise the votes."""
-        self._begin()
+        self._require_views()
         self.codes_, self.converged_ = self.vote_codes(), True
         self.observed_ = np.asarray(self.codes_.any(axis=1))
         return self
@@ -30,13 +29,12 @@ class VoteLearner(Learner):
     def move(self, name: str, camera: Camera) -> None:
         """Have a view seen from another camera: its votes are taken back, and those from there are added.
 
-        A view that sees nothing of the scene from there stays, without votes.
+        A view that sees nothing of the scene from there stays, without votes. On any error, nothing has changed.
         """
         before = self.views[name]
-        after = replace(before, camera=camera)
-        for view, sign in ((before, -1), (after, 1)):
-            with suppress(UnusableViewError):
-                self._vote(view, sign)
+        after, seen = replace(before, camera=camera), self._read(before)
+        self._lift(after, seen, 1)
+        self._lift(before, seen, -1)
         self.views[name] = after
         self._prepared.drop(name)
 

@@ -11,7 +11,6 @@ import numpy as np
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import UnknownGroupError
-from gsseg_core.learn.learner import UNITS
 from gsseg_core.learn.learner_state import State
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.scene_change import SceneChange
@@ -89,13 +88,13 @@ class LivingVotes(VoteLearner):
         from_nothing = all_kept and 2 * len(lifted) > len(views)
         names = list(views) if from_nothing else lifted
         # Masks in memory cannot fail: they are read one at a time.
-        read = {name: views[name].read_seen() for name in names if not views[name].is_in_memory}
+        read = {name: self._read(views[name]) for name in names if not views[name].is_in_memory}
         if from_nothing:
             self._votes[:] = 0
         else:
-            self._lift(self.views, lifted, read, -1)
+            self._lift_all(self.views, lifted, read, -1)
         self._votes, self.living, self.scene = change.carry(self._votes), change.after, change.after.scene
-        self._lift(views, names, read, 1)
+        self._lift_all(views, names, read, 1)
         self.views = views
         for name in lifted:
             self._ends.pop(views[name], None)
@@ -112,12 +111,11 @@ class LivingVotes(VoteLearner):
 
         return ends if self.device == "cpu" else None
 
-    def _lift(self, views: Mapping[str, View], names: list[str], read: Mapping[str, SeenLabels], sign: int) -> None:
+    def _lift_all(self, views: Mapping[str, View], names: list[str], read: Mapping[str, SeenLabels], sign: int) -> None:
         # In the order of groups, so that the scene is brought into the frame of each but once.
         for name in sorted(names, key=lambda name: str(views[name].group)):
-            seen = read[name] if name in read else views[name].read_seen()
             # A view that sees nothing any more is kept: it may see what is added later.
-            self._operator_of(views[name]).vote(seen.labels, seen.evidence, self._votes, UNITS, sign)
+            self._lift(views[name], read[name] if name in read else self._read(views[name]), sign)
 
     def _joined(self, view: View, group: int | None) -> View:
         """Have a view belong to a group: it stays where it is in the scene, and from then on moves along."""

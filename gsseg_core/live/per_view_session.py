@@ -91,8 +91,8 @@ class PerViewSession(LiveSession):
             names = order if moved and forgotten else [name for name in order if name in set(repair.changed)]
             views = {name: self._table.relabelled(self._table.views[name]) for name in names}
             try:
-                for view in views.values():
-                    self._grow_for(view)
+                if views:  # All at once: if there is no room for all, there are no more classes than before.
+                    self._grow_for(max(views.values(), key=lambda view: view.largest_label))
             except GssegError:
                 undo()
                 raise

@@ -29,9 +29,6 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.spatial.neighbourhood import find_neighbours
 
-LIVE = "votes"
-"""Name of the learner that fuses views as they arrive."""
-
 
 class LiveSession:
     """Fuses views as they arrive, learns better class probabilities when asked, and segments at any time.
@@ -147,10 +144,14 @@ class LiveSession:
         with self._lock:
             if era is not None and era is not self._era:
                 return Rejection(SCENE_CHANGED, f"view '{view.name}': it came before all that was known was forgotten")
+            num_classes = self._live.num_classes
             try:
-                return self._fuse(view)
+                rejection = self._fuse(view)
             except GssegError as error:
-                return self.reject(Rejection.of(error))
+                rejection = self.reject(Rejection.of(error))
+            if rejection is not None:  # Nor do classes come with it.
+                self._live.resize(num_classes)
+            return rejection
 
     def _fuse(self, view: View) -> Rejection | None:
         self._grow_for(view)
@@ -220,7 +221,7 @@ class LiveSession:
                 raise NoUsableViewsError("all views were forgotten while they were learnt from; nothing was learnt")
             if dataset is not None and not self._declared:
                 self._names = names_with(dataset, self._names, fused=self.num_fused > 0)
-            self._live.grow(num_classes)
+            self._live.resize(max(num_classes, self._live.num_classes))
             outcome = replace(outcome, learnt=self._carried(outcome.learnt, scene))
             self._learnt = outcome.learnt
             self._cameras = [] if dataset is None else [view.camera for view in views]
@@ -330,7 +331,7 @@ class LiveSession:
                 self._names = {0: BACKGROUND_NAME, **state.class_names}
             self._forget()
             self._live.adopt(state)
-            self._live.grow(max(state.num_classes, len(self._names) if self._declared else 1))
+            self._live.resize(max(state.num_classes, max(self._names) + 1 if self._declared else 1))
             self.num_fused, self._learnt = state.num_fused, state.learnt
             self._drop_old_views()
         return state.learnt.num_views if state.learnt is not None else state.num_fused
@@ -374,7 +375,7 @@ class LiveSession:
         """Raise `StateFileError` if a state has too many classes, other names than were declared, or objects."""
         if state.per_view and not self._PER_VIEW:
             raise StateFileError(f"{path}: {OBJECTS_OF_ONE_SESSION}; expected classes, or a session with ids per-view")
-        most, why = (len(self._names), ", as were named") if self._declared else (self.max_classes, " (max_classes)")
+        most, why = (max(self._names) + 1, " (as named)") if self._declared else (self.max_classes, " (max_classes)")
         if state.num_classes > most:
             raise StateFileError(f"{path}: holds {state.num_classes} classes; expected at most {most}{why}")
         if self._declared:
@@ -389,11 +390,10 @@ class LiveSession:
         return learnt
 
     def _grow_for(self, view: View) -> None:
-        if self._declared or not view.has_mask or (needed := view.largest_label + 1) <= self._live.num_classes:
-            return
-        what = f"view '{view.name}': {self._LABEL}"
-        require_affordable(needed, self.max_classes, len(self.scene), what, self._REMEDY)
-        self._live.grow(needed)
+        if not self._declared and view.has_mask and (needed := view.largest_label + 1) > self._live.num_classes:
+            what = f"view '{view.name}': {self._LABEL}"
+            require_affordable(needed, self.max_classes, len(self.scene), what, self._REMEDY)
+            self._live.resize(needed)
 
     def _drop_old_views(self) -> None:
         while len(self._live.views) > self.max_views:

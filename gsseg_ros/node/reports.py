@@ -14,7 +14,7 @@ from std_msgs.msg import Header
 
 from gsseg_core.export.pictures import palette
 from gsseg_core.export.summary import gaussian_counts
-from gsseg_core.live.session import LIVE, LiveSession
+from gsseg_core.live.session import LiveSession
 from gsseg_core.objects.oriented_boxes import class_box
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -148,7 +148,7 @@ def report_message(
         num_background=background,
         num_unobserved=counts["unobserved"],
         num_removed=counts["removed"],
-        learner=LIVE if learnt is None else learnt.learner,
+        learner="votes" if learnt is None else learnt.learner,
         num_views=session.num_fused if learnt is None else learnt.num_views,
         num_views_rejected=sum(count for _, count in rejected),
         rejection_reasons=[reason for reason, _ in rejected],

@@ -65,7 +65,7 @@ def test_em_on_workers_equals_em_here_bit_for_bit(client: Any, errors: bool) -> 
 def test_votes_on_workers_equal_votes_here_as_views_come_and_go(client: Any) -> None:
     there, here = DistributedVotes(client, SCENE, NUM_CLASSES - 2), VoteLearner(SCENE, NUM_CLASSES - 2)
     for learner in (there, here):
-        learner.grow(NUM_CLASSES)
+        learner.resize(NUM_CLASSES)
         learner.observe_all(VIEWS[:4])
         assert learner.observe(VIEWS[5])
         learner.retract(VIEWS[1].name)

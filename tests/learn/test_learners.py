@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import tracemalloc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +19,8 @@ from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import MaskSizeError, NoUsableViewsError, SettingsError, UnknownLabelError
 from gsseg_core.learn import prepared_views
-from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.learn.em import em_learner
+from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.gradient_learner import GradientLearner
 from gsseg_core.learn.learner import VOTE_UNIT, Learner
 from gsseg_core.learn.mask_reliability import check_views
@@ -115,6 +118,52 @@ def test_nothing_is_asked_twice_of_a_view_that_is_in_the_file(monkeypatch: pytes
     learner.retract(VIEWS[0].name)
     answers = learner._prepared._answers
     assert not answers.holds(VIEWS[0].name) and answers.holds(VIEWS[1].name)
+
+
+def test_without_a_budget_views_vote_at_once_and_no_table_of_votes_is_made_for_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    kept = VoteLearner(SCENE, NUM_CLASSES)
+    kept.observe_all(VIEWS)
+    monkeypatch.setattr("gsseg_core.learn.learner.vote_total", lambda *_: pytest.fail("a table was made"))
+    passing = VoteLearner(SCENE, NUM_CLASSES, memory_budget=0)
+    passing.observe_all(VIEWS)
+    np.testing.assert_array_equal(passing._votes, kept._votes)
+
+
+def test_votes_of_classes_that_are_no_more_are_gone_and_the_others_stay() -> None:
+    learner = taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS)
+    before = learner._votes
+    learner.resize(NUM_CLASSES + 2)
+    assert learner._votes.shape == (len(SCENE), NUM_CLASSES + 2) and not learner._votes[:, NUM_CLASSES:].any()
+    learner.resize(NUM_CLASSES)
+    np.testing.assert_array_equal(learner._votes, before)
+    assert learner._votes.flags.c_contiguous and learner.num_classes == NUM_CLASSES
+
+
+def test_a_view_that_cannot_be_moved_keeps_its_votes_and_its_camera() -> None:
+    learner = taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS)
+    before, view = learner._votes.copy(), VIEWS[0]
+    with pytest.raises(MaskSizeError):
+        learner.move(view.name, replace(view.camera, width=view.camera.width - 1))
+    np.testing.assert_array_equal(learner._votes, before)
+    assert learner.views[view.name] is view
+
+
+@pytest.mark.parametrize("weight", [0.0, 3.0])
+def test_neighbours_are_looked_for_beside_a_gpu_if_the_prior_asks_for_them(
+    weight: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @contextmanager
+    def at_once(work: Callable[[], object], device: str) -> Iterator[None]:
+        work()
+        yield
+
+    found: list[object] = []
+    monkeypatch.setattr(em_learner, "meanwhile", at_once)
+    monkeypatch.setattr(em_learner, "find_neighbours", lambda scene, k: found.append(scene))
+    taught(EMLearner(SCENE, NUM_CLASSES, EMSettings(max_steps=1, prior_weight=weight)), VIEWS[:2]).fit()
+    assert len(found) == (weight > 0)
 
 
 @pytest.mark.parametrize("budget", [0, 1, 1 << 30])

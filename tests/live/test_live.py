@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +92,16 @@ def test_views_that_cannot_be_used_are_counted_by_reason_and_change_nothing() ->
     assert session.rejected == {"all_pixels_unknown": 70, "unknown_label": 70, "no_mask": 70}
     np.testing.assert_array_equal(session.codes(), before)
     assert session.class_names == names and session.num_fused == len(VIEWS)
+
+
+def test_a_view_that_is_refused_brings_no_class() -> None:
+    session = fed(LiveSession(SCENE))
+    names, shape = session.class_names, session.codes().shape
+    away = VIEWS[0].camera.world_to_camera.copy()
+    away[0, 3] += 1e4
+    unseen = blank(View(replace(VIEWS[0].camera, name="away", world_to_camera=away)), 200)
+    assert session.fuse(unseen).reason == "sees_no_Gaussian"  # type: ignore[union-attr]
+    assert session.class_names == names and session.codes().shape == shape
 
 
 def test_only_the_last_views_are_kept_and_no_vote_is_dropped() -> None:
@@ -294,6 +305,19 @@ def test_a_saved_session_comes_back_whole(tmp_path: Path) -> None:
     assert again.class_names == session.class_names and again.num_fused == 8 and again.num_views == 4
     np.testing.assert_array_equal(again.learn().learnt.codes, session.learn().learnt.codes)
     assert LiveSession(SCENE, NAMES).load(tmp_path / "state.npz") == 4
+
+
+def test_classes_whose_declared_ids_have_gaps_are_saved_loaded_and_go_on(tmp_path: Path) -> None:
+    gaps = {**NAMES, 9: "chair"}
+    session = fed(LiveSession(SCENE, gaps))
+    session.save(tmp_path / "state.npz")
+    fed(LiveSession(SCENE, NAMES)).save(tmp_path / "fewer.npz")
+    for name in ("state.npz", "fewer.npz"):
+        again = LiveSession(SCENE, gaps)
+        assert again.load(tmp_path / name) == len(VIEWS)
+        assert again.class_names == session.class_names
+        np.testing.assert_array_equal(again.codes(), session.codes())
+        assert again.fuse(blank(VIEWS[0], 9)) is None
 
 
 def test_a_state_that_does_not_fit_is_refused_and_changes_nothing(tmp_path: Path) -> None:

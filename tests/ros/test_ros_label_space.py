@@ -71,7 +71,7 @@ def test_label_info_names_the_classes_and_what_has_0_gets_the_next_id() -> None:
     node = Node()
     assert node.space.hear(ADE) and not node.space.hear(dict(ADE))
     assert node.classes([0, 1, 2, 3, 255, -1]) == [5, 1, 2, 3, -1, -1]
-    node.session._live.grow(6)
+    node.session._live.resize(6)
     assert node.session.class_names == {0: "background", 1: "floor", 2: "person", 3: "chair", 4: "armchair", 5: "wall"}
 
 

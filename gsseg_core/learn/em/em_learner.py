@@ -23,6 +23,7 @@ regions whose label the votes of all other views contradict lose it (`rejected_r
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from types import ModuleType
@@ -159,11 +160,6 @@ class EMLearner(Learner):
         return (EMSettings(max_steps=max_steps or EMSettings.max_steps),)
 
     @property
-    def n_iter_(self) -> int:
-        """Steps of `fit` in all."""
-        return len(self.history_)
-
-    @property
     def lower_bound_(self) -> float:
         """J per labelled pixel, in nats, before the last step: the last entry of `history_`."""
         return self.history_[-1] if self.history_ else float("nan")
@@ -176,10 +172,11 @@ class EMLearner(Learner):
     def fit(self, progress: Progress = silent) -> EMLearner:
         """Alternate E and M steps until a step can gain no more than the tolerance."""
         settings = self.settings
-        self._begin()
+        self._require_views()
         self._last_step = None
         votes, tick = CSRRows.from_dense(self._votes), partial(progress, "em", 0, settings.max_steps)
-        with meanwhile(partial(find_neighbours, self.scene, settings.prior_k), self.device):
+        search = partial(find_neighbours, self.scene, settings.prior_k)
+        with meanwhile(search, self.device) if settings.prior_weight else nullcontext():
             votes, rejected = self._reject_regions(votes, tick) if settings.rejects_regions else (votes, {})
         resolved = resolved_votes(votes, self._possible())
         some_against, self.observed_ = resolved is not votes, np.diff(resolved.indptr) > 0
