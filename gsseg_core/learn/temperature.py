@@ -37,6 +37,7 @@ RIGHT = 0.3
 OUTLIERS = 1e-3  # share of pixels that carry any label of the view by chance
 _PRECISION = 0.02  # of the logarithm of the temperature
 _TINY = 1e-12
+_SMALLEST = np.finfo(np.float32).tiny
 _ROWS = 1 << 16  # of which powers are taken at a time
 
 
@@ -67,12 +68,12 @@ def tempered(
 
 
 def _tempered(shares: np.ndarray, temperature: float) -> np.ndarray:
-    peak = shares.max(axis=-1, keepdims=True, initial=0)
-    powers: np.ndarray = np.divide(shares, peak, out=np.zeros(shares.shape, np.float32), where=shares > 0)
-    np.power(powers, np.float32(1 / temperature), out=powers, where=powers > 0)
-    total = powers.sum(axis=-1, keepdims=True)
-    known = shares.sum(axis=-1, keepdims=True)
-    powers *= np.divide(known, total, out=np.zeros_like(total), where=total > 0)
+    known, peak = np.einsum("...k->...", shares)[..., None], shares.max(axis=-1, keepdims=True, initial=0)
+    with np.errstate(divide="ignore"):  # The logarithm of 0, of which any power is 0 again.
+        powers = np.log(np.divide(shares, np.maximum(peak, _SMALLEST), dtype=np.float32))
+    powers /= np.float32(temperature)
+    np.exp(powers, out=powers)
+    powers *= known / np.maximum(np.einsum("...k->...", powers)[..., None], _SMALLEST)
     # Rounding may take the only class of a row above the whole, and the whole above 1.
     np.minimum(powers, np.minimum(known, 1), out=powers)
     return powers
@@ -160,10 +161,11 @@ def log_likelihood(sample: Sample, temperature: float) -> float:
     confusion[diagonal] += RIGHT
     confusion /= confusion.sum(axis=1, keepdims=True)
     for step in range(STEPS):
-        by_pixel = ((1 - OUTLIERS) * confusion.T)[column] * probabilities  # (P, C): this class, meant by this label
-        likelihood = np.maximum(by_pixel.sum(axis=1) + OUTLIERS / len(present), _TINY)
+        confusion *= 1 - OUTLIERS
+        likelihood = np.einsum("pk,pk->p", confusion.T[column], probabilities) + OUTLIERS / len(present)
+        likelihood = np.maximum(likelihood, _TINY)
         if step < STEPS - 1:
-            counts = np.add.reduceat(by_pixel / likelihood[:, None], first, axis=0).T
+            counts = confusion * np.add.reduceat(probabilities / likelihood[:, None], first, axis=0).T
             counts[diagonal] += right
             total = counts.sum(axis=1, keepdims=True)
             np.divide(counts, total, out=confusion, where=total > 0)
