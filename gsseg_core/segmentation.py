@@ -42,7 +42,7 @@ from gsseg_core.text import clipped
 T = TypeVar("T")
 
 UNOBSERVED, REMOVED = -1, -2
-"""Labels of Gaussians that no view spoke for, and of those that the filter took out."""
+"""Labels of Gaussians of which nothing is known, and of those that the filter or carving took out."""
 
 FORMAT = "gsseg-segmentation-1"
 

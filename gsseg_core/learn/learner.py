@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -15,7 +14,7 @@ import numpy as np
 from gsseg_core.data.label_evidence import impute_probabilities
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
-from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
+from gsseg_core.errors import NoUsableViewsError, SettingsError, UnknownLabelError
 from gsseg_core.learn.em.em_kernels import normalise_votes, weigh_votes
 from gsseg_core.learn.learner_state import State
 from gsseg_core.learn.prepared_views import PreparedViews, default_budget
@@ -133,12 +132,12 @@ class Learner(ABC):
 
     def observe_all(self, views: Sequence[View], progress: Progress = silent) -> None:
         """Add views, as `observe` does; the error that one of them raises ends it."""
-        at_once = self.memory_budget == 0  # Then each view votes as it is lifted, and nothing is kept of it.
+        keeps_nothing = self.memory_budget == 0  # Then each view votes as it is lifted.
         opened = closing(several_at_once(self._opened, views, self.device))
-        with opened as each, nullcontext() if at_once else vote_total(self._votes, self.device) as total:
+        with opened as each, nullcontext() if keeps_nothing else vote_total(self._votes, self.device) as total:
             for done, view in enumerate(views):
                 progress("observe", done, len(views))
-                if at_once:
+                if keeps_nothing:
                     self.observe(view)
                 else:
                     self._add(view, next(each), total)
@@ -213,34 +212,9 @@ class Learner(ABC):
         """Share of a view's labelled pixels whose label `fit` has not used, in [0, 1]."""
         return 0.0
 
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Save the views, with their masks and votes, atomically. The scene itself is not in the file.
-
-        Raises
-        ------
-        WriteError
-            The file cannot be written; an earlier one is unchanged.
-        """
-        self.state().save(path, self.scene.digest)
-
     def state(self) -> State:
         """Return a copy of votes and views, to be saved."""
         return State(self._votes.copy(), list(self.views.values()), len(self.views))
-
-    def restore(self, path: str | os.PathLike[str]) -> None:
-        """Replace the views by those of a saved state; on any error nothing changes.
-
-        Raises
-        ------
-        StateFileError
-            The file is missing or broken.
-        StateMismatchError
-            It was saved for another scene or another number of classes.
-        """
-        state = State.load(path, self.scene.digest, len(self.scene))
-        if state.votes.shape[1] != self.num_classes:
-            raise StateMismatchError(f"{path}: holds {state.votes.shape[1]} classes; expected {self.num_classes}")
-        self.adopt(state)
 
     def adopt(self, state: State) -> None:
         """Replace views, votes and number of classes by those of a state of the same scene."""

@@ -212,10 +212,13 @@ class LivingSession(LiveSession):
     def _posed_views(self) -> list[View]:
         return [self._live.in_scene(view) for view in self._live.views.values()]
 
-    def _carried(self, learnt: Learnt, scene: GaussianScene) -> Learnt:
-        if scene is self.scene:
-            return learnt
-        return replace(learnt, codes=carried(learnt.codes, self._past[scene]))
+    def _carrier(self) -> Callable[[Learnt], Learnt]:
+        scene = self.scene
+
+        def carry(learnt: Learnt) -> Learnt:
+            return learnt if scene is self.scene else replace(learnt, codes=carried(learnt.codes, self._past[scene]))
+
+        return carry
 
     def _read_state(self, path: Path, within: Path | None) -> State:
         state = State.load(path, self.scene.digest, len(self.scene), within, self._first)

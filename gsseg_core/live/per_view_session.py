@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, SettingsError
-from gsseg_core.learn.learner_state import State
+from gsseg_core.learn.learner_state import Learnt, State
 from gsseg_core.live.results import Outcome, Rejection
 from gsseg_core.live.session import LiveSession
 from gsseg_core.objects.object_table import ObjectTable, Repair, object_name
@@ -105,8 +106,9 @@ class PerViewSession(LiveSession):
                 self._live.observe(view)
             # The oldest view still is the first one to go.
             self._live.views = {name: self._live.views[name] for name in every if name in self._live.views}
-            if self._learnt is not None and moved:
-                self._learnt = replace(self._learnt, codes=_renumber(self._learnt.codes, repair.successors))
+            if moved:
+                self._repairs.append(repair.successors)
+                self._learnt = self._learnt and _renumbered(self._learnt, repair.successors)
             self._version += 1
         return repair
 
@@ -158,11 +160,20 @@ class PerViewSession(LiveSession):
         super()._forget()
         self._table = ObjectTable(self.scene, device=self.device)
         self._with_tree = None
+        self._repairs: list[np.ndarray] = []  # successors of each repair that gave objects other numbers
+
+    def _carrier(self) -> Callable[[Learnt], Learnt]:
+        repaired = len(self._repairs)
+        return lambda learnt: reduce(_renumbered, self._repairs[repaired:], learnt)
 
     def _drop_old_views(self) -> None:
         super()._drop_old_views()
         for name in [name for name in self._table.views if name not in self._live.views]:
             self._table.forget(name)
+
+
+def _renumbered(learnt: Learnt, successors: np.ndarray) -> Learnt:
+    return replace(learnt, codes=_renumber(learnt.codes, successors))
 
 
 def _renumber(columns: np.ndarray, successors: np.ndarray) -> np.ndarray:

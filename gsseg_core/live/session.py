@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from weakref import WeakKeyDictionary
@@ -208,6 +208,7 @@ class LiveSession:
         """
         with self._lock:
             views, num_classes, era, scene = self._posed_views(), self._live.num_classes, self._era, self.scene
+            carried = self._carrier()
         if dataset is not None:
             views = dataset.views("train")
             check_names_of(dataset, self._names if self._declared or self.num_fused else {})
@@ -222,11 +223,10 @@ class LiveSession:
             if dataset is not None and not self._declared:
                 self._names = names_with(dataset, self._names, fused=self.num_fused > 0)
             self._live.resize(max(num_classes, self._live.num_classes))
-            outcome = replace(outcome, learnt=self._carried(outcome.learnt, scene))
-            self._learnt = outcome.learnt
+            self._learnt = learnt = carried(outcome.learnt)
             self._cameras = [] if dataset is None else [view.camera for view in views]
             self._version += 1
-        return outcome
+        return replace(outcome, learnt=learnt)
 
     def codes(self) -> np.ndarray:
         """Class probabilities of every Gaussian as they are now, (N, K) float32; a row of zeros where nothing is known.
@@ -385,9 +385,9 @@ class LiveSession:
         """List the views that are kept, posed in the scene as it is now."""
         return list(self._live.views.values())
 
-    def _carried(self, learnt: Learnt, scene: GaussianScene) -> Learnt:
-        """Carry what was learnt of the scene as it was over to the scene as it is."""
-        return learnt
+    def _carrier(self) -> Callable[[Learnt], Learnt]:
+        """Return what will carry over to the session as it is then what has been learnt of it as it is now."""
+        return lambda learnt: learnt
 
     def _grow_for(self, view: View) -> None:
         if not self._declared and view.has_mask and (needed := view.largest_label + 1) > self._live.num_classes:

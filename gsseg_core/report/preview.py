@@ -23,7 +23,7 @@ RECORD = np.dtype(
         ("color", "u1", 3), ("confidence", "u1"),
     ]
 )  # fmt: skip
-"""A Gaussian as report_page.js reads it; 0 to the largest number of each type stands for the range in the header."""
+"""A Gaussian as `page.js` reads it; 0 to the largest number of each type stands for the range in the header."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -102,6 +102,30 @@ def test_a_repair_keeps_the_calibration_of_what_was_learnt() -> None:
     assert session.learnt is not None and (session.learnt.temperature, session.learnt.num_views) == (1.7, 5)
 
 
+def test_objects_that_are_repaired_while_they_are_learnt_keep_what_was_learnt_of_them() -> None:
+    halves, others = [in_halves(view, 1) for view in VIEWS[:2]], VIEWS[2:]
+    session, after = PerViewSession(SCENE), PerViewSession(SCENE)
+    for each in (session, after):
+        for view in halves:
+            assert each.fuse(view) is None
+
+    def come(each: PerViewSession) -> np.ndarray:
+        for view in others:
+            assert each.fuse(view) is None
+        return each.repair().successors
+
+    def while_learning(stage: str, *_: object) -> None:
+        if session.num_fused == len(halves):
+            successors = come(session)
+            assert (successors != np.arange(len(successors))).any(), "two halves have become one object"
+
+    session.learn("votes", report=while_learning)
+    after.learn("votes")
+    come(after)
+    assert session.learnt is not None and after.learnt is not None
+    np.testing.assert_array_equal(session.learnt.codes, after.learnt.codes)
+
+
 def test_in_a_live_session_a_view_of_a_name_that_is_kept_takes_its_place() -> None:
     session = PerViewSession(SCENE)
     for view in VIEWS[:5]:

@@ -343,7 +343,7 @@ class EMLearner(Learner):
             return ErrorModel.from_counts(evidence, counts, settings.error_prior, outliers, observation.areas)
 
         models = dict(self._of_each(estimate, names, tick))
-        return {name: models[name] for name in (self.views if names is None else names) if name in models}
+        return {name: models[name] for name in (self.views if names is None else names)}
 
     def _e_step(self, codes: CSRRows, models: dict[str, ErrorModel], tick: Tick) -> tuple[np.ndarray, dict[str, float]]:
         """Sum over the views of these models the gradient of the log-likelihood.
@@ -383,7 +383,7 @@ class EMLearner(Learner):
             shares = on_device.shares(observation, said, likelihood[:, 0])
             counts = on_device.confusion_counts(without, pairs, shares.pairs, self.num_classes, len(likelihood))
             counts[0] += shares.rest
-            # What was gone through of each label speaks for all of it.
+            # Only some pixels of each label were gone through: they count for all of them.
             counts *= observation.areas / np.maximum(observation.weighted_areas, 1)
             model.m_step(model.expected_counts(counts))
 
