@@ -328,7 +328,8 @@ class Segmentation:
 
     @cached_property
     def _blended(self) -> tuple[CSRRows, bool]:
-        codes = tempered(self.probabilities, 1 / self.temperature).copy()
+        codes = tempered(self.probabilities, 1 / self.temperature)
+        codes = codes.copy() if codes is self.probabilities else codes
         codes[self.clustered] = np.where(self.learnt.any(axis=1, keepdims=True), self.learnt, codes[self.clustered])
         return CSRRows.from_dense(codes), bool(codes[:, 0].any())
 

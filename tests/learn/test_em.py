@@ -287,15 +287,15 @@ def test_the_error_model_tells_which_object_was_swapped_in_which_view() -> None:
     for view in views:
         model = models[view.name]
         np.testing.assert_allclose(model.confusion.sum(axis=1), 1, atol=1e-5)
-        seen_as = model.classes[model.confusion[1].argmax()]
+        seen_as = model.evidence.vocabulary[model.confusion[1].argmax()]
         assert seen_as == (3 if view is views[2] else 1)
-        assert model.classes[model.confusion[2].argmax()] == 2
+        assert model.evidence.vocabulary[model.confusion[2].argmax()] == 2
 
 
 def test_without_the_error_model_every_mask_is_taken_at_its_word() -> None:
     learner = taught(EMLearner(SCENE, NUM_CLASSES, EMSettings(errors=False)), wrong_views(4)).fit()
     for model in learner.error_models_.values():
-        np.testing.assert_array_equal(model.confusion, np.eye(NUM_CLASSES)[:, model.classes])
+        np.testing.assert_array_equal(model.confusion, np.eye(NUM_CLASSES)[:, model.evidence.vocabulary])
 
 
 def test_the_order_of_the_gaussians_does_not_matter() -> None:

@@ -19,7 +19,7 @@ from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import MaskSizeError, NoUsableViewsError, SettingsError, UnknownLabelError
 from gsseg_core.learn import prepared_views
-from gsseg_core.learn.em import em_learner
+from gsseg_core.learn.em import em_learner, spatial_prior
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.gradient_learner import GradientLearner
 from gsseg_core.learn.learner import VOTE_UNIT, Learner
@@ -162,6 +162,8 @@ def test_neighbours_are_looked_for_beside_a_gpu_if_the_prior_asks_for_them(
     found: list[object] = []
     monkeypatch.setattr(em_learner, "meanwhile", at_once)
     monkeypatch.setattr(em_learner, "find_neighbours", lambda scene, k: found.append(scene))
+    if not weight:
+        monkeypatch.setattr(spatial_prior, "neighbours_of", lambda *_: pytest.fail("a tree was built"))
     taught(EMLearner(SCENE, NUM_CLASSES, EMSettings(max_steps=1, prior_weight=weight)), VIEWS[:2]).fit()
     assert len(found) == (weight > 0)
 

@@ -153,7 +153,7 @@ def test_a_region_without_its_label_still_tells_what_its_pixels_are() -> None:
     learner = taught(EMLearner(SCENE, NUM_CLASSES), views).fit()
     model = learner.error_models_[views[2].name]
     assert model.evidence.nameless is not None and model.evidence.nameless.sum() == 1
-    (word,) = np.flatnonzero(model.classes == UNKNOWN)
+    (word,) = np.flatnonzero(model.evidence.vocabulary == UNKNOWN)
     assert model.confusion[1].argmax() == word
     assert model.confusion[:, word].argmax() == 1
     np.testing.assert_allclose(model.confusion.sum(axis=1), 1, atol=1e-5)

@@ -211,7 +211,7 @@ def test_error_models_of_partial_masks_take_none_of_these_for_the_right_word() -
     views = [partial(v, 1, 2) for v in clean_views(4)] + clean_views(4, "full", 0.5)
     learner = taught(EMLearner(SCENE, NUM_CLASSES), views).fit()
     model = learner.error_models_["view0"]
-    assert model.classes.tolist() == [1, 2, UNKNOWN]
+    assert model.evidence.vocabulary.tolist() == [1, 2, UNKNOWN]
     np.testing.assert_allclose(model.confusion.sum(axis=1), 1, atol=1e-5)
     assert model.confusion[[0, 1, 2, 3], [2, 0, 1, 2]].min() > 0.8
     np.testing.assert_allclose(model.likelihood.sum(axis=1), 1, atol=1e-5)

@@ -21,7 +21,7 @@ class ErrorModel:
     """Probability of each label of one view's mask given the true class."""
 
     evidence: LabelEvidence  # of the L labels that occur in the view's mask, in a vocabulary of W words
-    confusion: np.ndarray  # (K, W) float32: R_v; rows are true classes, columns the words seen; rows sum to 1
+    confusion: np.ndarray  # (K, W) float32: R_v; rows, true classes, sum to 1; columns are `evidence.vocabulary`
     pseudo_counts: np.ndarray  # (T,) float64: a_v, px added to the count of the correct word of each class that has one
     outliers: float  # share of pixels labelled by chance
     areas: np.ndarray  # (L,) px with each label
@@ -61,14 +61,9 @@ class ErrorModel:
         return int(self.areas[self.evidence.informative & (self.evidence.named() != UNKNOWN)].sum())
 
     @property
-    def classes(self) -> np.ndarray:
-        """Words of the confusion matrix's columns, (W,) int32; `UNKNOWN` (-1), the last, is "none of these"."""
-        return self.evidence.vocabulary
-
-    @property
     def likelihood(self) -> np.ndarray:
         """C_v: probability of each label given the class, (K, L) float32."""
-        words: np.ndarray = (1 - self.outliers) * self.confusion + np.float32(self.outliers / len(self.classes))
+        words: np.ndarray = (1 - self.outliers) * self.confusion + np.float32(self.outliers / self.confusion.shape[1])
         plausible = self.evidence.word_plausibility
         return words if plausible is None else np.asarray(words @ plausible.T)
 

@@ -27,8 +27,8 @@ def spatial_prior(
         Of each class, N rows, in any unit: votes of at least 0, or probabilities.
     observed : (N,) bool
     """
-    neighbours = neighbours_of(scene, k)
-    if neighbours is None or weight == 0:
+    neighbours = neighbours_of(scene, k) if weight else None
+    if neighbours is None:
         return CSRRows(np.zeros_like(shares.indptr), np.empty(0, np.uint32), np.empty(0, np.float32))
     mean = neighbours.mean_codes(shares.with_data(shares.data.astype(np.float32)).normalised(), observed, num_classes)
     mean = mean.normalised()
