@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -46,19 +47,20 @@ def test_soft_and_partial_masks_on_workers_give_the_same_bit_for_bit(client: Any
     assert_same(there, taught(here, views))
 
 
-def with_a_useless_one() -> list[View]:
-    return [*VIEWS[:3], View.from_arrays(VIEWS[3].camera, np.full((48, 64), -1, np.int32)), *VIEWS[4:]]
+def with_useless_ones() -> list[View]:
+    unknown = View.from_arrays(VIEWS[3].camera, np.full((48, 64), -1, np.int32))
+    return [*VIEWS[:3], unknown, *VIEWS[4:], View(replace(VIEWS[3].camera, name="without a mask"))]
 
 
 @pytest.mark.parametrize("errors", [True, False])
 def test_em_on_workers_equals_em_here_bit_for_bit(client: Any, errors: bool) -> None:
     settings = EMSettings(errors=errors)
     there = DistributedEM(client, SCENE, NUM_CLASSES, settings)
-    there.observe_all(with_a_useless_one())
+    there.observe_all(with_useless_ones())
     here = EMLearner(SCENE, NUM_CLASSES, settings)
-    here.observe_all(with_a_useless_one())
+    here.observe_all(with_useless_ones())
     assert_same(there, here)
-    assert there.reject_summary() == {"all pixels unknown": 1}
+    assert there.rejected == here.rejected and there.reject_summary() == {"all pixels unknown": 1, "no mask": 1}
     assert (there.error_models_[VIEWS[4].name].evidence.nameless is not None) == errors  # the clutter
 
 

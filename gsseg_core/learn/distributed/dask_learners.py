@@ -268,13 +268,13 @@ class DistributedEM(_OnWorkers, EMLearner):
 
 def _by_path(view: View) -> tuple[View, str | None]:
     """Make a view of which a worker reads the mask from its own files, if they are the same; its digest tells."""
-    if view.mask_path is None or view.mask_path.is_dir():  # A folder has no digest, so what it holds is sent.
-        return _packed(view)
-    return replace(view, mask_path=view.mask_path.resolve()), digest_of(view.mask_path)
+    if view.mask_path is not None and (digest := digest_of(view.mask_path)) is not None:
+        return replace(view, mask_path=view.mask_path.resolve()), digest
+    return _packed(view)  # A folder has no digest, so what it holds is sent.
 
 
 def _packed(view: View) -> tuple[View, None]:
-    """Make a view that has its mask with it."""
-    if view.is_in_memory:
+    """Make a view that has its mask with it, if there is one."""
+    if view.is_in_memory or not view.has_mask:
         return view, None
     return View.from_seen(view.camera, view.read_seen(), view.class_names), None
