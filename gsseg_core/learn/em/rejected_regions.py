@@ -16,7 +16,7 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import SeenLabels
-from gsseg_core.kernels.compiler import kernel
+from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.learn.em.pair_kernels import kernels_on
 from gsseg_core.raster.observation import Observation
 
@@ -124,7 +124,7 @@ def connected_pixels(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
     return connected, first[:count].copy(), area
 
 
-@kernel
+@called_by_kernels
 def _root(parent: np.ndarray, i: int) -> int:
     while parent[i] != i:
         parent[i] = parent[parent[i]]
