@@ -93,10 +93,6 @@ class ObjectTree:
         at = _climbed(np.where((nodes >= self.num_classes) & (self.parents >= 0), self.parents, nodes))
         return np.where(at < self.num_classes, at, -1).astype(np.int32)
 
-    def class_of(self, node: int) -> int:
-        """Class that a node is, or is inside of; -1 for a whole."""
-        return int(self._classes[node])
-
     def kind(self, node: int) -> str:
         """`PART`, `OBJECT` or `WHOLE`."""
         return OBJECT if node < self.num_classes else PART if self._classes[node] >= 0 else WHOLE

@@ -36,7 +36,7 @@ def test_a_node_has_parts_a_whole_a_kind_and_a_name() -> None:
     assert [cups.kind(node) for node in range(7)] == [OBJECT] * 4 + [PART] * 2 + [WHOLE]
     assert cups.parts(1) == [4, 5] and cups.parts(6) == [1, 2] and cups.parts(3) == []
     assert cups.whole(4) == 1 and cups.whole(1) == 6 and cups.whole(6) is None
-    assert cups.class_of(5) == 1 and cups.class_of(6) == -1
+    assert cups._classes[5] == 1 and cups._classes[6] == -1
     assert cups.names(NAMES) == {**NAMES, 4: "mug.1", 5: "mug.2", 6: "whole_001"}
     sizes = cups.sizes(np.array([0, 1, 1, 1, 2, 3, -1], np.int32))
     assert cups.inside(6) == [1, 4, 5, 2] and sizes.tolist() == [1, 3, 1, 1, 2, 1, 4]
@@ -126,7 +126,7 @@ def test_every_level_is_a_union_of_what_a_finer_one_has(tree: ObjectTree, one: f
 
 @given(trees())
 def test_the_level_of_the_objects_is_the_objects_and_each_granularity_cuts_otherwise(tree: ObjectTree) -> None:
-    classes = np.array([tree.class_of(leaf) for leaf in tree.leaves.tolist()])
+    classes = tree._classes[tree.leaves]
     np.testing.assert_array_equal(tree.cut(tree.level)[tree.leaves], classes)
     cuts = [tuple(tree.cut(g).tolist()) for g in tree.granularities]
     assert len(set(cuts)) == len(cuts) and list(tree.granularities) == sorted(tree.granularities)
@@ -136,7 +136,7 @@ def test_the_level_of_the_objects_is_the_objects_and_each_granularity_cuts_other
 
 @given(trees(), st.floats(0, 1))
 def test_shares_keep_their_sum_and_labels_are_their_nodes(tree: ObjectTree, granularity: float) -> None:
-    classes = np.array([tree.class_of(leaf) for leaf in tree.leaves.tolist()], np.int32)
+    classes = tree._classes[tree.leaves]
     shares = np.eye(tree.num_classes, dtype=np.float32)[classes]
     at, nodes = tree.shares_at(granularity, shares, tree.leaves)
     np.testing.assert_allclose(at.sum(axis=1), 1)

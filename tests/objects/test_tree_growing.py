@@ -158,7 +158,7 @@ def test_the_command_writes_the_level_that_is_asked_for_and_keeps_the_objects(tm
     assert (
         result.tree is not None
         and sum(names[part]["gaussians"] for part in parts)
-        == (result.counts()[result.tree.class_of(names[parts[0]]["id"])])
+        == (result.counts()[result.tree._classes[names[parts[0]]["id"]]])
     )
     left = tmp_path / "left.ply"
     assert main(["remove", f"{data}/scene.ply", "--segmentation", f"{tmp_path}/out/segmentation.npz",
