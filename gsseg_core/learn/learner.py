@@ -194,18 +194,14 @@ class Learner(ABC):
         """
         return self._blend_codes(self.codes_, view)
 
-    def classes_without(self, view: View, wanted: np.ndarray | None = None) -> np.ndarray:
-        """Tell the class of each pixel of a view by `predict_without`, (H, W) int32; `UNKNOWN` where little is known.
-
-        That is, where most of a ray ends on Gaussians that only this view has seen. If only some pixels with a label
-        are `wanted`, (H, W) bool, others may have any class, and it takes less time.
-        """
-        return self.strongest_without(view, wanted).labels()
-
     def strongest_without(
         self, view: View, wanted: np.ndarray | None = None, grid: PixelGrid | None = None
     ) -> Strongest:  # fmt: skip
-        """Tell the same, and the probabilities of the pixels of a grid, as far as they are wanted."""
+        """Tell the class of each pixel of a view by `predict_without`, and the probabilities of the pixels of a grid.
+
+        Little is known where most of a ray ends on Gaussians that only this view has seen. If only some pixels with a
+        label are `wanted`, (H, W) bool, others may have any class and probabilities, and it takes less time.
+        """
         return Strongest.of(self.predict_without(view, wanted is not None), grid)
 
     def rejected_share(self, view: View) -> float:

@@ -145,7 +145,7 @@ class MaskChecker:
         learner, seen = self.learner, view.read_seen()
         wanted = _compared(seen.labels)
         sampled = view.name in self._sampled
-        predicted = self._predict(view, seen, wanted) if sampled else learner.classes_without(view, wanted)
+        predicted = self._predict(view, seen, wanted) if sampled else learner.strongest_without(view, wanted).labels()
         predicted[~wanted] = UNKNOWN
         check = compare_mask(view, predicted, learner.num_classes, seen)
         return replace(check, rejected=learner.rejected_share(view))
@@ -153,7 +153,7 @@ class MaskChecker:
     def _everywhere(self, view: View) -> PackedLabels:
         """Tell the class of each pixel of a view that is shown, also where nothing is compared."""
         labelled = view.read_seen().labels >= 0
-        return PackedLabels(self.learner.classes_without(view, labelled if labelled.all() else None))
+        return PackedLabels(self.learner.strongest_without(view, labelled if labelled.all() else None).labels())
 
     def _predict(self, view: View, seen: SeenLabels, wanted: np.ndarray) -> np.ndarray:  # (H, W) bool
         """Tell the class of each pixel that is compared, (H, W) int32, and keep the probabilities of some."""
