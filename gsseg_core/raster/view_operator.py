@@ -28,7 +28,7 @@ class ViewOperator(ViewRenderer):
     w[p, i] = alpha_i(p) * prod over nearer j of (1 - alpha_j(p)), as 3DGS blends colours (Kerbl et al. 2023, eq. 3).
     A row of W sums to 1 minus the ray's final transmittance.
 
-    Its `ids` are nearest first; all other Gaussians have a column of zeros.
+    Its `ids` come in an order of its own; all other Gaussians have a column of zeros.
     """
 
     def adjoint(self, residual: np.ndarray) -> np.ndarray:

@@ -225,11 +225,10 @@ def test_alpha_below_one_in_255_counts_as_zero_and_alpha_is_at_most_099(backend)
 # What the interface says
 
 
-def test_ids_and_listed_weights_are_nearest_first(backend):
+def test_listed_weights_are_nearest_first(backend):
     scene, camera = random_view(5)
     operator = backend.make(scene, camera)
     _, depth = camera.project(scene.means)
-    assert (np.diff(depth[operator.ids]) > -1e-5).all()
     listed = operator.weights()
     assert (np.diff(listed.pixels) >= 0).all()
     same_pixel = np.diff(listed.pixels) == 0

@@ -21,7 +21,7 @@ from gsseg_core.raster.cpu.tiling import TILE, Tiles
 
 _TINY = np.float32(TINY)
 
-# Each chunk of Gaussians counts from 0, and `renumber` makes one count of these.
+# Each chunk of Gaussians counts from 0, and `number_on` makes one count of these.
 _CHUNK = 27  # the bits above these say which chunk a number belongs to
 _NUMBER = (1 << _CHUNK) - 1
 
@@ -112,43 +112,12 @@ def number_pairs(
     return found, gaussians, counts, labels, votes
 
 
-@kernel
-def renumber(numbers: np.ndarray, before: np.ndarray, count: int) -> np.ndarray:
-    """Give numbers of int32, which begin anew in every chunk, others in the order in which they occur; -1 stays.
-
-    That is done in place. Those of the `count` numbers that occur nowhere come last, and `before`, (CHUNKS,), are in
-    the chunks before. Returns the new number of each, (count,) int32. What one tile meets comes to lie close together:
-    to fetch that from anywhere in memory is a quarter of the time of `share`.
-    """
-    new, n = np.full(count, -1, np.int32), np.int32(0)
-    for i in range(numbers.shape[0]):
-        later = max(numbers[min(i + 2 * AHEAD, numbers.shape[0] - 1)], 0)
-        simd.prefetch(new, (later & _NUMBER) + before[later >> _CHUNK])
-        if numbers[i] >= 0:
-            number = (numbers[i] & _NUMBER) + before[numbers[i] >> _CHUNK]
-            known = new[number]
-            numbers[i] = new[number] = n if known < 0 else known  # without a branch, which nobody could predict
-            n += np.int32(known < 0)
-    for i in range(count if n < count else 0):
-        if new[i] < 0:
-            new[i] = n
-            n += np.int32(1)
-    return new
-
-
 @kernel(parallel=True)
-def put_in_order(
-    order: np.ndarray, first: np.ndarray, start: np.ndarray,  # (M,); (M,), (M + 1,) where pairs begin, before and after
-    pair_numbers: np.ndarray, labels: np.ndarray, votes: np.ndarray,  # (P,)
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Put the pairs of the Gaussians into another order: numbers, int32, labels and votes of each."""
-    numbers, new_labels, new_votes = np.empty(len(labels), np.int32), np.empty_like(labels), np.empty_like(votes)
-    for m in nb.prange(len(order)):
-        before = first[order[m]] - start[m]
-        for s in range(start[m], start[m + 1]):
-            numbers[s] = pair_numbers[before + s]
-            new_labels[s], new_votes[s] = labels[before + s], votes[before + s]
-    return numbers, new_labels, new_votes
+def number_on(numbers: np.ndarray, before: np.ndarray) -> None:
+    """Make one count, in place, of numbers of int32 that begin anew in every chunk, `before`, (CHUNKS,); -1 stays."""
+    for i in nb.prange(numbers.shape[0]):
+        number = (numbers[i] & _NUMBER) + before[max(numbers[i], 0) >> _CHUNK]
+        numbers[i] = number if numbers[i] >= 0 else -1
 
 
 @kernel(parallel=True, fastmath=simd.FAST, error_model="numpy")
@@ -199,7 +168,9 @@ def _blend_likelihood(
     lines = np.empty((2, TILE), np.float32)
     n = 0
     for e in range(entries.shape[0]):
-        simd.prefetch(table, entries[min(e + AHEAD, entries.shape[0] - 1)])
+        later = min(e + AHEAD, entries.shape[0] - 1)
+        simd.prefetch(table, entries[later])
+        simd.prefetch(likelihood, max(pair[later * label_count], 0))
         g, todo = entries[e], np.int64(blocks[e])
         aim(table, g, left, top, lines)
         only = likelihood[pair[e * label_count]] if label_count == 1 else np.float32(0.0)
@@ -287,9 +258,11 @@ def sum_shares(
 def add_up(slot_start: np.ndarray, pair: np.ndarray, sums: np.ndarray, num_pairs: int) -> np.ndarray:
     """Add up what `share` summed for each pair, in tile order: (PARTS, P) float32, of each part of the image."""
     tiles, parts = slot_start.shape[0] - 1, np.zeros((PARTS, num_pairs), np.float32)
+    last = pair.shape[0] - 1
     for part in nb.prange(PARTS):
         total = parts[part]
         for i in range(slot_start[part * tiles // PARTS], slot_start[(part + 1) * tiles // PARTS]):
+            simd.prefetch(total, max(pair[min(i + 2 * AHEAD, last)], 0))
             if pair[i] >= 0:
                 total[pair[i]] += sums[i]
     return parts

@@ -24,7 +24,6 @@ from gsseg_core.raster.cpu.depth_sort import sort_by_depth
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.simd import prefetch
 
 FRUSTUM_MARGIN = 0.3
 """The linearisation point is kept within the image widened by this fraction of half its width, as trainers do."""
@@ -43,19 +42,18 @@ BATCH = 128  # Gaussians that are looked at together before those among them tha
 MEAN, QUAT, SCALES, OPACITY, OUT, DEPTH = 0, 3, 7, 10, 11, 19
 NUMBERS = 20
 
-AHEAD = 32  # how many rows ahead memory is asked for
-
 
 class Projected(NamedTuple):
-    """The Gaussians that reach the image, nearest first.
+    """The Gaussians that reach the image, in the order of the scene: where it follows space, neighbours lie together.
 
     The table has of each: centre u, v in px; shear; WIDTH = log2(e) / (2 var(x|y)) and HEIGHT = log2(e) / (2 S_yy), so
     that log2(alpha) = LOG_OPACITY - WIDTH (dx - shear dy)^2 - HEIGHT dy^2; reach in y in px, where alpha falls to
     1/255; and dy at the rightmost point of that ellipse.
     """
 
-    ids: np.ndarray  # (M,) int32: index of each in the scene
+    ids: np.ndarray  # (M,) int32: index of each in the scene, ascending
     table: np.ndarray  # (M, 8) float32
+    order: np.ndarray  # (M,) int32: rows of the table, nearest first
 
 
 class _Lens(NamedTuple):
@@ -100,10 +98,15 @@ def project(scene: GaussianScene, camera: Camera) -> Projected:
     splats = _Splats(scene.means, scene.quats, scene.scales, scene.log_opacities)
     found = _project(splats, _Lens.of(camera), table, depth, ids)
     begins = np.arange(CHUNKS) * len(scene) // CHUNKS
-    rows = np.concatenate([np.arange(first, first + count) for first, count in zip(begins, found, strict=True)])
-    order, depth = sort_by_depth(depth[rows])
-    _break_ties(order, rows, np.flatnonzero(depth[1:] == depth[:-1]), table)
-    return Projected(*_gather(rows, order, ids, table))
+    table, depth, ids = (joined(part, begins, found) for part in (table, depth, ids))
+    order, depth = sort_by_depth(depth)
+    _break_ties(order, np.flatnonzero(depth[1:] == depth[:-1]), table)
+    return Projected(ids, table, order)
+
+
+def joined(values: np.ndarray, begins: np.ndarray, counts: np.ndarray) -> np.ndarray:  # (CHUNKS,), (CHUNKS,)
+    """Put together what each chunk has written to its own part of the values."""
+    return np.concatenate([values[begin : begin + count] for begin, count in zip(begins, counts, strict=True)])
 
 
 _KEPT = threading.local()
@@ -120,8 +123,8 @@ def _scratch(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @kernel
 def _break_ties(
-    order: np.ndarray, rows: np.ndarray,  # (M,) of the next, sorted by depth, changed in place; (M,) of the table
-    tied: np.ndarray, table: np.ndarray,  # (Z,) places whose depth is that of the next place, ascending; (N, 8)
+    order: np.ndarray,  # (M,) rows of the table, sorted by depth, changed in place
+    tied: np.ndarray, table: np.ndarray,  # (Z,) places whose depth is that of the next place, ascending; (M, 8)
 ) -> None:  # fmt: skip
     """Sort runs of equal depth by their rows of the table, and then by place: insertion sorts of ever closer ones."""
     t = 0
@@ -134,32 +137,18 @@ def _break_ties(
             step = max(step * 5 // 11, 1)
             for m in range(step, run.shape[0]):
                 moving, free = run[m], m
-                while free >= step and _is_before(table, rows, moving, run[free - step]):
+                while free >= step and _is_before(table, moving, run[free - step]):
                     run[free] = run[free - step]
                     free -= step
                 run[free] = moving
 
 
 @called_by_kernels
-def _is_before(table: np.ndarray, rows: np.ndarray, one: int, other: int) -> bool:
+def _is_before(table: np.ndarray, one: int, other: int) -> bool:
     for column in range(table.shape[1]):
-        if table[rows[one], column] != table[rows[other], column]:
-            return bool(table[rows[one], column] < table[rows[other], column])
+        if table[one, column] != table[other, column]:
+            return bool(table[one, column] < table[other, column])
     return bool(one < other)
-
-
-@kernel(parallel=True)
-def _gather(rows: np.ndarray, order: np.ndarray, ids: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    sorted_ids, sorted_table = np.empty(order.shape[0], np.int32), np.empty((order.shape[0], 8), np.float32)
-    for m in nb.prange(order.shape[0]):
-        later = rows[order[min(m + AHEAD, order.shape[0] - 1)]]
-        prefetch(table, later)
-        prefetch(ids, later)
-        row = rows[order[m]]
-        sorted_ids[m] = ids[row]
-        for j in range(8):
-            sorted_table[m, j] = table[row, j]
-    return sorted_ids, sorted_table
 
 
 @kernel(parallel=True, error_model="numpy")

@@ -9,10 +9,10 @@ import numpy as np
 
 from gsseg_core.csr_rows import starts
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
-from gsseg_core.raster.constants import CHUNKS
+from gsseg_core.raster.constants import AHEAD, CHUNKS
 from gsseg_core.raster.cpu.projection import Projected
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
-from gsseg_core.simd import LANES
+from gsseg_core.simd import LANES, prefetch
 
 TILE = LANES
 """Side of a tile in px. One row of a tile is one vector register of sixteen float32."""
@@ -46,20 +46,22 @@ def assign(projected: Projected, width: int, height: int) -> Tiles:
     columns, rows = -(-width // TILE), -(-height // TILE)
     count = len(projected.ids)
     gaussian_start = np.zeros(count + 1, np.int64)
-    place, capacity = np.zeros((CHUNKS, columns * rows), np.int64), TYPICAL * (count // CHUNKS + 1)
+    capacity = TYPICAL * (count // CHUNKS + 1)
     while True:
         touched = np.empty((CHUNKS, capacity), np.int32)
-        most = _list(projected.table, columns, rows, gaussian_start[1:], place, touched)
-        if most <= capacity:
+        needed = _list(projected.table, columns, rows, gaussian_start[1:], touched)
+        if needed.max() <= capacity:
             break
-        capacity = most
+        capacity = int(needed.max())
     np.cumsum(gaussian_start, out=gaussian_start)
-    start = starts(place.sum(axis=0))
-    # From counts to places: chunks follow each other within a tile, so that its entries stay sorted by depth.
-    place = np.cumsum(place, axis=0) - place + start[:-1]
-    entries, gaussian_entries = np.empty(start[-1], np.int32), np.empty(start[-1], np.int32)
-    _fill(touched, gaussian_start, place, entries, gaussian_entries)
-    return Tiles(width, height, columns, rows, projected.table, start, entries, gaussian_start, gaussian_entries)
+    touched = np.concatenate([own[:n] for own, n in zip(touched, needed, strict=True)])
+    counts = _count(touched, gaussian_start, projected.order, nb.get_num_threads(), columns * rows)
+    start = starts(counts.sum(axis=0))
+    # From counts to places: parts follow each other within a tile, so that its entries stay sorted by depth.
+    place = np.cumsum(counts, axis=0) - counts + start[:-1]
+    entries = np.empty(start[-1], np.int32)
+    _fill(touched, gaussian_start, projected.order, place, entries)
+    return Tiles(width, height, columns, rows, projected.table, start, entries, gaussian_start, touched)
 
 
 @nb.njit(inline="always")
@@ -127,14 +129,13 @@ def _touch_two_rows(
 def _list(
     table: np.ndarray, columns: int, rows: int,  # (M, 8)
     per_gaussian: np.ndarray,  # (M,) out: tiles that it touches
-    per_tile: np.ndarray,  # (CHUNKS, T) out: Gaussians of each chunk that touch it
     touched: np.ndarray,  # (CHUNKS, R) int32 out: these tiles, Gaussian after Gaussian, as far as they fit
-) -> int:  # fmt: skip
-    """List which tiles Gaussians touch; returns the capacity that the chunk with most of them needs."""
+) -> np.ndarray:  # fmt: skip
+    """List which tiles Gaussians touch; returns how many each chunk has, (CHUNKS,), which may be more than fit."""
     count, capacity = table.shape[0], touched.shape[1]
     needed = np.zeros(CHUNKS, np.int64)
     for chunk in nb.prange(CHUNKS):
-        counts, own, n = per_tile[chunk], touched[chunk], 0
+        own, n = touched[chunk], 0
         beside, found = np.empty(8 * BATCH, np.float32), np.empty(6 * BATCH, np.int32)
         last = (chunk + 1) * count // CHUNKS
         for begin in range(chunk * count // CHUNKS, last, BATCH):
@@ -157,11 +158,8 @@ def _list(
                     own[n] = two + 1
                     n += two + 1 < two_end
                 per_gaussian[g] = n - before
-        counts[:] = 0
-        for i in range(min(n, capacity)):
-            counts[own[i]] += 1
         needed[chunk] = n
-    return int(needed.max())
+    return needed
 
 
 @called_by_kernels(error_model="numpy")
@@ -184,19 +182,48 @@ def _list_many(
 
 
 @kernel(parallel=True)
-def _fill(
-    touched: np.ndarray, gaussian_start: np.ndarray,  # (CHUNKS, R), (M + 1,)
-    place: np.ndarray,  # (CHUNKS, T) where each chunk's next entry of a tile goes
-    entries: np.ndarray, gaussian_entries: np.ndarray,  # (E,) out, each
-) -> None:  # fmt: skip
-    count = gaussian_start.shape[0] - 1
-    for chunk in nb.prange(CHUNKS):
-        cursor, own = place[chunk], touched[chunk]
-        begin = gaussian_start[chunk * count // CHUNKS]
-        for g in range(chunk * count // CHUNKS, (chunk + 1) * count // CHUNKS):
+def _count(
+    touched: np.ndarray, gaussian_start: np.ndarray, order: np.ndarray,  # (E,), (M + 1,), (M,)
+    parts: int, num_tiles: int,
+) -> np.ndarray:  # fmt: skip
+    """Count the Gaussians of each part of an order that touch each tile, (parts, num_tiles) int64."""
+    counts, count = np.zeros((parts, num_tiles), np.int64), order.shape[0]
+    for part in nb.prange(parts):
+        own = counts[part]
+        if parts == 1:  # Then their order does not matter.
+            for tile in touched:
+                own[tile] += 1
+            continue
+        for m in range(part * count // parts, (part + 1) * count // parts):
+            _fetch(touched, gaussian_start, order, m)
+            g = order[m]
             for n in range(gaussian_start[g], gaussian_start[g + 1]):
-                tile = own[n - begin]
-                e = cursor[tile]
-                cursor[tile] = e + 1
+                own[touched[n]] += 1
+    return counts
+
+
+@kernel(parallel=True)
+def _fill(
+    touched: np.ndarray, gaussian_start: np.ndarray, order: np.ndarray,  # (E,) in: tiles, out: entries; (M + 1,); (M,)
+    place: np.ndarray,  # (parts, T) where the next entry of a tile goes
+    entries: np.ndarray,  # (E,) out
+) -> None:  # fmt: skip
+    count, parts = order.shape[0], place.shape[0]
+    for part in nb.prange(parts):
+        cursor = place[part]
+        for m in range(part * count // parts, (part + 1) * count // parts):
+            _fetch(touched, gaussian_start, order, m)
+            g = order[m]
+            for n in range(gaussian_start[g], gaussian_start[g + 1]):
+                e = cursor[touched[n]]
+                cursor[touched[n]] = e + 1
                 entries[e] = g
-                gaussian_entries[n] = e
+                touched[n] = e
+
+
+@nb.njit(inline="always")
+def _fetch(touched: np.ndarray, gaussian_start: np.ndarray, order: np.ndarray, m: int) -> None:
+    """Ask for what of the two arrays is needed some places after place m of the order."""
+    last = order.shape[0] - 1
+    prefetch(gaussian_start, order[min(m + 2 * AHEAD, last)])
+    prefetch(touched, gaussian_start[order[min(m + AHEAD, last)]])
