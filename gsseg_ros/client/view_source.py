@@ -30,8 +30,8 @@ ANSWER_SECONDS = 30.0
 """How long a request, and the clouds that follow it, may take."""
 
 _PARAMETERS = ("scene_to_map.scale", "scene_to_map.translation", "scene_to_map.rotation")
-_CHANGING = ("views fused", "codes", "last job")
-"""Values of the node's diagnostics that change with its class probabilities."""
+_CHANGING = ("views fused", "codes", "changes of the class probabilities")
+"""Values of the node's diagnostics that change with its class probabilities, and with nothing else: not by asking."""
 
 
 class RosSource:

@@ -242,6 +242,7 @@ def _scene_values(workspace: Workspace) -> dict[str, object]:
         "gaussians": len(session.scene),
         "classes": len(session.class_names),
         "codes": "none" if not session.has_codes else "votes" if learnt is None else learnt.learner,
+        "changes of the class probabilities": session.version,
         "views fused": session.num_fused,
         "views kept": session.num_views,
         **{f"scene changes: {what}": count for what, count in sorted(workspace.changes.items())},

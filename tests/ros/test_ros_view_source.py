@@ -55,6 +55,8 @@ def test_live_codes_are_those_of_the_node_wherever_the_scene_lies_in_the_map(ros
         known = labels >= 0
         assert np.allclose(probabilities.max(axis=1)[known], truth.confidence[known], atol=1e-6)
         assert not probabilities[~known].any()
+        source.wait(3.0)  # What was told before the node had learnt may have been told anew.
+        assert source.wait(3.0) is None, "the node is asked again, though nothing has changed but by asking it"
         other, _ = many_classes(30)
         wrong = RosSource(other, domain_id=ros.domain, find_timeout=PATIENCE)
         with pytest.raises(StateMismatchError, match=r"has the scene .*scene.ply, which is not this one"):
