@@ -34,7 +34,7 @@ from gsseg_ros.node.size_limits import require_size
 from gsseg_ros.node.workspace import Workspace
 
 CODES_PERIOD, OBJECTS_PERIOD = 1.0, 2.0
-"""Seconds for which a segmentation is reused before it is made again, and between two messages of objects."""
+"""Seconds for which pictures reuse a segmentation before it is made again, and between two messages of objects."""
 
 IMAGE_SILENCE = 2.0
 """Seconds without a usable camera image until the classes are drawn without one."""
@@ -164,7 +164,7 @@ class LiveOutputs:
         photo = None
         if camera is None:
             camera, photo = self._photo(paired)
-        result = self._current()
+        result = self._current(CODES_PERIOD)
         colors = palette(result.num_classes)
         labels = result.render(make_operator(session.scene_of(result), camera, session.device)).labels
         picture = colors[labels] if photo is None else overlay(photo, labels, colors)
@@ -193,20 +193,20 @@ class LiveOutputs:
         # What a run or a reset publishes while these are put together is newer.
         since = self._outputs.objects_count
         self._news = None
-        result = self._current()
+        result = self._current(0.0)  # What is told now stays until there is more news.
         selection = Selection(session, result, sorted(result.class_names), 0.0, settings.scene_to_map)
         header = Header(stamp=self._now(), frame_id=settings.map_frame)
         if self._outputs.publish_objects(selection.objects(header, revision=0), since) and self._news == since:
             self._news = self._outputs.objects_count  # A view came meanwhile.
         self._last_objects = time.monotonic()
 
-    def _current(self) -> Segmentation:
-        """Segmentation without refinement, as it is now or was a second ago."""
+    def _current(self, oldest: float) -> Segmentation:
+        """Segmentation without refinement, as it is now or was so many seconds ago at most."""
         session = self._workspace.session
         key = (session.era, session.version)
         if self._segmentation is not None:
             kept, since, result = self._segmentation
-            if kept == key or (kept[0] is key[0] and time.monotonic() - since < CODES_PERIOD):
+            if kept == key or (kept[0] is key[0] and time.monotonic() - since < oldest):
                 return result
         learnt = session.learnt
         result = session.unrefined()

@@ -28,6 +28,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from builtin_interfaces.msg import Time
+from gsseg_msgs.msg import ObjectArray
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
@@ -37,6 +38,7 @@ from gsseg_ros.frames import Similarity
 from gsseg_ros.node import live_outputs
 from gsseg_ros.node.live_outputs import LiveOutputs
 from gsseg_ros.node.pairing import Paired
+from gsseg_ros.node.reports import Selection
 
 
 @pytest.fixture
@@ -178,6 +180,7 @@ class Shown:
 
     def __init__(self) -> None:
         self.stamps: list[int] = []
+        self.objects: list[ObjectArray] = []
         self.wanted: list[Callable[[], bool]] = []
         self.go_on = threading.Event()
 
@@ -189,6 +192,10 @@ class Shown:
         self.stamps.append(image.header.stamp.sec)
         self.go_on.wait(PATIENCE)
 
+    def publish_objects(self, objects: ObjectArray, since: int) -> bool:
+        self.objects.append(objects)
+        return True
+
 
 @pytest.fixture
 def live() -> Iterator[tuple[LiveOutputs, Shown, dict[str, int]]]:
@@ -197,7 +204,7 @@ def live() -> Iterator[tuple[LiveOutputs, Shown, dict[str, int]]]:
     for view in clean_views(2):
         session.fuse(view)
     similarity = Similarity(np.eye(3), np.zeros(3), 1.0)
-    settings = SimpleNamespace(rectified="auto", scene_to_map=similarity, max_pixels=1 << 24)
+    settings = SimpleNamespace(rectified="auto", scene_to_map=similarity, max_pixels=1 << 24, map_frame="map")
     shown, state = Shown(), {"busy": False, "asked": 0}
     workspace: Any = SimpleNamespace(session=session, settings=settings, era=session.era)
     outputs: Any = shown
@@ -276,3 +283,22 @@ def test_a_picture_that_was_begun_before_a_reset_is_not_published_after_it(
     assert shown.wanted[0]()
     outputs._workspace.era = object()
     assert not shown.wanted[0]()
+
+
+def test_objects_are_those_of_the_newest_view_though_a_picture_was_drawn_just_before_it(
+    live: tuple[LiveOutputs, Shown, dict[str, int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawer, shown, _ = live
+    monkeypatch.setattr(live_outputs, "CODES_PERIOD", PATIENCE)  # However slow this machine is.
+    session = drawer._workspace.session
+    shown.go_on.set()
+    drawer.fused(paired(1), CAMERA)
+    wait_until(lambda: shown.stamps, "a picture")
+    (view,) = clean_views(1, "late")
+    session.fuse(View.from_arrays(view.camera, np.full_like(view.read_labels(), 1)))
+    drawer.fused(paired(2), CAMERA)
+    drawer.show_objects()
+    wait_until(lambda: shown.objects, "the objects")
+    now = session.unrefined()
+    selection = Selection(session, now, sorted(now.class_names), 0.0, drawer._workspace.settings.scene_to_map)
+    assert shown.objects == [selection.objects(Header(frame_id="map"), revision=0)]
