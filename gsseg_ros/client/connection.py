@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -61,7 +60,7 @@ class Connection:
         self._reach(node)
         self._clients = {kind: node.create_client(kind, f"{self._name}/{name}") for kind, name in _SERVICES.items()}
         self._diagnostics: Any = None
-        self._statuses: deque[Any] = deque(maxlen=10)
+        self._status: Any = None  # what the node told last of itself
 
     def _reach(self, node: Any) -> None:
         """Make what else the node is reached by."""
@@ -125,21 +124,17 @@ class Connection:
             They were not, in time; the message says what the node has to say about its inputs.
         """
         deadline, views = time.monotonic() + timeout, 0
-        if self._diagnostics is None:
-            self._diagnostics = self._spinner.node.create_subscription(
-                DiagnosticArray, "/diagnostics", self._on_diagnostics, 10
-            )
-        said = None
-        self._statuses.clear()
-        while self._spinner.wait_for(lambda: self._statuses, deadline - time.monotonic()):
-            said = self._statuses.popleft()
+        self._spinner.run(self._hear_diagnostics)
+        before = said = self._status
+        while self._spinner.wait_for(lambda: self._status is not said, deadline - time.monotonic()):
+            said = self._status
             values = {value.key: value.value for value in said.values}
             views = int(values.get("views fused", 0))
             if on_views is not None:
                 on_views(views)
             if views >= count:
                 return views
-        if said is None:
+        if said is before:
             raise self._calls.absent("its status on /diagnostics", timeout)
         rejected = [f"{key}: {value}" for key, value in values.items() if key.startswith("rejected ")]
         raise NodeUnavailableError(
@@ -150,5 +145,11 @@ class Connection:
     def _call(self, kind: Any, request: Any, timeout: float) -> Any:
         return self._calls.call(self._clients[kind], request, timeout)
 
+    def _hear_diagnostics(self) -> None:
+        if self._diagnostics is None:
+            self._diagnostics = self._spinner.node.create_subscription(
+                DiagnosticArray, "/diagnostics", self._on_diagnostics, 10
+            )
+
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        self._statuses.extend(status for status in message.status if status.name == self._name)
+        self._status = next((status for status in message.status if status.name == self._name), self._status)

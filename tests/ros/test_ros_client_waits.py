@@ -29,12 +29,13 @@ from ros_client_cases import (  # noqa: F401
     shared_fixture,
     start_node,
 )
-from ros_helpers import REPOSITORY, Ros, ros_fixture  # noqa: F401
+from ros_helpers import REPOSITORY, Ros, ros_fixture, wait_until  # noqa: F401
 from small_scenes import write_dataset
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from gsseg_msgs.srv import Reset
 
 from gsseg_ros.client import NodeUnavailableError, SegmentationClient, SegmentationError
@@ -155,6 +156,22 @@ def test_an_absent_node_is_an_error_that_says_what_to_check(ros: Ros) -> None:
             message = str(caught.value)
             assert message.startswith(f"/robot1/gsseg: {what} was not there within ")
             assert f"ROS_DOMAIN_ID ({ros.domain})" in message and message.endswith("nodes seen: /test")
+
+
+def test_what_the_node_says_of_its_views_is_heard_by_every_thread_that_waits_for_them(ros: Ros) -> None:
+    with SegmentationClient(domain_id=ros.domain) as client:
+
+        def say(views: int) -> None:
+            status = DiagnosticStatus(name="/gsseg", values=[KeyValue(key="views fused", value=str(views))])
+            client._spinner.run(lambda: client._on_diagnostics(DiagnosticArray(status=[status])))
+
+        told: list[list[int]] = [[], []]
+        waits = [Background(lambda seen=seen: client.wait_for_views(3, PATIENCE, seen.append)) for seen in told]  # type: ignore[misc]
+        wait_until(lambda: say(1) or all(told), "both to listen")  # type: ignore[func-returns-value]
+        say(3)
+        for wait in waits:
+            wait.join()
+            assert (wait.result, wait.error) == (3, None)
 
 
 def test_a_node_that_is_not_active_is_waited_for_and_its_state_named(ros: Ros, tmp_path: Path) -> None:
