@@ -126,8 +126,8 @@ class Connection:
         deadline, views = time.monotonic() + timeout, 0
         self._spinner.run(self._hear_diagnostics)
         before = said = self._status
-        while self._spinner.wait_for(lambda: self._status is not said, deadline - time.monotonic()):
-            said = self._status
+        while (news := self._status_after(said, deadline)) is not said:
+            said = news
             values = {value.key: value.value for value in said.values}
             views = int(values.get("views fused", 0))
             if on_views is not None:
@@ -144,6 +144,11 @@ class Connection:
 
     def _call(self, kind: Any, request: Any, timeout: float) -> Any:
         return self._calls.call(self._clients[kind], request, timeout)
+
+    def _status_after(self, known: Any, deadline: float) -> Any:
+        """Wait until the node has said something after what is known, and give that; at the deadline what is known."""
+        self._spinner.wait_for(lambda: self._status is not known, deadline - time.monotonic())
+        return self._status
 
     def _hear_diagnostics(self) -> None:
         if self._diagnostics is None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from gsseg_msgs.msg import ObjectArray, SegmentationReport
+from gsseg_msgs.srv import Segment
 from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode
@@ -51,6 +52,8 @@ class Outputs:
     ----------
     objects_count : int
         How often objects were published.
+    latched : Segment.Request or None
+        What the run was asked for whose clouds are latched; None if there are none.
     """
 
     def __init__(self, node: LifecycleNode, cameras: Sequence[str] = ()) -> None:
@@ -58,6 +61,7 @@ class Outputs:
         self._lock = threading.RLock()
         self._revision, self._closed = 0, False
         self.objects_count = 0
+        self.latched: Segment.Request | None = None
         self._always: list[Publisher] = []
         self._classes: dict[str, Publisher] = {}
         self._announced: set[str] = set()
@@ -168,6 +172,7 @@ class Outputs:
         with self.turn(report.revision) as newest:
             if not newest:
                 return
+            self.latched = None
             self.publish_objects(ObjectArray(header=header, revision=report.revision))
             self._empty(self._filled, header)
             self._filled = set()

@@ -162,7 +162,7 @@ class SegmentNode(LifecycleNode):
         self._outputs = Outputs(self, settings.cameras)
         self._outputs.announce(self.workspace.label_space.classes)
         self._scene_frame = SceneFrame(self, settings.map_frame, settings.scene_frame)
-        self._scene_frame.publish(settings.scene_to_map, self.get_clock().now().to_msg())
+        self._scene_frame.publish(self.workspace.settings.scene_to_map, self.get_clock().now().to_msg())
         if self.workspace.has_scene:
             session = self.workspace.session
             self.get_logger().info(f"loaded {session.scene.path}: {len(session.scene):,} Gaussians")
@@ -239,7 +239,7 @@ class SegmentNode(LifecycleNode):
         return self.inputs.tf.look_up if self.inputs is not None and self.inputs.tf is not None else None
 
     def _check_parameters(self, changed: Sequence[Parameter]) -> SetParametersResult:
-        configured = self._outputs is not None
+        configured = self.configuring or self._outputs is not None
         result = parameters.check(self, changed, configured, self.workspace.require_allowed)
         if result.successful and not self._told_after:
             self._take_parameters(changed)
@@ -250,20 +250,22 @@ class SegmentNode(LifecycleNode):
         if not names:
             return
         with self.workspace.placement.fusing:
-            before, settings = self.workspace.settings, Settings.read(self, changed)
-            if self._scene_frame is None or not any(name.startswith("scene_to_map.") for name in names):
+            # Those that are set already are read as they are now: another thread may have set them since.
+            before, settings = self.workspace.settings, Settings.read(self, () if self._told_after else changed)
+            frame = self._scene_frame  # In another thread the node may be cleaned up meanwhile.
+            if frame is None or not any(name.startswith("scene_to_map.") for name in names):
                 self.workspace.settings = settings
                 return
             self._out_of_place = True
             self.workspace.placement.change(
                 before.scene_to_map, settings.scene_to_map, lambda: setattr(self.workspace, "settings", settings)
             )
-            self._scene_frame.publish(settings.scene_to_map, self.get_clock().now().to_msg())
+            frame.publish(settings.scene_to_map, self.get_clock().now().to_msg())
 
     def _publish_again(self) -> None:
         """Publish anew what was published when the scene lay elsewhere, if the node is active; else it is due then."""
-        inputs = self.inputs  # In another thread the node may be cleaned up meanwhile.
-        if not self.workspace.active or inputs is None:
+        inputs, outputs = self.inputs, self._outputs  # In another thread the node may be cleaned up meanwhile.
+        if not self.workspace.active or inputs is None or outputs is None:
             return
         self._out_of_place = False
         session = self.workspace.session if self.workspace.has_scene else None
@@ -276,8 +278,10 @@ class SegmentNode(LifecycleNode):
         notes = ["; ~/learn learns from where views are now"] * (session.learnt is not None)
         notes += [f"; votes of {left} that are not kept any more stay as they were"] * (left > 0)
         self.get_logger().info(f"the scene was moved, and {following} views have followed{''.join(notes)}")
-        if not self._requests.publish_again():
+        if outputs.latched is None:
             inputs.live.show_objects()
+        else:
+            self._requests.publish_again(outputs.latched)
 
     def _show_change(self) -> None:
         if (inputs := self.inputs) is not None:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeAlias
 
 from gsseg_msgs.srv import Export, LoadScene, LoadState, Pick, RenderView, Reset, SaveState, Segment
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -49,10 +49,13 @@ _PUBLISHED = ("min_confidence", "skip_refinement", "skip_filter", "refine", "gra
 AT_WORK, WAITING = 2, 4
 """Most long requests that work at a time, and that wait besides; each holds a thread of the executor."""
 
-Handler = TypeVar("Handler", bound=Callable[..., Any])
+_PAUSE = 1.0  # s, until what is latched is tried to be published anew, where too many requests are at work
+
+Handler: TypeAlias = Callable[..., None]
+"""A method that fills in the response to a request."""
 
 
-def answered(handler: Handler) -> Handler:
+def answered(handler: Handler) -> Callable[..., Any]:
     """Make a handler answer every error with its code and one line; nothing that a request asks may end the node."""
 
     @functools.wraps(handler)
@@ -67,7 +70,7 @@ def answered(handler: Handler) -> Handler:
             response.error_msg = explain(self.node, error)
         return response
 
-    return answer  # type: ignore[return-value]
+    return answer
 
 
 def in_turn(handler: Handler) -> Handler:
@@ -79,7 +82,7 @@ def in_turn(handler: Handler) -> Handler:
             self.workspace.require_active()  # It may have waited for long.
             handler(self, request, response)
 
-    return work  # type: ignore[return-value]
+    return work
 
 
 def explain(node: LifecycleNode, error: Exception) -> str:
@@ -126,7 +129,6 @@ class Services:
         self.node, self.workspace, self.show = node, workspace, show
         self.turns = Turns(AT_WORK, WAITING)
         self._outputs, self._lookup = outputs, lookup
-        self._published: Segment.Request | None = None  # What the run was asked for that is latched.
         # Reentrant: a request must not wait for another one to be answered.
         group = ReentrantCallbackGroup()
         for interface, name, handler in (
@@ -178,17 +180,16 @@ class Services:
                     if overlay.width:
                         outputs.publish_overlay(overlay)
                     outputs.publish_report(report)
-                    self._published = Segment.Request(**{name: getattr(request, name) for name in _PUBLISHED})
+                    outputs.latched = Segment.Request(**{name: getattr(request, name) for name in _PUBLISHED})
             # What is published is serialised by now.
             report.classes = [summary for summary in report.classes if summary.class_id in selection.chosen]
             response.report = report
             response.objects = [thing for thing in objects.objects if thing.id in selection.chosen]
 
-    def publish_again(self) -> bool:
-        """Publish anew what is latched, of what is known now; returns whether a run was published before."""
-        if self._published is not None:
-            self.segment(self._published, Segment.Response())
-        return self._published is not None
+    def publish_again(self, request: Segment.Request) -> None:
+        """Publish anew what a request has had published, of what is known now; while many others are at work, wait."""
+        while self.segment(request, Segment.Response()).error_code == Segment.Response.BUSY:
+            time.sleep(_PAUSE)
 
     @answered
     @in_turn
@@ -358,7 +359,6 @@ class Services:
         workspace = self.workspace
         workspace.number(run)
         session = workspace.session if workspace.has_scene else None
-        self._published = None
         self._outputs().clear(empty_report(run, session, workspace.settings.map_frame))
 
     def _header(self, run: Run) -> Header:

@@ -20,7 +20,8 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from gsseg_ros.node import diagnostics
+from gsseg_ros.node import diagnostics, segment_node
+from gsseg_ros.node.scene_frame import SceneFrame
 from gsseg_ros.node.segment_node import SegmentNode
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
@@ -104,6 +105,30 @@ def test_parameters_take_effect_at_once_on_humble_too(
         assert (node.workspace.settings.k, node.workspace.settings.pose_source) == (7, "topic")
     finally:
         node.close()
+
+
+def test_of_two_that_set_a_parameter_at_once_the_value_that_it_has_counts(node: SegmentNode) -> None:
+    node.set_parameters([Parameter("k", value=7)])
+    node._take_parameters([Parameter("k", value=5)])  # Its thread set it before, and comes to tell only now.
+    assert (node.get_parameter("k").value, node.workspace.settings.k) == (7, 7)
+
+
+def test_what_is_set_while_it_configures_is_refused_or_takes_effect(
+    node: SegmentNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moved, frames = [1.0, 2.0, 3.0], []
+
+    def set_meanwhile(*_: object) -> None:
+        late = [Parameter("max_views", value=7), Parameter("k", value=7)]
+        late.append(Parameter("scene_to_map.translation", value=moved))
+        assert [result.successful for result in node.set_parameters(late)] == [False, True, True]
+
+    monkeypatch.setattr(segment_node, "warm_up", set_meanwhile)
+    monkeypatch.setattr(SceneFrame, "publish", lambda self, similarity, stamp: frames.append(similarity.translation))
+    assert node.trigger_configure() == SUCCESS
+    assert (node.get_parameter("max_views").value, node.workspace.session.max_views) == (200, 200)
+    assert node.workspace.settings.k == 7
+    assert [frame.tolist() for frame in frames] == [moved]
 
 
 def test_a_deactivate_that_fails_is_said_and_brings_it_back_to_unconfigured(

@@ -29,6 +29,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, Quaternion
 from gsseg_msgs.msg import ObjectArray, SegmentationReport
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 
@@ -36,9 +37,12 @@ from gsseg_core.scene.scene_delta import GroupMove, SceneDelta
 from gsseg_core.scene.similarity import Similarity as CoreSimilarity
 from gsseg_ros.conversions import arrays_from_cloud, matrix_from_transform
 from gsseg_ros.delta_messages import message_from_delta
+from gsseg_ros.errors import BusyError
 from gsseg_ros.frames import Similarity
+from gsseg_ros.node import services
 from gsseg_ros.node.placement import Placement
 from gsseg_ros.node.scene_frame import SceneFrame, transform
+from gsseg_ros.node.services import AT_WORK, WAITING
 
 ASIDE = Similarity.from_parameters(1.0, [0.05, -0.02, 0.03], [0.0, 0.0, 0.02, 1.0])
 FAR = Similarity.from_parameters(1.0, [1e4, 0, 0], [0.0, 0.0, 0.0, 1.0])
@@ -217,6 +221,38 @@ def test_while_active_views_follow_and_all_that_is_latched_comes_anew(
         np.testing.assert_allclose(here.node.workspace.session.codes(), core_session(scene, names).codes(), atol=5e-3)
         for subscription in subscriptions:
             shared.node.destroy_subscription(subscription)
+
+
+def test_what_is_latched_comes_anew_though_too_many_requests_were_at_work(
+    shared: Ros, parameters: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with node_here(shared, parameters) as here:
+        here.fuse(clean_views(2))
+        first = here.done("segment", skip_refinement=True).report.revision
+        places, tries = here.node._requests.turns._places, []
+        monkeypatch.setattr(services, "_PAUSE", 0.01)
+        monkeypatch.setattr(services, "explain", lambda node, error: tries.append(error) or str(error))
+        while places.acquire(blocking=False):
+            pass
+        here.node.set_parameters_atomically(parameters_of(ASIDE, 0.02))
+        wait_until(lambda: tries, "the first try")
+        places.release(AT_WORK + WAITING)
+        wait_until(lambda: here.outputs._revision > first, "the clouds where the scene is now")
+        assert all(isinstance(error, BusyError) for error in tries)
+
+
+def test_what_was_published_before_the_node_was_cleaned_up_does_not_come_anew(
+    shared: Ros, parameters: dict[str, Any]
+) -> None:
+    with node_here(shared, parameters) as here:
+        here.fuse(clean_views(2))
+        here.done("segment", skip_refinement=True)
+        assert here.node.trigger_deactivate() == here.node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+        here.configure()
+        here.fuse(clean_views(2))
+        here.node.set_parameters_atomically(parameters_of(ASIDE, 0.02))
+        wait_until(lambda: here.outputs.objects_count, "the objects where the scene is now")
+        assert here.outputs._revision == 0, "clouds that nobody has asked for"
 
 
 def test_a_scene_is_loaded_to_a_place_of_its_own(
