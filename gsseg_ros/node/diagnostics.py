@@ -252,7 +252,7 @@ def _scene_values(workspace: Workspace) -> dict[str, object]:
 def _input_values(inputs: Inputs) -> dict[str, object]:
     now = time.monotonic()
     values: dict[str, object] = {}
-    for topic, (count, last) in inputs.arrivals.items():
+    for topic, (count, last) in list(inputs.arrivals.items()):  # Another thread may subscribe to detections.
         values[f"{topic} received"] = count
         values[f"{topic} age [s]"] = f"{now - last:.1f}" if count else "never"
     values.update({f"{topic} lost on the way": count for topic, count in inputs.lost.items()})

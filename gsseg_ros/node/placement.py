@@ -75,8 +75,9 @@ class Placement:
     def bring(self, names: Iterable[str]) -> None:
         """Have some views follow before anything else; whoever goes on from where they are then holds `fusing`."""
         with self.fusing:
-            for name in set(names) & self._moved_from.keys():
-                self._follows(name)
+            moved_from = self._moved_from
+            for name in set(names) & moved_from.keys():
+                self._follows(name, moved_from)
 
     def forget(self) -> tuple[_Ways, dict[str, Similarity]]:
         """Leave all views where they are, before they are replaced; returns what `resume` takes if they are not."""
@@ -108,13 +109,12 @@ class Placement:
             self._running, moved_from = False, self._moved_from  # Whatever is raised here, others may follow later.
             if not moved_from or not self._owner.has_scene:
                 return False
-            self._follows(next(iter(moved_from)))
+            self._follows(next(iter(moved_from)), moved_from)
             self._running = True
             return True
 
-    def _follows(self, name: str) -> None:
-        session, moved_from = self._owner.session, self._moved_from
-        before, after = moved_from[name]
+    def _follows(self, name: str, moved_from: _Ways) -> None:
+        session, (before, after) = self._owner.session, moved_from[name]
         try:
             done = session.move_view(name, partial(_moved, before=before, after=after), session.era)
         except GssegError as error:

@@ -81,8 +81,9 @@ class SceneChanges:
     def on_scene_delta(self, message: SceneDeltaMessage) -> None:
         """Change the scene by a message of the topic."""
         try:
-            self.workspace.require_active()
-            self._update(self.workspace.living_session, delta_from_message(message))
+            with self.workspace.requests.one():
+                self.workspace.require_active()
+                self._update(self.workspace.living_session, delta_from_message(message))
         except Exception as error:
             self.workspace.changes["refused"] += 1
             # What was not foreseen is logged with its traceback, too.

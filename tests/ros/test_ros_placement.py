@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from patience import PATIENCE
 from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros, wait_until
 from ros_node_here import node_here
@@ -106,6 +108,24 @@ def test_views_of_a_state_that_is_loaded_meanwhile_stay_where_they_are() -> None
         placement.forget()
     wait_until(lambda: settled, "the thread to end")
     np.testing.assert_array_equal(session.codes(), codes)
+
+
+def test_a_state_that_is_loaded_between_two_looks_at_what_has_to_follow_ends_it_quietly() -> None:
+    session, settled = living_session(clean_views(2)), threading.Event()
+
+    class Owner:
+        has_scene = True
+
+        @property
+        def session(self) -> LivingSession:
+            placement.forget()
+            return session
+
+    placement = Placement(Owner(), settled.set)
+    with placement.fusing:
+        placement._moved_from = {name: (IDENTITY, FAR) for name in session.view_names}
+        placement._begin()
+    assert settled.wait(PATIENCE)
 
 
 def test_views_of_a_scene_that_is_put_back_before_they_followed_stay_as_they_are() -> None:

@@ -29,7 +29,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from gsseg_msgs.msg import SceneDelta as SceneDeltaMessage
 
 from gsseg_core.data.dataset import Dataset
-from gsseg_core.live.living_session import LivingSession
+from gsseg_core.live.living_session import Changed, LivingSession
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_delta import GroupMove, SceneDelta
 from gsseg_core.scene.similarity import Similarity
@@ -233,6 +233,30 @@ def test_a_delta_out_of_turn_is_complained_of_once_and_changes_nothing(
     assert here.node.workspace.changes["refused"] == 1 and len(session.scene) == len(SCENE) - 2
     assert here.node.workspace.refused_change[1] == said[0]
     np.testing.assert_array_equal(votes(session), as_refused(session))
+
+
+def test_a_delta_of_the_topic_that_is_being_made_is_waited_for_before_the_node_is_inactive(
+    here: NodeHere, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session, begun, made = here.node.workspace.living_session, threading.Event(), threading.Event()
+    update = session.update
+
+    def slowly(delta: SceneDelta) -> Changed:
+        begun.set()
+        made.wait(1.0)  # Until the node is inactive, if it does not wait.
+        return update(delta)
+
+    monkeypatch.setattr(session, "update", slowly)
+    message = message_from_delta(SceneDelta(removed=np.array([0])))
+    change = threading.Thread(target=here.node._changes.on_scene_delta, args=(message,))
+    change.start()
+    assert begun.wait(PATIENCE)
+    here.node.trigger_deactivate()
+    revision = session.living.revision
+    made.set()
+    change.join(PATIENCE)
+    here.node.trigger_activate()
+    assert revision == 1, "it is made when the node is inactive already"
 
 
 def test_states_of_other_robots_are_added_exactly(here: NodeHere) -> None:

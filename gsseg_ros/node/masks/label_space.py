@@ -114,20 +114,18 @@ class LabelSpace:
 
     def _ids(self, session: LiveSession, source: str, say: Callable[[str], None]) -> dict[int, int]:
         """Find the ids of the session's classes for the labels of masks that come without names."""
-        labels = self.heard or self._class_names
-        if not labels:
-            return self._ids_by_number(session)
+        labels, new_names = self.heard or self._class_names, self._new_names
+        if new_names is not None and not labels:
+            return self._ids_by_number(new_names, session)
         labels = {0: BACKGROUND_NAME, **labels}
-        names = dict(labels) if self._new_names is None else self._new_names.names(labels)
+        names = dict(labels) if new_names is None else new_names.names(labels)
         labeled = {k: None if name is None or name.lower() == UNLABELED else name for k, name in names.items()}
         return self._numbered(labeled, session, source, say)
 
-    def _ids_by_number(self, session: LiveSession) -> dict[int, int]:
+    def _ids_by_number(self, new_names: NewNames, session: LiveSession) -> dict[int, int]:
         """Apply the label map to labels that have no names."""
         labels = {k: class_name({0: BACKGROUND_NAME}, k) for k in range(self._max_classes)}
-        if self._new_names is None:
-            return {k: k for k in labels}
-        found = map_labels(self._new_names.given, labels, self._new_names.source)
+        found = map_labels(new_names.given, labels, new_names.source)
         ids = session.number_classes({k: n for k, n in found.class_names.items() if n != labels.get(k)})
         return {k: ids.get(new, new) for k, new in found.new_ids.items()}
 
