@@ -110,7 +110,7 @@ class ScratchFile:
         """Find where so many bytes go: into a hole that is large enough, or to the end, if the disk has room there."""
         for number, (offset, room) in enumerate(self._holes):
             if room >= size:
-                self._holes[number] = offset + size, room - size
+                self._holes[number : number + 1] = [(offset + size, room - size)] * (room > size)
                 return offset
         assert self._file is not None
         descriptor = self._file.fileno()

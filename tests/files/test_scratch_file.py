@@ -59,6 +59,7 @@ def test_space_of_what_was_dropped_is_used_again() -> None:
     for number in range(20):
         assert scratch.put("a", np.full(1000, number))
     assert scratch._file is not None and os.fstat(scratch._file.fileno()).st_size < 3 * 8192
+    assert not scratch._holes, "what is filled again is no hole, and is not looked at every time"
     np.testing.assert_array_equal(scratch.get("a"), np.full(1000, 19))
 
 
