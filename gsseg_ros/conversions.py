@@ -14,15 +14,15 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Transform
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Transform, Vector3
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import MaskFormatError, PoseError, SceneValueError
 from gsseg_core.files.limits import MAX_LABEL
-from gsseg_core.scene.camera import Camera
-from gsseg_ros.frames import quaternion_from_rotation, rigid, rotation_from_quaternion
+from gsseg_core.scene.camera import Camera, rigid_motion
+from gsseg_ros.frames import quaternion_from_rotation, rotation_from_quaternion
 
 _NS = 1_000_000_000
 _UNIT_TOLERANCE = 1e-3
@@ -169,6 +169,16 @@ def pose_from_matrix(
     x, y, z = matrix[:3, 3].tolist()
     qx, qy, qz, qw = quaternion_from_rotation(matrix[:3, :3])
     return Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+
+
+def transform_of(
+    rotation: npt.NDArray[np.float64],  # (3, 3)
+    translation: npt.NDArray[np.float64],  # (3,), in metres
+) -> Transform:
+    """Turn a rotation and a translation into a transform."""
+    pose = pose_from_matrix(rigid_motion(rotation, translation))
+    place = pose.position
+    return Transform(translation=Vector3(x=place.x, y=place.y, z=place.z), rotation=pose.orientation)
 
 
 def viewpoint_messages(
@@ -374,4 +384,4 @@ def _matrix(position: Any, orientation: Any, topic: str) -> npt.NDArray[np.float
         raise PoseError(f"{topic}: orientation is all zeros: was it filled in? expected a quaternion of length 1")
     if abs(norm - 1) > _UNIT_TOLERANCE:
         raise PoseError(f"{topic}: orientation {q} has length {norm:.6g}; expected a quaternion of length 1")
-    return rigid(rotation_from_quaternion(*q), place)
+    return rigid_motion(rotation_from_quaternion(*q), place)

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
-from geometry_msgs.msg import Quaternion, Transform, Vector3
 from gsseg_msgs.msg import GroupMove as GroupMoveMessage
 from gsseg_msgs.msg import SceneDelta as SceneDeltaMessage
 
 from gsseg_core.errors import GssegError
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.scene.quaternions import rotations
 from gsseg_core.scene.scene_delta import MAX_ID, GroupMove, SceneDelta
 from gsseg_core.scene.similarity import Similarity
+from gsseg_ros.conversions import transform_of
 from gsseg_ros.errors import InvalidRequestError
+from gsseg_ros.frames import rotation_from_quaternion
 
 _SIZES = {"means": 3, "quats": 4, "scales": 3, "opacities": 1}
 
@@ -42,7 +44,10 @@ def message_from_delta(delta: SceneDelta) -> SceneDeltaMessage:
         revision=delta.revision or 0,
         moves=[
             GroupMoveMessage(
-                group=move.group, motion=_transform(move.motion), scale=move.motion.scale, views=list(move.views)
+                group=move.group,
+                motion=transform_of(move.motion.rotation, move.motion.translation),
+                scale=move.motion.scale,
+                views=list(move.views),
             )
             for move in delta.moves
         ],
@@ -82,20 +87,13 @@ def _added(message: SceneDeltaMessage, count: int) -> GaussianScene | None:
 
 def _move(message: GroupMoveMessage) -> GroupMove:
     turn, shift = message.motion.rotation, message.motion.translation
-    quat = np.array([[turn.w, turn.x, turn.y, turn.z]])
-    length = float(np.linalg.norm(quat))
+    quaternion = turn.x, turn.y, turn.z, turn.w
+    length = math.hypot(*quaternion)
     if not 0 < length < np.inf or message.group > MAX_ID:
         raise InvalidRequestError(
             f"scene delta: group {message.group} moves by a quaternion of length {length:g}; expected one of length 1, "
             f"and a group of at most {MAX_ID}"
         )
-    motion = Similarity(message.scale or 1.0, rotations(quat / length)[0], np.array([shift.x, shift.y, shift.z]))
+    rotation, translation = rotation_from_quaternion(*quaternion), np.array([shift.x, shift.y, shift.z])
+    motion = Similarity(message.scale or 1.0, rotation, translation)
     return GroupMove(message.group, motion, tuple(message.views))
-
-
-def _transform(motion: Similarity) -> Transform:
-    from scipy.spatial.transform import Rotation  # It takes a while to load, and few need it.
-
-    x, y, z, w = Rotation.from_matrix(motion.rotation).as_quat().tolist()
-    shift = Vector3(**dict(zip("xyz", motion.translation.tolist(), strict=True)))
-    return Transform(translation=shift, rotation=Quaternion(x=x, y=y, z=z, w=w))

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from gsseg_core.errors import SettingsError
 from gsseg_core.objects.oriented_boxes import OrientedBox
+from gsseg_core.scene.camera import rigid_motion
 from gsseg_core.scene.quaternions import rotations
 
 Array: TypeAlias = npt.NDArray[np.float64]
@@ -74,7 +75,7 @@ class Similarity:
         """
         pose = np.asarray(camera_in_map, np.float64)
         center = self.rotation.T @ (pose[:3, 3] - self.translation) / self.scale
-        return inverse(rigid(self.rotation.T @ pose[:3, :3], center))
+        return inverse(rigid_motion(self.rotation.T @ pose[:3, :3], center))
 
     def camera_in_map(
         self,
@@ -82,7 +83,7 @@ class Similarity:
     ) -> Array:
         """Turn a camera of the scene into its pose (4, 4) in the map, in metres: undoes `world_to_camera`."""
         pose = inverse(np.asarray(world_to_camera, np.float64))
-        return rigid(self.rotation @ pose[:3, :3], self.scale * self.rotation @ pose[:3, 3] + self.translation)
+        return rigid_motion(self.rotation @ pose[:3, :3], self.scale * self.rotation @ pose[:3, 3] + self.translation)
 
 
 def pose_from_parameters(
@@ -103,25 +104,14 @@ def pose_from_parameters(
     if not any(quaternion_xyzw):
         raise SettingsError(f"{name}.rotation is all zeros; expected a quaternion x y z w, [0, 0, 0, 1] for none")
     x, y, z, w = quaternion_xyzw
-    return rigid(rotation_from_quaternion(x, y, z, w), translation)
-
-
-def rigid(
-    rotation: npt.ArrayLike,  # (3, 3)
-    translation: npt.ArrayLike,  # (3,)
-) -> Array:
-    """Put a rotation and a translation together into a rigid motion (4, 4)."""
-    pose = np.eye(4)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = translation
-    return pose
+    return rigid_motion(rotation_from_quaternion(x, y, z, w), translation)
 
 
 def inverse(
     pose: Array,  # (4, 4)
 ) -> Array:
     """Invert a rigid motion (4, 4)."""
-    return rigid(pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3])
+    return rigid_motion(pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3])
 
 
 def rotation_from_quaternion(x: float, y: float, z: float, w: float) -> Array:
@@ -169,4 +159,4 @@ def interpolate(
     share_a, share_b = ((s * np.sinc(s * angle / np.pi) / np.sinc(angle / np.pi)) for s in (1 - share, share))
     x, y, z, w = share_a * a + share_b * b
     translation = (1 - share) * pose_a[:3, 3] + share * pose_b[:3, 3]
-    return rigid(rotation_from_quaternion(x, y, z, w), translation)
+    return rigid_motion(rotation_from_quaternion(x, y, z, w), translation)

@@ -13,8 +13,8 @@ from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from gsseg_core.objects.oriented_boxes import OrientedBox
+from gsseg_core.scene.camera import rigid_motion
 from gsseg_ros.conversions import matrix_from_pose, pose_from_matrix
-from gsseg_ros.frames import rigid
 
 BOX_ALPHA, TEXT_SHARE, TEXT_RANGE = 0.35, 0.3, (0.03, 0.3)
 """How opaque a marker's box is; height of its name as a share of the box's middle side, and within which bounds [m]."""
@@ -37,7 +37,7 @@ def object_message(
         color=color,
         num_gaussians=len(confidence),
         confidence=float(confidence.mean(dtype=np.float64)),
-        box_pose=pose_from_matrix(rigid(box.axes, box.center)),
+        box_pose=pose_from_matrix(rigid_motion(box.axes, box.center)),
         box_size=Vector3(**_xyz(box.size)),
         center=point_message(box.mean),
         covariance=box.covariance.ravel(),

@@ -40,10 +40,8 @@ class JobSlot:
     """Holds one job at a time: learning, or whatever replaces the scene or its state."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        self._changed = threading.Condition()
         self._job: Job | None = None
-        self._free = threading.Event()
-        self._free.set()
 
     @contextmanager
     def take(self, name: str) -> Iterator[Job]:
@@ -54,29 +52,28 @@ class JobSlot:
         BusyError
             Another one is running.
         """
-        with self._lock:
+        with self._changed:
             if self._job is not None:
                 raise BusyError(f"{self._job.name} is running; expected to start {name} after it: cancel it, or wait")
             job = self._job = Job(name)
-            self._free.clear()
         try:
             yield job
         finally:
-            with self._lock:
+            with self._changed:
                 self._job = None
-                self._free.set()
+                self._changed.notify_all()
 
     @property
     def busy(self) -> bool:
         """Whether a job runs."""
-        return not self._free.is_set()
+        return self._job is not None
 
     def cancel(self, timeout_s: float) -> bool:
         """Ask the running job to stop, and wait for that; return whether the slot is free."""
-        with self._lock:
+        with self._changed:
             if self._job is not None:
                 self._job.cancel()
-        return self._free.wait(timeout_s)
+            return self._changed.wait_for(lambda: self._job is None, timeout_s)
 
 
 class Requests:

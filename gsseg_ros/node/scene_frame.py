@@ -7,15 +7,15 @@ from contextlib import contextmanager
 from typing import Any
 
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Transform, TransformStamped, Vector3
+from geometry_msgs.msg import TransformStamped
 from gsseg_msgs.srv import LoadScene
 from rclpy.parameter import Parameter
 from std_msgs.msg import Header
 
 from gsseg_core.errors import PoseError
-from gsseg_ros.conversions import matrix_from_pose, pose_from_matrix
+from gsseg_ros.conversions import matrix_from_pose, transform_of
 from gsseg_ros.errors import InvalidRequestError
-from gsseg_ros.frames import Similarity, rigid
+from gsseg_ros.frames import Similarity
 from gsseg_ros.node.declarations import SCALES
 from gsseg_ros.qos import latched
 
@@ -104,10 +104,8 @@ class SceneFrame:
 
 def transform(map_frame: str, scene_frame: str, similarity: Similarity, stamp: Time) -> TransformStamped:
     """Write the pose of the scene in the map as a transform."""
-    pose = pose_from_matrix(rigid(similarity.rotation, similarity.translation))
-    place = Vector3(x=pose.position.x, y=pose.position.y, z=pose.position.z)
     return TransformStamped(
         header=Header(stamp=stamp, frame_id=map_frame),
         child_frame_id=scene_frame,
-        transform=Transform(translation=place, rotation=pose.orientation),
+        transform=transform_of(similarity.rotation, similarity.translation),
     )

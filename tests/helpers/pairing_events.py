@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from gsseg_ros.frames import rigid
+from gsseg_core.scene.camera import rigid_motion
 from gsseg_ros.node.pairing import Pairing
 from gsseg_ros.node.pose_sources import GivenPose
 
@@ -18,7 +18,7 @@ Event = tuple[str, int]
 
 
 def pose(x: float) -> np.ndarray:
-    return rigid(np.eye(3), [x, 0, 0])
+    return rigid_motion(np.eye(3), [x, 0, 0])
 
 
 def send(pairing: Pairing, events: Iterable[Event]) -> None:

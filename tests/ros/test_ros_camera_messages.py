@@ -18,7 +18,7 @@ from ros_message_cases import HEADER, IDENTITY, K, info, refusal
 from sensor_msgs.msg import CameraInfo, RegionOfInterest
 
 from gsseg_core.errors import IntrinsicsError, MaskSizeError, PoseError
-from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.camera import Camera, rigid_motion
 from gsseg_ros.camera_infos import (
     camera_from_messages,
     camera_of_image,
@@ -34,7 +34,7 @@ from gsseg_ros.conversions import (
     pose_from_matrix,
     viewpoint_messages,
 )
-from gsseg_ros.frames import Similarity, rigid, rotation_from_quaternion
+from gsseg_ros.frames import Similarity, rotation_from_quaternion
 
 
 def test_intrinsics_are_taken_as_they_stand() -> None:
@@ -93,7 +93,7 @@ components = st.floats(-1, 1)
     st.tuples(*[st.floats(-1e3, 1e3)] * 3),
 )
 def test_a_rigid_motion_survives_its_pose(q: tuple[float, ...], place: tuple[float, ...]) -> None:
-    matrix = rigid(rotation_from_quaternion(*q), place)
+    matrix = rigid_motion(rotation_from_quaternion(*q), place)
     assert np.allclose(matrix_from_pose(pose_from_matrix(matrix), "/some/topic"), matrix, rtol=0, atol=1e-12)
 
 
@@ -134,14 +134,14 @@ def test_a_quaternion_of_few_digits_still_gives_a_rotation() -> None:
 
 def test_a_camera_is_built_from_camera_info_pose_and_similarity() -> None:
     similarity = Similarity.from_parameters(2.0, [10.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
-    camera = camera_from_messages("view", info(), rigid(np.eye(3), [14.0, 0.0, 0.0]), similarity, "/some/topic")
+    camera = camera_from_messages("view", info(), rigid_motion(np.eye(3), [14.0, 0.0, 0.0]), similarity, "/some/topic")
     assert (camera.name, camera.width, camera.height) == ("view", 64, 48)
     assert np.allclose(camera.center, [2, 0, 0])
     refusal(IntrinsicsError, camera_from_messages, "view", info(d=[1.0]), np.eye(4), IDENTITY, "/some/topic")
 
 
 def test_a_viewpoint_comes_back_as_the_camera_it_was() -> None:
-    pose = rigid(rotation_from_quaternion(0.1, 0.7, -0.1, 0.7), (1.0, -2.0, 3.0))
+    pose = rigid_motion(rotation_from_quaternion(0.1, 0.7, -0.1, 0.7), (1.0, -2.0, 3.0))
     camera = Camera("viewpoint", 64, 48, K, pose)
     message, info = viewpoint_messages(camera)
     assert message.header.frame_id == ""

@@ -10,14 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsseg_core.errors import SettingsError
-from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.camera import Camera, rigid_motion
 from gsseg_ros.frames import (
     Similarity,
     interpolate,
     inverse,
     pose_from_parameters,
     quaternion_from_rotation,
-    rigid,
     rotation_from_quaternion,
 )
 
@@ -32,7 +31,7 @@ quaternions = (
     .map(lambda q: q / np.linalg.norm(q))
 )
 places = st.tuples(*[st.floats(-100, 100)] * 3).map(np.array)
-poses = st.builds(lambda q, place: rigid(rotation_from_quaternion(*q), place), quaternions, places)
+poses = st.builds(lambda q, place: rigid_motion(rotation_from_quaternion(*q), place), quaternions, places)
 similarities = st.builds(Similarity.from_parameters, st.floats(1e-3, 1e3), places.map(list), quaternions.map(list))
 
 
@@ -136,7 +135,7 @@ def test_interpolation_starts_at_the_first_pose_and_ends_at_the_second(a: np.nda
 
 @given(poses, quaternions, st.floats(0, 1))
 def test_interpolation_turns_at_constant_speed(a: np.ndarray, turn: np.ndarray, share: float) -> None:
-    b = a @ rigid(rotation_from_quaternion(*turn), np.zeros(3))
+    b = a @ rigid_motion(rotation_from_quaternion(*turn), np.zeros(3))
     between = interpolate(a, b, share)
     assert np.allclose(between[:3, :3] @ between[:3, :3].T, np.eye(3), rtol=0, atol=1e-12)
     part, whole = (angle(a[:3, :3].T @ pose[:3, :3]) for pose in (between, b))

@@ -23,8 +23,8 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 from gsseg_msgs.msg import Object, ObjectArray
 from visualization_msgs.msg import Marker, MarkerArray
 
+from gsseg_core.scene.camera import rigid_motion
 from gsseg_ros.conversions import pose_from_matrix
-from gsseg_ros.frames import rigid
 from gsseg_ros.node.live_outputs import OBJECTS_PERIOD
 from gsseg_ros.object_messages import box_from_object
 
@@ -144,7 +144,7 @@ def test_boxes_are_in_the_map_where_the_scene_has_another_frame_and_scale(
     rotation, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
     rotation *= np.linalg.det(rotation)
     place = Similarity(rotation, np.array([4.0, -1.0, 0.5]), 2.5)
-    q = pose_from_matrix(rigid(rotation, np.zeros(3))).orientation
+    q = pose_from_matrix(rigid_motion(rotation, np.zeros(3))).orientation
     robot = Robot(ros).started({
         **parameters, "scene_to_map.scale": 2.5, "scene_to_map.translation": [4.0, -1.0, 0.5],
         "scene_to_map.rotation": [q.x, q.y, q.z, q.w],

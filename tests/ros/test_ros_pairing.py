@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pairing_events import MS, Event, S, at_all, expire, pose, send
 
-from gsseg_ros.frames import rigid
+from gsseg_core.scene.camera import rigid_motion
 from gsseg_ros.node.pairing import Paired, Pairing, PairingSettings
 from gsseg_ros.node.pose_sources import GivenPose, InterpolatedPoses, MessagePoses
 
@@ -119,7 +119,7 @@ class CameraPoses(MessagePoses):
 
     def at(self, stamp: int, frame_id: str = "", last_chance: bool = False, several: bool = False) -> np.ndarray | None:
         found = super().at(stamp)
-        return None if found is None else rigid(np.eye(3), [found[0, 3], len(frame_id), 0])
+        return None if found is None else rigid_motion(np.eye(3), [found[0, 3], len(frame_id), 0])
 
 
 def test_depth_images_of_one_stamp_go_with_the_masks_of_their_camera() -> None:

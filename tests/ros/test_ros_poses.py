@@ -9,7 +9,7 @@ import pytest
 from pairing_events import MS, S, expire, pose
 
 from gsseg_core.errors import SettingsError
-from gsseg_ros.frames import rigid
+from gsseg_core.scene.camera import rigid_motion
 from gsseg_ros.node.pairing import Pairing
 from gsseg_ros.node.pose_frames import PoseFrames
 from gsseg_ros.node.pose_sources import GivenPose, InterpolatedPoses, MessagePoses, TfFirst
@@ -173,8 +173,8 @@ def test_automatic_poses_are_those_of_tf_and_else_of_the_topic() -> None:
     tree = Tree(left=("map", 7.0, 2 * S))
     poses = TfFirst(tree)
     for stamp in (1 * S, 2 * S):
-        poses.add(stamp, GivenPose(rigid(np.eye(3), [0, stamp / S, 0])))
-    assert np.array_equal(poses.at(1 * S, "left"), rigid(np.eye(3), [0, 1, 0]))
+        poses.add(stamp, GivenPose(rigid_motion(np.eye(3), [0, stamp / S, 0])))
+    assert np.array_equal(poses.at(1 * S, "left"), rigid_motion(np.eye(3), [0, 1, 0]))
     assert np.array_equal(poses.at(2 * S, "left"), pose(7.0))
     assert poses.at(2 * S, "right", several=True) is None, "the pose on the topic may be of the other camera"
     poses.clear()
