@@ -15,6 +15,9 @@ from gsseg_ros.conversions import stamp_ns
 from gsseg_ros.errors import NodeUnavailableError
 from gsseg_ros.qos import all_clouds
 
+_MOST = 16
+"""Clouds that are kept; of two that ask in turn, and never rest together, all would be."""
+
 
 class RunClouds:
     """Listens to a node's `~/cloud`; its methods may be called from several threads.
@@ -68,3 +71,5 @@ class RunClouds:
         with self._lock:
             if self._awaiting:
                 self._clouds[stamp_ns(message.header.stamp)] = message
+                while len(self._clouds) > _MOST:
+                    del self._clouds[next(iter(self._clouds))]

@@ -35,11 +35,15 @@ from small_scenes import write_dataset
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 import rclpy
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from gsseg_msgs.srv import Reset
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
 
 from gsseg_ros.client import NodeUnavailableError, SegmentationClient, SegmentationError
 from gsseg_ros.client.calls import Calls
+from gsseg_ros.client.run_clouds import RunClouds
 
 
 def test_a_question_whose_answer_is_lost_is_asked_again_for_as_long_as_the_node_is_there() -> None:
@@ -62,6 +66,20 @@ def test_a_question_whose_answer_is_lost_is_asked_again_for_as_long_as_the_node_
     ready = iter([True] * 4)
     assert calls.ask(client, "well?", time.monotonic() + PATIENCE) is None
     assert calls.ask(client, "well?", time.monotonic()) is None
+
+
+def test_of_the_clouds_of_requests_that_overlap_without_end_only_the_last_are_kept() -> None:
+    node = SimpleNamespace(create_subscription=lambda kind, topic, take, quality: take)
+    spinner: Any = SimpleNamespace(node=node, wait_for=lambda condition, _: condition())
+    clouds = RunClouds(spinner, "/gsseg/cloud")
+    take: Any = clouds._topic
+    with clouds.kept():  # One of them is always at work.
+        for second in range(1, 1001):
+            take(PointCloud2(header=Header(stamp=Time(sec=second))))
+            found = clouds.of_run(Header(stamp=Time(sec=second)), time.monotonic())
+            assert found is not None and found.header.stamp.sec == second
+        assert len(clouds._clouds) < 20
+        assert clouds.of_run(Header(stamp=Time(sec=1)), time.monotonic()) is None, "it is asked for again"
 
 
 def test_cancel_from_another_thread_ends_learning_and_changes_nothing(learnt: Place) -> None:
