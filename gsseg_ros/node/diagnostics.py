@@ -205,7 +205,7 @@ def _verdict(
         return DiagnosticStatus.WARN, clock_problem
     if inputs is None or not workspace.active:
         return DiagnosticStatus.WARN, "not active"
-    if not workspace.has_scene:
+    if workspace.loaded is None:
         return DiagnosticStatus.WARN, "no scene is loaded"
     refused = recent.total() - recent[_ACCEPTED]
     if refused and refused >= WARN_SHARE * recent.total():
@@ -233,9 +233,8 @@ def _refusals(inputs: Inputs, recent: Counter[str]) -> str:
 
 
 def _scene_values(workspace: Workspace) -> dict[str, object]:
-    if not workspace.has_scene:
+    if (session := workspace.loaded) is None:
         return {"scene": "none"}
-    session = workspace.session
     learnt = session.learnt
     return {
         "scene": f"{session.scene.path}",

@@ -12,6 +12,9 @@ from gsseg_ros.errors import BusyError, CanceledError
 
 T = TypeVar("T")
 
+END_SECONDS = 5.0
+"""How long the end of a thread is waited for, at most."""
+
 
 class Job:
     """A job that can be asked to stop."""
@@ -190,13 +193,13 @@ class Worker(Generic[T]):
             self._items.clear()
             return forgotten
 
-    def stop(self, timeout_s: float = 5.0) -> None:
+    def stop(self) -> None:
         """Finish the item in hand, and end."""
         with self._changed:
             self._stopping = True
             self._items.clear()
             self._changed.notify()
-        self._thread.join(timeout_s)
+        self._thread.join(END_SECONDS)
 
     def _too_large(self) -> bool:
         return sum(map(self._size, self._items)) > self._most_bytes

@@ -26,6 +26,7 @@ from gsseg_core.segmentation import Segmentation
 from gsseg_ros.camera_infos import camera_of_image, is_rectified
 from gsseg_ros.color_images import color_from_image
 from gsseg_ros.conversions import rgb_image
+from gsseg_ros.node.jobs import END_SECONDS
 from gsseg_ros.node.masks.compressed import decompress_picture
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.pairing import Paired
@@ -119,12 +120,12 @@ class LiveOutputs:
             self._objects_due = True
             self._changed.notify()
 
-    def close(self, timeout_s: float = 5.0) -> None:
+    def close(self) -> None:
         """Finish what is in hand, and end."""
         with self._changed:
             self._stopping = True
             self._changed.notify()
-        self._thread.join(timeout_s)
+        self._thread.join(END_SECONDS)
 
     def _show(self, paired: Paired, camera: Camera | None) -> None:
         if self._outputs.wants_overlay(paired.stream):

@@ -95,10 +95,10 @@ class Obstacles:
 
     def _cells(self, settings: Settings) -> Cells:
         """Cells (M, 3) of the classes that count as obstacles, in the map."""
-        if not self._workspace.has_scene or not self._workspace.session.has_codes:
+        session, kept, now = self._workspace.loaded, self._kept, time.monotonic()
+        if session is None or not session.has_codes:
             self._kept = None
             return np.empty((0, 3), np.float32)
-        session, kept, now = self._workspace.session, self._kept, time.monotonic()
         version = session.version
         same = kept is not None and kept.era is session.era and kept.settings is settings
         if kept is not None and same and (kept.version == version or now - kept.since < RENEWAL_SECONDS):

@@ -19,12 +19,8 @@ class Placed(Protocol):
     """What a placement belongs to: a workspace."""
 
     @property
-    def has_scene(self) -> bool:
-        """Whether there is a session."""
-
-    @property
-    def session(self) -> Any:
-        """The session, whose views follow: a `LivingSession`, or a `PerViewSession`, which loads SciPy."""
+    def loaded(self) -> Any:
+        """The session, if any, whose views follow: a `LivingSession`, or a `PerViewSession`, which loads SciPy."""
 
 
 class Placement:
@@ -64,7 +60,8 @@ class Placement:
         """Move the scene, and begin to have the views follow; `take_over` makes it known to those that come now."""
         with self.fusing:
             take_over()
-            names = self._owner.session.view_names if self._owner.has_scene else []
+            session = self._owner.loaded
+            names = [] if session is None else session.view_names
             at = self._left | {name: moved[0] for name, moved in self._moved_from.items()}
             moved_from = {name: (at.get(name, before), after) for name in names}
             # To go nowhere costs as much as to go far, and rounds the camera.
@@ -75,9 +72,10 @@ class Placement:
     def bring(self, names: Iterable[str]) -> None:
         """Have some views follow before anything else; whoever goes on from where they are then holds `fusing`."""
         with self.fusing:
-            moved_from = self._moved_from
-            for name in set(names) & moved_from.keys():
-                self._follows(name, moved_from)
+            moved_from, session = self._moved_from, self._owner.loaded
+            waiting = [] if session is None else set(names) & moved_from.keys()
+            for name in waiting:
+                self._follows(session, name, moved_from)
 
     def forget(self) -> tuple[_Ways, dict[str, Similarity]]:
         """Leave all views where they are, before they are replaced; returns what `resume` takes if they are not."""
@@ -107,14 +105,15 @@ class Placement:
         """Have one view follow; returns whether there was one."""
         with self.fusing:
             self._running, moved_from = False, self._moved_from  # Whatever is raised here, others may follow later.
-            if not moved_from or not self._owner.has_scene:
+            session = self._owner.loaded
+            if not moved_from or session is None:
                 return False
-            self._follows(next(iter(moved_from)), moved_from)
+            self._follows(session, next(iter(moved_from)), moved_from)
             self._running = True
             return True
 
-    def _follows(self, name: str, moved_from: _Ways) -> None:
-        session, (before, after) = self._owner.session, moved_from[name]
+    def _follows(self, session: Any, name: str, moved_from: _Ways) -> None:
+        before, after = moved_from[name]
         try:
             done = session.move_view(name, partial(_moved, before=before, after=after), session.era)
         except GssegError as error:

@@ -124,7 +124,7 @@ class SceneChanges:
 
     def _require_current(self, session: LivingSession) -> None:
         """Raise `InvalidRequestError` where another scene was loaded while a file was read."""
-        if not self.workspace.has_scene or self.workspace.session is not session:
+        if self.workspace.loaded is not session:
             raise InvalidRequestError("another scene was loaded meanwhile, and is unchanged; expected one that stays")
 
 

@@ -163,8 +163,7 @@ class SegmentNode(LifecycleNode):
         self._outputs.announce(self.workspace.label_space.classes)
         self._scene_frame = SceneFrame(self, settings.map_frame, settings.scene_frame)
         self._scene_frame.publish(self.workspace.settings.scene_to_map, self.get_clock().now().to_msg())
-        if self.workspace.has_scene:
-            session = self.workspace.session
+        if (session := self.workspace.loaded) is not None:
             self.get_logger().info(f"loaded {session.scene.path}: {len(session.scene):,} Gaussians")
         else:
             self.get_logger().warning("no scene yet: set the parameter scene_path, or call ~/load_scene")
@@ -268,7 +267,7 @@ class SegmentNode(LifecycleNode):
         if not self.workspace.active or inputs is None or outputs is None:
             return
         self._out_of_place = False
-        session = self.workspace.session if self.workspace.has_scene else None
+        session = self.workspace.loaded
         if session is None or not session.has_codes:
             return
         following = session.num_views

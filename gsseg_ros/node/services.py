@@ -358,8 +358,7 @@ class Services:
         """Replace all that is latched by empty messages."""
         workspace = self.workspace
         workspace.number(run)
-        session = workspace.session if workspace.has_scene else None
-        self._outputs().clear(empty_report(run, session, workspace.settings.map_frame))
+        self._outputs().clear(empty_report(run, workspace.loaded, workspace.settings.map_frame))
 
     def _header(self, run: Run) -> Header:
         return Header(stamp=run.stamp, frame_id=self.workspace.settings.map_frame)

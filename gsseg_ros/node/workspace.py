@@ -96,9 +96,9 @@ class Workspace:
         self._revision = self._clock = self._stamp = 0
 
     @property
-    def has_scene(self) -> bool:
-        """Whether a scene is loaded."""
-        return self._session is not None
+    def loaded(self) -> LiveSession | None:
+        """The session of the scene; None if no scene is loaded."""
+        return self._session
 
     @property
     def session(self) -> LiveSession:
@@ -109,9 +109,9 @@ class Workspace:
         NoSceneError
             No scene is loaded.
         """
-        if self._session is None:
+        if (session := self._session) is None:
             raise NoSceneError("no scene is loaded; expected the parameter scene_path, or a call of ~/load_scene")
-        return self._session
+        return session
 
     @property
     def living_session(self) -> LivingSession:

@@ -165,12 +165,13 @@ class Hears:
 
     def verdict(self, clock_problem: str = "") -> tuple[bytes, str]:
         scene = type("Scene", (list,), {"path": "scene.ply"})()
-        session = SimpleNamespace(learnt=None, scene=scene, class_names={}, has_codes=False, num_fused=0, num_views=0)
+        session = SimpleNamespace(
+            learnt=None, scene=scene, class_names={}, has_codes=False, num_fused=0, num_views=0, version=0
+        )
         workspace: Any = SimpleNamespace(
             active=True,
-            has_scene=True,
+            loaded=session,
             last_job="none",
-            session=session,
             changes=Counter(),
             refused_change=self.refused_change,
         )

@@ -73,7 +73,7 @@ def test_a_configure_that_breaks_off_leaves_nothing_behind_and_works_afterwards(
     (line,) = errors
     assert line.startswith("cannot be configured: unexpected MemoryError: none left\nTraceback")
     assert_nothing_more(node, before)
-    assert not node.workspace.has_scene
+    assert node.workspace.loaded is None
     assert node.trigger_configure() == SUCCESS
 
 

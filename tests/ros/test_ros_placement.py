@@ -61,7 +61,7 @@ def placed_views(views: list[View], now: Similarity) -> list[View]:
 
 def placement_of(session: LivingSession) -> tuple[Placement, list[int]]:
     settled: list[int] = []
-    owner: Any = SimpleNamespace(has_scene=True, session=session)
+    owner: Any = SimpleNamespace(loaded=session)
     return Placement(owner, lambda: settled.append(session.num_views)), settled
 
 
@@ -114,10 +114,8 @@ def test_a_state_that_is_loaded_between_two_looks_at_what_has_to_follow_ends_it_
     session, settled = living_session(clean_views(2)), threading.Event()
 
     class Owner:
-        has_scene = True
-
         @property
-        def session(self) -> LivingSession:
+        def loaded(self) -> LivingSession:
             placement.forget()
             return session
 
