@@ -336,10 +336,14 @@ def _match(pairs: _Pairs, num: int, least: float) -> np.ndarray | None:
 
 
 def _move(stack: _Stack, objects: np.ndarray, settings: AssociationSettings) -> np.ndarray:
-    """Give every segment to the object that explains it best by what the other views say."""
+    """Give every segment to the object that explains it best by what the other views say.
+
+    That ends when none moves any more, or when some do nothing but change places with each other.
+    """
     parts = [slice(*bounds) for bounds in itertools.pairwise(stack.starts.tolist())]
+    before = objects
     for _ in range(settings.rounds):
-        before, objects = objects, objects.copy()
+        earlier, before, objects = before, objects, objects.copy()
         profiles = Profiles.empty(stack.num_gaussians)
         for view, rows in zip(stack.views, parts, strict=True):
             profiles.add(view, before[rows])
@@ -347,7 +351,7 @@ def _move(stack: _Stack, objects: np.ndarray, settings: AssociationSettings) -> 
             best, seen = profiles.explain(view, before[rows])
             moves = ~stack.background[rows] & (seen >= settings.unseen)
             objects[rows] = np.where(moves, best, before[rows])
-        if (objects == before).all():
+        if (objects == before).all() or (objects == earlier).all():
             break
     return objects
 
