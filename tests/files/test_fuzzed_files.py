@@ -70,7 +70,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     Segmentation.from_codes(SCENE, np.eye(NUM_CLASSES, dtype=np.float32)[TRUTH], NAMES).save(
         folder / "segmentation.npz"
     )
-    taught(VoteLearner(SCENE, NUM_CLASSES), clean_views(2)).save(folder / "state.npz")
+    taught(VoteLearner(SCENE, NUM_CLASSES), clean_views(2)).state().save(folder / "state.npz", SCENE.digest)
     delta = SceneDelta(1, np.arange(5), SMALL, np.arange(len(SMALL)) + 999, np.full(len(SMALL), 2, np.int64))
     replace(delta, moves=(GroupMove(2, Similarity(2.0), ("view0",)),)).save(folder / "delta.npz")
     session = LivingSession(SCENE, NAMES)

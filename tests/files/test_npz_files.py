@@ -75,7 +75,7 @@ def saved(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def state(tmp_path: Path) -> Path:
-    taught(VoteLearner(SCENE, NUM_CLASSES), clean_views(2)).save(tmp_path / "state.npz")
+    taught(VoteLearner(SCENE, NUM_CLASSES), clean_views(2)).state().save(tmp_path / "state.npz", SCENE.digest)
     return tmp_path / "state.npz"
 
 
@@ -186,7 +186,7 @@ def test_votes_against_classes_are_kept_where_masks_say_what_is_not_there(tmp_pa
     view = clean_views(1)[0]
     partial = View.from_arrays(view.camera, view.read_labels() * (view.read_labels() == 1), supervised=[1])
     learner = taught(VoteLearner(SCENE, NUM_CLASSES), [partial])
-    learner.save(tmp_path / "state.npz")
+    learner.state().save(tmp_path / "state.npz", SCENE.digest)
     votes = State.load(tmp_path / "state.npz", SCENE.digest, N).votes
     assert votes.min() < 0
     np.testing.assert_array_equal(votes, learner._votes)
