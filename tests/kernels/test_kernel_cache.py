@@ -23,8 +23,9 @@ for path in kernels:
     importlib.import_module(".".join(path.relative_to(folder.parent).with_suffix("").parts))
 import numpy as np
 from gsseg_core.kernels import kernel_cache
-from gsseg_core.learn.em.rejected_regions import _root
-print(len(kernels) > 15, kernel_cache.FOLDER, _root(np.array([0, 0, 1]), 2), _root.stats.cache_path)
+from gsseg_core.learn.em.rejected_regions import connected_pixels
+_, first, _ = connected_pixels(np.zeros((2, 2), np.int32))
+print(len(kernels) > 15, kernel_cache.FOLDER, *first, connected_pixels.stats.cache_path)
 """
 
 
