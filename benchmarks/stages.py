@@ -22,9 +22,9 @@ from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu.depth_sort import sort_by_depth
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.tiling import assign
+from gsseg_core.raster.depth import depths
 from gsseg_core.refine.knn_filter import cluster_in_place, statistical_filter
 from gsseg_core.refine.settings import RefineSettings
-from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.spatial.neighbourhood import Neighbours
@@ -72,11 +72,11 @@ def _view_stages(scene: GaussianScene, views: list[View], num_classes: int, runs
     for view in views:
         camera, mask = view.camera, view.read_labels()
         projected, operator = project(scene, camera), make_operator(scene, camera)
-        observation, depths = operator.observe(mask), _depths(scene, camera, projected.ids)
+        observation, depth = operator.observe(mask), depths(scene, camera, projected.ids)
         mine = codes[observation.ids[observation.rows], observation.classes[observation.labels]]
         rest = np.ones(len(observation.classes), np.float32)
         add("project and sort", lambda c=camera: project(scene, c))
-        add("of this, sort", lambda d=depths: sort_by_depth(d))
+        add("of this, sort", lambda d=depth: sort_by_depth(d))
         add("bin", lambda p=projected, c=camera: assign(p, c.width, c.height))
         add("blend", operator.transmittance)
         add(f"render {num_classes} classes", lambda o=operator: o.render(codes))
@@ -90,12 +90,6 @@ def _view_stages(scene: GaussianScene, views: list[View], num_classes: int, runs
 def _averaged(jobs: list[Callable[[], object]], runs: int) -> list[float]:
     rows = [timed(job, runs) for job in jobs]
     return [sum(row) / len(rows) for row in zip(*rows, strict=True)]
-
-
-def _depths(scene: GaussianScene, camera: Camera, ids: np.ndarray) -> np.ndarray:
-    """Depths of what a view shows, in the order of the scene."""
-    pose = camera.world_to_camera
-    return (scene.means[np.sort(ids)] @ pose[2, :3] + pose[2, 3]).astype(np.float32)
 
 
 def _fuse(scene: GaussianScene, data: Dataset, runs: int, sampled: int) -> list[float]:

@@ -10,7 +10,7 @@ import numpy as np
 from gsseg_core.csr_rows import starts
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.raster.constants import AHEAD, CHUNKS
-from gsseg_core.raster.cpu.projection import Projected
+from gsseg_core.raster.cpu.projection import Projected, joined
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
 from gsseg_core.simd import LANES, prefetch
 
@@ -54,7 +54,7 @@ def assign(projected: Projected, width: int, height: int) -> Tiles:
             break
         capacity = int(needed.max())
     np.cumsum(gaussian_start, out=gaussian_start)
-    touched = np.concatenate([own[:n] for own, n in zip(touched, needed, strict=True)])
+    touched = joined(touched.reshape(-1), capacity * np.arange(CHUNKS), needed)
     counts = _count(touched, gaussian_start, projected.order, nb.get_num_threads(), columns * rows)
     start = starts(counts.sum(axis=0))
     # From counts to places: parts follow each other within a tile, so that its entries stay sorted by depth.
