@@ -16,7 +16,6 @@ import numpy as np
 from numba.core import event
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.data.label_evidence import resolved_votes
 from gsseg_core.data.soft_masks import quantise
 from gsseg_core.data.view import View
 from gsseg_core.export.pictures import overlay, palette
@@ -24,6 +23,7 @@ from gsseg_core.kernels import kernel_cache
 from gsseg_core.learn.em.boundary_alignment import align_boundaries
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.vote_learner import VoteLearner
+from gsseg_core.learn.vote_resolution import resolved_votes
 from gsseg_core.objects.clicks import merge_tree
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu.occlusion import ray_ends

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsseg_core.data.label_evidence import is_resolved
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn.learner import Learner, Progress, silent
+from gsseg_core.learn.vote_resolution import is_resolved
 from gsseg_core.raster.observation import Observation
 from gsseg_core.scene.gaussian_scene import GaussianScene
 

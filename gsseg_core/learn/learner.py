@@ -11,13 +11,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from gsseg_core.data.label_evidence import impute_probabilities
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError, UnknownLabelError
 from gsseg_core.learn.em.em_kernels import normalise_votes, weigh_votes
 from gsseg_core.learn.learner_state import State
 from gsseg_core.learn.prepared_views import PreparedViews, default_budget
+from gsseg_core.learn.vote_resolution import impute_probabilities
 from gsseg_core.progress import Progress as Progress
 from gsseg_core.progress import silent as silent
 from gsseg_core.raster.backends import make_operator, vote_total

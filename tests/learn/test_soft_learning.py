@@ -22,7 +22,7 @@ from small_scenes import (
 
 from gsseg_core.cli.main import main
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.data.label_evidence import LabelEvidence, impute_probabilities, resolved_votes
+from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
@@ -32,6 +32,7 @@ from gsseg_core.learn.learner import VOTE_UNIT, Learner
 from gsseg_core.learn.mask_reliability import check_views
 from gsseg_core.learn.registry import LEARNERS, make_learner
 from gsseg_core.learn.vote_learner import VoteLearner
+from gsseg_core.learn.vote_resolution import impute_probabilities, resolved_votes
 from gsseg_core.live.session import LiveSession
 from gsseg_core.raster.backends import make_operator
 

@@ -6,10 +6,11 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.data.label_evidence import LabelEvidence, resolve_row, vote_units
+from gsseg_core.data.label_evidence import LabelEvidence, vote_units
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.learn.em.em_kernels import BLOCKS, pairs_of
 from gsseg_core.learn.learner import UNITS
+from gsseg_core.learn.vote_resolution import resolve_row
 from gsseg_core.raster.observation import Observation, ViewPairs
 
 
