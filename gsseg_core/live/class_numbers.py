@@ -17,12 +17,22 @@ def require_affordable(needed: int, max_classes: int, num_gaussians: int, what: 
 
     The message begins with `what` the last of them is for, and ends in a `remedy`.
     """
+    most, why = most_classes(max_classes, num_gaussians)
+    if needed > most:
+        raise UnknownLabelError(f"{what} {needed - 1}; expected at most {most - 1}{why}{remedy}")
+
+
+def most_classes(max_classes: int, num_gaussians: int, num_declared: int = 0) -> tuple[int, str]:
+    """How many classes there may be, and why: those declared, if any, or else what is allowed and there is memory for.
+
+    The reason is the end of a sentence that the number is in.
+    """
+    if num_declared:
+        return num_declared, " (as named)"
     affordable = VOTES_LIMIT // (8 * num_gaussians)
-    if needed > min(max_classes, affordable):
-        most = f"{affordable - 1} for a scene of {num_gaussians} Gaussians"
-        if max_classes <= affordable:
-            most = f"{max_classes - 1}, as max_classes is {max_classes}"
-        raise UnknownLabelError(f"{what} {needed - 1}; expected at most {most}{remedy}")
+    if max_classes <= affordable:
+        return max_classes, f", as max_classes is {max_classes}"
+    return affordable, f" for a scene of {num_gaussians} Gaussians"
 
 
 def ids_by_name(

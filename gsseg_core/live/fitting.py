@@ -11,6 +11,7 @@ from gsseg_core.errors import ClassesFileError, UnknownLabelError
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.learner_state import Learnt
+from gsseg_core.live.class_numbers import most_classes
 from gsseg_core.live.results import Outcome
 from gsseg_core.progress import Stopwatch
 
@@ -34,13 +35,13 @@ def fitted(name: str, learner: Learner, views: Sequence[View], report: Report, w
     return Outcome(learnt, len(learner.history_), learner.converged_, learner.loss, dict(learner.rejected))
 
 
-def num_classes_with(dataset: Dataset, num_classes: int, max_classes: int) -> int:
+def num_classes_with(dataset: Dataset, num_classes: int, max_classes: int, num_gaussians: int) -> int:
     """Count the classes once those of a dataset are added; raises `UnknownLabelError` if they are too many."""
     num_classes = max(num_classes, dataset.num_classes)
-    if num_classes > max_classes:
+    most, why = most_classes(max_classes, num_gaussians)
+    if num_classes > most:
         raise UnknownLabelError(
-            f"{dataset.root}: has {num_classes} classes; expected at most {max_classes}, as max_classes says, or "
-            "class_names that declare them"
+            f"{dataset.root}: has {num_classes} classes; expected at most {most}{why}, or class_names that declare them"
         )
     return num_classes
 

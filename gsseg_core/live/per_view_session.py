@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import reduce
 from pathlib import Path
@@ -156,8 +156,8 @@ class PerViewSession(LiveSession):
             self._table.reserve(self._live.num_classes - 1)
         return loaded
 
-    def _forget(self) -> None:
-        super()._forget()
+    def _forget(self, class_names: Mapping[int, str]) -> None:
+        super()._forget(class_names)
         self._table = ObjectTable(self.scene, device=self.device)
         self._with_tree = None
         self._repairs: list[np.ndarray] = []  # successors of each repair that gave objects other numbers

@@ -19,7 +19,7 @@ from gsseg_core.errors import GssegError, NoCodesError, NoUsableViewsError, Sett
 from gsseg_core.learn.learner_state import OBJECTS_OF_ONE_SESSION, Learnt, State
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.learn.vote_learner import VoteLearner
-from gsseg_core.live.class_numbers import add_names, ids_by_name, require_affordable
+from gsseg_core.live.class_numbers import add_names, ids_by_name, most_classes, require_affordable
 from gsseg_core.live.fitting import Report, check_names_of, fitted, names_with, num_classes_with
 from gsseg_core.live.results import SCENE_CHANGED, Outcome, Rejection
 from gsseg_core.progress import Stopwatch
@@ -82,7 +82,7 @@ class LiveSession:
         self._names = {0: BACKGROUND_NAME, **(class_names or {})}
         self._lock, self._version = threading.RLock(), 0
         self._scenes: WeakKeyDictionary[Segmentation, GaussianScene] = WeakKeyDictionary()
-        self._forget()
+        self._forget({})
 
     @property
     def class_names(self) -> dict[int, str]:
@@ -204,7 +204,7 @@ class LiveSession:
         NoUsableViewsError
             There is no view to learn from, or all that was known was forgotten meanwhile.
         UnknownLabelError, ClassesFileError, GssegError
-            The dataset has more classes than `max_classes`, calls one otherwise than it is called here, or is broken.
+            The dataset has more classes than there may be, calls one otherwise than it is called here, or is broken.
         """
         with self._lock:
             views, num_classes, era, scene = self._posed_views(), self._live.num_classes, self._era, self.scene
@@ -213,7 +213,7 @@ class LiveSession:
             views = dataset.views("train")
             check_names_of(dataset, self._names if self._declared or self.num_fused else {})
             if not self._declared:
-                num_classes = num_classes_with(dataset, num_classes, self.max_classes)
+                num_classes = num_classes_with(dataset, num_classes, self.max_classes, len(scene))
         made = make_learner(learner, scene, num_classes, max_steps=max_steps, device=self.device)
         views = spread(views, num_views)
         outcome = fitted(learner, made, views, report, watch or Stopwatch())
@@ -317,8 +317,8 @@ class LiveSession:
         Raises
         ------
         StateFileError
-            The file is missing or damaged, or has more classes than there are names for, or without names than
-            `max_classes`, or other names than were given, or objects of a `PerViewSession`. Nothing has changed.
+            The file is missing or damaged, or has more classes than there are names for, or without names than there
+            may be, or other names than were given, or objects of a `PerViewSession`. Nothing has changed.
         StateMismatchError
             It belongs to another scene. Nothing has changed.
         PathNotAllowedError
@@ -327,9 +327,7 @@ class LiveSession:
         state = self._read_state(Path(path), within)
         self._check_classes(path, state)
         with self._lock:
-            if not self._declared:
-                self._names = {0: BACKGROUND_NAME, **state.class_names}
-            self._forget()
+            self._forget(state.class_names)
             self._live.adopt(state)
             self._live.resize(max(state.num_classes, max(self._names) + 1 if self._declared else 1))
             self.num_fused, self._learnt = state.num_fused, state.learnt
@@ -351,14 +349,16 @@ class LiveSession:
         self._era = object()
 
     def reset(self) -> int:
-        """Forget votes, views and class probabilities; return how many views were forgotten."""
+        """Forget votes, views, class probabilities and classes that turned up; return how many views were forgotten."""
         with self._lock:
             dropped = self.num_fused
             self.rejected.clear()
-            self._forget()
+            self._forget({})
         return dropped
 
-    def _forget(self) -> None:
+    def _forget(self, class_names: Mapping[int, str]) -> None:
+        if not self._declared:
+            self._names = {0: BACKGROUND_NAME, **class_names}
         self._live = self._no_votes(max(self._names) + 1 if self._declared else 1)
         self._learnt, self._segmented, self.num_fused, self._cameras = None, None, 0, []
         self._version += 1
@@ -375,7 +375,7 @@ class LiveSession:
         """Raise `StateFileError` if a state has too many classes, other names than were declared, or objects."""
         if state.per_view and not self._PER_VIEW:
             raise StateFileError(f"{path}: {OBJECTS_OF_ONE_SESSION}; expected classes, or a session with ids per-view")
-        most, why = (max(self._names) + 1, " (as named)") if self._declared else (self.max_classes, " (max_classes)")
+        most, why = most_classes(self.max_classes, len(self.scene), max(self._names) + 1 if self._declared else 0)
         if state.num_classes > most:
             raise StateFileError(f"{path}: holds {state.num_classes} classes; expected at most {most}{why}")
         if self._declared:

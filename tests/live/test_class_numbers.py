@@ -44,15 +44,13 @@ def test_more_classes_than_labels_are_refused() -> None:
         ids_by_name({0: "wall"}, {0: "background", 65534: "last"}, 256)
 
 
-def test_a_session_learns_names_once_and_keeps_them_through_a_reset() -> None:
+def test_a_session_learns_names_once() -> None:
     session = LiveSession(balls_on_a_table()[0])
     before = session.version
     assert session.number_classes({0: "wall", 1: "chair"}) == {0: 2, 1: 1}
     assert session.version > before
     version = session.version
     assert session.number_classes({7: "chair"}) == {7: 1} and session.version == version
-    session.reset()
-    assert session.number_classes({3: "wall"}) == {3: 2}
 
 
 def test_a_session_with_declared_classes_learns_no_names() -> None:

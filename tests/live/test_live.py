@@ -28,6 +28,7 @@ from gsseg_core.errors import (
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live import class_numbers
+from gsseg_core.live.living_session import LivingSession
 from gsseg_core.live.session import LiveSession
 from gsseg_core.refine.settings import UNREFINED, RefineSettings
 from gsseg_core.spatial.neighbourhood import neighbours_of
@@ -80,6 +81,31 @@ def test_a_label_that_would_take_too_much_memory_is_refused(monkeypatch: pytest.
     rejection = session.fuse(blank(VIEWS[1], 10))
     assert rejection is not None and "expected at most 9 for a scene of 626 Gaussians" in rejection.message
     assert len(session.class_names) == 10
+
+
+def test_neither_a_dataset_nor_a_state_brings_more_classes_than_there_is_memory_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fed(LiveSession(SCENE)).save(tmp_path / "state.npz")
+    data = Dataset(write_dataset(tmp_path / "data"))
+    monkeypatch.setattr(class_numbers, "VOTES_LIMIT", 8 * len(SCENE) * 3)
+    session = LivingSession(SCENE)
+    for take_in in (session.load, lambda path: session.merge([path])):
+        with pytest.raises(StateFileError, match="holds 4 classes; expected at most 3 for a scene of 626 Gaussians"):
+            take_in(tmp_path / "state.npz")
+    with pytest.raises(UnknownLabelError, match="has 4 classes; expected at most 3 for a scene of 626 Gaussians"):
+        session.learn("votes", data)
+    assert not session.has_codes and session.class_names == {0: "background"}
+    assert fed(LiveSession(SCENE, NAMES)).num_fused == len(VIEWS), "names that were declared all count"
+
+
+def test_reset_forgets_the_names_of_classes_that_turned_up_and_their_numbers() -> None:
+    session, declared = fed(LiveSession(SCENE)), LiveSession(SCENE, NAMES)
+    assert session.number_classes({1: "mug", 2: "bowl"}) == {1: 1, 2: 2}
+    session.reset()
+    assert session.number_classes({1: "bowl"}) == {1: 1}
+    declared.reset()
+    assert declared.class_names == NAMES
 
 
 def test_views_that_cannot_be_used_are_counted_by_reason_and_change_nothing() -> None:
@@ -165,9 +191,9 @@ def test_no_more_classes_turn_up_than_are_allowed(tmp_path: Path) -> None:
     np.testing.assert_array_equal(session.codes(), before)
     session.save(tmp_path / "state.npz")
     few, data = LiveSession(SCENE, max_classes=3), Dataset(write_dataset(tmp_path / "data"))
-    with pytest.raises(StateFileError, match=r"holds 4 classes; expected at most 3 \(max_classes\)"):
+    with pytest.raises(StateFileError, match="holds 4 classes; expected at most 3, as max_classes is 3"):
         few.load(tmp_path / "state.npz")
-    with pytest.raises(UnknownLabelError, match="has 4 classes; expected at most 3, as max_classes says"):
+    with pytest.raises(UnknownLabelError, match="has 4 classes; expected at most 3, as max_classes is 3, or "):
         few.learn(dataset=data)
     assert not few.has_codes
     assert LiveSession(SCENE).fuse(blank(VIEWS[0], 256)) is not None
