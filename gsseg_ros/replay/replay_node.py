@@ -57,6 +57,9 @@ _SETTLE_S = 0.5
 # up the others for longer.
 _PATIENCE_S = 30.0
 
+# Less than that is no news: whoever is busy with a large message takes it.
+_USUAL_S = 5.0
+
 # A signal is noticed when a wait ends, so no wait is longer.
 _SLICE_S = 0.05
 
@@ -74,6 +77,8 @@ class Topic:
         Reliable; keeps `_QOS.depth` messages.
     wait : callable
         Waits until a time (s, `time.monotonic`); what it raises ends the wait for receivers.
+    say : callable
+        Gets, in one line, what is waited for where that takes long.
 
     Attributes
     ----------
@@ -81,9 +86,9 @@ class Topic:
         Messages so far.
     """
 
-    def __init__(self, publisher: Any, wait: Callable[[float], None]) -> None:
+    def __init__(self, publisher: Any, wait: Callable[[float], None], say: Callable[[str], object]) -> None:
         self.publisher, self.published = publisher, 0
-        self._wait, self._unheard, self._patience_s = wait, 0, _PATIENCE_S
+        self._wait, self._say, self._unheard, self._patience_s = wait, say, 0, _PATIENCE_S
 
     def publish(self, message: Any) -> None:
         """Publish a message, once receivers have asked for all that could be pushed out by it."""
@@ -99,7 +104,13 @@ class Topic:
         while not self._arrived() and self._patience_s > 0:
             started = time.monotonic()
             self._wait(started + min(_SLICE_S, self._patience_s))
+            usual = self._patience_s > _PATIENCE_S - _USUAL_S
             self._patience_s -= time.monotonic() - started
+            if usual and self._patience_s <= _PATIENCE_S - _USUAL_S:
+                self._say(
+                    f"'{self.publisher.topic_name}': a receiver has not taken in what was sent for {_USUAL_S:g} s (is "
+                    f"it busy, or was it killed?); going on without it after {_PATIENCE_S:g} s"
+                )
         self._unheard = 0
 
     def _arrived(self) -> bool:
@@ -122,7 +133,8 @@ class ReplayNode(Node):
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
         self._topics = {
-            name: Topic(self.create_publisher(kind, name, _QOS), self._spin_until) for name, kind in _CLASSES.items()
+            name: Topic(self.create_publisher(kind, name, _QOS), self._spin_until, self.get_logger().warning)
+            for name, kind in _CLASSES.items()
         }
 
     def declare(self) -> dict[str, Any]:
