@@ -133,6 +133,11 @@ class Turns:
         finally:
             self._places.release()
 
+    def await_place(self) -> None:
+        """Wait until one more may wait; another one may be faster to do so."""
+        with self._places:
+            pass
+
 
 class Worker(Generic[T]):
     """Handles items one after the other, in a thread of its own; of too many that wait, the oldest are dropped.

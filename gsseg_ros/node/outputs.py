@@ -166,8 +166,8 @@ class Outputs:
                 self._overlays[camera].publish(image)
                 self._shown.add(camera)
 
-    def clear(self, report: SegmentationReport) -> None:
-        """Replace all that is latched: clouds, objects and overlay by empty ones, the report by this one."""
+    def clear(self, report: SegmentationReport, class_names: Mapping[int, str]) -> None:
+        """Replace all that is latched: clouds, objects and overlay by empty ones, report and names by these."""
         header = report.header
         with self.turn(report.revision) as newest:
             if not newest:
@@ -181,6 +181,7 @@ class Outputs:
             for camera in self._shown:
                 self._overlays[camera].publish(Image(header=header))
             self._shown.clear()
+            self._publish_names(class_names, header)
             self._report.publish(report)
 
     def close(self) -> None:
@@ -195,8 +196,8 @@ class Outputs:
             self._classes.clear()
 
     def _publish_names(self, class_names: Mapping[int, str], header: Header) -> None:
-        """Publish the names of the classes, where vision_msgs is installed and they are news."""
-        if self._label_info is not None and dict(class_names) != self._names:
+        """Publish the names of the classes, where there are any, vision_msgs is installed and they are news."""
+        if self._label_info is not None and class_names and dict(class_names) != self._names:
             self._names = dict(class_names)
             self._label_info.publish(label_info(class_names, header))
 

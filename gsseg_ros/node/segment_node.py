@@ -235,7 +235,8 @@ class SegmentNode(LifecycleNode):
         return self._outputs
 
     def _lookup(self) -> Lookup | None:
-        return self.inputs.tf.look_up if self.inputs is not None and self.inputs.tf is not None else None
+        inputs = self.inputs  # In another thread the node may be deactivated meanwhile.
+        return inputs.tf.look_up if inputs is not None and inputs.tf is not None else None
 
     def _check_parameters(self, changed: Sequence[Parameter]) -> SetParametersResult:
         configured = self.configuring or self._outputs is not None

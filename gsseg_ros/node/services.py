@@ -23,6 +23,7 @@ from gsseg_core.export.class_files import mesh_file_name, write_classes
 from gsseg_core.export.collision import check_collision, collision_meshes
 from gsseg_core.export.summary import RunReport
 from gsseg_core.files.json_files import write_json
+from gsseg_core.live.session import LiveSession
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.scene_writers import check_format
 from gsseg_core.segmentation import Segmentation
@@ -48,8 +49,6 @@ _PUBLISHED = ("min_confidence", "skip_refinement", "skip_filter", "refine", "gra
 
 AT_WORK, WAITING = 2, 4
 """Most long requests that work at a time, and that wait besides; each holds a thread of the executor."""
-
-_PAUSE = 1.0  # s, until what is latched is tried to be published anew, where too many requests are at work
 
 Handler: TypeAlias = Callable[..., None]
 """A method that fills in the response to a request."""
@@ -167,12 +166,12 @@ class Services:
                 response.report = finish(report_message(run, selection, refine, settings.map_frame), run)
                 return
             everything = selection.of_all_classes
+            with run.watch.stage("boxes"):
+                objects = everything.objects(header, run.revision)
             with outputs.turn(run.revision, lambda: self.workspace.holds(run)) as newest:
                 if newest:
                     with run.watch.stage("publish"):
                         outputs.publish_clouds(everything, header)
-                with run.watch.stage("boxes"):
-                    objects = everything.objects(header, run.revision)
                 topics = outputs.topics(everything.result.class_names)
                 report = finish(report_message(run, everything, refine, settings.map_frame, topics), run)
                 if newest:
@@ -189,7 +188,7 @@ class Services:
     def publish_again(self, request: Segment.Request) -> None:
         """Publish anew what a request has had published, of what is known now; while many others are at work, wait."""
         while self.segment(request, Segment.Response()).error_code == Segment.Response.BUSY:
-            time.sleep(_PAUSE)
+            self.turns.await_place()
 
     @answered
     @in_turn
@@ -214,7 +213,7 @@ class Services:
         with self.workspace.run("render_view") as run:
             self.workspace.number(run)
             result = session.segmentation(refinement(request, settings), run.watch)
-            result = self._at_level(result, run, settings.granularity)
+            result = _at_level(session, result, run, settings.granularity)
             camera = viewpoint(request, settings, self._lookup())
             header = Header(stamp=run.stamp, frame_id=request.viewpoint_camera.header.frame_id)
             selection = Selection(session, result, sorted(result.class_names), 0.0, settings.scene_to_map)
@@ -338,27 +337,30 @@ class Services:
             # Before the work: a wrong name should not have to wait for it.
             chosen_classes(request, session.class_names)
         with_tree = isinstance(request, Export.Request)
-        result = self._at_level(session.segmentation(refine, run.watch), run, level, with_tree)
+        result = _at_level(session, session.segmentation(refine, run.watch), run, level, with_tree)
         chosen = chosen_classes(request, result.class_names)
         return Selection(session, result, chosen, threshold, self.workspace.settings.scene_to_map), refine
 
-    def _at_level(self, result: Segmentation, run: Run, level: float, with_tree: bool = False) -> Segmentation:
-        """Cut a result at a level, as the parameter granularity has it; the objects have a tree only on request."""
-        session = self.workspace.session
-        if level < 0 and not with_tree:
-            return result
-        from gsseg_core.live.per_view_session import PerViewSession  # Others start without SciPy.
-
-        if not isinstance(session, PerViewSession):
-            return result
-        with run.watch.stage("parts"):
-            return session.at_level(result, level if level >= 0 else None)
-
     def clear(self, run: Run) -> None:
         """Replace all that is latched by empty messages."""
-        workspace = self.workspace
+        workspace, session = self.workspace, self.workspace.loaded
         workspace.number(run)
-        self._outputs().clear(empty_report(run, workspace.loaded, workspace.settings.map_frame))
+        names = {} if session is None else session.class_names
+        self._outputs().clear(empty_report(run, session, workspace.settings.map_frame), names)
 
     def _header(self, run: Run) -> Header:
         return Header(stamp=run.stamp, frame_id=self.workspace.settings.map_frame)
+
+
+def _at_level(
+    session: LiveSession, result: Segmentation, run: Run, level: float, with_tree: bool = False
+) -> Segmentation:
+    """Cut a session's result at a level, as the parameter granularity has it; objects have a tree only on request."""
+    if level < 0 and not with_tree:
+        return result
+    from gsseg_core.live.per_view_session import PerViewSession  # Others start without SciPy.
+
+    if not isinstance(session, PerViewSession):
+        return result
+    with run.watch.stage("parts"):
+        return session.at_level(result, level if level >= 0 else None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from ros_robot import Robot
 from small_scenes import balls_on_a_table, clean_views, write_dataset
 
 from gsseg_core.data.view import View
+from gsseg_core.live.per_view_session import PerViewSession
 from gsseg_core.segmentation import Segmentation
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
@@ -22,6 +24,9 @@ from action_msgs.msg import GoalStatus
 from gsseg_msgs.action import Learn
 from gsseg_msgs.msg import SegmentationReport
 from gsseg_msgs.srv import Segment
+
+from gsseg_ros.node.services import Services
+from gsseg_ros.node.workspace import Run
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +55,19 @@ def fused(robot: Robot, views: list[View]) -> SegmentationReport:
     robot.drive(views)
     robot.ros.wait_until(lambda: robot.ask("segment").report.num_views == len(views), f"{len(views)} views")
     return robot.done("segment").report
+
+
+def test_parts_are_cut_by_the_session_that_segmented_though_a_scene_is_loaded_meanwhile() -> None:
+    (scene, _), views = balls_on_a_table(), views_in_halves()[:3]
+    first, second = PerViewSession(scene), PerViewSession(scene.subset(np.arange(len(scene) // 2)))
+    for view in views:
+        first.fuse(view)
+    handed = [first]  # From then on the second.
+    between = type("Between", (SimpleNamespace,), {"session": property(lambda _: handed.pop() if handed else second)})
+    settings = SimpleNamespace(k=5, beta=0.5, granularity=0.9, scene_to_map=None)
+    services: Any = SimpleNamespace(workspace=between(settings=settings))
+    selection, _ = Services._select(services, Segment.Request(), Run("segment", None))
+    assert selection.session is first and len(selection.result.labels) == len(scene)
 
 
 def assert_objects_are_the_balls(result: Segmentation) -> None:

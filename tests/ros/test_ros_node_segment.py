@@ -53,7 +53,7 @@ def test_a_request_left_at_its_defaults_means_all_classes_refined_without_a_thre
         == (report.num_objects + report.num_background + report.num_unobserved + report.num_removed)
     )
     assert (report.job, report.learner, report.num_views, report.num_views_rejected) == ("segment", "votes", 6, 0)
-    assert [stage.name for stage in report.stages] == ["codes", "knn", "filter", "publish", "boxes"]
+    assert [stage.name for stage in report.stages] == ["codes", "knn", "filter", "boxes", "publish"]
     assert 0 < sum(stage.seconds for stage in report.stages) <= report.total_seconds
     for summary in report.classes:
         index = expected.labels == summary.class_id

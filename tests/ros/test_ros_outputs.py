@@ -191,6 +191,16 @@ def test_two_runs_do_not_publish_at_the_same_time() -> None:
     assert took == [2]
 
 
+def test_when_all_is_emptied_the_names_are_those_of_the_classes_that_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outputs_module, "label_info_class", lambda: object)
+    monkeypatch.setattr(outputs_module, "label_info", lambda names, header: dict(names))
+    ours, publishers = outputs()
+    ours.publish_clouds(selection(0, 1, 2, 3), Header())
+    ours.clear(SegmentationReport(revision=1), {0: "background"})
+    ours.clear(SegmentationReport(revision=2), {})  # No scene has no names, which would be no message.
+    assert publishers["~/label_info"].sent == [selection().result.class_names, {0: "background"}]
+
+
 def test_nothing_is_published_once_closed_and_no_topic_comes_back() -> None:
     ours, publishers = outputs()
     ours.announce(NAMES)
@@ -203,6 +213,6 @@ def test_nothing_is_published_once_closed_and_no_topic_comes_back() -> None:
     assert ours.publish_objects(ObjectArray()) is False
     ours.publish_overlay(Image())
     ours.publish_report(SegmentationReport())
-    ours.clear(SegmentationReport(revision=2))
+    ours.clear(SegmentationReport(revision=2), {})
     assert not publishers and not any(publisher.sent for publisher in before.values())
     assert ours.topics(NAMES) == {}
