@@ -38,7 +38,7 @@ from gsseg_core.learn.mask_reliability import MaskChecker, ViewCheck, compare_ma
 from gsseg_core.learn.prepared_views import default_budget
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.objects.object_table import ObjectTable, find_objects
-from gsseg_core.progress import Progress, Stopwatch, silent
+from gsseg_core.progress import Progress, Stopwatch, silent, with_progress
 from gsseg_core.refine.label_propagation import GraphSettings, propagate, scarce_evidence
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.report.findings import Evidence
@@ -390,11 +390,10 @@ def render(
     overlays = []
     places = [*names, *(f"overlays/{name}" for name in (*names, "contact_sheet.png", "legend.png"))]
     with staged_run(out, "render", places=places) as run:
-        for done, (_, labels, image, _) in enumerate(draw_views(scene, numbered, views, device=device)):
-            progress("render", done, len(views))
-            write_mask(run.folder / names[done], ids[labels], bits, run.id)
+        drawn = draw_views(scene, numbered, views, device=device)
+        for name, (_, labels, image, _) in zip(with_progress(progress, "render", names), drawn, strict=True):
+            write_mask(run.folder / name, ids[labels], bits, run.id)
             overlays.append(image)
-            save_png(run.folder / "overlays" / names[done], image, run.id)
-        progress("render", len(views), len(views))
+            save_png(run.folder / "overlays" / name, image, run.id)
         write_overview(numbered, overlays, [view.name for view in views], run.folder / "overlays", run.id)
     return [Path(out) / name for name in names]

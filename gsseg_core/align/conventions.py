@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from gsseg_core.align.agreement import Shown, render, thinned
 from gsseg_core.align.settings import AlignSettings
-from gsseg_core.progress import Progress, silent
+from gsseg_core.progress import Progress, silent, with_progress
 from gsseg_core.scene.camera import Camera, rigid_motion
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.similarity import Similarity
@@ -137,13 +137,11 @@ def find_convention(
     scores = np.zeros((len(tried), 4))  # by quarter turns of the camera
     left = list(range(len(tried)))
     for number, view in enumerate(shown):
-        for done, i in enumerate(left):
-            progress(f"try conventions on view {number + 1} of {len(shown)}", done, len(left))
+        for i in with_progress(progress, f"try conventions on view {number + 1} of {len(shown)}", left):
             inverted, world, looking = tried[i]
             rendered = render(scene, Convention(inverted, world, _LOOKING[looking]).camera(view.camera), device)
             turned = np.array([view.score(rendered.turned(quarters)) for quarters in range(4)])
             scores[i] += turned - np.roll(turned, 2)  # above that of the same upside down
-        progress(f"try conventions on view {number + 1} of {len(shown)}", len(left), len(left))
         kept = max(_LEAST, round(settings.survivors * len(left)))
         left = sorted(left, key=lambda i: -float(scores[i].max()))[:kept]
     best = max(left, key=lambda i: float(scores[i].max()))

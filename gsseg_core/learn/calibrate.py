@@ -10,9 +10,10 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from gsseg_core.data.view import spread
-from gsseg_core.learn.learner import Learner, Progress, silent
+from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.mask_reliability import MaskChecker
 from gsseg_core.learn.temperature import VIEWS, fit_temperature
+from gsseg_core.progress import Progress, silent, with_progress
 
 
 class Calibration(NamedTuple):
@@ -33,10 +34,7 @@ def calibrate(learner: Learner, checker: MaskChecker | None = None, progress: Pr
 
     A checker of this learner may be at hand: what it has rendered is not rendered again.
     """
-    views, checker, samples = spread(list(learner.views.values()), VIEWS), checker or MaskChecker(learner), []
-    for done, view in enumerate(views):
-        progress("calibrate", done, len(views))
-        samples.append(checker.sample(view))
-    progress("calibrate", len(views), len(views))
+    views, checker = spread(list(learner.views.values()), VIEWS), checker or MaskChecker(learner)
+    samples = [checker.sample(view) for view in with_progress(progress, "calibrate", views)]
     pixels = sum(len(sample.seen) for sample in samples)
     return Calibration(fit_temperature(samples), len(views), pixels, learner.leaves_out)

@@ -20,6 +20,7 @@ from gsseg_core.learn.prepared_views import PreparedViews, default_budget
 from gsseg_core.learn.vote_resolution import impute_probabilities
 from gsseg_core.progress import Progress as Progress
 from gsseg_core.progress import silent as silent
+from gsseg_core.progress import with_progress
 from gsseg_core.raster.backends import make_operator, vote_total
 from gsseg_core.raster.observation import Observation
 from gsseg_core.raster.view_operator import ViewOperator
@@ -135,13 +136,11 @@ class Learner(ABC):
         keeps_nothing = self.memory_budget == 0  # Then each view votes as it is lifted.
         opened = closing(several_at_once(self._opened, views, self.device))
         with opened as each, nullcontext() if keeps_nothing else vote_total(self._votes, self.device) as total:
-            for done, view in enumerate(views):
-                progress("observe", done, len(views))
+            for view in with_progress(progress, "observe", views):
                 if keeps_nothing:
                     self.observe(view)
                 else:
                     self._add(view, next(each), total)
-        progress("observe", len(views), len(views))
 
     def retract(self, name: str) -> None:
         """Take a view's votes back, exactly.

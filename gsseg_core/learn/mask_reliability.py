@@ -22,8 +22,9 @@ from gsseg_core.data.label_images import UNKNOWN, PackedLabels
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View, spread
 from gsseg_core.kernels.compiler import kernel
-from gsseg_core.learn.learner import Learner, Progress, silent
+from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.temperature import VIEWS, Sample, grid_of, sample_grid
+from gsseg_core.progress import Progress, silent, with_progress
 from gsseg_core.scene.camera import Camera
 from gsseg_core.several_at_once import several_at_once
 
@@ -129,15 +130,13 @@ class MaskChecker:
         views = self.learner.views
         checks = {}
         with closing(several_at_once(self._check, views.values(), self.learner.device)) as checked:
-            for done, name in enumerate(views):
-                progress("check views", done, len(views))
+            for name in with_progress(progress, "check views", views):
                 checks[name] = next(checked)
         shown = shown_views(list(checks.values()))
         again = [views[check.name] for check in shown if not _is_of_all(check, views[check.name].camera)]
         with closing(several_at_once(self._everywhere, again, self.learner.device)) as predicted:
             for view, everywhere in zip(again, predicted, strict=True):
                 checks[view.name] = replace(checks[view.name], predicted=everywhere)
-        progress("check views", len(views), len(views))
         return list(checks.values())
 
     def _check(self, view: View) -> ViewCheck:

@@ -14,10 +14,10 @@ from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.errors import UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
-from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.objects.association import AssociationSettings, associate
 from gsseg_core.objects.lifted_segments import Lifted, Profiles, sums
 from gsseg_core.objects.tree_growing import grow_tree
+from gsseg_core.progress import Progress, silent, with_progress
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
@@ -97,10 +97,8 @@ class ObjectTable:
     def add_all(self, views: Sequence[View], progress: Progress = silent) -> None:
         """Add views, as `add` does; the error that one of them raises ends it."""
         with closing(several_at_once(self._lift, views, self.device)) as lifted:
-            for done, view in enumerate(views):
-                progress("lift", done, len(views))
+            for view in with_progress(progress, "lift", views):
                 self._add(view, next(lifted))
-        progress("lift", len(views), len(views))
 
     def match(self, view: View) -> View:
         """Add a view, and give its ids the numbers of the objects so far; what nobody has seen yet is a new object.

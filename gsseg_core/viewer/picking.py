@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsseg_core.data.view import View
-from gsseg_core.learn.learner import Progress, silent
+from gsseg_core.progress import Progress, silent, with_progress
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera, pose_looking
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -71,15 +71,13 @@ class ViewVotes:
         self._num_gaussians = len(scene)
         # By view: Gaussians in ascending order, labels, weights, each of one length.
         self._votes: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
-        for done, view in enumerate(views):
-            progress("collect the votes of each view", done, len(views))
+        for view in with_progress(progress, "collect the votes of each view", views):
             if view.has_mask:
                 observation = make_operator(scene, view.camera, device).observe(view.read_labels())
                 ids = observation.ids[observation.rows]
                 order = np.argsort(ids, kind="stable")
                 labels = observation.classes[observation.labels]
                 self._votes[view.name] = ids[order], labels[order], observation.votes()[order]
-        progress("collect the votes of each view", len(views), len(views))
 
     def of(self, gaussian: int) -> list[ViewVote]:
         """List the votes for the labels of one Gaussian, the largest first."""

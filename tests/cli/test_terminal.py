@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from gsseg_core.data.label_images import write_mask
-from gsseg_core.progress import progress_bars
+from gsseg_core.progress import progress_bars, with_progress
 from gsseg_core.text import counted, table
 
 GSSEG = [sys.executable, "-m", "gsseg_core.cli"]
@@ -111,3 +111,14 @@ def test_tables_show_names_that_a_terminal_would_obey_or_that_fill_it() -> None:
 def test_one_is_not_many() -> None:
     assert [counted(n, "view") for n in (0, 1, 1200)] == ["0 views", "1 view", "1,200 views"]
     assert counted(2, "class", "classes") == "2 classes"
+
+
+def test_items_come_with_word_of_how_many_are_done_and_no_more_where_that_ends_the_work() -> None:
+    told: list[object] = []
+    for item in with_progress(lambda *what: told.append(what), "look", "ab"):
+        told.append(item)
+    assert told == [("look", 0, 2), "a", ("look", 1, 2), "b", ("look", 2, 2)]
+    items = with_progress(lambda stage, done, total: 1 // (1 - done), "look", "ab")
+    assert next(items) == "a"
+    with pytest.raises(ZeroDivisionError):
+        next(items)
