@@ -76,7 +76,8 @@ class RosSource:
             self._segment = node.create_client(Segment, f"{self._name}/segment")
             node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
             self._listen(f"{self._name}/cloud")
-            self._places = _Places(self._similarity().points_to_map(scene.means))
+            self._where = node.create_client(GetParameters, f"{self._name}/get_parameters")
+            self._places = self._find_places()
         except BaseException:
             self._spinner.close()
             raise
@@ -100,18 +101,22 @@ class RosSource:
             if error.name == "BUSY":  # Many ask; this one can wait.
                 self._spinner.wait_for(lambda: False, timeout)
                 return None
-            if error.name in ("NOT_ACTIVE", "NO_CODES"):
-                self._shown = said
-                return None
-            raise
+            if error.name not in ("NOT_ACTIVE", "NO_CODES"):
+                raise
+            self._shown = said
+            return LiveUpdate(Labelling.unknown(len(self._scene)), 0) if error.name == "NO_CODES" else None
         if report.scene_hash != self._scene.digest:
             raise StateMismatchError(
                 f"{self._name} has the scene {report.scene_path}, which is not {self._scene.path or 'this one'}; "
                 "expected the same file"
             )
-        update = LiveUpdate(self._labelling(report, before), int(report.num_views))
+        try:
+            labelling = self._labelling(report, before)
+        except StateMismatchError:  # The scene may have been put elsewhere in the map.
+            self._places = self._find_places()
+            labelling = self._labelling(report, before)
         self._shown = said
-        return update
+        return LiveUpdate(labelling, int(report.num_views))
 
     def close(self) -> None:
         """Leave ROS; the node goes on."""
@@ -152,8 +157,11 @@ class RosSource:
             raise NodeUnavailableError(f"{topic}: no cloud of the last run within {ANSWER_SECONDS:g} s")
         return arrays_from_cloud(self._clouds[topic], topic)
 
+    def _find_places(self) -> _Places:
+        return _Places(self._similarity().points_to_map(self._scene.means))
+
     def _similarity(self) -> Similarity:
-        client = self._spinner.node.create_client(GetParameters, f"{self._name}/get_parameters")
+        client = self._where
         self._calls.find(client.service_is_ready, f"service {client.srv_name}", ANSWER_SECONDS)
         question = GetParameters.Request(names=list(_PARAMETERS))
         told = self._calls.ask(client, question, time.monotonic() + ANSWER_SECONDS)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,7 +24,10 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 from gsseg_core.viewer.live_source import LiveUpdate, open_source
 from gsseg_ros.client import NodeUnavailableError, SegmentationClient
-from gsseg_ros.client.view_source import RosSource
+from gsseg_ros.client.view_source import RosSource, _Places
+from gsseg_ros.conversions import CloudArrays
+from gsseg_ros.errors import SegmentationError
+from gsseg_ros.frames import Similarity
 
 MOVED = {"scene_to_map.scale": 2.0, "scene_to_map.translation": [1.0, -2.0, 0.5]}
 
@@ -90,3 +94,44 @@ def test_a_cloud_of_before_a_run_is_not_taken_for_its_own_whatever_the_clock_did
     for cloud in (later, after):
         source._clouds["/cloud"] = cloud
         assert source._cloud("/cloud", 50 * 10**9, before) is cloud
+
+
+def source_of(scene: GaussianScene, said: str, answer: Any, place: Similarity) -> RosSource:
+    """A source of a node that has said something, answers that or raises it, and has the scene in a place."""
+    source = RosSource.__new__(RosSource)
+    source._scene, source._name, source._said, source._shown = scene, "/gsseg", (said,), None
+    source._clouds, source._segment = {}, None
+    source._places = _Places(scene.means)
+    points = place.points_to_map(scene.means[:2])
+    cloud = CloudArrays(points, np.zeros((2, 3), np.uint8), np.ones(2, np.int32), np.ones(2, np.float32))
+
+    def call(*_: object) -> Any:
+        if isinstance(answer, Exception):
+            raise answer
+        return SimpleNamespace(report=answer)
+
+    instead = {"_calls": SimpleNamespace(call=call), "_spinner": SimpleNamespace(wait_for=lambda held, _: held())}
+    instead |= {"_listen": lambda topic: None, "_cloud": lambda *_: cloud, "_similarity": lambda: place}
+    vars(source).update(instead)
+    return source
+
+
+def test_a_scene_that_the_node_puts_elsewhere_is_found_there() -> None:
+    scene, _ = many_classes(30)
+    mug = SimpleNamespace(class_id=1, name="mug", topic="")
+    report = SimpleNamespace(scene_hash=scene.digest, classes=[mug], num_views=3, header=Header())
+    source = source_of(
+        scene, "3 views", report, Similarity.from_parameters(2.0, [1.0, -2.0, 0.5], [0.0, 0.0, 0.0, 1.0])
+    )
+    update = source.wait(0.1)
+    assert update is not None and np.flatnonzero(update.labelling.labels == 1).tolist() == [0, 1]
+    assert source.wait(0.1) is None
+
+
+def test_when_the_node_has_forgotten_all_nothing_is_known_any_more() -> None:
+    scene, _ = many_classes(30)
+    place = Similarity.from_parameters(1.0, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
+    source = source_of(scene, "0 views", SegmentationError(1, "NO_CODES", "nothing is known"), place)
+    update = source.wait(0.1)
+    assert update is not None and update.num_views == 0 and (update.labelling.labels == UNOBSERVED).all()
+    assert source.wait(0.1) is None
