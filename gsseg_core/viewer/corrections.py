@@ -12,6 +12,7 @@ from gsseg_core.data.class_names import class_name
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError
+from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.live.session import LiveSession
 from gsseg_core.objects.clicks import click_labels
 from gsseg_core.raster.backends import make_operator
@@ -80,7 +81,7 @@ class Corrections:
     def __init__(self, scene: GaussianScene, *, device: str = "cpu") -> None:
         self._scene, self._device = scene, device
         self.views: list[View] = []
-        self._session = LiveSession(scene, device=device)
+        self._session = LiveSession(scene, device=device, max_classes=MAX_LABEL + 1)
         self._seen: list[np.ndarray] = []
 
     def __len__(self) -> int:
@@ -106,10 +107,21 @@ class Corrections:
             return False
         self.views.pop()
         self._seen.pop()
+        self._fuse_anew()
+        return True
+
+    def renumber(self, ids: Mapping[int, int]) -> None:
+        """Give some classes other numbers."""
+        table = np.arange(MAX_LABEL + 2)
+        table[-1] = UNKNOWN
+        table[list(ids)] = list(ids.values())
+        self.views = [View.from_arrays(view.camera, table[view.read_labels()]) for view in self.views]
+        self._fuse_anew()
+
+    def _fuse_anew(self) -> None:
         self._session.reset()
         for view in self.views:
             self._session.fuse(view)
-        return True
 
     def apply(self, before: Labelling, names: Mapping[int, str] | None = None) -> Labelling:
         """Combine a labelling of the same scene with the corrections; it stays where none has seen a Gaussian.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -141,8 +142,18 @@ class ViewerState:
         return undone
 
     def replace(self, learnt: Labelling) -> None:
-        """Show what a live source has learnt by now, under the same corrections."""
+        """Show what a live source has learnt by now, under the same corrections.
+
+        Classes that were added here make room for those that turn up there; one of the same name becomes that class.
+        """
         with self._lock:
+            taken, added, model = learnt.class_names, self.added_names, self.model
+            known, free = {name: k for k, name in taken.items()}, itertools.count(max([*taken, *added]) + 1)
+            ids = {k: known[name] if name in known else next(free) for k, name in added.items() if k in taken}
+            if ids:
+                self.corrections.renumber(ids)
+                self.added_names = {ids.get(k, k): name for k, name in added.items() if ids.get(k, k) not in taken}
+                model.hidden, model.removed = ({ids.get(k, k) for k in off} for off in (model.hidden, model.removed))
             self._learnt = learnt
             self._relabel()
 

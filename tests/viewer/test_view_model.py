@@ -304,6 +304,31 @@ def test_corrections_are_of_objects_on_every_level_and_the_tree_is_saved(tmp_pat
     assert Segmentation.load(tmp_path / "s.npz", SCENE).tree is None
 
 
+def test_a_class_that_was_added_stays_apart_from_those_that_turn_up_in_a_live_source_and_joins_its_namesake() -> None:
+    state, camera = ViewerState(model(), [], {}, "cpu"), ring(1)[0]
+    (uv,), _ = camera.project(SCENE.means[TRUTH == 1].mean(axis=0, keepdims=True))
+    state.added_names[K] = "spoon"
+    assert state.correct(disc(camera, *uv, 3, K)) > 0
+    spoon = state.objects.labels == K
+    state.model.toggle(K)
+    labels, probabilities, names, _ = state._learnt
+    wider = np.pad(probabilities, ((0, 0), (0, 1)))
+    state.replace(Labelling(labels, wider, {**names, K: "fork"}))
+    np.testing.assert_array_equal(state.objects.labels == K + 1, spoon)
+    assert state.objects.class_names[K + 1] == "spoon" and state.model.hidden == {K + 1}
+    state.replace(
+        Labelling(labels, np.pad(wider, ((0, 0), (0, 2))), {**names, K: "fork", K + 1: "cup", K + 2: "spoon"})
+    )
+    np.testing.assert_array_equal(state.objects.labels == K + 2, spoon)
+    assert not state.added_names and state.undo() and not (state.objects.labels == K + 2).any()
+
+
+def test_a_correction_may_be_of_any_class_that_a_segmentation_can_have() -> None:
+    state, camera = ViewerState(model(), [], {}, "cpu"), ring(1)[0]
+    (uv,), _ = camera.project(SCENE.means[TRUTH == 1].mean(axis=0, keepdims=True))
+    assert state.correct(disc(camera, *uv, 3, 300)) > 0
+
+
 def test_levels_need_a_tree() -> None:
     with pytest.raises(SettingsError, match="parts and wholes are not known"):
         ViewerState(model(), [], {}, "cpu").set_level(0.5)
