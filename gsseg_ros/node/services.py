@@ -146,10 +146,11 @@ class Services:
     @in_turn
     def segment(self, request: Segment.Request, response: Segment.Response) -> None:
         """Segment the scene, answer with what was asked for, and publish all classes, unless that is not wanted."""
-        settings, outputs = self.workspace.settings, self._outputs()
+        outputs = self._outputs()
         with self.workspace.run("segment") as run:
             overlay = Image()
             selection, refine = self._select(request, run)
+            settings = self.workspace.settings  # As the selection has them: the scene may have been put elsewhere.
             self.workspace.number(run)
             if request.viewpoint_camera.width:
                 camera = viewpoint(request, settings, self._lookup())

@@ -38,11 +38,11 @@ from sensor_msgs.msg import PointCloud2
 
 from gsseg_core.scene.scene_delta import GroupMove, SceneDelta
 from gsseg_core.scene.similarity import Similarity as CoreSimilarity
-from gsseg_ros.conversions import arrays_from_cloud, matrix_from_transform
+from gsseg_ros.conversions import arrays_from_cloud, matrix_from_transform, viewpoint_messages
 from gsseg_ros.delta_messages import message_from_delta
 from gsseg_ros.errors import BusyError
 from gsseg_ros.frames import Similarity
-from gsseg_ros.node import services
+from gsseg_ros.node import services, viewpoints
 from gsseg_ros.node.placement import Placement
 from gsseg_ros.node.scene_frame import SceneFrame, transform
 from gsseg_ros.node.services import AT_WORK, WAITING
@@ -258,6 +258,27 @@ def test_what_is_latched_comes_anew_though_too_many_requests_were_at_work(
         assert [type(error) for error in tries] == [BusyError], "it asks anew only when there is room"
         places.release(AT_WORK + WAITING)
         wait_until(lambda: here.outputs._revision > first, "the clouds where the scene is now")
+
+
+def test_a_label_image_and_a_cloud_of_one_answer_have_the_scene_in_one_place(
+    shared: Ros, parameters: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    segmentation, drawn_at, (pose, info) = LivingSession.segmentation, [], viewpoint_messages(clean_views(1)[0].camera)
+    with node_here(shared, parameters) as here:
+        here.fuse(clean_views(2))
+
+        def moved(self: LivingSession, *arguments: Any) -> Any:
+            here.node.set_parameters_atomically(parameters_of(ASIDE, 0.02))
+            return segmentation(self, *arguments)
+
+        def viewpoint(request: Any, settings: Any, lookup: Any) -> Any:
+            drawn_at.append(settings.scene_to_map)
+            return viewpoints.viewpoint(request, settings, lookup)
+
+        monkeypatch.setattr(LivingSession, "segmentation", moved)
+        monkeypatch.setattr(services, "viewpoint", viewpoint)
+        here.done("segment", skip_refinement=True, publish_nothing=True, viewpoint_pose=pose, viewpoint_camera=info)
+        assert [at is here.node.workspace.settings.scene_to_map for at in drawn_at] == [True]
 
 
 def test_what_was_published_before_the_node_was_cleaned_up_does_not_come_anew(
