@@ -77,19 +77,10 @@ class Placement:
             for name in waiting:
                 self._follows(session, name, moved_from)
 
-    def forget(self) -> tuple[_Ways, dict[str, Similarity]]:
-        """Leave all views where they are, before they are replaced; returns what `resume` takes if they are not."""
-        # Without the lock: whoever replaces them must not wait for one that is being fused.
-        forgotten = self._moved_from, self._left
+    def forget(self) -> None:
+        """Leave all views where they are, as they are replaced."""
+        # Without the lock: whoever replaces the scene must not wait for a view that is being fused.
         self._moved_from, self._left = {}, {}
-        return forgotten
-
-    def resume(self, forgotten: tuple[_Ways, dict[str, Similarity]]) -> None:
-        """Have views follow after all."""
-        with self.fusing:
-            self._moved_from, self._left = forgotten[0] | self._moved_from, forgotten[1] | self._left
-            if self._moved_from:
-                self._begin()
 
     def _begin(self) -> None:
         if not self._running:

@@ -242,13 +242,9 @@ class Workspace:
 
     def load_state(self, path: str | Path, within: Path | None = None) -> int:
         """Replace what is known of the scene by a saved state; return how many views are in it."""
-        # Views of the state may have the names of some that are still to follow.
-        on_their_way = self.placement.forget()
-        try:
+        with self.placement.fusing:  # Views of the state may have the names of some that are still to follow.
             loaded = self.session.load(path, within)
-        except Exception:
-            self.placement.resume(on_their_way)
-            raise
+            self.placement.forget()
         self.forget_waiting()
         return loaded
 

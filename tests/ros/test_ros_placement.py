@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -46,6 +47,7 @@ from gsseg_ros.node import services, viewpoints
 from gsseg_ros.node.placement import Placement
 from gsseg_ros.node.scene_frame import SceneFrame, transform
 from gsseg_ros.node.services import AT_WORK, WAITING
+from gsseg_ros.node.workspace import Workspace
 
 ASIDE = Similarity.from_parameters(1.0, [0.05, -0.02, 0.03], [0.0, 0.0, 0.02, 1.0])
 FAR = Similarity.from_parameters(1.0, [1e4, 0, 0], [0.0, 0.0, 0.0, 1.0])
@@ -107,6 +109,24 @@ def test_views_of_a_state_that_is_loaded_meanwhile_stay_where_they_are() -> None
     with placement.fusing:
         placement.change(IDENTITY, FAR, lambda: None)
         placement.forget()
+    wait_until(lambda: settled, "the thread to end")
+    np.testing.assert_array_equal(session.codes(), codes)
+
+
+def test_views_of_a_state_stay_where_they_are_though_the_scene_is_put_elsewhere_meanwhile(tmp_path: Path) -> None:
+    session = living_session(clean_views(2))
+    session.save(tmp_path / "state.npz")
+    codes, load = session.codes(), session.load
+    placement, settled = placement_of(session)
+
+    def moved(path: Path, within: Path | None) -> int:
+        with session._lock:  # So that views of these names follow only when those of the state are there.
+            placement.change(IDENTITY, FAR, lambda: None)
+            return load(path, within)
+
+    session.load = moved  # type: ignore[method-assign]
+    workspace: Any = SimpleNamespace(session=session, placement=placement, forget_waiting=lambda: None)
+    assert Workspace.load_state(workspace, tmp_path / "state.npz") == 2
     wait_until(lambda: settled, "the thread to end")
     np.testing.assert_array_equal(session.codes(), codes)
 
