@@ -31,7 +31,7 @@ from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu import label_pairs
 from gsseg_core.raster.cpu.blending import open_rays
 from gsseg_core.raster.cpu.lifting import Lifted
-from gsseg_core.raster.cpu.splat import WIDTH, aim, blend_block
+from gsseg_core.raster.cpu.splat import WIDTH, aim, lift_block
 from gsseg_core.raster.cpu.tile_operator import TileObservation
 from gsseg_core.raster.cpu.tiling import TILE
 from gsseg_core.raster.observation import VoteShares
@@ -168,7 +168,7 @@ def store(tiles, blocks, first, kept, left_over) -> None:  # type: ignore[no-unt
             while todo:
                 b = first_bit(todo)
                 todo &= todo - 1
-                weight, _ = blend_block(rays, b, lines, table[g, WIDTH])
+                weight, _ = lift_block(rays, b, lines, table[g, WIDTH])
                 store_row(record, 0, weight)
                 for c in range(TILE):
                     kept[n, c] = np.uint16(record[0, c] * np.float32(STEPS) + np.float32(0.5))

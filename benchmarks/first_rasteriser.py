@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
+from gsseg_core.raster.constants import T_LIFTED
 from gsseg_core.raster.cpu.projection import HALF_LOG2E, HEIGHT, LOG_OPACITY, SHEAR, WIDTH, Projected, U, V
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
 
@@ -88,7 +89,7 @@ def _lift(
             for row in range(max(top, int(np.floor(v - reach_y))), min(bottom, int(np.ceil(v + reach_y)))):
                 for column in range(max(left, int(np.floor(u - reach_x))), min(right, int(np.ceil(u + reach_x)))):
                     before = transmittance[row - top, column - left]
-                    if before < np.float32(1e-4):
+                    if before < np.float32(T_LIFTED):
                         continue
                     dx, dy = np.float32(column + 0.5) - u, np.float32(row + 0.5) - v
                     power = np.float32(-0.5) * (a * dx * dx + c * dy * dy) - b * dx * dy
@@ -96,9 +97,10 @@ def _lift(
                     if alpha < np.float32(1 / 255):
                         continue
                     weight = alpha * before
-                    transmittance[row - top, column - left] = before - weight
-                    if before - weight < np.float32(1e-4):
+                    if before - weight < np.float32(T_LIFTED):
+                        weight = before
                         open_rays -= 1
+                    transmittance[row - top, column - left] = before - weight
                     label = labels[row, column]
                     if label >= 0:
                         sums[e, label] += weight

@@ -25,6 +25,7 @@ from gsseg_core.learn.learner import UNITS, Learner
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.metrics import Evaluation
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.constants import T_LIFTED, T_MIN
 from gsseg_core.raster.cpu.lifting import Lifted
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.tiling import assign
@@ -106,10 +107,12 @@ def _lift_view(scene: GaussianScene, view: View, runs: int) -> dict[str, Any]:
     projected, operator = project(scene, camera), make_operator(scene, camera)
     tiles, splats = assign(projected, camera.width, camera.height), to_splats(projected)
     observation = operator.observe(mask)
-    work = count_work(projected, tiles, camera.width, camera.height, mask)
+    work, whole = (
+        count_work(projected, tiles, camera.width, camera.height, mask, least) for least in (T_LIFTED, T_MIN)
+    )
     pairs = len(operator.weights().pixels)
-    if abs(work.pairs - pairs) > 1e-4 * pairs:
-        raise RuntimeError(f"view '{view.name}': counted {work.pairs} pairs; the operator has {pairs}")
+    if abs(whole.pairs - pairs) > 1e-4 * pairs:
+        raise RuntimeError(f"view '{view.name}': counted {whole.pairs} pairs; the operator has {pairs}")
     many = len(observation.classes)
     local = np.where(mask >= 0, np.searchsorted(observation.classes, mask), -1).astype(np.int32)
 

@@ -3,7 +3,7 @@
 A *pair* is a non-zero weight of W: one Gaussian in one pixel. The lift blends a view and sums its weights by label. Its
 work is counted here in *aims*, one Gaussian in one tile (`splat.aim`: which blocks of 4 x 4 pixels does it reach?), and
 *evaluations*, one Gaussian over the sixteen pixels of a block that it reaches and in which a ray is open
-(`splat.blend_block`). Operations, each on sixteen numbers:
+(`splat.lift_block`). Operations, each on sixteen numbers:
 
 | step of an aim                                    | fma | add, sub, mul | other                      |
 | ------------------------------------------------- | --- | ------------- | -------------------------- |
@@ -18,9 +18,10 @@ work is counted here in *aims*, one Gaussian in one tile (`splat.aim`: which blo
 | alpha <= 0.99                                     |     |               | min                        |
 | counts it? is the ray open, still?                |     |               | 3 compares                 |
 | weight = alpha T, T = T - weight                  |     | 2             |                            |
+| where it ends the ray: weight = T, T = 0          |     |               | 2 selections               |
 
 That is 6 + 10 + 13 = 29 vector instructions and 6 * 2 + 10 = 22 floating-point operations a lane of an aim,
-6 + 5 + 10 = 21 and 6 * 2 + 5 = 17 a pixel of an evaluation. Summing by label adds one addition for each label in the
+6 + 5 + 12 = 23 and 6 * 2 + 5 = 17 a pixel of an evaluation. Summing by label adds one addition for each label in the
 block, and per entry and label a sum of sixteen numbers, 15 additions in 4 steps.
 """
 
@@ -36,14 +37,15 @@ from machine import once
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
+from gsseg_core.raster.constants import T_LIFTED
 from gsseg_core.raster.cpu.blending import in_tile
 from gsseg_core.raster.cpu.projection import Projected
-from gsseg_core.raster.cpu.splat import ALPHA_MAX, HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, T_MIN, WIDTH, U, V
+from gsseg_core.raster.cpu.splat import ALPHA_MAX, HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, U, V
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
 from gsseg_core.simd import LANES
 
 AIM_FLOPS, AIM_INSTRUCTIONS = 22, 29  # of one aim, per lane and per sixteen
-FLOPS, INSTRUCTIONS = 17, 21  # of one evaluation, per pixel and per sixteen
+FLOPS, INSTRUCTIONS = 17, 23  # of one evaluation, per pixel and per sixteen
 SUM_FLOPS, SUM_INSTRUCTIONS = 15, 4  # of one sum of sixteen
 CHAINS = (8, 10, 12)
 
@@ -93,15 +95,18 @@ def count_work(
     width: int,
     height: int,
     labels: np.ndarray | None = None,  # (H, W)
+    least: float = T_LIFTED,
 ) -> Work:
-    """Count by going through the pixels one by one, with an exponential of its own.
+    """Count by going through the pixels one by one, with an exponential of its own; a ray ends with less than `least`.
 
     Alphas within rounding of 1/255 may fall on the other side than the operator's, about one pair in a million.
     """
     if labels is None:
         labels = np.zeros((height, width), np.int32)
     counts = np.zeros((tiles.columns * tiles.rows, len(Work._fields)), np.int64)
-    _count(tiles.columns, projected.table, tiles.start, tiles.entries, labels.astype(np.int32), counts)
+    _count(
+        tiles.columns, projected.table, tiles.start, tiles.entries, labels.astype(np.int32), np.float32(least), counts
+    )
     return Work(*counts.sum(axis=0).tolist())
 
 
@@ -112,6 +117,7 @@ def _count(
     start: np.ndarray,  # (T + 1,)
     entries: np.ndarray,  # (E,)
     labels: np.ndarray,  # (H, W)
+    least: float,
     counts: np.ndarray,  # (T, 6) out, as in Work
 ) -> None:
     height, width = labels.shape
@@ -126,7 +132,7 @@ def _count(
                     rays[r, c] = 1.0
                     seen.add(labels[top + r, left + c])
             many[b] = len(seen) - 1
-        live = np.array([_is_open(rays, b) for b in range(TILE)])
+        live = np.array([_is_open(rays, b, least) for b in range(TILE)])
         for e in range(start[tile], start[tile + 1]):
             if not live.any():
                 break
@@ -134,8 +140,8 @@ def _count(
             g, any_hit = entries[e], False
             for b in range(TILE):
                 if live[b]:
-                    reached, hits = _blend(table[g], left, top, b, rays)
-                    live[b] = _is_open(rays, b)
+                    reached, hits = _blend(table[g], left, top, b, rays, least)
+                    live[b] = _is_open(rays, b, least)
                     any_hit = any_hit or hits > 0
                     counts[tile, 0] += hits
                     counts[tile, 2] += reached
@@ -145,16 +151,16 @@ def _count(
 
 
 @nb.njit
-def _is_open(rays: np.ndarray, b: int) -> bool:
+def _is_open(rays: np.ndarray, b: int, least: float) -> bool:
     """Whether a ray of a block is open."""
     found = False
     for i in range(LANES):
-        found = found or rays[in_tile(b, i)] >= np.float32(T_MIN)
+        found = found or rays[in_tile(b, i)] >= least
     return found
 
 
 @nb.njit
-def _blend(splat: np.ndarray, left: int, top: int, b: int, rays: np.ndarray) -> tuple[bool, int]:
+def _blend(splat: np.ndarray, left: int, top: int, b: int, rays: np.ndarray, least: float) -> tuple[bool, int]:
     """Whether a Gaussian reaches a block, and how many of its open rays it hits."""
     reached, hits = False, 0
     for i in range(LANES):
@@ -164,7 +170,7 @@ def _blend(splat: np.ndarray, left: int, top: int, b: int, rays: np.ndarray) -> 
         power = splat[LOG_OPACITY] - splat[HEIGHT] * dy * dy - splat[WIDTH] * (np.float32(c) - x) ** 2
         if power >= np.float32(LOG_ALPHA_MIN):
             reached = True
-            if rays[r, c] >= np.float32(T_MIN):
+            if rays[r, c] >= least:
                 hits += 1
                 rays[r, c] *= 1 - min(np.float32(2.0) ** power, np.float32(ALPHA_MAX))
     return reached, hits

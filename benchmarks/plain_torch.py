@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from gsseg_core.learn.gradient_learner import GradientSettings
+from gsseg_core.raster.constants import T_LIFTED, T_MIN
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -77,7 +78,7 @@ class PlainTorch:
         codes = torch.softmax(self.logits, dim=1)
         inner = codes.detach().requires_grad_()
         scale, total = 1 / (int((labels >= 0).sum()) * codes.shape[1]), 0.0
-        for tile in self.blend(camera):
+        for tile in self.blend(camera, lifts=True):
             image = self.render_tile(tile, inner)
             seen = labels[tile.rows, tile.columns].flatten()
             right = image[seen >= 0].gather(1, seen[seen >= 0, None])
@@ -105,8 +106,8 @@ class PlainTorch:
         return image + torch.nn.functional.pad(tile.left_over[:, None], (0, codes.shape[1] - 1))
 
     @torch.no_grad()
-    def blend(self, camera: Camera) -> Iterator[Blend]:
-        """Weights of every tile."""
+    def blend(self, camera: Camera, lifts: bool = False) -> Iterator[Blend]:
+        """Weights of every tile; rays that lift a mask end early, at a Gaussian that takes what is left."""
         splats = self.project(camera)
         for top in range(0, camera.height, TILE):
             for left in range(0, camera.width, TILE):
@@ -123,7 +124,10 @@ class PlainTorch:
                 alpha = torch.where(alpha < 1 / 255, 0.0, alpha.clamp_max(0.99))
                 after = torch.cumprod(1 - alpha, dim=1)
                 before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], dim=1)[:, : len(mine)]
-                weights = torch.where(before < 1e-4, 0.0, alpha * before)
+                weights = torch.where(before < (T_LIFTED if lifts else T_MIN), 0.0, alpha * before)
+                if lifts:
+                    ends = (before >= T_LIFTED) & (after[:, : len(mine)] < T_LIFTED)
+                    weights = torch.where(ends, before, weights)
                 yield Blend(slice(top, bottom), slice(left, right), splats.ids[mine], weights, 1 - weights.sum(dim=1))
 
     def project(self, camera: Camera) -> Splats:

@@ -18,6 +18,7 @@ from room import build_room
 from scipy.spatial import cKDTree
 
 from gsseg_core.data.dataset import Dataset
+from gsseg_core.raster.constants import T_MIN
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.tiling import assign
 from gsseg_core.scene.camera import Camera
@@ -48,7 +49,7 @@ def scene_statistics(scene: GaussianScene, cameras: Sequence[Camera]) -> dict[st
     for camera in cameras[:: max(1, len(cameras) // CAMERAS)]:
         projected = project(scene, camera)
         tiles = assign(projected, camera.width, camera.height)
-        pairs = count_work(projected, tiles, camera.width, camera.height).pairs
+        pairs = count_work(projected, tiles, camera.width, camera.height, least=T_MIN).pairs
         seen = len(projected.ids)
         rows.append([pairs / (camera.width * camera.height), seen / len(scene), len(tiles.entries) / max(seen, 1)])
     pairs, seen, tiles_each = np.median(rows, axis=0).tolist()

@@ -59,6 +59,7 @@ class GradientLearner(Learner):
       rendered probabilities.)
     - All codes start at zero, the "initial state of uniform distribution across all categories" of its section 3.2.
     - Adam with rate 0.05, falling exponentially to a tenth; one view a step, in random order, ten times over all views.
+    - Rays end at surfaces, as wherever masks are learnt from (`T_LIFTED` in `gsseg_core.raster.constants`).
     - Pixels whose label is unknown do not count, neither in the sum nor in N.
     - Where a mask is soft or partial, a rendered code counts by how plausible the pixel's label makes each class (see
       `gsseg_core.data.label_evidence`): -log sum_k pl(k) M_bar_k. With one class per label that is the same.

@@ -7,6 +7,13 @@ DILATION = 0.3  # added to both variances on the image, in px^2 (the low-pass fi
 ALPHA_MIN = 1.0 / 255.0  # alphas and opacities below this count as zero
 ALPHA_MAX = 0.99  # largest alpha
 T_MIN = 1e-4  # a ray ends when its transmittance falls below this
+
+T_LIFTED = 0.1
+"""A ray that lifts a mask ends at the Gaussian that leaves less than this of it, and that one takes what is left.
+
+What shines through a surface by less is nothing that a mask speaks of: a floor that is only ever seen through a table's
+soft edges would be learnt to be the table.
+"""
 TINY = 1e-30  # floor of a pixel's likelihood
 
 CHANNELS = 32

@@ -20,6 +20,7 @@ import pytest
 import torch
 from first_rasteriser import first_lift, to_splats
 from lift_rate import count_work
+from operator_cases import lifting
 from plain_torch import PlainTorch
 from report import Bar, Report, short
 from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, ring
@@ -27,6 +28,7 @@ from workloads import SIZES, RoomSize, make_room, split
 
 from gsseg_core.learn.gradient_learner import GradientLearner, GradientSettings
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.constants import T_LIFTED, T_MIN
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.tiling import assign
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -76,8 +78,13 @@ def test_plain_torch_learns_the_codes_of_the_gradient_learner() -> None:
 def test_work_is_counted_as_the_operator_lists_it() -> None:
     camera = SMALL_ROOM.cameras[0]
     projected = project(SMALL_ROOM.scene, camera)
-    work = count_work(projected, assign(projected, camera.width, camera.height), camera.width, camera.height)
-    assert work.pairs == pytest.approx(len(make_operator(SMALL_ROOM.scene, camera).weights().pixels), rel=1e-4)
+    tiles = assign(projected, camera.width, camera.height)
+    work, whole = (
+        count_work(projected, tiles, camera.width, camera.height, least=least) for least in (T_LIFTED, T_MIN)
+    )
+    operator = make_operator(SMALL_ROOM.scene, camera)
+    assert whole.pairs == pytest.approx(len(operator.weights().pixels), rel=1e-4)
+    assert work.pairs == pytest.approx((lifting(operator, SMALL_ROOM.scene)[0] > 0).sum(), rel=1e-4)
     assert work.pairs <= 16 * work.records <= 16 * work.evaluations
     assert work.products == work.records  # With one label only.
     assert work.flops > 17 * 16 * work.evaluations

@@ -101,4 +101,4 @@ def test_masks_of_bent_images_teach_as_much_as_those_of_a_pinhole(
     scene, cameras, parts, truths = table
     write_dataset(tmp_path, lens_of_demo(name), cameras[TRAIN], parts)
     bent = score(scene, Dataset(tmp_path), cameras[TEST], truths)
-    assert pinhole > 0.8 and bent > pinhole - 0.01
+    assert pinhole > 0.8 and bent > pinhole - 0.015

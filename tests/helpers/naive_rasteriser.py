@@ -22,7 +22,7 @@ class NaiveView(NamedTuple):
         What each ray has left over.
     slack : (H * W,) float64
         How far off a weight may be in lower precision, because some alpha is as good as 1/255 or some transmittance as
-        good as 1e-4, so that rounding decides whether it counts. 0 in most pixels.
+        good as that with which a ray ends, so that rounding decides whether it counts. 0 in most pixels.
     """
 
     weights: np.ndarray
@@ -30,8 +30,11 @@ class NaiveView(NamedTuple):
     slack: np.ndarray
 
 
-def naive_view(scene: GaussianScene, camera: Camera, rounding: float = 1e-4) -> NaiveView:
-    """Blend a scene into a view; `rounding` is the relative error up to which a threshold is a matter of luck."""
+def naive_view(scene: GaussianScene, camera: Camera, lifts: bool = False, rounding: float = 1e-4) -> NaiveView:
+    """Blend a scene into a view; `rounding` is the relative error up to which a threshold is a matter of luck.
+
+    Rays that lift a mask end at the Gaussian that leaves less than a tenth of them, which takes what is left.
+    """
     weights = np.zeros((camera.height * camera.width, len(scene)))
     transmittance, slack = np.ones(len(weights)), np.zeros(len(weights))
     for i, alpha in _alphas(scene, camera, scene.opacities):
@@ -41,8 +44,12 @@ def naive_view(scene: GaussianScene, camera: Camera, rounding: float = 1e-4) -> 
         alpha[(alpha < 1 / 255) | ~going_on] = 0.0
         weights[:, i] = alpha * transmittance
         transmittance *= 1 - alpha
-        doubtful = (alpha > 0) & (np.abs(transmittance * 1e4 - 1) < rounding)
+        doubtful = (alpha > 0) & (np.abs(transmittance / (0.1 if lifts else 1e-4) - 1) < rounding)
         slack[doubtful] += transmittance[doubtful]
+        if lifts:
+            ends = transmittance < 0.1
+            weights[ends, i] += transmittance[ends]
+            transmittance[ends] = 0
     return NaiveView(weights, transmittance, slack)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gsseg_core.raster.constants import T_LIFTED
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -78,6 +79,19 @@ def dense(operator):
     full = np.zeros((operator.camera.height * operator.camera.width, operator.num_gaussians))
     np.add.at(full, (listed.pixels, listed.gaussians), listed.weights)
     return full
+
+
+def lifting(operator, scene):
+    """W by which masks are lifted, (P, N), and what its rays have left over, (P,): they end as `T_LIFTED` says."""
+    depths = scene.means @ operator.camera.world_to_camera[2, :3]
+    order = np.argsort(depths, kind="stable")
+    weights = dense(operator)[:, order]
+    after = 1 - np.cumsum(weights, axis=1)
+    before = np.column_stack([np.ones(len(after)), after[:, :-1]])
+    ends = after < T_LIFTED
+    full = np.zeros_like(weights)
+    full[:, order] = np.where(before < T_LIFTED, 0, np.where(ends, before, weights))
+    return full, np.where(ends[:, -1], 0, after[:, -1])
 
 
 def spread(operator, observation, per_pair, num_labels=60001):

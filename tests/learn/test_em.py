@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from operator_cases import lifting
 from scipy import ndimage
 from small_scenes import (
     NUM_CLASSES,
@@ -49,10 +50,7 @@ def slow_em(
     words = rejected_regions(scene, views, settings) if settings.errors else [view.read_labels() for view in views]
     for view, word in zip(views, words, strict=True):
         operator, y = make_operator(scene, view.camera), word.ravel()
-        entries = operator.weights()
-        W = np.zeros((y.size, n))
-        W[entries.pixels, entries.gaussians] = entries.weights
-        rest = operator.transmittance().ravel().astype(np.float64)
+        W, rest = lifting(operator, scene)
         classes = np.unique(view.read_labels()[view.read_labels() >= 0])
         parts = np.unique(y[y >= K])  # rejected regions, each a word of its own
         onehot = (y[:, None] == np.append(classes, parts)).astype(np.float64)
@@ -131,9 +129,7 @@ def rejected_regions(scene: GaussianScene, views: list[View], settings: EMSettin
     """Labels of each view with a number of its own, from `NUM_CLASSES` on, for each rejected region."""
     weights, regions, onehots = [], [], []
     for view in views:
-        entries, labels = make_operator(scene, view.camera).weights(), view.read_labels()
-        W = np.zeros((labels.size, len(scene)))
-        W[entries.pixels, entries.gaussians] = entries.weights
+        W, labels = lifting(make_operator(scene, view.camera), scene)[0], view.read_labels()
         onehot = (labels.reshape(-1, 1) == np.arange(NUM_CLASSES)).astype(np.float64)
         weights.append(W)
         onehots.append(onehot)

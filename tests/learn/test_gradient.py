@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from operator_cases import lifting
 from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, taught
 
 from gsseg_core.data.view import View
@@ -30,8 +31,9 @@ def random_codes(seed: int = 0) -> torch.Tensor:
 def test_the_loss_is_the_formula_of_the_paper_over_the_labelled_pixels() -> None:
     view, codes = partly_known(), random_codes()
     operator, labels = make_operator(SCENE, view.camera), view.read_labels()
-    image = operator.render(codes.numpy()).astype(np.float64)
-    image[..., 0] += operator.transmittance()
+    weights, left_over = lifting(operator, SCENE)
+    image = (weights @ codes.numpy()).reshape(*labels.shape, NUM_CLASSES)
+    image[..., 0] += left_over.reshape(labels.shape)
     known = labels >= 0
     losses = [-np.log(image[..., k][labels == k]).sum() / known.sum() for k in range(NUM_CLASSES)]
     loss = cross_entropy(codes, operator.observe(labels))

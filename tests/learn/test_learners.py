@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from operator_cases import lifting
 from small_scenes import NAMES, NUM_CLASSES, OUT_OF_SIGHT, balls_on_a_table, clean_views, look_at, mean_iou, taught
 
 from gsseg_core.data.label_images import UNKNOWN
@@ -212,10 +213,12 @@ def test_the_order_of_the_views_and_the_memory_budget_do_not_matter(kind: type[L
     np.testing.assert_allclose(one.codes_, two.codes_, atol=1e-4)
 
 
-def test_votes_are_the_sum_over_views_of_the_adjoint_of_the_masks() -> None:
+def test_votes_are_the_sum_over_views_of_what_the_masks_lift() -> None:
     learner = taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS).fit()
     onehot = np.eye(NUM_CLASSES, dtype=np.float32)
-    expected = sum(make_operator(SCENE, view.camera).adjoint(onehot[view.read_labels()]) for view in VIEWS)
+    expected = sum(
+        lifting(make_operator(SCENE, view.camera), SCENE)[0].T @ onehot[view.read_labels().ravel()] for view in VIEWS
+    )
     np.testing.assert_allclose(learner._votes * VOTE_UNIT, expected, rtol=1e-4, atol=1e-5)
     seen = expected.sum(axis=1) > 1e-4
     share = expected[seen] / expected[seen].sum(axis=1, keepdims=True)

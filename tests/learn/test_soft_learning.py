@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from operator_cases import lifting
 from small_scenes import (
     NAMES,
     NUM_CLASSES,
@@ -95,9 +96,7 @@ def test_soft_votes_are_weights_times_masses_by_a_slow_twin() -> None:
     view = View.from_probabilities(clean_views(1)[0].camera, probabilities, [3, 1])
     seen = view.read_seen()
     assert seen.evidence is not None
-    W = np.zeros((48 * 64, len(SCENE)))
-    entries = make_operator(SCENE, view.camera).weights()
-    W[entries.pixels, entries.gaussians] = entries.weights
+    W, _ = lifting(make_operator(SCENE, view.camera), SCENE)
     said = seen.evidence.votes.dense(NUM_CLASSES)[seen.labels.ravel()]
     learner = taught(VoteLearner(SCENE, NUM_CLASSES), [view])
     np.testing.assert_allclose(learner._votes * VOTE_UNIT, W.T @ said, atol=2e-3)

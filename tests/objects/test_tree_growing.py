@@ -139,7 +139,7 @@ def test_views_that_came_one_by_one_make_the_same_tree() -> None:
 
 
 def test_the_command_writes_the_level_that_is_asked_for_and_keeps_the_objects(tmp_path: Path) -> None:
-    data = write_dataset(tmp_path / "data", SCENE, TRUTH, ring(18), NAMES)
+    data = write_dataset(tmp_path / "data", SCENE, TRUTH, ring(24), NAMES)
     for i, view in enumerate(Dataset(data).views("train")):
         labels = seen_as(view, TRUTH if i % 3 else halved(1)).read_labels()
         write_mask(data / "labels" / f"{view.name}.png", labels, 8)

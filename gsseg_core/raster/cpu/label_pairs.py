@@ -16,7 +16,7 @@ from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.raster.constants import AHEAD, CHUNKS, TINY
 from gsseg_core.raster.cpu.blending import open_rays, stride_of, tile_of_turn
 from gsseg_core.raster.cpu.lifting import Labels, weighted_blocks
-from gsseg_core.raster.cpu.splat import WIDTH, aim, blend_block
+from gsseg_core.raster.cpu.splat import WIDTH, aim, lift_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
 
 _TINY = np.float32(TINY)
@@ -177,7 +177,7 @@ def _blend_likelihood(
         while todo:
             b = simd.first_bit(todo)
             todo &= todo - 1
-            weight, _ = blend_block(rays, b, lines, table[g, WIDTH])
+            weight, _ = lift_block(rays, b, lines, table[g, WIDTH])
             simd.store_row(weights, n, weight)
             n += 1
             total = simd.load_row(value, b)

@@ -15,7 +15,7 @@ import numpy as np
 from gsseg_core.csr_rows import starts
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.raster.cpu.blending import aim_next, in_tile, open_rays, stride_of, tile_of_turn
-from gsseg_core.raster.cpu.splat import OPEN, SIDE, WIDTH, blend_block
+from gsseg_core.raster.cpu.splat import OPEN, SIDE, WIDTH, lift_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
 from gsseg_core.simd import FAST, LANES, add_where, count_bits, first_bit, nothing, sum_row
 
@@ -185,7 +185,7 @@ def _lift_tile(
         while blocks:
             b = first_bit(blocks)
             blocks &= blocks - 1
-            weight, bits = blend_block(rays, b, own, wide)
+            weight, bits = lift_block(rays, b, own, wide)
             if not bits & OPEN:
                 live &= ~(1 << b)
             hit |= np.int64(bits >> LANES & labelled[b] > 0) << b

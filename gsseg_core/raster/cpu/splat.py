@@ -13,7 +13,7 @@ from typing import Any
 from llvmlite import ir
 from numba.core import cgutils, types
 
-from gsseg_core.raster.constants import ALPHA_MAX, BLOCK, T_MIN
+from gsseg_core.raster.constants import ALPHA_MAX, BLOCK, T_LIFTED, T_MIN
 from gsseg_core.simd import BITS, F32, I64, LANES, ROW, Builder, constant, intrinsic, row_type
 
 SIDE = BLOCK
@@ -123,23 +123,41 @@ def blend_block(typing: Any, rays: Any, b: Any, lines: Any, wide: Any) -> tuple[
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        row = _Splat(context, builder, signature, arguments)
-        alpha, power = row.alpha(1)
-        address = row.row(0)
-        before = row.load(address)
-        hit = builder.and_(
-            builder.fcmp_ordered(">=", power, constant(LOG_ALPHA_MIN)),
-            builder.fcmp_ordered(">=", before, constant(T_MIN)),
-        )
-        weight = builder.select(hit, builder.fmul(alpha, before), constant(0.0))
-        after = builder.fsub(before, weight)
-        row.store(after, address)
-        still_open = row.bits(builder.fcmp_ordered(">=", after, constant(T_MIN)))
-        bits = builder.or_(builder.shl(row.bits(hit), ir.Constant(I64, LANES)), still_open)
-        return context.make_tuple(builder, signature.return_type, [weight, bits])
+        return _blended(_Splat(context, builder, signature, arguments), context, signature, lifts=False)
 
-    both: Any = types.Tuple((row_type, types.int64))  # type: ignore[no-untyped-call]
-    return both(rays, b, lines, types.float32), generate
+    return _BLENDED(rays, b, lines, types.float32), generate
+
+
+@intrinsic
+def lift_block(typing: Any, rays: Any, b: Any, lines: Any, wide: Any) -> tuple[Any, Callable[..., Any]]:
+    """Blend one Gaussian into block b of rays that lift a mask: as `blend_block`, but they end as `T_LIFTED` says."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return _blended(_Splat(context, builder, signature, arguments), context, signature, lifts=True)
+
+    return _BLENDED(rays, b, lines, types.float32), generate
+
+
+_BLENDED: Any = types.Tuple((row_type, types.int64))  # type: ignore[no-untyped-call]
+
+
+def _blended(row: _Splat, context: Any, signature: Any, lifts: bool) -> Any:
+    """Weights and bits of `blend_block`, or of `lift_block`; what is left of the rays is stored."""
+    llvm = row.llvm
+    alpha, power = row.alpha(1)
+    address = row.row(0)
+    before = row.load(address)
+    hit = llvm.and_(
+        llvm.fcmp_ordered(">=", power, constant(LOG_ALPHA_MIN)), llvm.fcmp_ordered(">=", before, constant(T_MIN))
+    )
+    weight = llvm.select(hit, llvm.fmul(alpha, before), constant(0.0))
+    after = llvm.fsub(before, weight)
+    goes_on = llvm.fcmp_ordered(">=", after, constant(T_LIFTED if lifts else T_MIN))
+    if lifts:  # A ray that has ended has nothing left, so it stays as it is.
+        weight, after = llvm.select(goes_on, weight, before), llvm.select(goes_on, after, constant(0.0))
+    row.store(after, address)
+    bits = llvm.or_(llvm.shl(row.bits(hit), ir.Constant(I64, LANES)), row.bits(goes_on))
+    return context.make_tuple(llvm, signature.return_type, [weight, bits])
 
 
 @intrinsic

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gsseg_core.raster.constants import ALPHA_MAX, T_MIN
+from gsseg_core.raster.constants import ALPHA_MAX, T_LIFTED, T_MIN
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, U, V
 from gsseg_core.raster.cpu.tiling import TILE
 from gsseg_core.raster.gpu.device import called_by_kernels, cuda, gpu_kernel
@@ -28,6 +28,7 @@ STRIDE = THREADS + PARTS  # of the weights in shared memory: threads of a warp m
 WARP, WARPS = 32, THREADS // 32  # threads of a warp, and warps of a block of threads
 
 OPEN = np.float32(T_MIN)
+LIFTED = np.float32(T_LIFTED)
 HALF_PIXEL = np.float32(0.5)
 _LEAST, _MOST, _LN2 = np.float32(LOG_ALPHA_MIN), np.float32(ALPHA_MAX), np.float32(math.log(2))
 _NOTHING = np.float32(0)
@@ -105,11 +106,16 @@ def blend_kernel(channels: int) -> Any:
 
 @called_by_kernels
 def weigh_batch(
-    splats: np.ndarray, count: int, x: Any, y: Any, ray: Any, scale: Any, weights: np.ndarray, t: int
+    splats: np.ndarray, count: int, x: Any, y: Any, ray: Any, least: Any, scale: Any, weights: np.ndarray, t: int
 ) -> Any:  # fmt: skip
-    """Write what each Gaussian of a batch weighs in the pixel of a thread, times `scale`; returns what is left."""
+    """Write what each Gaussian of a batch weighs in the pixel of a thread, times `scale`; returns what is left.
+
+    The one that leaves less than `least` takes what is left.
+    """
     for e in range(count):
         weight = alpha_of(splats, e, x, y) * ray if ray >= OPEN else _NOTHING
+        if ray - weight < least:
+            weight = ray
         ray -= weight
         weights[e, t] = weight * scale
     return ray
@@ -139,7 +145,7 @@ def carry_back(
         count = min(BATCH, start[tile + 1] - first)
         load_batch(table, entries, first, count, splats, t)
         cuda.syncthreads()
-        ray = weigh_batch(splats, count, x, y, ray, np.float32(1), weights, t)
+        ray = weigh_batch(splats, count, x, y, ray, _NOTHING, np.float32(1), weights, t)
         cuda.syncthreads()
         e = t // PARTS
         for k in range(CARRIED):

@@ -16,6 +16,7 @@ from gsseg_core.raster.cpu.tiling import TILE
 from gsseg_core.raster.gpu.blending import (
     BATCH,
     HALF_PIXEL,
+    LIFTED,
     OPEN,
     PARTS,
     STRIDE,
@@ -122,7 +123,7 @@ def lift(
         count = min(BATCH, start[tile + 1] - first)
         load_batch(table, entries, first, count, splats, t)
         cuda.syncthreads()
-        ray = weigh_batch(splats, count, x, y, ray, np.float32(1), weighed, t)
+        ray = weigh_batch(splats, count, x, y, ray, LIFTED, np.float32(1), weighed, t)
         cuda.syncthreads()
         if e < count:
             place = slot_start[tile] + (first + e - start[tile]) * label_count
@@ -184,6 +185,8 @@ def share(
         if ray >= OPEN:
             for e in range(count):
                 weight = alpha_of(splats, e, x, y) * ray if ray >= OPEN else _NOTHING
+                if ray - weight < LIFTED:
+                    weight = ray
                 if weight > 0:
                     ray -= weight
                     if label_count == 1:
@@ -208,7 +211,7 @@ def share(
         load_batch(table, entries, first, count, splats, t)
         cuda.syncthreads()
         if busy[t // WARP]:
-            ray = weigh_batch(splats, count, x, y, ray, inverse, weighed, t)
+            ray = weigh_batch(splats, count, x, y, ray, LIFTED, inverse, weighed, t)
         cuda.syncthreads()
         if e < count:
             place = slot_start[tile] + (first + e - start[tile]) * label_count
