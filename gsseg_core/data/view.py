@@ -37,7 +37,8 @@ class View:
         Where from.
     mask_path : pathlib.Path or None
         The mask: a label image (.png), probabilities (.npz) or a folder of detections, see docs/masks.md; None if there
-        is none or it is in memory. It is drawn on the image as it was taken, and undistorted when it is read.
+        is none or it is in memory. It is drawn on the image as it was taken, and undistorted when it is read. `held`
+        leaves it, as what messages name.
     image_path : pathlib.Path or None
         The photo as it was taken, if there is one.
     class_names : mapping from id to name, or None
@@ -170,6 +171,15 @@ class View:
         view = cls(camera, class_names=class_names)
         view._check_seen(seen, f"view '{camera.name}'")
         return replace(view, _mask=PackedMask(seen))
+
+    def held(self) -> View:
+        """Keep the mask in memory as its file has it now, whatever becomes of that; raises as `read_labels` does.
+
+        That is the view itself where the mask is there already, or there is none.
+        """
+        if self.is_in_memory or not self.has_mask:
+            return self
+        return replace(self, _mask=PackedMask(self.read_seen()), label_map=None, numbering=None)
 
     def smaller(self, step: int) -> View:
         """Make the view of every step-th pixel of each row and column; the view itself where that is all, or none.

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from gsseg_core.errors import SettingsError
-from gsseg_core.learn.learner import Learner, Progress, silent
+from gsseg_core.learn.learner import Learner, Progress, all_or_nothing, silent
 from gsseg_core.learn.vote_resolution import is_resolved
 from gsseg_core.raster.observation import Observation
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -87,6 +87,7 @@ class GradientLearner(Learner):
         """Cross-entropy summed over the classes (K times CES), in nats per labelled pixel; mean of the last epoch."""
         return self.history_[-1] * self.num_classes if self.history_ else float("nan")
 
+    @all_or_nothing
     def fit(self, progress: Progress = silent) -> GradientLearner:
         """Run all epochs."""
         settings = self.settings

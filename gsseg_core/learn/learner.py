@@ -7,7 +7,8 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, nullcontext
-from typing import Any, TypeVar
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -34,6 +35,7 @@ UNITS = 1 / VOTE_UNIT  # units per px
 NO_MASK, SEES_NOTHING, ALL_UNKNOWN = "no mask", "sees no Gaussian", "all pixels unknown"
 
 Self = TypeVar("Self", bound="Learner")
+P = ParamSpec("P")
 R = TypeVar("R")
 
 _ALONE = threading.Lock()  # of two threads at work on a view each, one at a time lends out the votes
@@ -41,6 +43,24 @@ _ALONE = threading.Lock()  # of two threads at work on a view each, one at a tim
 
 class UnusableViewError(Exception):
     """A view that nothing can be learnt from; the message says why, in the words above."""
+
+
+def all_or_nothing(fit: Callable[P, R]) -> Callable[P, R]:
+    """Make a `fit` that leaves what an earlier one has set, all that ends with "_", if an error ends it half-way."""
+
+    @wraps(fit)
+    def whole(*args: P.args, **kwargs: P.kwargs) -> R:
+        fitted = vars(args[0])
+        before = {name: value for name, value in fitted.items() if name.endswith("_")}
+        try:
+            return fit(*args, **kwargs)
+        except BaseException:  # Ctrl-C in a notebook, too.
+            for name in [name for name in fitted if name.endswith("_") and name not in before]:
+                del fitted[name]
+            fitted.update(before)
+            raise
+
+    return whole
 
 
 class Learner(ABC):
@@ -123,6 +143,8 @@ class Learner(ABC):
         MaskFormatError, MaskSizeError, UnknownLabelError
             The mask is broken, of another size than the camera, or has labels beyond the classes.
         """
+        if self.memory_budget == 0:
+            view = view.held()  # Nothing else tells which votes were its own, should its file have changed by then.
         if self.memory_budget == 0 and view.name not in self.views:
             try:
                 sees = self._lift(view, self._read_usable(view), 1)
@@ -177,7 +199,7 @@ class Learner(ABC):
 
     @abstractmethod
     def fit(self: Self, progress: Progress = silent) -> Self:
-        """Learn `codes_` from the views observed so far.
+        """Learn `codes_` from the views observed so far; one that takes steps is `all_or_nothing`.
 
         Raises
         ------

@@ -8,7 +8,6 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import UnknownGroupError
 from gsseg_core.learn.learner_state import State
@@ -57,7 +56,7 @@ class LivingVotes(VoteLearner):
         return replace(view, camera=view.camera if is_identity(frame) else frame.camera(view.camera), group=None)
 
     def change(self, change: SceneChange, joining: Mapping[str, int | None], *, all_kept: bool = False) -> list[str]:
-        """Go over to the scene after a change, with the votes that views have in that; on any error, nothing changes.
+        """Go over to the scene after a change, with the votes that views have in that: their masks are `View.held`.
 
         Parameters
         ----------
@@ -72,11 +71,6 @@ class LivingVotes(VoteLearner):
         -------
         list of str
             Views that were lifted anew.
-
-        Raises
-        ------
-        GssegError
-            The mask of a view that is lifted anew cannot be read any more.
         """
         views = {name: self._joined(view, joining.get(name, view.group)) for name, view in self.views.items()}
         lifted = [
@@ -87,14 +81,12 @@ class LivingVotes(VoteLearner):
         # To take a view back costs as much as to add it: with more than half of them, all are lifted from nothing.
         from_nothing = all_kept and 2 * len(lifted) > len(views)
         names = list(views) if from_nothing else lifted
-        # Masks in memory cannot fail: they are read one at a time.
-        read = {name: self._read(views[name]) for name in names if not views[name].is_in_memory}
         if from_nothing:
             self._votes[:] = 0
         else:
-            self._lift_all(self.views, lifted, read, -1)
+            self._lift_all(self.views, lifted, -1)
         self._votes, self.living, self.scene = change.carry(self._votes), change.after, change.after.scene
-        self._lift_all(views, names, read, 1)
+        self._lift_all(views, names, 1)
         self.views = views
         for name in lifted:
             self._ends.pop(views[name], None)
@@ -111,11 +103,11 @@ class LivingVotes(VoteLearner):
 
         return ends if self.device == "cpu" else None
 
-    def _lift_all(self, views: Mapping[str, View], names: list[str], read: Mapping[str, SeenLabels], sign: int) -> None:
+    def _lift_all(self, views: Mapping[str, View], names: list[str], sign: int) -> None:
         # In the order of groups, so that the scene is brought into the frame of each but once.
         for name in sorted(names, key=lambda name: str(views[name].group)):
             # A view that sees nothing any more is kept: it may see what is added later.
-            self._lift(views[name], read[name] if name in read else self._read(views[name]), sign)
+            self._lift(views[name], self._read(views[name]), sign)
 
     def _joined(self, view: View, group: int | None) -> View:
         """Have a view belong to a group: it stays where it is in the scene, and from then on moves along."""

@@ -131,7 +131,7 @@ class LiveSession:
         Parameters
         ----------
         view : View
-            With a mask.
+            With a mask, which is kept as it is now, whatever becomes of its file.
         era : object, optional
             What `era` was when the view was taken: if that has changed, the view belongs to what was forgotten, and is
             neither used nor counted as rejected.

@@ -6,6 +6,7 @@ import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 from operator_cases import lifting
 from small_scenes import NAMES, NUM_CLASSES, OUT_OF_SIGHT, balls_on_a_table, clean_views, look_at, mean_iou, taught
 
-from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.label_images import UNKNOWN, write_mask
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import MaskSizeError, NoUsableViewsError, SettingsError, UnknownLabelError
@@ -248,6 +249,41 @@ def test_a_view_of_the_same_name_replaces_the_earlier_one(budget: int) -> None:
     fresh = taught(VoteLearner(SCENE, NUM_CLASSES), [VIEWS[0], other, *VIEWS[2:]])
     np.testing.assert_array_equal(learner._votes, fresh._votes)
     assert len(learner.views) == 5
+
+
+@pytest.mark.parametrize("budget", [0, 1 << 30])
+def test_a_mask_that_was_corrected_in_its_file_replaces_what_the_file_held_before(budget: int, tmp_path: Path) -> None:
+    view, labels = View(VIEWS[1].camera, tmp_path / "1.png"), VIEWS[1].read_labels()
+    write_mask(view.source, np.full_like(labels, 3), 8)
+    learner = taught(VoteLearner(SCENE, NUM_CLASSES, memory_budget=budget), [VIEWS[0], view])
+    write_mask(view.source, labels, 8)
+    assert learner.observe(view)
+    np.testing.assert_array_equal(learner._votes, taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS[:2])._votes)
+    write_mask(view.source, np.full_like(labels, 2), 8)
+    learner.retract(view.name)
+    np.testing.assert_array_equal(learner._votes, taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS[:1])._votes)
+
+
+@pytest.mark.parametrize("kind", [EMLearner, GradientLearner])
+def test_a_fit_that_is_stopped_leaves_what_was_fitted_before_it(kind: type[Learner]) -> None:
+    learner = taught(kind(SCENE, NUM_CLASSES), VIEWS[:3])
+
+    def stop(stage: str, done: int, total: int) -> None:
+        if done == 1:
+            raise InterruptedError(stage)
+
+    with pytest.raises(InterruptedError):
+        learner.fit(stop)
+    assert not learner.history_ and not learner.converged_ and not hasattr(learner, "observed_")
+    learner.fit()
+    before, told = vars(learner).copy(), learner.predict_without(VIEWS[0])
+    learner.observe(VIEWS[3])
+    with pytest.raises(InterruptedError):
+        learner.fit(stop)
+    assert all(vars(learner)[name] is value for name, value in before.items() if name.endswith("_"))
+    np.testing.assert_array_equal(learner.predict_without(VIEWS[0]), told)
+    again = taught(kind(SCENE, NUM_CLASSES), VIEWS[:4]).fit()
+    np.testing.assert_array_equal(learner.fit().codes_, again.codes_)
 
 
 @pytest.mark.parametrize("budget", [0, 1 << 30])

@@ -42,7 +42,7 @@ from gsseg_core.learn.em.confusion_model import ErrorModel
 from gsseg_core.learn.em.pair_kernels import codes_without, kernels_on
 from gsseg_core.learn.em.rejected_regions import find_rejected, split_regions
 from gsseg_core.learn.em.spatial_prior import spatial_prior, with_prior
-from gsseg_core.learn.learner import VOTE_UNIT, Learner, Progress, silent
+from gsseg_core.learn.learner import VOTE_UNIT, Learner, Progress, all_or_nothing, silent
 from gsseg_core.learn.vote_resolution import resolved_votes
 from gsseg_core.raster.observation import Observation, ViewPairs, VoteShares
 from gsseg_core.raster.view_operator import ViewOperator
@@ -152,7 +152,7 @@ class EMLearner(Learner):
         self.settings = settings or EMSettings()
         self.error_models_: dict[str, ErrorModel] = {}
         # Probabilities before it and the gradient of all views, both on the device; whether any are of the background.
-        self._last_step: tuple[Any, Any, bool] | None = None
+        self._last_step_: tuple[Any, Any, bool] | None = None
 
     @classmethod
     def default_settings(cls, max_steps: int | None, seed: int) -> tuple[EMSettings]:
@@ -169,11 +169,11 @@ class EMLearner(Learner):
         """-J per labelled pixel, in nats."""
         return -self.lower_bound_
 
+    @all_or_nothing
     def fit(self, progress: Progress = silent) -> EMLearner:
         """Alternate E and M steps until a step can gain no more than the tolerance."""
         settings = self.settings
         self._require_views()
-        self._last_step = None
         votes, tick = CSRRows.from_dense(self._votes), partial(progress, "em", 0, settings.max_steps)
         search = partial(find_neighbours, self.scene, settings.prior_k)
         with meanwhile(search, self.device) if settings.prior_weight else nullcontext():
@@ -204,7 +204,7 @@ class EMLearner(Learner):
             if self.converged_ or len(history) == settings.max_steps:
                 here, on_device = self._put(codes.with_data(codes.data.copy()), self.device)
                 background = bool((codes.indices == 0).any())
-                self._last_step = here, on_device.put(gradient, self.device), background
+                self._last_step_ = here, on_device.put(gradient, self.device), background
             elif small:
                 self._refit_error_models(codes, gradient, prior.data, models, tick)
                 rounds.append(0)
@@ -243,8 +243,8 @@ class EMLearner(Learner):
         If only its labelled pixels count, what they see is at hand, and the codes are those of these Gaussians, whose
         ids come second; else of all. Third is told whether any code has a share of the background.
         """
-        assert self._last_step is not None, "expected fit() first"
-        codes, gradient, background = self._last_step
+        assert self._last_step_ is not None, "expected fit() first"
+        codes, gradient, background = self._last_step_
         observation, on_device = self.observation(view.name), kernels_on(self.device)
         no_prior, ids = on_device.zeros(codes, np.float32), on_device.pairs_of(observation).ids
         stepped = codes_without(observation, self.error_models_[view.name], codes, gradient, no_prior, self.device)
