@@ -4,13 +4,22 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gsseg_core.cli.shared import add_collision, add_format, add_scene, load_kernels
 from gsseg_core.cli.terminal import tell
 from gsseg_core.errors import SettingsError
 from gsseg_core.progress import progress_bars
-from gsseg_core.scene.scene_writers import DEFAULT
+from gsseg_core.scene.scene_writers import DEFAULT, SCENE_WRITERS
 from gsseg_core.text import quoted
+
+if TYPE_CHECKING:  # Loaded by those who pick alone: `gsseg --help` is quick.
+    import numpy as np
+
+    from gsseg_core.data.dataset import Dataset
+    from gsseg_core.objects.pick import Pick
+    from gsseg_core.scene.camera import Camera
+    from gsseg_core.scene.gaussian_scene import GaussianScene
 
 CANDIDATES = 24  # cameras of which the next view is chosen, spread over all: neighbours in a capture see much the same
 
@@ -47,72 +56,100 @@ def run(options: argparse.Namespace) -> int:
     """Pick, and say what was written."""
     from gsseg_core.align.placing import place
     from gsseg_core.data.dataset import Dataset
-    from gsseg_core.data.mask_formats.place import view_of
-    from gsseg_core.data.view import View, spread
-    from gsseg_core.errors import NoUsableViewsError
-    from gsseg_core.export.collision import check_collision, collision_mesh
-    from gsseg_core.export.pictures import overlay, palette, save_png
-    from gsseg_core.export.view_pictures import background_image
+    from gsseg_core.data.view import spread
+    from gsseg_core.export.collision import check_collision
+    from gsseg_core.export.pictures import save_png
     from gsseg_core.files.run_folder import staged_run
-    from gsseg_core.objects.pick import pick_masks, read_object_mask
-    from gsseg_core.raster.backends import make_operator
     from gsseg_core.scene.gaussian_scene import GaussianScene
-    from gsseg_core.scene.scene_writers import SCENE_WRITERS, SceneObject, check_format, write_objects, write_scene
+    from gsseg_core.scene.scene_writers import check_format
 
     dataset = Dataset(options.data)
-    names = [camera.name for camera in dataset.cameras]
-    options.views = [view_of(view, names) or view for view in options.views]
-    for view in options.views:
-        if view not in names:
-            raise SettingsError(f"{options.data}: has no view {view!r}; expected a stem such as {min(names)!r}")
-    if len(options.views) != len(options.masks) or len({*options.views}) != len(options.views):
-        raise SettingsError(
-            f"found --view {len(options.views)} times, of {len({*options.views})} views, and --mask "
-            f"{len(options.masks)} times; expected one mask for each view"
-        )
+    options.views = _names_of_views(options, dataset)
     check_format(options.format)
     check_collision(options.collision)
-    writer = SCENE_WRITERS[options.format]
-    file = f"object{writer.suffixes[0]}"
+    file = f"object{SCENE_WRITERS[options.format].suffixes[0]}"
     out, scene = Path(options.out), GaussianScene.load(options.scene)
     load_kernels(options.quiet, options.device)
     with progress_bars(options.quiet) as progress:
         placed = place(
             scene, dataset, align=options.align, dataparser=options.dataparser, device=options.device, progress=progress
         )
-    cameras = dict(zip(names, placed.dataset.cameras, strict=True))
+    cameras = {camera.name: camera for camera in placed.dataset.cameras}
     with staged_run(out, "pick", places=(file, "object.obj", "pick.npz", "pick.png", "next.png")) as run:
-        known = dataset.class_names if options.label and not options.label.isdecimal() else None
-        views = [
-            View.from_arrays(cameras[name], read_object_mask(mask, cameras[name], options.label, known))
-            for name, mask in zip(options.views, options.masks, strict=True)
-        ]
-        picked = pick_masks(scene, views, device=options.device)
-        if not len(picked.ids):
-            raise NoUsableViewsError(
-                f"{', '.join(options.masks)}: no Gaussian lies more in the object than beside it; expected a mask of "
-                "what the scene shows there as Gaussians of its own"
-            )
-        shown = picked.silhouette(scene, views[0].camera, device=options.device)
-        image = background_image(scene, make_operator(scene, views[0].camera, options.device))
-        kind, part = options.collision, scene.subset(picked.ids)
-        mesh = collision_mesh(scene, picked.ids, picked.membership, kind) if kind else None
-        if mesh is not None:
-            mesh.save(run.folder / "object.obj", run.id)
-        if writer.together:
-            write_objects([SceneObject(part, collision=mesh)], run.folder / file, options.format, run.id)
-        else:
-            write_scene(part, run.folder / file, options.format, run.id)
-        picked.save(run.folder / "pick.npz", run.id)
-        save_png(run.folder / "pick.png", overlay(image, shown.astype(int), palette(2)), run.id)
-        unseen = [camera for name, camera in cameras.items() if name not in options.views]
+        picked = _picked(options, scene, cameras, dataset)
+        _write(options, scene, picked, cameras[options.views[0]], run.folder / file, run.id)
+        unseen = spread([camera for name, camera in cameras.items() if name not in options.views], CANDIDATES)
         if unseen:
-            unseen = spread(unseen, CANDIDATES)
             following = unseen[picked.next_view(scene, unseen, device=options.device)]
-            image = background_image(scene, make_operator(scene, following, options.device))
-            save_png(run.folder / "next.png", image, run.id)
+            save_png(run.folder / "next.png", _picture(options, scene, following), run.id)
     tell(f"{len(picked.ids):,} of {len(scene):,} Gaussians: {out}/{file}, pick.npz, and pick.png to look at")
     if unseen:
         lens = "" if following.undistortion is None else ", without its lens: masks are of the photo"
         tell(f"a mask of view {quoted(following.name)} would tell most: {out}/next.png is the scene from there{lens}")
     return 0
+
+
+def _names_of_views(options: argparse.Namespace, dataset: Dataset) -> list[str]:
+    """Find the views that are asked for, different ones, one for each mask."""
+    from gsseg_core.data.mask_formats.place import view_of
+
+    names = [camera.name for camera in dataset.cameras]
+    views = [view_of(view, names) or view for view in options.views]
+    for view in views:
+        if view not in names:
+            raise SettingsError(f"{options.data}: has no view {view!r}; expected a stem such as {min(names)!r}")
+    if len(views) != len(options.masks) or len({*views}) != len(views):
+        raise SettingsError(
+            f"found --view {len(views)} times, of {len({*views})} views, and --mask {len(options.masks)} times; "
+            "expected one mask for each view"
+        )
+    return views
+
+
+def _picked(options: argparse.Namespace, scene: GaussianScene, cameras: dict[str, Camera], dataset: Dataset) -> Pick:
+    """Pick the object that the masks show."""
+    from gsseg_core.data.view import View
+    from gsseg_core.errors import NoUsableViewsError
+    from gsseg_core.objects.pick import pick_masks, read_object_mask
+
+    known = dataset.class_names if options.label and not options.label.isdecimal() else None
+    views = [
+        View.from_arrays(cameras[name], read_object_mask(mask, cameras[name], options.label, known))
+        for name, mask in zip(options.views, options.masks, strict=True)
+    ]
+    picked = pick_masks(scene, views, device=options.device)
+    if not len(picked.ids):
+        raise NoUsableViewsError(
+            f"{', '.join(options.masks)}: no Gaussian lies more in the object than beside it; expected a mask of "
+            "what the scene shows there as Gaussians of its own"
+        )
+    return picked
+
+
+def _write(
+    options: argparse.Namespace, scene: GaussianScene, picked: Pick, camera: Camera, path: Path, run: str
+) -> None:
+    """Write the object, as a scene and maybe as a mesh, its indices, and how it is seen by a camera."""
+    from gsseg_core.export.collision import collision_mesh
+    from gsseg_core.export.pictures import overlay, palette, save_png
+    from gsseg_core.scene.scene_writers import SceneObject, write_objects, write_scene
+
+    kind, part, folder = options.collision, scene.subset(picked.ids), path.parent
+    mesh = collision_mesh(scene, picked.ids, picked.membership, kind) if kind else None
+    if mesh is not None:
+        mesh.save(folder / "object.obj", run)
+    if SCENE_WRITERS[options.format].together:
+        write_objects([SceneObject(part, collision=mesh)], path, options.format, run)
+    else:
+        write_scene(part, path, options.format, run)
+    picked.save(folder / "pick.npz", run)
+    shown = picked.silhouette(scene, camera, device=options.device)
+    image = _picture(options, scene, camera)
+    save_png(folder / "pick.png", overlay(image, shown.astype(int), palette(2)), run)
+
+
+def _picture(options: argparse.Namespace, scene: GaussianScene, camera: Camera) -> np.ndarray:
+    from gsseg_core.export.view_pictures import background_image
+    from gsseg_core.raster.backends import make_operator
+
+    return background_image(scene, make_operator(scene, camera, options.device))

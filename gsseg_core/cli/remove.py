@@ -37,7 +37,6 @@ def run(options: argparse.Namespace) -> int:
     import numpy as np
 
     from gsseg_core.data.class_names import class_ids, listed
-    from gsseg_core.errors import SettingsError
     from gsseg_core.export.class_files import write_selection
     from gsseg_core.export.collision import check_collision, collision_meshes
     from gsseg_core.files.atomic import check_writable
@@ -56,10 +55,7 @@ def run(options: argparse.Namespace) -> int:
     scene = GaussianScene.load(options.scene)
     segmentation = Segmentation.load(options.segmentation, scene)
     names = segmentation.node_names
-    try:
-        chosen = class_ids(options.classes, names)
-    except SettingsError as error:
-        raise SettingsError(f"{options.segmentation}: {error}") from error
+    chosen = class_ids(options.classes, names, options.segmentation)
     rest = left_without(scene, segmentation, chosen)
     left = replace(segmentation, labels=np.where(rest, segmentation.labels, np.int32(REMOVED)))
     meshes = collision_meshes(scene, left, options.collision) if options.collision else {}

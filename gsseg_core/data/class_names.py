@@ -98,26 +98,26 @@ def id_of(text: str, class_names: Mapping[int, str]) -> int | None:
     return number if number in class_names else None
 
 
-def class_ids(wanted: Iterable[str], class_names: Mapping[int, str]) -> list[int]:
+def class_ids(wanted: Iterable[str], class_names: Mapping[int, str], source: object = "") -> list[int]:
     """Look up classes by id or name: their ids in the order asked for, each once.
 
-    A number is the id of a class where there is one; everything else is a name.
+    A number is the id of a class where there is one; everything else is a name. Errors begin with the `source`, if any.
 
     Raises
     ------
     SettingsError
         There is no such class, or several have this name.
     """
-    ids = []
+    ids, where = [], f"{source}: " if source else ""
     for name in wanted:
         number = id_of(name, class_names)
         meant = [k for k, known in class_names.items() if known == name] if number is None else [number]
         if not meant:
             known = listed(f"{k} ({clipped(known)})" for k, known in class_names.items())
-            raise SettingsError(f"class {quoted(name)} does not exist; expected one of {known}")
+            raise SettingsError(f"{where}class {quoted(name)} does not exist; expected one of {known}")
         if len(meant) > 1:
             found = f"{len(meant)} classes have the name {quoted(name)}"
-            raise SettingsError(f"{found}; expected one of their ids, {listed(map(str, meant))}")
+            raise SettingsError(f"{where}{found}; expected one of their ids, {listed(map(str, meant))}")
         ids += meant
     return list(dict.fromkeys(ids))
 

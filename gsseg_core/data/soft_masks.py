@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from gsseg_core.data.class_names import listed
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN, PackedLabels
 from gsseg_core.errors import MaskFormatError, MaskSizeError, UnknownLabelError
@@ -294,8 +295,8 @@ def restrict(labels: npt.NDArray[np.integer], supervised: Collection[int], sourc
     unknown_ids = [i for i in ids.tolist() if i not in looked_for and i not in (0, UNKNOWN)]
     if unknown_ids:
         raise UnknownLabelError(
-            f"{source}: mask holds the labels {str(unknown_ids)[1:-1][:60]}; expected those that it supervises, "
-            f"{str(looked_for.tolist())[1:-1][:60]}, and 0 for none of these"
+            f"{source}: mask holds the labels {listed(map(str, unknown_ids))}; expected those that it supervises, "
+            f"{listed(map(str, looked_for.tolist()))}, and 0 for none of these"
         )
     prototypes = ids[ids != UNKNOWN].astype(np.int32)
     named = prototypes[np.isin(prototypes, looked_for)]

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from gsseg_core.data.class_names import listed
 from gsseg_core.data.label_images import UNKNOWN, mask_header
 from gsseg_core.data.label_map import LabelMap
 from gsseg_core.data.mask_files import read_soft_mask
@@ -297,7 +298,7 @@ class View:
             expected = f"0 to {MAX_LABEL}, or {UNKNOWN} for unknown"
             if self.class_names is not None:
                 expected = f"ids from {min(self.class_names)} to {max(self.class_names)} that classes.json names"
-            raise UnknownLabelError(f"{source}: mask holds the labels {str(unknown)[1:-1][:60]}; expected {expected}")
+            raise UnknownLabelError(f"{source}: mask holds the labels {listed(map(str, unknown))}; expected {expected}")
 
 
 def spread(views: Sequence[T], count: int | None) -> list[T]:

@@ -28,7 +28,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsseg_core.data.class_names import class_ids
+from gsseg_core.data.class_names import class_ids, listed
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.mask_files import CLASS_ID, masks_below
 from gsseg_core.data.mask_formats.images import read_label_image
@@ -190,15 +190,15 @@ def read_object_mask(
         labels = read_label_image(path, camera)
     else:
         names, labels = masks.class_names, masks.views[camera.image].labels(camera)
-    mask = object_mask(labels, None if label is None else _label_id(str(label), names), str(path))
+    mask = object_mask(labels, None if label is None else _label_id(str(label), names, path), str(path))
     return mask if camera.undistortion is None else camera.undistortion.sample(mask, UNKNOWN)
 
 
-def _label_id(label: str, class_names: Mapping[int, str] | None) -> int:
+def _label_id(label: str, class_names: Mapping[int, str] | None, path: Path) -> int:
     if class_names is not None:
-        return class_ids([label], dict(sorted(class_names.items())))[0]
+        return class_ids([label], dict(sorted(class_names.items())), path)[0]
     if not re.fullmatch(CLASS_ID, label):
-        raise SettingsError(f"label is {quoted(label)}; expected a number, as the mask has no names of classes")
+        raise SettingsError(f"{path}: label is {quoted(label)}; expected a number, as the mask has no names of classes")
     return int(label)
 
 
@@ -211,9 +211,9 @@ def object_mask(labels: np.ndarray, label: int | None, source: str) -> np.ndarra
         labels = np.where(labels == UNKNOWN, 1, labels)
     chosen = labels > 0 if label is None else labels == label
     if not chosen.any():
-        there = np.unique(labels[labels != UNKNOWN]).tolist()
+        there = listed(map(str, np.unique(labels[labels != UNKNOWN]).tolist()))
         wanted = "a label above 0" if label is None else f"the label {label}"
-        raise MaskFormatError(f"{source}: holds the labels {str(there)[1:-1][:60]}; expected pixels with {wanted}")
+        raise MaskFormatError(f"{source}: holds the labels {there}; expected pixels with {wanted}")
     return np.where(chosen, 1, np.where(labels == UNKNOWN, UNKNOWN, 0)).astype(np.int32)
 
 

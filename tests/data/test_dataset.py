@@ -70,6 +70,10 @@ def test_labels_in_memory_are_checked_at_once() -> None:
         View.from_arrays(camera(), LABELS, {0: "background", 1: "chair"})
     with pytest.raises(UnknownLabelError, match="mask holds the labels -5; expected 0 to 65534, or -1 for unknown"):
         View.from_arrays(camera(), np.full((HEIGHT, WIDTH), -5))
+    with pytest.raises(
+        UnknownLabelError, match=r"the labels 1000, 1001, .*, 1019 and 4 more; expected ids from 0 to 0 that"
+    ):
+        View.from_arrays(camera(), np.arange(1000, 1024).reshape(HEIGHT, WIDTH), {0: "background"})
     with pytest.raises(UnknownLabelError):
         View.from_arrays(camera(), np.full((HEIGHT, WIDTH), 2**31 + 7))
     with pytest.raises(MaskFormatError, match=r"labels are float64 of shape \(4, 6\); expected integers \(H, W\)"):

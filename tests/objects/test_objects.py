@@ -308,7 +308,7 @@ def test_gsseg_remove_writes_the_rest_and_refuses_what_is_not_there(
     assert f"without 3 (box), 1 (red ball): {kept:,} of {len(SCENE):,} Gaussians" in capsys.readouterr().out
     assert len(GaussianScene.load(tmp_path / "rest.ply")) == kept
     assert main([*command, "--class", "chair", "--out", f"{tmp_path}/none.ply"]) == 2
-    assert "class 'chair' does not exist" in capsys.readouterr().err
+    assert f"{tmp_path}/segmentation.npz: class 'chair' does not exist" in capsys.readouterr().err
     assert not (tmp_path / "none.ply").exists()
 
 

@@ -122,7 +122,7 @@ def test_drawn_masks_are_read_black_and_white_or_by_label(tmp_path: Path) -> Non
     with pytest.raises(MaskFormatError, match="expected pixels with the label 7"):
         read_object_mask(tmp_path / "labels.png", small, 7)
     assert read_object_mask(tmp_path / "labels.png", small, "cup", {3: "box", 5: "cup"}).tolist() == [[0, 1, 0, -1]]
-    with pytest.raises(SettingsError, match="label is 'cup'; expected a number"):
+    with pytest.raises(SettingsError, match=r"labels\.png: label is 'cup'; expected a number"):
         read_object_mask(tmp_path / "labels.png", small, "cup")
     with pytest.raises(MaskSizeError, match="for an image of 4 x 1 pixels"):
         read_object_mask(tmp_path / "labels.png", CAMERA)
@@ -142,7 +142,7 @@ def test_an_object_of_another_program_is_asked_for_by_name(tmp_path: Path) -> No
     labels[:2] = 2
     place = WRITERS["COCO text"](tmp_path, {CAMERA.name: labels}, NAMES)
     np.testing.assert_array_equal(read_object_mask(place, CAMERA, NAMES[2]), labels == 2)
-    with pytest.raises(SettingsError, match="class 'lamp' does not exist; expected one of 0"):
+    with pytest.raises(SettingsError, match=r"\.json: class 'lamp' does not exist; expected one of 0"):
         read_object_mask(place, CAMERA, "lamp")
 
 
