@@ -162,8 +162,10 @@ class Segmentation:
         """Bring all probabilities to a temperature, as `gsseg_core.learn.calibrate` fits it; labels and pictures stay.
 
         What blends into a view are always the shares that were learnt; a pixel's probability is what they blend to, at
-        this temperature.
+        this temperature, above 0; else `SettingsError`.
         """
+        if not 0 < temperature < np.inf:
+            raise SettingsError(f"temperature is {temperature}; expected a number above 0")
         change = temperature / self.temperature
         return replace(self, probabilities=tempered(self.probabilities, change), temperature=temperature)
 

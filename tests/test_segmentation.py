@@ -24,6 +24,13 @@ SCENE, TRUTH = balls_on_a_table()
 CODES = np.eye(NUM_CLASSES, dtype=np.float32)[TRUTH]
 
 
+@pytest.mark.parametrize("temperature", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_temperature_that_is_none_is_refused(temperature: float) -> None:
+    codes = np.eye(NUM_CLASSES, dtype=np.float32)[TRUTH]
+    with pytest.raises(SettingsError, match=r"temperature is .*; expected a number above 0"):
+        Segmentation.from_codes(SCENE, codes, NAMES).calibrated(temperature)
+
+
 def test_labels_are_the_largest_probability_and_minus_one_where_nothing_is_known() -> None:
     codes = CODES.copy()
     codes[[3, 500]] = 0

@@ -172,13 +172,11 @@ class Learner(ABC):
         SettingsError
             There is no such view.
         """
-        if name not in self.views:
-            raise SettingsError(f"view {name!r} was not observed; there are {len(self.views)} others")
-        observation = self._prepared.get(name)
+        view, observation = self._observed(name), self._prepared.get(name)
         if observation is not None:
             observation.vote(self._votes, UNITS, -1)
         else:
-            self._lift(self.views[name], self._read(self.views[name]), -1)
+            self._lift(view, self._read(view), -1)
         self.forget(name)
 
     def forget(self, name: str) -> None:
@@ -210,8 +208,8 @@ class Learner(ABC):
     def predict_without(self, view: View, only_labelled: bool = False) -> np.ndarray:
         """Blend into a view the probabilities learnt without its mask, as far as `leaves_out`: (H, W, K) float32.
 
-        After `fit`, for one of its views; nothing of the learner changes. Rows sum to less where little is known. If
-        only pixels with a label are wanted, others may have any value, and it may take less time.
+        After `fit`, for one of its views, or `SettingsError`; nothing of the learner changes. Rows sum to less where
+        little is known. If only pixels with a label are wanted, others may have any value, and it may take less time.
         """
         return self._blend_codes(self.codes_, view)
 
@@ -271,13 +269,20 @@ class Learner(ABC):
         """Return a view with its mask, prepared; it is kept, in memory as far as the budget goes."""
         observation = self._prepared.get(name)
         if observation is None:
-            observation = self._prepare(self.views[name], self._read(self.views[name]))
+            view = self._observed(name)
+            observation = self._prepare(view, self._read(view))
             self._prepared.keep(name, observation)
         return observation
 
     def prepared_bytes(self) -> tuple[int, int]:
         """Tell how many bytes of prepared views are kept, in memory and in the temporary file."""
         return self._prepared.nbytes
+
+    def _observed(self, name: str) -> View:
+        """Return a view by name; raise `SettingsError` where there is none."""
+        if name not in self.views:
+            raise SettingsError(f"view {name!r} was not observed; there are {len(self.views)} others")
+        return self.views[name]
 
     def _lift(self, view: View, seen: SeenLabels, sign: int) -> bool:
         """Add a view's votes, or take them away, and keep nothing of it; tell whether it sees any Gaussian."""

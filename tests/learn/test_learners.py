@@ -286,6 +286,30 @@ def test_a_fit_that_is_stopped_leaves_what_was_fitted_before_it(kind: type[Learn
     np.testing.assert_array_equal(learner.fit().codes_, again.codes_)
 
 
+@pytest.mark.parametrize("kind", [EMLearner, VoteLearner])
+def test_what_was_not_learnt_from_is_one_clear_error_to_predict_without(kind: type[Learner]) -> None:
+    learner = taught(kind(SCENE, NUM_CLASSES), VIEWS[:3])
+    if kind is EMLearner:
+        with pytest.raises(SettingsError, match="view 'view0' was not learnt from"):
+            learner.predict_without(VIEWS[0])
+    learner.fit()
+    with pytest.raises(SettingsError, match="view 'view4' was not"):
+        learner.predict_without(VIEWS[4])
+    learner.retract(VIEWS[0].name)
+    with pytest.raises(SettingsError, match="view 'view0' was not"):
+        learner.predict_without(VIEWS[0])
+
+
+def test_a_mask_that_came_after_the_fit_has_no_part_in_what_was_fitted_under_its_name() -> None:
+    plain = View.from_arrays(VIEWS[0].camera, np.zeros_like(VIEWS[0].read_labels()))
+    learner = taught(EMLearner(SCENE, NUM_CLASSES), [plain, *VIEWS[1:3]]).fit()
+    learner.observe(VIEWS[0])
+    for ask in (learner.predict_without, learner.strongest_without, learner.rejected_share):
+        with pytest.raises(SettingsError, match="view 'view0' was not learnt from"):
+            ask(VIEWS[0])
+    learner.predict_without(VIEWS[1])
+
+
 @pytest.mark.parametrize("budget", [0, 1 << 30])
 @every_learner
 def test_views_that_cannot_be_used_are_counted_by_reason_and_change_nothing(kind: type[Learner], budget: int) -> None:

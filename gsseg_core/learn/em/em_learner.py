@@ -26,7 +26,6 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -39,7 +38,7 @@ from gsseg_core.learn.em import em_kernels as kernels
 from gsseg_core.learn.em.block_weights import block_weights
 from gsseg_core.learn.em.boundary_alignment import align_boundaries, reach
 from gsseg_core.learn.em.confusion_model import ErrorModel
-from gsseg_core.learn.em.pair_kernels import codes_without, kernels_on
+from gsseg_core.learn.em.pair_kernels import codes_without, kernels_on, rows_on
 from gsseg_core.learn.em.rejected_regions import find_rejected, split_regions
 from gsseg_core.learn.em.spatial_prior import spatial_prior, with_prior
 from gsseg_core.learn.learner import VOTE_UNIT, Learner, Progress, all_or_nothing, silent
@@ -152,7 +151,7 @@ class EMLearner(Learner):
         self.settings = settings or EMSettings()
         self.error_models_: dict[str, ErrorModel] = {}
         # Probabilities before it and the gradient of all views, both on the device; whether any are of the background.
-        self._last_step_: tuple[Any, Any, bool] | None = None
+        self._last_step_: Any = None
 
     @classmethod
     def default_settings(cls, max_steps: int | None, seed: int) -> tuple[EMSettings]:
@@ -202,7 +201,7 @@ class EMLearner(Learner):
             small = kernels.predicted_gain(codes, gradient, prior.data) < tolerance
             self.converged_ = small and last_round
             if self.converged_ or len(history) == settings.max_steps:
-                here, on_device = self._put(codes.with_data(codes.data.copy()), self.device)
+                here, on_device = rows_on(codes.with_data(codes.data.copy()), self.device)
                 background = bool((codes.indices == 0).any())
                 self._last_step_ = here, on_device.put(gradient, self.device), background
             elif small:
@@ -243,19 +242,28 @@ class EMLearner(Learner):
         If only its labelled pixels count, what they see is at hand, and the codes are those of these Gaussians, whose
         ids come second; else of all. Third is told whether any code has a share of the background.
         """
-        assert self._last_step_ is not None, "expected fit() first"
+        model, observation, on_device = self._model_of(view), self.observation(view.name), kernels_on(self.device)
         codes, gradient, background = self._last_step_
-        observation, on_device = self.observation(view.name), kernels_on(self.device)
         no_prior, ids = on_device.zeros(codes, np.float32), on_device.pairs_of(observation).ids
-        stepped = codes_without(observation, self.error_models_[view.name], codes, gradient, no_prior, self.device)
+        stepped = codes_without(observation, model, codes, gradient, no_prior, self.device)
         if only_labelled:
             return stepped, ids, background, observation.operator(view.camera, len(self.scene))
         return codes.with_rows(ids, stepped), None, background, self._operator_of(view)
 
     def rejected_share(self, view: View) -> float:
         """Share of a view's labelled pixels that lie in rejected regions."""
-        evidence, areas = self.error_models_[view.name].evidence, self.observation(view.name).areas
+        evidence, areas = self._model_of(view).evidence, self.observation(view.name).areas
         return 0.0 if evidence.nameless is None else float(areas[evidence.nameless].sum() / areas.sum())
+
+    def forget(self, name: str) -> None:
+        """Drop a view, its mask and its error model: what comes under its name has another."""
+        super().forget(name)
+        self.error_models_.pop(name, None)
+
+    def _model_of(self, view: View) -> ErrorModel:
+        if view.name not in self.error_models_:
+            raise SettingsError(f"view {view.name!r} was not learnt from; expected a view of the last fit()")
+        return self.error_models_[view.name]
 
     def _prepare(self, view: View, seen: SeenLabels) -> Observation:
         operator = self._operator_of(view)
@@ -299,7 +307,7 @@ class EMLearner(Learner):
             Which they are; views without any are left out.
         """
         possible, device = self._possible(), self._device_of(votes)
-        here, on_device = self._put(votes, device)
+        here, on_device = rows_on(votes, device)
         remaining, rejected = on_device.zeros(here, np.int64), {}
 
         def find(name: str, observation: Observation) -> tuple[np.ndarray, Observation]:
@@ -317,12 +325,6 @@ class EMLearner(Learner):
         """Where votes are counted: what is voted against, the CPU alone resolves."""
         return "cpu" if votes.data.min(initial=0) < 0 else self.device
 
-    @staticmethod
-    def _put(rows: CSRRows, device: str) -> tuple[Any, ModuleType]:
-        """Put rows on a device, and tell what works on them there."""
-        on_device = kernels_on(device)
-        return on_device.put_rows(rows, device), on_device
-
     def _initial_error_models(
         self, votes: CSRRows, rejected: Mapping[str, np.ndarray], tick: Tick, names: Iterable[str] | None = None
     ) -> dict[str, ErrorModel]:
@@ -331,7 +333,7 @@ class EMLearner(Learner):
         The votes, int64, are without those of labels that are `rejected`: (L,) bool, of views that have any.
         """
         settings, possible = self.settings, self._possible()
-        here, on_device = self._put(votes, self._device_of(votes))
+        here, on_device = rows_on(votes, self._device_of(votes))
 
         def estimate(name: str, observation: Observation) -> ErrorModel:
             evidence, outliers = observation.evidence, settings.outliers
@@ -355,7 +357,7 @@ class EMLearner(Learner):
         log_likelihoods : dict of str to float
             Of each view's labels, in nats.
         """
-        here, on_device = self._put(codes, self.device)
+        here, on_device = rows_on(codes, self.device)
 
         def share(name: str, observation: Observation) -> tuple[ViewPairs, np.ndarray, VoteShares]:
             (likelihood, used), pairs = models[name].by_label, on_device.pairs_of(observation)
@@ -372,7 +374,7 @@ class EMLearner(Learner):
         self, codes: CSRRows, gradient: np.ndarray, prior: np.ndarray, models: dict[str, ErrorModel], tick: Tick
     ) -> dict[str, ErrorModel]:
         """Re-estimate each view's error model, in place, from the step without this view; see `codes_without`."""
-        here, on_device = self._put(codes, self.device)
+        here, on_device = rows_on(codes, self.device)
         all_gained, all_prior = (on_device.put(array, self.device) for array in (gradient, prior))
 
         def refit(name: str, observation: Observation) -> None:
@@ -387,8 +389,7 @@ class EMLearner(Learner):
             counts *= observation.areas / np.maximum(observation.weighted_areas, 1)
             model.m_step(model.expected_counts(counts))
 
-        for _ in self._of_each(refit, models, tick):
-            pass
+        dict(self._of_each(refit, models, tick))
         return models
 
     def _spatial_prior(self, of: CSRRows) -> CSRRows:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +16,12 @@ from gsseg_core.raster.observation import Observation
 def kernels_on(device: str) -> ModuleType:
     """Return the module whose functions work on a device: `em_cpu_kernels`, or its like for a GPU."""
     return importlib.import_module(f"gsseg_core.learn.em.{'em_cpu_kernels' if device == 'cpu' else 'em_gpu_kernels'}")
+
+
+def rows_on(rows: CSRRows, device: str) -> tuple[Any, ModuleType]:
+    """Put rows on a device, and tell what works on them there."""
+    on_device = kernels_on(device)
+    return on_device.put_rows(rows, device), on_device
 
 
 def codes_without(
