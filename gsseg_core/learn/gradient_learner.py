@@ -80,7 +80,7 @@ class GradientLearner(Learner):
     @classmethod
     def default_settings(cls, max_steps: int | None, seed: int) -> tuple[GradientSettings]:
         """Return settings for the registry; `max_steps` are epochs."""
-        return (GradientSettings(epochs=max_steps or GradientSettings.epochs, seed=seed),)
+        return (GradientSettings(epochs=GradientSettings.epochs if max_steps is None else max_steps, seed=seed),)
 
     @property
     def loss(self) -> float:

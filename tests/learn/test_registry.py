@@ -45,6 +45,12 @@ def test_a_learner_in_the_table_is_made_by_its_name(toy: None) -> None:
     assert type(make_learner("toy", SCENE, NUM_CLASSES, max_steps=3, seed=1, memory_budget=0)) is ToyLearner
 
 
+@pytest.mark.parametrize("name", ["em", "gradient"])
+def test_no_steps_at_all_are_refused_and_not_taken_for_as_many_as_usual(name: str) -> None:
+    with pytest.raises(SettingsError, match=r"is 0.* expected at least"):
+        make_learner(name, SCENE, NUM_CLASSES, max_steps=0)
+
+
 def test_a_learner_in_the_table_is_in_the_help(toy: None, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="0"):
         build_parser().parse_args(["segment", "--help"])

@@ -156,7 +156,7 @@ class EMLearner(Learner):
     @classmethod
     def default_settings(cls, max_steps: int | None, seed: int) -> tuple[EMSettings]:
         """Return settings for the registry."""
-        return (EMSettings(max_steps=max_steps or EMSettings.max_steps),)
+        return (EMSettings(max_steps=EMSettings.max_steps if max_steps is None else max_steps),)
 
     @property
     def lower_bound_(self) -> float:
