@@ -206,7 +206,7 @@ def reliability_report(checks: Iterable[ViewCheck], class_names: Mapping[int, st
     Returns
     -------
     list of dict
-        `name`; `reliability` in [0, 1], None where there is no prediction; `num_pixels` with a label; `unheard`,
+        `name`; `reliability` in [0, 1], None where there is no prediction; `num_pixels` with a label; `rejected_share`,
         the share of them whose label was rejected; `confusions`, largest first: `true`, the class that the others
         predict, `seen` as, and the `share` of the view's checked pixels.
     """
@@ -219,7 +219,7 @@ def reliability_report(checks: Iterable[ViewCheck], class_names: Mapping[int, st
             "name": check.name,
             "reliability": round(check.reliability, 4) if check.checked else None,
             "num_pixels": check.num_pixels,
-            "unheard": round(check.rejected, 4),
+            "rejected_share": round(check.rejected, 4),
             "confusions": [
                 {"true": name(k), "seen": name(y), "share": round(share, 4)} for k, y, share in check.confusions()
             ],

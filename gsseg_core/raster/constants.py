@@ -4,7 +4,6 @@ from __future__ import annotations
 
 NEAR = 0.01  # centres nearer than this to the camera plane are not drawn, in scene units
 DILATION = 0.3  # added to both variances on the image, in px^2 (the low-pass filter of 3DGS trainers)
-ALPHA_MIN = 1.0 / 255.0  # alphas and opacities below this count as zero
 ALPHA_MAX = 0.99  # largest alpha
 T_MIN = 1e-4  # a ray ends when its transmittance falls below this
 

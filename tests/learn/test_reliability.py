@@ -74,7 +74,8 @@ def test_report_is_sorted_worst_first_and_plain_json() -> None:
     assert json.loads(json.dumps(report)) == report
     assert {entry["name"] for entry in report[: len(BAD)]} == BAD
     assert [entry["reliability"] for entry in report] == sorted(entry["reliability"] for entry in report)
-    assert max(entry["unheard"] for entry in report[len(BAD) :]) == 0 < min(e["unheard"] for e in report[: len(BAD)])
+    rejected = [entry["rejected_share"] for entry in report]
+    assert max(rejected[len(BAD) :]) == 0 < min(rejected[: len(BAD)])
     for entry in report[: len(BAD)]:
         assert entry["num_pixels"] == 64 * 48
         shares = [confusion["share"] for confusion in entry["confusions"]]
@@ -120,7 +121,7 @@ def test_views_of_which_nothing_is_known_come_last_and_have_no_figure() -> None:
     assert math.isnan(unknown.reliability) and good.reliability == 1
     assert [check.name for check in worst_views([unknown, good])] == ["good", "unknown"]
     assert reliability_report([unknown], {})[0] == {
-        "name": "unknown", "reliability": None, "num_pixels": 5, "unheard": 0.0, "confusions": [],
+        "name": "unknown", "reliability": None, "num_pixels": 5, "rejected_share": 0.0, "confusions": [],
     }  # fmt: skip
 
 
