@@ -208,8 +208,9 @@ class Learner(ABC):
     def predict_without(self, view: View, only_labelled: bool = False) -> np.ndarray:
         """Blend into a view the probabilities learnt without its mask, as far as `leaves_out`: (H, W, K) float32.
 
-        After `fit`, for one of its views, or `SettingsError`; nothing of the learner changes. Rows sum to less where
-        little is known. If only pixels with a label are wanted, others may have any value, and it may take less time.
+        After `fit`, for one of its views; what `leaves_out` its mask raises `SettingsError` for others. Nothing of the
+        learner changes. Rows sum to less where little is known. If only pixels with a label are wanted, others may have
+        any value, and it may take less time.
         """
         return self._blend_codes(self.codes_, view)
 
