@@ -210,7 +210,8 @@ def _step(
                 # What is not reached yet is zero, and without a branch.
                 mass += weights[e] if reached[indices[e]] <= step else np.float32(0)
                 total = add_scaled(total, load_row(codes, indices[e]), weights[e])
-            value = divided(total, mass)
+            # A code without evidence stays as it is until something is known around it.
+            value = divided(total, mass) if mass > 0 else load_row(codes, i)
             store_row(values, m, value)
             changed[m] = apart(value, load_row(codes, i), SETTLED) != 0 or reached[i] == step + 1
 

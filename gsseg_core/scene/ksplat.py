@@ -45,15 +45,16 @@ def read_ksplat(path: Path, within: Path | None = None) -> ReadScene:
         check_size(len(content), place, f"{sections:,} headers of sections")
         low, high = struct.unpack_from("<2f", content, 36)
         sh_range = (low or _SH_RANGE[0], high or _SH_RANGE[1])
+        headers = [_section(content, _HEADER + i * _SECTION) for i in range(sections)]
+        highest = max((section.degree for section in headers), default=0)
         parts: list[npt.NDArray[np.void]] = []
-        for i in range(sections):
-            section = _section(content, _HEADER + i * _SECTION)
-            part, place = _read_section(content, place, section, level, sh_range)
+        for section in headers:
+            part, place = _read_section(content, place, section, level, sh_range, highest)
             parts.append(part)
         found = sum(map(len, parts))
         if found != total or not parts:
             raise UnfitError(f"claims {total:,} Gaussians and has {found:,} in its sections; expected as many")
-    return ReadScene(_joined(parts), f"0.1, level {level}")
+    return ReadScene(np.concatenate(parts), f"0.1, level {level}")
 
 
 def _section(content: bytes, place: int) -> _Section:
@@ -76,9 +77,9 @@ def _record(level: int, degree: int) -> np.dtype[np.void]:
 
 
 def _read_section(
-    content: bytes, place: int, section: _Section, level: int, sh_range: tuple[float, float]
+    content: bytes, place: int, section: _Section, level: int, sh_range: tuple[float, float], highest: int
 ) -> tuple[npt.NDArray[np.void], int]:
-    """Read the section that starts at `place`; its Gaussians, and where the next one starts."""
+    """Read the section at `place`: its Gaussians, with SH of the highest degree, and where the next one starts."""
     record = _record(level, section.degree)
     centers_at = place + 4 * section.partial_buckets
     records_at = centers_at + section.bucket_bytes * section.buckets
@@ -93,7 +94,7 @@ def _read_section(
     rgba = records["rgba"] / 255
     vertices = pack_vertices(
         means, records["quat"], log_scales(records["scale"]), logits(rgba[:, 3]), dc_of(rgba[:, :3]),
-        _rest(records["sh"].astype(np.float32), section.degree, level, sh_range),
+        _rest(records["sh"].astype(np.float32), section.degree, level, sh_range, highest),
     )  # fmt: skip
     return vertices, end
 
@@ -120,24 +121,17 @@ def _centers(
 
 
 def _rest(
-    sh: npt.NDArray[np.float32], degree: int, level: int, sh_range: tuple[float, float]
+    sh: npt.NDArray[np.float32], degree: int, level: int, sh_range: tuple[float, float], highest: int
 ) -> npt.NDArray[np.float32] | None:
-    """Coefficients (N, B, 3) above degree 0; in the file, each band holds all of red, then green, then blue."""
-    if degree == 0:
+    """Coefficients (N, B, 3) above degree 0, up to the highest of the file; those that a section has not are zero.
+
+    In the file, each band holds all of red, then green, then blue.
+    """
+    if highest == 0:
         return None
     if level == 2:
         sh = sh_range[0] + sh * np.float32((sh_range[1] - sh_range[0]) / 255)
-    bands = [sh[:, 3 * a : 3 * b].reshape(len(sh), 3, b - a) for a, b in _BANDS[:degree]]
-    return np.concatenate(bands, axis=2).transpose(0, 2, 1)
-
-
-def _joined(parts: list[npt.NDArray[np.void]]) -> npt.NDArray[np.void]:
-    """Put sections one after the other; SH that one has not are zero."""
-    widest = max((part.dtype for part in parts), key=lambda kind: len(kind.names or ()))
-    out = np.zeros(sum(map(len, parts)), widest)
-    start = 0
-    for part in parts:
-        for name in part.dtype.names or ():
-            out[name][start : start + len(part)] = part[name]
-        start += len(part)
-    return out
+    rest = np.zeros((len(sh), _BANDS[highest - 1][1], 3), np.float32)
+    for a, b in _BANDS[:degree]:
+        rest[:, a:b] = sh[:, 3 * a : 3 * b].reshape(len(sh), 3, b - a).transpose(0, 2, 1)
+    return rest

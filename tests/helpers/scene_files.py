@@ -187,32 +187,44 @@ def unzipped(path: Path, scene: GaussianScene) -> None:
 
 
 def write_ksplat(level: int) -> Callable[[Path, GaussianScene], None]:
-    """A `.ksplat` of one section: buckets of 64 Gaussians in the order of the scene, and a last one with the rest."""
+    """A `.ksplat` of one section."""
 
     def write(path: Path, scene: GaussianScene) -> None:
-        n, size, steps, block = len(scene), 64, 32767, 2 * EXTENT
-        full, rest = divmod(n, size)
-        centers = np.array([scene.means[i * size : (i + 1) * size].mean(axis=0) for i in range(full + (rest > 0))])
-        place, number, harmonic = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))[level]
-        bands = min(scene.sh_degree, 2)
-        count = 3 * ((bands + 1) ** 2 - 1)
-        kinds = [("mean", place, 3), ("scale", number, 3), ("quat", number, 4), ("rgba", "u1", 4)]
-        records = np.zeros(n, [*kinds, ("sh", harmonic, (count,))])
-        offsets = scene.means - centers.repeat(size, axis=0)[:n]
-        records["mean"] = scene.means if level == 0 else np.round(offsets / (block / 2 / steps) + steps)
-        records["scale"], records["quat"] = scene.scales, scene.quats
-        records["rgba"] = np.round(255 * np.c_[np.clip(scene.sh[:, 0] * C0 + 0.5, 0, 1), scene.opacities])
-        sh = [scene.sh[:, d * d : (d + 1) ** 2].transpose(0, 2, 1).reshape(n, -1) for d in range(1, bands + 1)]
-        values = np.concatenate(sh, axis=1) if sh else np.zeros((n, 0))
-        records["sh"] = np.round((values + 1.5) / 3 * 255) if level == 2 else values
-        partial = struct.pack("<I", rest) if rest else b""
-        data = partial + centers.astype("<f4").tobytes() + records.tobytes()
-        head = struct.pack("<4B4IH", 0, 1, 0, 0, 1, 1, n, n, level).ljust(4096, b"\0")
-        section = struct.pack("<4IfH2x", n, n, size, len(centers), block, 12)
-        section += struct.pack("<4IH", steps, len(data), full, int(rest > 0), bands)
-        path.write_bytes(head + section.ljust(1024, b"\0") + data)
+        write_ksplat_sections(path, level, [scene])
 
     return write
+
+
+def write_ksplat_sections(path: Path, level: int, scenes: list[GaussianScene]) -> None:
+    """A `.ksplat` of a section for each scene, of SH degree 2 at most."""
+    sections = [_ksplat_section(level, scene) for scene in scenes]
+    count, total = len(sections), sum(map(len, scenes))
+    head = struct.pack("<4B4IH", 0, 1, 0, 0, count, count, total, total, level).ljust(4096, b"\0")
+    path.write_bytes(head + b"".join(header for header, _ in sections) + b"".join(data for _, data in sections))
+
+
+def _ksplat_section(level: int, scene: GaussianScene) -> tuple[bytes, bytes]:
+    """Header and data: buckets of 64 Gaussians in the order of the scene, and a last one with the rest."""
+    n, size, steps, block = len(scene), 64, 32767, 2 * EXTENT
+    full, rest = divmod(n, size)
+    centers = np.array([scene.means[i * size : (i + 1) * size].mean(axis=0) for i in range(full + (rest > 0))])
+    place, number, harmonic = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))[level]
+    bands = min(scene.sh_degree, 2)
+    count = 3 * ((bands + 1) ** 2 - 1)
+    kinds = [("mean", place, 3), ("scale", number, 3), ("quat", number, 4), ("rgba", "u1", 4)]
+    records = np.zeros(n, [*kinds, ("sh", harmonic, (count,))])
+    offsets = scene.means - centers.repeat(size, axis=0)[:n]
+    records["mean"] = scene.means if level == 0 else np.round(offsets / (block / 2 / steps) + steps)
+    records["scale"], records["quat"] = scene.scales, scene.quats
+    records["rgba"] = np.round(255 * np.c_[np.clip(scene.sh[:, 0] * C0 + 0.5, 0, 1), scene.opacities])
+    sh = [scene.sh[:, d * d : (d + 1) ** 2].transpose(0, 2, 1).reshape(n, -1) for d in range(1, bands + 1)]
+    values = np.concatenate(sh, axis=1) if sh else np.zeros((n, 0))
+    records["sh"] = np.round((values + 1.5) / 3 * 255) if level == 2 else values
+    partial = struct.pack("<I", rest) if rest else b""
+    data = partial + centers.astype("<f4").tobytes() + records.tobytes()
+    header = struct.pack("<4IfH2x", n, n, size, len(centers), block, 12)
+    header += struct.pack("<4IH", steps, len(data), full, int(rest > 0), bands)
+    return header.ljust(1024, b"\0"), data
 
 
 def glb_parts(scene: GaussianScene, **node: object) -> tuple[dict[str, object], bytes]:

@@ -121,6 +121,21 @@ def test_what_no_code_reaches_stays_unknown() -> None:
     assert not propagate(graph, np.zeros_like(codes), evidence).any()
 
 
+@given(st.integers(0, 99), st.integers(1, 40), st.integers(1, 4))
+def test_codes_without_evidence_are_probabilities_and_stay_where_nothing_is_known_around(
+    seed: int, count: int, k: int
+) -> None:
+    graph = Graph.build(*some_points(seed, count), k)
+    codes, evidence = some_codes(seed, count)
+    evidence[::2] = 0
+    known = codes.any(axis=1)
+    spread = propagate(graph, codes, evidence)
+    np.testing.assert_allclose(spread.sum(axis=1)[known], 1, atol=1e-5)
+    alone = np.zeros_like(codes)
+    alone[0] = 1 / 3
+    np.testing.assert_array_equal(propagate(graph, alone, evidence)[0], alone[0])
+
+
 def test_without_strength_nothing_changes() -> None:
     codes, evidence = some_codes()
     graph = Graph.build(*some_points(), 4)

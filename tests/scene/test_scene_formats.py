@@ -162,6 +162,21 @@ def test_axes_that_only_change_their_sign_leave_harmonics_exact() -> None:
         assert set(np.abs(matrix).ravel()) == {0, 1} and (matrix == np.diag(np.diag(matrix))).all()
 
 
+@pytest.mark.parametrize("level", [0, 1, 2])
+@pytest.mark.parametrize("degrees", [(1, 2), (2, 0, 1), (0, 0), (1, 1)])
+def test_sections_of_a_ksplat_with_fewer_harmonics_keep_those_that_they_have(
+    tmp_path: Path, level: int, degrees: tuple[int, ...]
+) -> None:
+    scenes = [some_scene(70, degree, seed=degree) for degree in degrees]
+    scene_files.write_ksplat_sections(tmp_path / "a.ksplat", level, scenes)
+    found = GaussianScene.load(tmp_path / "a.ksplat")
+    assert found.sh_degree == max(degrees) and len(found) == 70 * len(degrees)
+    for i, scene in enumerate(scenes):
+        part = found.subset(np.arange(70 * i, 70 * (i + 1)))
+        check_same(part, scene, CASES[f"ksplat {level}"])
+        assert not part.sh[:, (scene.sh_degree + 1) ** 2 :].any()
+
+
 def test_spz_says_its_axes_in_an_extension(tmp_path: Path) -> None:
     scene = some_scene(50, 2)
     body = bytearray(scene_files.spz_body(scene, 3, turned=False))

@@ -267,6 +267,36 @@ def test_a_palette_of_harmonics_stands_for_more_gaussians_than_it_has_entries(
     assert np.sqrt(((found.sh[:, 1:] - scene.sh[:, 1:]) ** 2).mean()) < 0.01
 
 
+def test_code_books_of_a_sog_are_made_for_all_axes_and_colours_of_a_large_scene(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from gsseg_core.scene.writers import sog
+
+    # Flat Gaussians: the scales of one axis say nothing of the others. A third of all numbers make the code books.
+    rng, scene = np.random.default_rng(0), some_scene(3000, 0)
+    scales = np.exp(rng.normal((0, -5, 3), 0.1, (3000, 3)))
+    scene = GaussianScene.from_arrays(scene.means, scene.quats, scales, scene.opacities, scene.sh)
+    monkeypatch.setattr(sog, "_SAMPLE", 3000)
+    found = by_gaussforge(written(tmp_path, "sog", scene))
+    off = np.abs(np.log(found.scales / scene.scales)).mean(axis=0)
+    assert off.max() < 2 * off.min()
+
+
+def test_a_scene_that_no_glb_can_hold_is_refused_and_the_earlier_file_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from gsseg_core.scene.writers import glb
+
+    monkeypatch.setattr(glb, "_LARGEST", 10_000)  # bytes, in place of 2^32
+    write_scene(some_scene(10, 3), tmp_path / "a.glb")
+    before = (tmp_path / "a.glb").read_bytes()
+    assert len(before) < 10_000
+    message = r"a\.glb: 100 Gaussians of SH degree 3 take 2\d,\d+ bytes; expected at most 10,000, which is as large"
+    with pytest.raises(SceneValueError, match=message):
+        write_scene(some_scene(100, 3), tmp_path / "a.glb")
+    assert (tmp_path / "a.glb").read_bytes() == before
+
+
 KILLED = """
 import os, signal, sys
 from gsseg_core.scene.gaussian_scene import GaussianScene

@@ -14,17 +14,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from gsseg_core.errors import SceneValueError
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.writers.axes import HALF_TURN_Z, turned
 
 EXTENSION = "KHR_gaussian_splatting"
 
+_LARGEST = 2**32 - 1  # bytes of a file, which it says in 32 bits
 _FLOAT, _BYTE, _VERTICES, _POINTS = 5126, 5121, 34962, 0
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
 def write_glb(path: Path, scene: GaussianScene, run: str | None) -> None:
-    """Write a scene as GLB; the id of a run is in `asset.extras`."""
+    """Write a scene as GLB; the id of a run is in `asset.extras`.
+
+    Raises `SceneValueError` where there are more Gaussians than a file can hold.
+    """
     attributes = _attributes(scene)
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
@@ -47,8 +52,14 @@ def write_glb(path: Path, scene: GaussianScene, run: str | None) -> None:
     }  # fmt: skip
     header = json.dumps(content, separators=(",", ":")).encode()
     header += b" " * (-len(header) % 4)
+    length = 28 + len(header) + offset
+    if length > _LARGEST:
+        raise SceneValueError(
+            f"{len(scene):,} Gaussians of SH degree {scene.sh_degree} take {length:,} bytes; expected at most "
+            f"{_LARGEST:,}, which is as large as GLB goes"
+        )
     with open(path, "wb") as file:
-        file.write(struct.pack("<4sII", b"glTF", 2, 28 + len(header) + offset))
+        file.write(struct.pack("<4sII", b"glTF", 2, length))
         file.write(struct.pack("<I4s", len(header), b"JSON") + header)
         file.write(struct.pack("<I4s", offset, b"BIN\0"))
         for array in attributes.values():

@@ -23,6 +23,7 @@ LARGEST_PALETTE = 1 << 16  # entries of the palette of harmonics; a scene of no 
 _PER_ROW = 64  # entries of the palette of harmonics in a row of its image
 _COARSE, _STEPS = 256, 2  # clusters that the palette is divided into, and steps of k-means
 _AT_ONCE = 1 << 12
+_SAMPLE = 1 << 20  # values, about, that a code book is fitted to
 
 
 def write_sog(path: Path, scene: GaussianScene, run: str | None) -> None:
@@ -77,12 +78,13 @@ def _pixels(values: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:  # (N, C), whole
     return image.reshape(height, width, 4)
 
 
-def _coded(values: npt.NDArray[np.float32]) -> tuple[list[float], npt.NDArray[np.uint8]]:
+def _coded(values: npt.NDArray[np.float32]) -> tuple[list[float], npt.NDArray[np.uint8]]:  # (M, C)
     """Replace values by the nearest of 256, which are returned first: Lloyd's quantiser, from quantiles and even steps.
 
     Quantiles alone would leave the few large values to the ends, even steps the many small ones to a few.
     """
-    seen = np.sort(values.reshape(-1)[:: max(1, values.size >> 20)]).astype(np.float64)
+    # Whole rows: every third number of all would be those of one axis, or of one colour.
+    seen = np.sort(values[:: max(1, values.size // _SAMPLE)], axis=None).astype(np.float64)
     even = np.linspace(values.min(), values.max(), 128)
     book = np.sort(np.concatenate([np.quantile(seen, np.linspace(0, 1, 128)), even]))
     for _ in range(12):
