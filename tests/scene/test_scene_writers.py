@@ -6,6 +6,7 @@ import json
 import struct
 import subprocess
 import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -265,6 +266,24 @@ def test_a_palette_of_harmonics_stands_for_more_gaussians_than_it_has_entries(
     monkeypatch.setattr(sog, "_COARSE", 8)
     found = by_gaussforge(written(tmp_path, "sog", scene))
     assert np.sqrt(((found.sh[:, 1:] - scene.sh[:, 1:]) ** 2).mean()) < 0.01
+
+
+def test_harmonics_that_many_gaussians_share_take_one_entry_of_the_palette(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from gsseg_core.scene.writers import sog
+
+    # As after a conversion: no view-dependent colour, or one of three.
+    rng, scene = np.random.default_rng(0), some_scene(3000)
+    looks = np.concatenate([np.zeros((1, 15, 3)), rng.uniform(-0.4, 0.4, (3, 15, 3))])
+    sh = np.concatenate([scene.sh[:, :1], looks[rng.integers(0, 4, len(scene))]], axis=1)
+    scene = GaussianScene.from_arrays(scene.means, scene.quats, scene.scales, scene.opacities, sh)
+    monkeypatch.setattr(sog, "LARGEST_PALETTE", 300)
+    monkeypatch.setattr(sog, "_COARSE", 8)
+    path = written(tmp_path, "sog", scene)
+    with zipfile.ZipFile(path) as archive:
+        assert json.loads(archive.read("meta.json"))["shN"]["count"] == 4
+    np.testing.assert_allclose(by_gaussforge(path).sh[:, 1:], scene.sh[:, 1:], atol=KEPT["sog"].rest)
 
 
 def test_code_books_of_a_sog_are_made_for_all_axes_and_colours_of_a_large_scene(

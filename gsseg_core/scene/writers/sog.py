@@ -130,10 +130,13 @@ def _k_means(
     count: int,
     rng: np.random.Generator,
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
-    """Lloyd's k-means from entries drawn at random: entries (count, D), and the nearest of each value, (M,)."""
+    """Lloyd's k-means from at most `count` entries drawn at random: (K, D), and the nearest of each value, (M,)."""
     if count >= len(values):
         return values, np.arange(len(values))
     entries = values[rng.choice(len(values), count, replace=False)]
+    # Where many values are the same, as zeros are, all would be compared with the same entry again and again.
+    _, first = np.unique(entries.view(f"V{entries.itemsize * entries.shape[1]}"), return_index=True)
+    entries, count = entries[np.sort(first)], len(first)
     for step in range(_STEPS):
         # Whoever has few entries for many values need not ask all of these where the entries go.
         sample = values if step == _STEPS - 1 else values[rng.permutation(len(values))[: max(count * 64, 1 << 14)]]
