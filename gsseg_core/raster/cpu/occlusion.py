@@ -8,7 +8,7 @@ import numpy as np
 from gsseg_core.kernels.compiler import kernel
 from gsseg_core.raster.cpu.blending import aim_next, in_block, open_rays, stride_of, tile_of_turn
 from gsseg_core.raster.cpu.projection import project
-from gsseg_core.raster.cpu.splat import OPEN, WIDTH, blend_block
+from gsseg_core.raster.cpu.splat import OPEN, WIDTH, lift_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles, assign
 from gsseg_core.raster.depth import depths
 from gsseg_core.scene.camera import Camera
@@ -80,7 +80,7 @@ def _find_ends(tiles: Tiles, mask: np.ndarray) -> np.ndarray:
             while blocks:
                 b = first_bit(blocks)
                 blocks &= blocks - 1
-                _, bits = blend_block(rays, b, own, wide)
+                _, bits = lift_block(rays, b, own, wide)
                 if not bits & OPEN:
                     live &= ~(1 << b)
             if not live:
