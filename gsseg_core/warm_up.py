@@ -22,6 +22,7 @@ from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.kernels import kernel_cache
 from gsseg_core.learn.em.boundary_alignment import align_boundaries
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
+from gsseg_core.learn.mask_reliability import compare_mask
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.learn.vote_resolution import resolved_votes
 from gsseg_core.objects.clicks import merge_tree
@@ -145,6 +146,7 @@ def _learn_something(device: str) -> None:
     learner.observe(View.from_arrays(replace(camera, name="wrong"), 1 - labels))
     learner.fit()
     learner.predict_without(view)
+    compare_mask(view, labels, 2)
     learner.evidence()
     # What only some learners, live maps and programs ask of a view; here, as the process beside has more to compile.
     operator = make_operator(scene, camera)
@@ -169,7 +171,9 @@ def refine_something(device: str = "cpu") -> None:
     operator.render(scene.colors(camera.center))
     overlay(np.zeros((*labels.shape, 3), np.uint8), labels, palette(2))
     reordered(scene, curve_order(scene.means))
-    # What only some inputs need: soft masks, and colours that are not of a PLY.
+    # What only some inputs need: soft masks, partial ones, and colours that are not of a PLY.
     quantise(np.stack([labels == 0, labels == 1]).astype(np.float32))
+    rows = CSRRows.from_dense(codes)
+    rows.united(rows)
     resolved_votes(CSRRows.from_dense(np.array([[-1, 1]])), np.ones(2, bool))
     seen_colors(basis(np.eye(3), 3), scene.means, np.arange(3, dtype=np.int32), np.zeros(3, np.float32), 0)
