@@ -134,7 +134,7 @@ class Corrections:
         num_classes = max(drawn.shape[1], before.probabilities.shape[1])
         probabilities, drawn = _widened(before.probabilities, num_classes), _widened(drawn, num_classes)
         weight: np.ndarray = TRUST * np.stack(self._seen).sum(axis=0)
-        touched = np.flatnonzero(weight > 0)
+        touched = np.flatnonzero((weight > 0) & drawn.any(axis=1))  # What shines through is not what was drawn on.
         mixed = probabilities[touched] + weight[touched, None] * drawn[touched]
         mixed /= mixed.sum(axis=1, keepdims=True)
         probabilities[touched] = mixed

@@ -148,7 +148,7 @@ def test_levels_recolour_the_preview_and_parts_stand_under_their_object(
     page: Page, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     folder = tmp_path_factory.mktemp("levels")
-    data = write_dataset(folder / "data", SCENE, TRUTH, ring(18), NAMES)
+    data = write_dataset(folder / "data", SCENE, TRUTH, ring(24), NAMES)
     for i, view in enumerate(Dataset(data).views("train")):
         labels = seen_as(view, halved(1) if i % 2 else TRUTH).read_labels()
         write_mask(data / "labels" / f"{view.name}.png", labels, 8)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from operator_cases import lifting
 from small_scenes import NAMES, balls_on_a_table, clean_views, ring, true_labels
 
 from gsseg_core.data.label_images import UNKNOWN
@@ -68,7 +69,7 @@ def test_view_votes_are_listed_by_view_the_largest_first() -> None:
     assert [v.weight for v in found] == sorted((v.weight for v in found), reverse=True)
     for view in views:
         labels = view.read_labels()
-        votes = make_operator(SCENE, view.camera).adjoint(np.eye(4, dtype=np.float32)[labels])[i]
+        votes = lifting(make_operator(SCENE, view.camera), SCENE)[0][:, i] @ np.eye(4)[labels.ravel()]
         of_view = {v.label: v.weight for v in found if v.view == view.name}
         assert of_view == pytest.approx({k: votes[k] for k in range(4) if votes[k] > 0}, rel=1e-4, abs=1e-6)
     assert view_votes.of(len(SCENE) - 1) == []  # out of sight
@@ -77,7 +78,7 @@ def test_view_votes_are_listed_by_view_the_largest_first() -> None:
 def test_mean_reliability_weighs_views_by_how_much_they_saw() -> None:
     views = clean_views(3)
     mean = ViewVotes(SCENE, views).mean_reliability({views[0].name: 1.0, views[2].name: 0.25})
-    seen = np.stack([make_operator(SCENE, views[v].camera).visibility() for v in (0, 2)])
+    seen = np.stack([lifting(make_operator(SCENE, views[v].camera), SCENE)[0].sum(axis=0) for v in (0, 2)])
     known = seen.sum(axis=0) > 1e-3
     expected = (seen[0] + 0.25 * seen[1])[known] / seen.sum(axis=0)[known]
     assert np.allclose(mean[known], expected, atol=1e-3) and np.isnan(mean[-1])
