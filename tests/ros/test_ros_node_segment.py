@@ -76,13 +76,17 @@ def test_refinement_is_left_out_when_asked(robot: Robot, scene: GaussianScene) -
 
 def test_min_confidence_leaves_out_what_is_less_sure(robot: Robot, scene: GaussianScene) -> None:
     expected = refined(scene)
-    threshold = float(np.quantile(expected.confidence[expected.labels >= 0], 0.5)) - 1e-3
+    sure = np.sort(expected.confidence[expected.labels >= 0])
+    middle = sure[len(sure) // 4 : -len(sure) // 4]
+    # In the widest gap: the node may round in another way.
+    widest = int(np.diff(middle).argmax())
+    threshold = float(middle[widest : widest + 2].mean())
     report = robot.done("segment", min_confidence=threshold).report
     kept = expected.labels[(expected.labels >= 0) & (expected.confidence >= threshold)]
     assert list(counts(report).values()) == np.bincount(kept, minlength=4).tolist()
     assert report.min_confidence == pytest.approx(threshold)
     assert all(summary.min_confidence >= threshold - 1e-6 for summary in report.classes if summary.num_gaussians)
-    exported = robot.exported(robot.out("threshold"), min_confidence=threshold)
+    exported = robot.exported(robot.out("threshold"), min_confidence=threshold, refine="paper")
     assert exported.counts().tolist() == list(counts(report).values())
 
 
