@@ -1,9 +1,10 @@
 """One object from one view or a few: from masks, from scribbles, or from clicks.
 
 A mask says of one view what is the object (1), what is not (0), and where nothing is said (-1). The view's operator
-carries that to the Gaussians, W^T onehot(y) px of each; votes of several views add up. What no view shows takes its
-neighbours' answer along the graph of the scene (`gsseg_core.refine.label_propagation`): the back of a chair hangs
-together with its front, and the wall behind it with the wall beside it.
+carries that to the Gaussians, W^T onehot(y) px of each; votes of several views add up. Where learners end rays at
+surfaces, here they go on: of so few views, also what shines through tells of what lies just under a surface. What no
+view shows takes its neighbours' answer along the graph of the scene (`gsseg_core.refine.label_propagation`): the back
+of a chair hangs together with its front, and the wall behind it with the wall beside it.
 
 Two things would let a mask spread to rooms that no view shows. A thousandth of the light of a pixel comes from
 Gaussians behind what it shows; no other pixel contradicts, so all votes for these are votes for the object. And where
@@ -123,8 +124,7 @@ def pick_masks(
         labels = view.read_labels()
         if labels.max() > 1:
             raise SettingsError(f"view '{view.name}': labels up to {labels.max()}; expected 1 (object), 0 (not it), -1")
-        observation = make_operator(scene, view.camera, device).observe(labels)
-        votes[observation.ids[:, None], observation.classes] += observation.dense(observation.votes())
+        votes += make_operator(scene, view.camera, device).adjoint(np.stack([labels == 0, labels == 1], axis=2))
     for k, what in enumerate(("not the object", "the object")):
         if not votes[:, k].any():
             names = ", ".join(f"'{view.name}'" for view in views[:9])

@@ -55,7 +55,7 @@ class ViewOperator(ViewRenderer):
     def observe(
         self, labels: np.ndarray, evidence: LabelEvidence | None = None, weights: np.ndarray | None = None
     ) -> Observation:
-        """Tie the view to its mask.
+        """Tie the view to its mask; rays end at surfaces then (`T_LIFTED` in `gsseg_core.raster.constants`).
 
         Parameters
         ----------
@@ -81,7 +81,7 @@ class ViewOperator(ViewRenderer):
     def vote(
         self, labels: np.ndarray, evidence: LabelEvidence | None, total: np.ndarray, units: float, sign: int = 1
     ) -> bool:
-        """Add the view's votes to those of others, W^T onehot(y): those of `observe`, with nothing kept of it.
+        """Add the view's votes to those of others: those of `observe`, with nothing kept of it.
 
         Parameters
         ----------

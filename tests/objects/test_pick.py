@@ -17,6 +17,7 @@ from gsseg_core.data.label_images import write_mask
 from gsseg_core.data.view import View
 from gsseg_core.errors import MaskFormatError, MaskSizeError, NoUsableViewsError, SettingsError
 from gsseg_core.objects.pick import Pick, pick_mask, pick_masks, read_object_mask
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -38,6 +39,14 @@ def test_a_mask_in_one_view_gives_the_object_in_the_others(label: int) -> None:
         true = small_scenes.true_labels(SCENE, TRUTH, camera) == label
         seen = picked.silhouette(SCENE, camera)
         assert (seen & true).sum() / max((seen | true).sum(), 1) > 0.6
+
+
+def test_what_shines_through_a_surface_tells_of_what_lies_just_under_it() -> None:
+    operator = make_operator(SCENE, CAMERA)
+    picked = pick_mask(SCENE, View.from_arrays(CAMERA, (LABELS == 1).astype(int)))
+    np.testing.assert_allclose(picked.evidence, operator.visibility(), atol=1e-3)
+    lifted = operator.observe((LABELS == 1).astype(np.int32))
+    assert (picked.evidence > 0).sum() > len(lifted.ids)
 
 
 def test_what_lies_behind_the_mask_is_not_the_object() -> None:
