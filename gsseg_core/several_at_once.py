@@ -8,12 +8,14 @@ takes the memory of a view. On a GPU the rest of the work is such work, so there
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import TypeVar
 
 import numba
+
+from gsseg_core.progress import Progress, with_progress
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -43,6 +45,14 @@ def several_at_once(work: Callable[[T], R], items: Iterable[T], device: str = "c
         finally:
             for future in begun:
                 future.cancel()
+
+
+def each_with_made(
+    work: Callable[[T], R], items: Collection[T], device: str, progress: Progress, stage: str
+) -> Iterator[tuple[T, R]]:
+    """Give each item with what `work` makes of it, several at once as above, and tell how many are done."""
+    with closing(several_at_once(work, items, device)) as made:
+        yield from zip(with_progress(progress, stage, items), made, strict=True)
 
 
 @contextmanager

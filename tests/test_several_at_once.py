@@ -10,7 +10,7 @@ import pytest
 from patience import PATIENCE
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.several_at_once import meanwhile, several_at_once
+from gsseg_core.several_at_once import each_with_made, meanwhile, several_at_once
 
 
 @pytest.fixture(autouse=True)
@@ -44,6 +44,16 @@ def test_two_are_worked_on_at_once_and_no_more_are_begun_than_are_wanted() -> No
     assert next(results) == 0
     results.close()
     assert set(begun) <= {0, 1, 2}
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_items_come_with_what_is_made_of_them_each_told_before_it_and_all_at_the_end() -> None:
+    told: list[tuple[str, int, int]] = []
+    found = []
+    for item, made in each_with_made(len, ["a", "bc", "def"], "cpu", lambda *step: told.append(step), "count"):
+        found.append((item, made, told[-1]))
+    assert found == [("a", 1, ("count", 0, 3)), ("bc", 2, ("count", 1, 3)), ("def", 3, ("count", 2, 3))]
+    assert told[-1] == ("count", 3, 3)
 
 
 @pytest.mark.usefixtures("two_threads")

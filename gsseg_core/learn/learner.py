@@ -6,7 +6,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing, nullcontext
+from contextlib import closing
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
@@ -27,7 +27,7 @@ from gsseg_core.raster.observation import Observation
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import PixelGrid, Strongest
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.several_at_once import several_at_once
+from gsseg_core.several_at_once import each_with_made, several_at_once
 
 VOTE_UNIT = 2.0**-24  # votes are counted in whole multiples of this many px, so that adding and taking back are exact
 UNITS = 1 / VOTE_UNIT  # units per px
@@ -155,14 +155,13 @@ class Learner(ABC):
 
     def observe_all(self, views: Sequence[View], progress: Progress = silent) -> None:
         """Add views, as `observe` does; the error that one of them raises ends it."""
-        keeps_nothing = self.memory_budget == 0  # Then each view votes as it is lifted.
-        opened = closing(several_at_once(self._opened, views, self.device))
-        with opened as each, nullcontext() if keeps_nothing else vote_total(self._votes, self.device) as total:
+        if self.memory_budget == 0:  # Each view votes as it is lifted.
             for view in with_progress(progress, "observe", views):
-                if keeps_nothing:
-                    self.observe(view)
-                else:
-                    self._add(view, next(each), total)
+                self.observe(view)
+            return
+        with vote_total(self._votes, self.device) as total:
+            for view, opened in each_with_made(self._opened, views, self.device, progress, "observe"):
+                self._add(view, opened, total)
 
     def retract(self, name: str) -> None:
         """Take a view's votes back, exactly.

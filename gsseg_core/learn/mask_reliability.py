@@ -24,9 +24,9 @@ from gsseg_core.data.view import View, spread
 from gsseg_core.kernels.compiler import kernel
 from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.temperature import VIEWS, Sample, grid_of, sample_grid
-from gsseg_core.progress import Progress, silent, with_progress
+from gsseg_core.progress import Progress, silent
 from gsseg_core.scene.camera import Camera
-from gsseg_core.several_at_once import several_at_once
+from gsseg_core.several_at_once import each_with_made, several_at_once
 
 WORST = 4  # views that are trusted least, as pictures show them
 _ALL = 1 << 17  # px of the largest views of which all are compared; of others, every second tile
@@ -127,14 +127,12 @@ class MaskChecker:
         A prediction is unknown where most of a ray ends on Gaussians that only this view has seen; and, but for the
         `shown_views`, where the mask says nothing, and in every second tile of 16 x 16 pixels of a large view.
         """
-        views = self.learner.views
-        checks = {}
-        with closing(several_at_once(self._check, views.values(), self.learner.device)) as checked:
-            for name in with_progress(progress, "check views", views):
-                checks[name] = next(checked)
+        views, device = self.learner.views, self.learner.device
+        checked = each_with_made(self._check, views.values(), device, progress, "check views")
+        checks = {view.name: check for view, check in checked}
         shown = shown_views(list(checks.values()))
         again = [views[check.name] for check in shown if not _is_of_all(check, views[check.name].camera)]
-        with closing(several_at_once(self._everywhere, again, self.learner.device)) as predicted:
+        with closing(several_at_once(self._everywhere, again, device)) as predicted:
             for view, everywhere in zip(again, predicted, strict=True):
                 checks[view.name] = replace(checks[view.name], predicted=everywhere)
         return list(checks.values())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -17,11 +16,11 @@ from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.objects.association import AssociationSettings, associate
 from gsseg_core.objects.lifted_segments import Lifted, Profiles, sums
 from gsseg_core.objects.tree_growing import grow_tree
-from gsseg_core.progress import Progress, silent, with_progress
+from gsseg_core.progress import Progress, silent
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
-from gsseg_core.several_at_once import several_at_once
+from gsseg_core.several_at_once import each_with_made
 
 _EARLY_GRANULARITY = 0.5  # of the objects before all views were looked at together
 
@@ -96,9 +95,8 @@ class ObjectTable:
 
     def add_all(self, views: Sequence[View], progress: Progress = silent) -> None:
         """Add views, as `add` does; the error that one of them raises ends it."""
-        with closing(several_at_once(self._lift, views, self.device)) as lifted:
-            for view in with_progress(progress, "lift", views):
-                self._add(view, next(lifted))
+        for view, lifted in each_with_made(self._lift, views, self.device, progress, "lift"):
+            self._add(view, lifted)
 
     def match(self, view: View) -> View:
         """Add a view, and give its ids the numbers of the objects so far; what nobody has seen yet is a new object.
