@@ -18,7 +18,7 @@ from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Transform, V
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
-from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.label_images import UNKNOWN, in_bits
 from gsseg_core.errors import MaskFormatError, PoseError, SceneValueError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.scene.camera import Camera, rigid_motion
@@ -201,11 +201,7 @@ def mask_image(
     MaskFormatError
         A label does not fit.
     """
-    unknown = 2**bits - 1
-    low, high = (int(labels.min()), int(labels.max())) if labels.size else (0, 0)
-    if low < UNKNOWN or high >= unknown:
-        raise MaskFormatError(f"mask image: labels are {low} to {high}; {bits} bits hold {UNKNOWN} to {unknown - 1}")
-    values = np.where(labels == UNKNOWN, unknown, labels).astype(f"<u{bits // 8}")
+    values = in_bits(labels, bits, "mask image").astype(f"<u{bits // 8}", copy=False)
     return plain_image(values, f"mono{bits}", header)
 
 

@@ -122,13 +122,22 @@ def write_mask(
     """
     if bits not in (8, 16):
         raise SettingsError(f"{path}: masks of {bits} bits were asked for; expected 8 or 16")
+    values = in_bits(labels, bits, str(path))
+    with write_atomically(path) as temporary:
+        Image.fromarray(values).save(temporary, format="PNG", pnginfo=run_text(run))
+
+
+def in_bits(
+    labels: npt.NDArray[np.integer[Any]],  # (H, W)
+    bits: int,
+    source: str,
+) -> npt.NDArray[np.unsignedinteger[Any]]:
+    """Labels (H, W) in 8 or 16 bits, `UNKNOWN` as the largest number; `MaskFormatError` if one does not fit."""
     unknown = 2**bits - 1
     low, high = (int(labels.min()), int(labels.max())) if labels.size else (0, 0)
     if low < UNKNOWN or high >= unknown:
-        raise MaskFormatError(f"{path}: labels are {low} to {high}; {bits} bits hold {UNKNOWN} to {unknown - 1}")
-    values = np.where(labels == UNKNOWN, unknown, labels).astype(np.uint8 if bits == 8 else np.uint16)
-    with write_atomically(path) as temporary:
-        Image.fromarray(values).save(temporary, format="PNG", pnginfo=run_text(run))
+        raise MaskFormatError(f"{source}: labels are {low} to {high}; {bits} bits hold {UNKNOWN} to {unknown - 1}")
+    return np.where(labels == UNKNOWN, unknown, labels).astype(np.uint8 if bits == 8 else np.uint16)
 
 
 def run_text(run: str | None) -> PngInfo:

@@ -71,6 +71,24 @@ def open_input(path: str | os.PathLike[str], within: Path | None = None) -> Buff
     return os.fdopen(number, "rb")
 
 
+def read_input(
+    path: str | os.PathLike[str], error: type[GssegError], within: Path | None = None, first: int | None = None
+) -> bytes:
+    """Read a file, or its first bytes, below `within` if given.
+
+    Raises `error` if it cannot be read, or is larger than any JSON file is, as `Limits.max_json_bytes` says.
+    """
+    limit = LIMITS.max_json_bytes
+    try:
+        with open_input(path, within) as file:
+            content = file.read(limit + 1 if first is None else first)
+    except OSError as cause:
+        raise error(f"{path}: cannot be read ({reason(cause)})") from cause
+    if len(content) > limit:
+        raise error(f"{path}: is too large; expected at most {limit:,} bytes (limit max_json_bytes)")
+    return content
+
+
 def _open_below(path: str | os.PathLike[str], within: Path, flags: int) -> int:
     """Open the file that a path leads to now, and nothing that takes its place meanwhile."""
     found = os.open(path, os.O_PATH | os.O_CLOEXEC)  # opens nothing yet

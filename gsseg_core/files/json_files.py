@@ -9,8 +9,7 @@ from typing import Any
 
 from gsseg_core.errors import GssegError
 from gsseg_core.files.atomic import write_atomically
-from gsseg_core.files.input_files import open_input, reason
-from gsseg_core.files.limits import LIMITS
+from gsseg_core.files.input_files import read_input
 from gsseg_core.text import clipped
 
 _KINDS = {
@@ -21,13 +20,7 @@ _KINDS = {
 
 def read_json(path: Path, error: type[GssegError], within: Path | None = None) -> object:
     """Read a JSON file, below `within` if given; raise `error` if it is missing, broken, or larger than any is."""
-    try:
-        with open_input(path, within) as file:
-            content = file.read(LIMITS.max_json_bytes + 1)
-    except OSError as cause:
-        raise error(f"{path}: cannot be read ({reason(cause)})") from cause
-    if len(content) > LIMITS.max_json_bytes:
-        raise error(f"{path}: is too large; expected at most {LIMITS.max_json_bytes:,} bytes (limit max_json_bytes)")
+    content = read_input(path, error, within)
     try:
         # Editors on Windows write a byte order mark, which "utf-8" would hand to the parser.
         return json.loads(content.decode("utf-8-sig"))

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from gsseg_core.errors import GssegError, SettingsError
-from gsseg_core.files.input_files import open_input, reason
+from gsseg_core.files.input_files import read_input
 from gsseg_core.text import clipped
 
 _MOST_BYTES = 2**20
@@ -26,11 +26,7 @@ def read_yaml(path: Path, error: type[GssegError], within: Path | None = None) -
         import yaml
     except ModuleNotFoundError as missing:
         raise SettingsError(f"{path}: needs PyYAML, which is missing: pip install 'gsseg[formats]'") from missing
-    try:
-        with open_input(path, within) as file:
-            content = file.read(_MOST_BYTES + 1)
-    except OSError as cause:
-        raise error(f"{path}: cannot be read ({reason(cause)})") from cause
+    content = read_input(path, error, within, _MOST_BYTES + 1)
     if len(content) > _MOST_BYTES:
         raise error(f"{path}: is too large; expected at most {_MOST_BYTES:,} bytes")
     try:

@@ -29,7 +29,7 @@ from gsseg_core.errors import (
     StateFileError,
     SupervisesFileError,
 )
-from gsseg_core.files import input_files, json_files
+from gsseg_core.files import input_files
 from gsseg_core.files.input_files import open_input
 from gsseg_core.files.json_files import read_json
 from gsseg_core.files.limits import Limits
@@ -113,7 +113,7 @@ def test_a_link_that_leads_nowhere_is_refused_with_its_target(
 def test_a_json_file_that_is_larger_than_the_limit_is_refused_unparsed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(json_files, "LIMITS", Limits(max_json_bytes=1000))
+    monkeypatch.setattr(input_files, "LIMITS", Limits(max_json_bytes=1000))
     path = tmp_path / "classes.json"
     path.write_text("[" + "[]," * 500 + "[]]")
     refused(lambda: read_json(path, ClassesFileError), ClassesFileError, "max_json_bytes", "1,000")

@@ -9,9 +9,8 @@ from functools import cached_property
 from pathlib import Path, PureWindowsPath
 
 from gsseg_core.errors import MaskFormatError
-from gsseg_core.files.input_files import IMAGE_SUFFIXES, list_folder, open_input, reason
+from gsseg_core.files.input_files import IMAGE_SUFFIXES, list_folder, read_input
 from gsseg_core.files.json_files import read_json
-from gsseg_core.files.limits import LIMITS
 from gsseg_core.text import composed
 
 SUPERVISES = "supervises.json"
@@ -128,25 +127,11 @@ class Place:
 
     def holds(self, path: Path, pattern: bytes) -> bool:
         """Tell whether a file begins with a pattern, a regular expression, within its first 4096 bytes."""
-        return re.match(pattern, self.read(path, _PEEKED)) is not None
+        return re.match(pattern, read_input(path, MaskFormatError, self.within, _PEEKED)) is not None
 
-    def read(self, path: Path, most: int | None = None) -> bytes:
-        """Read a file, or its first bytes.
-
-        Raises
-        ------
-        MaskFormatError
-            It cannot be read, or is larger than any such file is.
-        """
-        limit = LIMITS.max_json_bytes
-        try:
-            with open_input(path, self.within) as file:
-                content = file.read(limit + 1 if most is None else most)
-        except OSError as cause:
-            raise MaskFormatError(f"{path}: cannot be read ({reason(cause)})") from cause
-        if len(content) > limit:
-            raise MaskFormatError(f"{path}: is too large; expected at most {limit:,} bytes (limit max_json_bytes)")
-        return content
+    def read(self, path: Path) -> bytes:
+        """Read a file; `MaskFormatError` if it cannot be read, or is larger than any such file is."""
+        return read_input(path, MaskFormatError, self.within)
 
     def text(self, path: Path) -> str:
         """Read a file of text; raises as `read` does, or if it is none."""

@@ -30,10 +30,6 @@ class Record:
             raise MaskFormatError(f"{where}: is {kind_of(value)}; expected an object")
         return cls(where, value)
 
-    def __contains__(self, key: str) -> bool:
-        """Whether there is such a field."""
-        return key in self.fields
-
     def value(self, key: str) -> Any:
         """Read a field."""
         if key not in self.fields:
