@@ -29,7 +29,7 @@ WARP, WARPS = 32, THREADS // 32  # threads of a warp, and warps of a block of th
 
 OPEN = np.float32(T_MIN)
 LIFTED = np.float32(T_LIFTED)
-HALF_PIXEL = np.float32(0.5)
+_HALF_PIXEL = np.float32(0.5)
 _LEAST, _MOST, _LN2 = np.float32(LOG_ALPHA_MIN), np.float32(ALPHA_MAX), np.float32(math.log(2))
 _NOTHING = np.float32(0)
 
@@ -43,6 +43,19 @@ def pixel_of(thread: int) -> tuple[int, int]:
 
 
 @called_by_kernels
+def pixel_in(tile: int, columns: int, thread: int) -> tuple[int, int]:
+    """Row and column in the image of the pixel of a thread, where there are so many columns of tiles."""
+    row, column = pixel_of(thread)
+    return tile // columns * TILE + row, tile % columns * TILE + column
+
+
+@called_by_kernels
+def centre_of(row: int, column: int) -> tuple[Any, Any]:
+    """Place x, y of a pixel's centre in the image."""
+    return np.float32(column) + _HALF_PIXEL, np.float32(row) + _HALF_PIXEL
+
+
+@called_by_kernels
 def alpha_of(splats: np.ndarray, e: int, x: Any, y: Any) -> Any:
     """Alpha of a projected Gaussian at a pixel's centre, as `raster.cpu.splat` has it."""
     dy = y - splats[e, V]
@@ -52,10 +65,12 @@ def alpha_of(splats: np.ndarray, e: int, x: Any, y: Any) -> Any:
 
 
 @called_by_kernels
-def load_batch(table: np.ndarray, entries: np.ndarray, first: int, count: int, splats: np.ndarray, t: int) -> None:
-    """Bring the projected Gaussians of a batch into shared memory, one number by each thread."""
+def load_batch(table: np.ndarray, entries: np.ndarray, first: int, end: int, splats: np.ndarray, t: int) -> int:
+    """Bring the projected Gaussians of a batch into shared memory, one number by each thread; returns how many."""
+    count = min(BATCH, end - first)
     if t // 8 < count:
         splats[t // 8, t % 8] = table[entries[first + t // 8], t % 8]
+    return count
 
 
 @functools.cache
@@ -72,18 +87,16 @@ def blend_kernel(channels: int) -> Any:
         own = cuda.shared.array((BATCH, channels), np.float32)
         values = cuda.local.array(channels, np.float32)
         tile, t = cuda.blockIdx.x, cuda.threadIdx.x
-        r, c = pixel_of(t)
-        row, column = tile // columns * TILE + r, tile % columns * TILE + c
+        row, column = pixel_in(tile, columns, t)
         inside = row < left_over.shape[0] and column < left_over.shape[1]
-        x, y = np.float32(column) + HALF_PIXEL, np.float32(row) + HALF_PIXEL
+        x, y = centre_of(row, column)
         ray = np.float32(1) if inside else _NOTHING
         for k in range(channels):
             values[k] = 0
         for first in range(start[tile], start[tile + 1], BATCH):
             if not cuda.syncthreads_or(np.int32(ray >= OPEN)):
                 break
-            count = min(BATCH, start[tile + 1] - first)
-            load_batch(table, entries, first, count, splats, t)
+            count = load_batch(table, entries, first, start[tile + 1], splats, t)
             for i in range(t, count * channels, THREADS):
                 own[i // channels, i % channels] = codes[entries[first + i // channels], i % channels]
             cuda.syncthreads()
@@ -139,11 +152,10 @@ def carry_back(
     r, c = pixel_of(t)
     top, left = tile // columns * TILE, tile % columns * TILE
     inside = top + r < residual.shape[0] and left + c < residual.shape[1]
-    x, y = np.float32(left + c) + HALF_PIXEL, np.float32(top + r) + HALF_PIXEL
+    x, y = centre_of(top + r, left + c)
     ray = np.float32(1) if inside else _NOTHING
     for first in range(start[tile], start[tile + 1], BATCH):
-        count = min(BATCH, start[tile + 1] - first)
-        load_batch(table, entries, first, count, splats, t)
+        count = load_batch(table, entries, first, start[tile + 1], splats, t)
         cuda.syncthreads()
         ray = weigh_batch(splats, count, x, y, ray, _NOTHING, np.float32(1), weights, t)
         cuda.syncthreads()

@@ -12,10 +12,8 @@ from typing import Any
 import numpy as np
 
 from gsseg_core.raster.constants import BLOCK, TINY
-from gsseg_core.raster.cpu.tiling import TILE
 from gsseg_core.raster.gpu.blending import (
     BATCH,
-    HALF_PIXEL,
     LIFTED,
     OPEN,
     PARTS,
@@ -24,8 +22,9 @@ from gsseg_core.raster.gpu.blending import (
     WARP,
     WARPS,
     alpha_of,
+    centre_of,
     load_batch,
-    pixel_of,
+    pixel_in,
     weigh_batch,
 )
 from gsseg_core.raster.gpu.device import called_by_kernels, cuda, gpu_kernel
@@ -51,8 +50,7 @@ def number_labels(
     labels = cuda.shared.array(THREADS, np.int32)
     begins = cuda.shared.array(THREADS, np.int32)
     tile, t = cuda.blockIdx.x, cuda.threadIdx.x
-    r, c = pixel_of(t)
-    row, column = tile // columns * TILE + r, tile % columns * TILE + c
+    row, column = pixel_in(tile, columns, t)
     label = mask[row, column] if row < mask.shape[0] and column < mask.shape[1] else np.int32(-1)
     labels[t] = label
     cuda.syncthreads()
@@ -82,9 +80,9 @@ def list_labels(
 ) -> None:
     """List the labels of one tile by their numbers."""
     tile, t = cuda.blockIdx.x, cuda.threadIdx.x
-    r, c = pixel_of(t)
+    row, column = pixel_in(tile, columns, t)
     if slots[tile, t] >= 0:
-        present[label_start[tile] + slots[tile, t]] = mask[tile // columns * TILE + r, tile % columns * TILE + c]
+        present[label_start[tile] + slots[tile, t]] = mask[row, column]
 
 
 @called_by_kernels
@@ -110,9 +108,8 @@ def lift(
     label_count = label_start[tile + 1] - label_start[tile]
     if label_count == 0:
         return
-    r, c = pixel_of(t)
-    row, column = tile // columns * TILE + r, tile % columns * TILE + c
-    x, y = np.float32(column) + HALF_PIXEL, np.float32(row) + HALF_PIXEL
+    row, column = pixel_in(tile, columns, t)
+    x, y = centre_of(row, column)
     slot_of[t] = slots[tile, t]
     counts[t] = slots[tile, t] >= 0 and weights[row // BLOCK, column // BLOCK] > 0
     ray = np.float32(1) if slots[tile, t] >= 0 else _NOTHING
@@ -120,8 +117,7 @@ def lift(
     for first in range(start[tile], start[tile + 1], BATCH):
         if not cuda.syncthreads_or(np.int32(ray >= OPEN)):
             break
-        count = min(BATCH, start[tile + 1] - first)
-        load_batch(table, entries, first, count, splats, t)
+        count = load_batch(table, entries, first, start[tile + 1], splats, t)
         cuda.syncthreads()
         ray = weigh_batch(splats, count, x, y, ray, LIFTED, np.float32(1), weighed, t)
         cuda.syncthreads()
@@ -159,8 +155,7 @@ def share(
     label_count = label_start[tile + 1] - label_start[tile]
     if label_count == 0:
         return
-    r, c = pixel_of(t)
-    row, column = tile // columns * TILE + r, tile % columns * TILE + c
+    row, column = pixel_in(tile, columns, t)
     slot, counts = slots[tile, t], _NOTHING
     if slot >= 0:
         counts = weights[row // BLOCK, column // BLOCK]
@@ -171,13 +166,12 @@ def share(
         return
     if counts > 0:
         busy[t // WARP] = 1
-    x, y = np.float32(column) + HALF_PIXEL, np.float32(row) + HALF_PIXEL
+    x, y = centre_of(row, column)
     value, ray = _NOTHING, np.float32(1) if counts > 0 else _NOTHING
     for first in range(start[tile], start[tile + 1], BATCH):
         if not cuda.syncthreads_or(np.int32(ray >= OPEN)):
             break
-        count = min(BATCH, start[tile + 1] - first)
-        load_batch(table, entries, first, count, splats, t)
+        count = load_batch(table, entries, first, start[tile + 1], splats, t)
         base = slot_start[tile] + (first - start[tile]) * label_count
         if label_count == 1 and t < count:
             only[t] = likelihood[pair[base + t]] if pair[base + t] >= 0 else _NOTHING
@@ -207,8 +201,7 @@ def share(
     for first in range(start[tile], start[tile + 1], BATCH):
         if not cuda.syncthreads_or(np.int32(ray >= OPEN)):
             break
-        count = min(BATCH, start[tile + 1] - first)
-        load_batch(table, entries, first, count, splats, t)
+        count = load_batch(table, entries, first, start[tile + 1], splats, t)
         cuda.syncthreads()
         if busy[t // WARP]:
             ray = weigh_batch(splats, count, x, y, ray, LIFTED, inverse, weighed, t)

@@ -16,13 +16,13 @@ from gsseg_core.raster.cpu.silhouette_kernels import ROUNDING
 from gsseg_core.raster.cpu.tiling import TILE
 from gsseg_core.raster.gpu.blending import (
     BATCH,
-    HALF_PIXEL,
     PARTS,
     STRIDE,
     THREADS,
     alpha_of,
+    centre_of,
     load_batch,
-    pixel_of,
+    pixel_in,
 )
 from gsseg_core.raster.gpu.device import called_by_kernels, cuda, gpu_kernel, launch, on_device, to_cpu
 from gsseg_core.raster.gpu.label_sharing import UNITS, add_units
@@ -94,15 +94,13 @@ def _reasons_to_go(
     splats = cuda.shared.array((BATCH, 8), np.float32)
     weighed = cuda.shared.array((BATCH, STRIDE), np.float32)
     tile, t = cuda.blockIdx.x, cuda.threadIdx.x
-    r, c = pixel_of(t)
-    row, column = tile // columns * TILE + r, tile % columns * TILE + c
-    x, y = np.float32(column) + HALF_PIXEL, np.float32(row) + HALF_PIXEL
+    row, column = pixel_in(tile, columns, t)
+    x, y = centre_of(row, column)
     seen, limit = _UNKNOWN, _NOTHING
     if row < shown.shape[0] and column < shown.shape[1]:
         seen, limit = shown[row, column], hidden_from[row, column]
     for first in range(start[tile], start[tile + 1], BATCH):
-        count = min(BATCH, start[tile + 1] - first)
-        load_batch(table, entries, first, count, splats, t)
+        count = load_batch(table, entries, first, start[tile + 1], splats, t)
         cuda.syncthreads()
         for e in range(count):
             g = entries[first + e]
@@ -122,9 +120,8 @@ def _reasons_to_stay(
     splats = cuda.shared.array((BATCH, 8), np.float32)
     weighed = cuda.shared.array((BATCH, STRIDE), np.float32)
     tile, t = cuda.blockIdx.x, cuda.threadIdx.x
-    r, c = pixel_of(t)
-    row, column = tile // columns * TILE + r, tile % columns * TILE + c
-    x, y = np.float32(column) + HALF_PIXEL, np.float32(row) + HALF_PIXEL
+    row, column = pixel_in(tile, columns, t)
+    x, y = centre_of(row, column)
     seen, wanted, through = _UNKNOWN, False, _ALL
     if row < shown.shape[0] and column < shown.shape[1]:
         seen = shown[row, column]
@@ -133,8 +130,7 @@ def _reasons_to_stay(
     if not cuda.syncthreads_or(np.int32(wanted)):
         return
     for first in range(start[tile], start[tile + 1], BATCH):
-        count = min(BATCH, start[tile + 1] - first)
-        load_batch(table, entries, first, count, splats, t)
+        count = load_batch(table, entries, first, start[tile + 1], splats, t)
         cuda.syncthreads()
         for e in range(count):
             if seen == labels[entries[first + e]]:
@@ -142,8 +138,7 @@ def _reasons_to_stay(
         cuda.syncthreads()
     need = through / (_ALL - through + _ROUNDING) if through >= _DARK else _NOTHING
     for first in range(start[tile], start[tile + 1], BATCH):
-        count = min(BATCH, start[tile + 1] - first)
-        load_batch(table, entries, first, count, splats, t)
+        count = load_batch(table, entries, first, start[tile + 1], splats, t)
         cuda.syncthreads()
         for e in range(count):
             g = entries[first + e]
