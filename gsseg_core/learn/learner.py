@@ -204,12 +204,11 @@ class Learner(ABC):
             There is no view.
         """
 
-    def predict_without(self, view: View, only_labelled: bool = False) -> np.ndarray:
+    def predict_without(self, view: View) -> np.ndarray:
         """Blend into a view the probabilities learnt without its mask, as far as `leaves_out`: (H, W, K) float32.
 
         After `fit`, for one of its views; what `leaves_out` its mask raises `SettingsError` for others. Nothing of the
-        learner changes. Rows sum to less where little is known. If only pixels with a label are wanted, others may have
-        any value, and it may take less time.
+        learner changes. Rows sum to less where little is known.
         """
         return self._blend_codes(self.codes_, view)
 
@@ -221,7 +220,7 @@ class Learner(ABC):
         Little is known where most of a ray ends on Gaussians that only this view has seen. If only some pixels with a
         label are `wanted`, (H, W) bool, others may have any class and probabilities, and it takes less time.
         """
-        return Strongest.of(self.predict_without(view, wanted is not None), grid)
+        return Strongest.of(self.predict_without(view), grid)
 
     def rejected_share(self, view: View) -> float:
         """Share of a view's labelled pixels whose label `fit` has not used, in [0, 1]."""
@@ -301,9 +300,9 @@ class Learner(ABC):
         if isinstance(opened, UnusableViewError):
             self.rejected[view.name] = str(opened)
             return False
+        if view.name in self.views:
+            self.retract(view.name)
         if opened is not None:
-            if view.name in self.views:
-                self.retract(view.name)
             opened.vote(self._votes if total is None else total, UNITS)
             self._prepared.keep(view.name, opened)
         self.rejected.pop(view.name, None)

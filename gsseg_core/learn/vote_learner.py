@@ -38,6 +38,6 @@ class VoteLearner(Learner):
         self.views[name] = after
         self._prepared.drop(name)
 
-    def predict_without(self, view: View, only_labelled: bool = False) -> np.ndarray:
+    def predict_without(self, view: View) -> np.ndarray:
         """Blend into a view the votes of all others as probabilities, (H, W, K) float32; exact, by subtraction."""
         return self._blend_codes(self.vote_codes_without(view.name), view)

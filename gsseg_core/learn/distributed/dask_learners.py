@@ -26,7 +26,7 @@ from gsseg_core.learn.distributed.dask_cluster import PATIENCE, UNREACHABLE, che
 from gsseg_core.learn.distributed.dask_worker import NotHereError, Part, digest_of
 from gsseg_core.learn.em.confusion_model import ErrorModel
 from gsseg_core.learn.em.em_learner import EMLearner
-from gsseg_core.learn.learner import Learner, Progress, silent
+from gsseg_core.learn.learner import Learner, Progress, UnusableViewError, silent
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -72,13 +72,7 @@ class _OnWorkers(Learner):
         if named:
             votes, why = self._sum(dask_worker.sum_votes, named, lambda done: progress("observe", done, len(named)))
             for name, view in named.items():
-                if why[name]:
-                    self.rejected[name] = why[name]
-                    continue
-                if name in self.views:
-                    self.retract(name)
-                self.rejected.pop(name, None)
-                self.views[name] = view
+                self._add(view, UnusableViewError(why[name]) if why[name] else None)
             self._votes += votes
         progress("observe", len(named), len(named))
 

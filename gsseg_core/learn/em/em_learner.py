@@ -218,13 +218,13 @@ class EMLearner(Learner):
         self._finish()
         return self
 
-    def predict_without(self, view: View, only_labelled: bool = False) -> np.ndarray:
+    def predict_without(self, view: View) -> np.ndarray:
         """Blend into a view the probabilities of a last step without its mask, (H, W, K) float32.
 
         The spatial prior is left out, too, so rows sum to less where no other view has seen anything.
         """
-        codes, of, background, operator = self._without(view, only_labelled)
-        image, left_over = operator.blend_rows(codes, self.num_classes, of)
+        codes, _, background, operator = self._without(view, only_labelled=False)
+        image, left_over = operator.blend_rows(codes, self.num_classes)
         if background:
             image[..., 0] += left_over
         return image
@@ -233,10 +233,10 @@ class EMLearner(Learner):
         self, view: View, wanted: np.ndarray | None = None, grid: PixelGrid | None = None
     ) -> Strongest:  # fmt: skip
         """Tell the class of each pixel by `predict_without`, without an image of all classes."""
-        codes, of, background, operator = self._without(view, wanted is not None)
+        codes, of, background, operator = self._without(view, only_labelled=wanted is not None)
         return operator.strongest(codes, self.num_classes, background, grid, of, wanted=wanted)
 
-    def _without(self, view: View, only_labelled: bool) -> tuple[CSRRows, np.ndarray | None, bool, ViewRenderer]:
+    def _without(self, view: View, *, only_labelled: bool) -> tuple[CSRRows, np.ndarray | None, bool, ViewRenderer]:
         """Take the last step of `fit` once more, without a view's mask: codes, and what to blend them with.
 
         If only its labelled pixels count, what they see is at hand, and the codes are those of these Gaussians, whose
