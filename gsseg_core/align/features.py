@@ -7,7 +7,7 @@ of that photo to a point of the scene.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from gsseg_core.data.view import View, spread
 from gsseg_core.errors import AlignmentError
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.depth import COVERED, colours_and_depth
-from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.camera import Camera, resized_camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 _LENGTH = 128  # of a descriptor
@@ -123,6 +123,5 @@ def matches(photo: Features, rendering: Features, ratio: float, within_px: float
 def at_most(camera: Camera, longer_px: int) -> Camera:
     """Shrink a camera's picture so that its longer side is at most so many px."""
     shrunk = min(1.0, longer_px / max(camera.width, camera.height))
-    size = np.maximum(np.rint(shrunk * np.array([camera.width, camera.height])), 1).astype(int)
-    K = np.diag([*(size / (camera.width, camera.height)), 1]) @ camera.K
-    return replace(camera, width=int(size[0]), height=int(size[1]), K=K)
+    width, height = (max(round(shrunk * side), 1) for side in (camera.width, camera.height))
+    return resized_camera(camera, width, height)

@@ -98,6 +98,12 @@ def id_of(text: str, class_names: Mapping[int, str]) -> int | None:
     return number if number in class_names else None
 
 
+def meant_by(text: str, class_names: Mapping[int, str]) -> list[int]:
+    """Return the ids that a text means: itself, if it is the id of a class; else those of all classes of that name."""
+    number = id_of(text, class_names)
+    return [k for k, name in class_names.items() if name == text] if number is None else [number]
+
+
 def class_ids(wanted: Iterable[str], class_names: Mapping[int, str], source: object = "") -> list[int]:
     """Look up classes by id or name: their ids in the order asked for, each once.
 
@@ -110,8 +116,7 @@ def class_ids(wanted: Iterable[str], class_names: Mapping[int, str], source: obj
     """
     ids, where = [], f"{source}: " if source else ""
     for name in wanted:
-        number = id_of(name, class_names)
-        meant = [k for k, known in class_names.items() if known == name] if number is None else [number]
+        meant = meant_by(name, class_names)
         if not meant:
             known = listed(f"{k} ({clipped(known)})" for k, known in class_names.items())
             raise SettingsError(f"{where}class {quoted(name)} does not exist; expected one of {known}")

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsseg_core.data.class_names import BACKGROUND_NAME, flaw_of_class_name, id_of, listed
+from gsseg_core.data.class_names import BACKGROUND_NAME, flaw_of_class_name, id_of, listed, meant_by
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import LabelMapError
 from gsseg_core.files.json_files import read_json
@@ -80,8 +80,7 @@ def map_labels(given: Mapping[str, str | None], class_names: Mapping[int, str], 
     renamed: dict[int, str | None] = dict.fromkeys(class_names, given[_OTHERS]) if _OTHERS in given else {}
     # Ids after names, since an id says which of several classes of one name is meant.
     for key in sorted(given, key=lambda key: id_of(key, class_names) is not None):
-        number = id_of(key, class_names)
-        meant = [k for k, name in class_names.items() if name == key] if number is None else [number]
+        meant = meant_by(key, class_names)
         if not meant and key != _OTHERS:
             known = listed(f"{k} ({name})" for k, name in class_names.items())
             raise LabelMapError(f"{source}: names {quoted(key)}, which the masks do not have; expected some of {known}")
