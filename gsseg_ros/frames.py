@@ -6,7 +6,6 @@ Rigid motions are (4, 4) float64. Quaternions are x, y, z, w, as in ROS messages
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -14,6 +13,7 @@ import numpy.typing as npt
 
 from gsseg_core.errors import SettingsError
 from gsseg_core.objects.oriented_boxes import OrientedBox
+from gsseg_core.scene import similarity
 from gsseg_core.scene.camera import rigid_motion
 from gsseg_core.scene.quaternions import rotations
 
@@ -21,13 +21,8 @@ Array: TypeAlias = npt.NDArray[np.float64]
 Quaternion: TypeAlias = tuple[float, float, float, float]
 
 
-@dataclass(frozen=True, eq=False)
-class Similarity:
-    """Where the scene lies in the map: map = scale * rotation @ scene + translation."""
-
-    rotation: Array  # (3, 3): from the axes of the scene to those of the map
-    translation: Array  # (3,): place of the scene's origin in the map, in metres
-    scale: float  # metres per scene unit, positive
+class Similarity(similarity.Similarity):
+    """Where the scene lies in the map, in metres: map = scale * rotation @ scene + translation."""
 
     @classmethod
     def from_parameters(
@@ -46,20 +41,14 @@ class Similarity:
         if not (np.isfinite(scale) and scale > 0):
             raise SettingsError(f"scene_to_map.scale is {scale:g}; expected a positive number of metres per scene unit")
         pose = pose_from_parameters("scene_to_map", translation, quaternion_xyzw)
-        return cls(pose[:3, :3], pose[:3, 3], float(scale))
-
-    def is_same(self, other: Similarity) -> bool:
-        """Whether it is the same as another one, bit for bit."""
-        same = np.array_equal(self.rotation, other.rotation) and np.array_equal(self.translation, other.translation)
-        return same and self.scale == other.scale
+        return cls(float(scale), pose[:3, :3], pose[:3, 3])
 
     def points_to_map(
         self,
         points: npt.ArrayLike,  # (M, 3)
     ) -> npt.NDArray[np.float32]:
         """Move points (M, 3) of the scene, in scene units, into the map: (M, 3) float32, in metres."""
-        moved = np.asarray(points, np.float64) @ (self.scale * self.rotation.T) + self.translation
-        return moved.astype(np.float32)
+        return self.points(np.asarray(points, np.float64)).astype(np.float32)
 
     def box_to_map(self, box: OrientedBox) -> OrientedBox:
         """Move the box of an object in the scene, in scene units, into the map, in metres."""
@@ -83,7 +72,7 @@ class Similarity:
     ) -> Array:
         """Turn a camera of the scene into its pose (4, 4) in the map, in metres: undoes `world_to_camera`."""
         pose = inverse(np.asarray(world_to_camera, np.float64))
-        return rigid_motion(self.rotation @ pose[:3, :3], self.scale * self.rotation @ pose[:3, 3] + self.translation)
+        return rigid_motion(self.rotation @ pose[:3, :3], self.points(pose[:3, 3]))
 
 
 def pose_from_parameters(

@@ -6,21 +6,14 @@ import threading
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 from gsseg_core.errors import GssegError
 from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.group_frames import is_same
 from gsseg_ros.frames import Similarity
 
 _Ways: TypeAlias = dict[str, tuple[Similarity, Similarity]]
-
-
-class Placed(Protocol):
-    """What a placement belongs to: a workspace."""
-
-    @property
-    def loaded(self) -> Any:
-        """The session, if any, whose views follow: a `LivingSession`, or a `PerViewSession`, which loads SciPy."""
 
 
 class Placement:
@@ -31,27 +24,23 @@ class Placement:
 
     Parameters
     ----------
-    owner : Placed
-        Of the session.
+    loaded : callable
+        The session, if any, whose views follow: a `LivingSession`, or a `PerViewSession`, which loads SciPy.
+
+    Attributes
+    ----------
     settled : callable
         Called in that thread when all views have followed.
     refused : callable
         Gets what was wrong with a view that cannot follow; it stays where it is until the next change.
-
-    Attributes
-    ----------
     fusing : threading.RLock
         Held from where a view's pose is brought into the scene until it is fused, and while the scene is moved.
     """
 
-    def __init__(
-        self,
-        owner: Placed,
-        settled: Callable[[], None] = lambda: None,
-        refused: Callable[[str], None] = lambda message: None,
-    ) -> None:
-        self.fusing, self.settled, self.refused = threading.RLock(), settled, refused
-        self._owner = owner
+    def __init__(self, loaded: Callable[[], Any]) -> None:
+        self.fusing, self._loaded = threading.RLock(), loaded
+        self.settled: Callable[[], None] = lambda: None
+        self.refused: Callable[[str], None] = lambda message: None
         self._moved_from: _Ways = {}  # By view, to where it has to follow.
         self._left: dict[str, Similarity] = {}  # By view that could not follow: where the scene was for it.
         self._running = False
@@ -60,19 +49,19 @@ class Placement:
         """Move the scene, and begin to have the views follow; `take_over` makes it known to those that come now."""
         with self.fusing:
             take_over()
-            session = self._owner.loaded
+            session = self._loaded()
             names = [] if session is None else session.view_names
             at = self._left | {name: moved[0] for name, moved in self._moved_from.items()}
             moved_from = {name: (at.get(name, before), after) for name in names}
             # To go nowhere costs as much as to go far, and rounds the camera.
-            self._moved_from = {name: ways for name, ways in moved_from.items() if not ways[0].is_same(ways[1])}
+            self._moved_from = {name: ways for name, ways in moved_from.items() if not is_same(*ways)}
             self._left = {}
             self._begin()
 
     def bring(self, names: Iterable[str]) -> None:
         """Have some views follow before anything else; whoever goes on from where they are then holds `fusing`."""
         with self.fusing:
-            moved_from, session = self._moved_from, self._owner.loaded
+            moved_from, session = self._moved_from, self._loaded()
             waiting = [] if session is None else set(names) & moved_from.keys()
             for name in waiting:
                 self._follows(session, name, moved_from)
@@ -96,7 +85,7 @@ class Placement:
         """Have one view follow; returns whether there was one."""
         with self.fusing:
             self._running, moved_from = False, self._moved_from  # Whatever is raised here, others may follow later.
-            session = self._owner.loaded
+            session = self._loaded()
             if not moved_from or session is None:
                 return False
             self._follows(session, next(iter(moved_from)), moved_from)

@@ -81,7 +81,7 @@ class Workspace:
 
     def __init__(self, settings: Settings, now: Callable[[], Time]) -> None:
         self.settings, self.slot, self.requests = settings, JobSlot(), Requests()
-        self.placement = Placement(self)
+        self.placement = Placement(lambda: self._session)
         self.forget_waiting: Callable[[], None] = lambda: None
         self.label_space = LabelSpace(settings.class_names, None, settings.max_classes)
         self._at_start = {name: getattr(settings, name) for name in _PATHS}

@@ -19,7 +19,7 @@ from gsseg_ros.frames import Similarity
 
 HEADER = Header(stamp=Time(sec=7, nanosec=8), frame_id="camera")
 K = np.array([[100.0, 0, 31.5], [0, 120.0, 20.25], [0, 0, 1]])
-IDENTITY = Similarity(np.eye(3), np.zeros(3), 1.0)
+IDENTITY = Similarity()
 
 
 def as_bytes(values: np.ndarray) -> array.array[int]:

@@ -61,7 +61,7 @@ GREETING_SECONDS = 2.0
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 CLASSES = list(NAMES.values())
-IDENTITY = Similarity(np.eye(3), np.zeros(3), 1.0)
+IDENTITY = Similarity()
 SECOND = 1_000_000_000
 STEP = SECOND // 10
 """Nanoseconds from one mask to the next."""

@@ -236,7 +236,7 @@ def test_poses_and_clouds_are_in_the_map_where_the_scene_has_another_frame_and_s
     ros: Ros, parameters: dict[str, Any], scene: GaussianScene
 ) -> None:
     motion = turned(0.8, 1) @ turned(-2.0, 0)
-    similarity = Similarity(motion[:3, :3], np.array([4.0, -1.0, 0.5]), 2.5)
+    similarity = Similarity(2.5, motion[:3, :3], np.array([4.0, -1.0, 0.5]))
     rotation = pose_from_matrix(motion).orientation
     robot = Robot(ros).started({
         **parameters, "queue_size": 1000, "scene_to_map.scale": 2.5, "scene_to_map.translation": [4.0, -1.0, 0.5],

@@ -58,7 +58,7 @@ def assert_objects(found: list[Object], scene: GaussianScene, result: Segmentati
 def test_the_objects_of_a_run_are_answered_and_latched_with_their_boxes(robot: Robot, scene: GaussianScene) -> None:
     response = robot.done("segment")
     session = core_session(scene, clean_views(6))
-    assert_objects(response.objects, scene, session.segmentation(PAPER), Similarity(np.eye(3), np.zeros(3), 1.0))
+    assert_objects(response.objects, scene, session.segmentation(PAPER), Similarity())
     (latched,) = robot.latched((ObjectArray, "objects"))
     assert (latched.header, latched.revision) == (response.report.header, response.report.revision)
     assert latched.objects == response.objects
@@ -143,7 +143,7 @@ def test_boxes_are_in_the_map_where_the_scene_has_another_frame_and_scale(
 ) -> None:
     rotation, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))
     rotation *= np.linalg.det(rotation)
-    place = Similarity(rotation, np.array([4.0, -1.0, 0.5]), 2.5)
+    place = Similarity(2.5, rotation, np.array([4.0, -1.0, 0.5]))
     q = pose_from_matrix(rigid_motion(rotation, np.zeros(3))).orientation
     robot = Robot(ros).started({
         **parameters, "scene_to_map.scale": 2.5, "scene_to_map.translation": [4.0, -1.0, 0.5],

@@ -203,7 +203,7 @@ def live() -> Iterator[tuple[LiveOutputs, Shown, dict[str, int]]]:
     session = LiveSession(scene, dict(enumerate(CLASSES)))
     for view in clean_views(2):
         session.fuse(view)
-    similarity = Similarity(np.eye(3), np.zeros(3), 1.0)
+    similarity = Similarity()
     settings = SimpleNamespace(rectified="auto", scene_to_map=similarity, max_pixels=1 << 24, map_frame="map")
     shown, state = Shown(), {"busy": False, "asked": 0}
     workspace: Any = SimpleNamespace(session=session, settings=settings, era=session.era)
@@ -213,7 +213,7 @@ def live() -> Iterator[tuple[LiveOutputs, Shown, dict[str, int]]]:
         state["asked"] += 1
         return bool(state["busy"])
 
-    live = LiveOutputs(workspace, outputs, busy, Time, lambda key, text: pytest.fail(text))
+    live = LiveOutputs(workspace, outputs, busy, Time, pytest.fail)
     yield live, shown, state
     shown.go_on.set()
     live.close()

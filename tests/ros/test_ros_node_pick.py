@@ -123,7 +123,7 @@ def test_where_the_scene_lies_elsewhere_in_the_map_so_does_the_object(
     here: NodeHere, shared: Ros, parameters: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(segment_node, "warm_up", lambda *_: None)
-    place = Similarity(np.eye(3), np.array([4.0, -1.0, 0.5]), 2.5)
+    place = Similarity(2.5, translation=np.array([4.0, -1.0, 0.5]))
     moved = {"scene_to_map.scale": 2.5, "scene_to_map.translation": [4.0, -1.0, 0.5]}
     view = clean_views(1)[0]
     labels, sent = view.read_labels(), messages(view, 1, place)

@@ -53,7 +53,7 @@ def selection(*chosen: int) -> Selection:
     session = LiveSession(balls_on_a_table()[0], NAMES)
     for view in clean_views(2):
         session.fuse(view)
-    return Selection(session, session.segmentation(PAPER), chosen, 0.0, Similarity(np.eye(3), np.zeros(3), 1.0))
+    return Selection(session, session.segmentation(PAPER), chosen, 0.0, Similarity())
 
 
 def test_what_a_run_held_is_free_as_soon_as_it_ends() -> None:

@@ -37,6 +37,7 @@ from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 
+from gsseg_core.scene.group_frames import is_same
 from gsseg_core.scene.scene_delta import GroupMove, SceneDelta
 from gsseg_core.scene.similarity import Similarity as CoreSimilarity
 from gsseg_ros.conversions import arrays_from_cloud, matrix_from_transform, viewpoint_messages
@@ -64,8 +65,9 @@ def placed_views(views: list[View], now: Similarity) -> list[View]:
 
 def placement_of(session: LivingSession) -> tuple[Placement, list[int]]:
     settled: list[int] = []
-    owner: Any = SimpleNamespace(loaded=session)
-    return Placement(owner, lambda: settled.append(session.num_views)), settled
+    placement = Placement(lambda: session)
+    placement.settled = lambda: settled.append(session.num_views)
+    return placement, settled
 
 
 SCENE, _ = balls_on_a_table()
@@ -134,13 +136,12 @@ def test_views_of_a_state_stay_where_they_are_though_the_scene_is_put_elsewhere_
 def test_a_state_that_is_loaded_between_two_looks_at_what_has_to_follow_ends_it_quietly() -> None:
     session, settled = living_session(clean_views(2)), threading.Event()
 
-    class Owner:
-        @property
-        def loaded(self) -> LivingSession:
-            placement.forget()
-            return session
+    def loaded() -> LivingSession:
+        placement.forget()
+        return session
 
-    placement = Placement(Owner(), settled.set)
+    placement = Placement(loaded)
+    placement.settled = settled.set
     with placement.fusing:
         placement._moved_from = {name: (IDENTITY, FAR) for name in session.view_names}
         placement._begin()
@@ -368,7 +369,7 @@ def test_to_grow_and_to_be_put_elsewhere_is_all_or_nothing(
         assert ("not now" if fails == "the place" else "tolerance is -1") in refused.error_msg
         assert not here.node.workspace.placement._moved_from, "views have nowhere to go"
         assert here.node.get_parameter("scene_to_map.scale").value == 1.0
-        assert here.node.workspace.settings.scene_to_map.is_same(IDENTITY)
+        assert is_same(here.node.workspace.settings.scene_to_map, IDENTITY)
         assert session.living is before and all(now is was for now, was in zip(session.views, views, strict=True))
 
 
