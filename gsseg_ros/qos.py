@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from rclpy.exceptions import ParameterException
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from gsseg_core.errors import SettingsError
 
@@ -63,6 +65,13 @@ def clear_overrides(topic: str) -> Iterator[None]:
             f"parameters qos_overrides of the topic {topic}: {error}; expected reliability reliable or best_effort, "
             "history keep_last or keep_all, and depth a number of messages"
         ) from error
+
+
+def overridable_publisher(node: Any, kind: Any, topic: str, quality: QoSProfile) -> Any:
+    """Make a publisher whose quality of service parameters may override; raises as `clear_overrides` does."""
+    with clear_overrides(topic):
+        overridable = QoSOverridingOptions.with_default_policies()
+        return node.create_publisher(kind, topic, quality, qos_overriding_options=overridable)
 
 
 def all_clouds() -> QoSProfile:

@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode
 from sensor_msgs.msg import CompressedImage
 
@@ -36,7 +35,7 @@ from gsseg_ros.node.matched_subscription import MatchedSubscription
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.pairing import MOST_BYTES, Paired
 from gsseg_ros.node.parameters import Settings
-from gsseg_ros.node.sim_time import on_set_back
+from gsseg_ros.node.sim_time import on_set_back, steady_timer
 from gsseg_ros.node.tf_poses import TfPoses
 from gsseg_ros.node.workspace import Workspace
 
@@ -120,7 +119,7 @@ class Inputs:
             outputs,
             lambda: self.worker.waiting > 0,
             lambda: node.get_clock().now().to_msg(),
-            lambda _, message: self._complaints.add(LIVE, message),
+            partial(self._complaints.add, LIVE),
         )
         built.callback(self.live.close)
         compressed = settings.image_transport == "compressed"
@@ -145,9 +144,7 @@ class Inputs:
             if settings.detections_topic:
                 self.detections.append(self._detections_of(camera, settings))
                 built.callback(self.detections[-1].close)
-        # Not by /clock, which may stand still.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        timer = node.create_timer(EXPIRE_PERIOD, self._expire, callback_group=self._group, clock=steady)
+        timer = steady_timer(node, EXPIRE_PERIOD, self._expire, self._group)
         built.callback(node.destroy_timer, timer)
         built.callback(on_set_back(node, self._set_back).unregister)
         workspace.forget_waiting = self._forget_waiting

@@ -60,7 +60,7 @@ class LiveOutputs:
     now : callable
         The stamp of this moment.
     complain : callable
-        Gets a key and what is wrong with a camera image.
+        Gets what is wrong with a camera image.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class LiveOutputs:
         outputs: Outputs,
         busy: Callable[[], bool],
         now: Callable[[], Time],
-        complain: Callable[[str, str], None],
+        complain: Callable[[str], None],
     ) -> None:
         self._workspace, self._outputs = workspace, outputs
         self._busy, self._now, self._complain = busy, now, complain
@@ -153,9 +153,9 @@ class LiveOutputs:
         try:
             work(*arguments)
         except GssegError as error:  # An image that cannot be used, or a reset in this moment.
-            self._complain(f"live {type(error).__name__}", str(error))
+            self._complain(str(error))
         except Exception as error:  # Nothing that is only to be looked at may end the thread.
-            self._complain("live", f"overlay or objects: unexpected {type(error).__name__}: {error}")
+            self._complain(f"overlay or objects: unexpected {type(error).__name__}: {error}")
 
     def _draw(self, paired: Paired, camera: Camera | None) -> None:
         session, header = self._workspace.session, paired.mask[1].header

@@ -9,11 +9,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
@@ -26,8 +23,9 @@ from gsseg_core.scene.quaternions import half_axes
 from gsseg_ros.conversions import points_cloud
 from gsseg_ros.node.complaints import OBSTACLES, Complaints
 from gsseg_ros.node.parameters import Settings
+from gsseg_ros.node.sim_time import steady_timer
 from gsseg_ros.node.workspace import Workspace
-from gsseg_ros.qos import clear_overrides, sensor_data
+from gsseg_ros.qos import overridable_publisher, sensor_data
 
 RENEWAL_SECONDS = 2.0
 """How long cells are published anew as they are, at least, while views come in."""
@@ -59,18 +57,10 @@ class Obstacles:
     def __init__(self, node: LifecycleNode, workspace: Workspace, complaints: Complaints) -> None:
         self._node, self._workspace, self._complaints = node, workspace, complaints
         self._kept: _Kept | None = None
-        overridable = QoSOverridingOptions.with_default_policies()
-        with clear_overrides("~/obstacles"):
-            self._publisher = node.create_publisher(
-                PointCloud2, "~/obstacles", sensor_data(), qos_overriding_options=overridable
-            )
-        # Not by /clock, which may stand still; and in a group of its own, since to find cells takes a while.
-        self._timer = node.create_timer(
-            1 / workspace.settings.obstacle_rate,
-            self.tick,
-            callback_group=MutuallyExclusiveCallbackGroup(),
-            clock=Clock(clock_type=ClockType.STEADY_TIME),
-        )
+        self._publisher = overridable_publisher(node, PointCloud2, "~/obstacles", sensor_data())
+        # In a group of its own, since to find cells takes a while.
+        group = MutuallyExclusiveCallbackGroup()
+        self._timer = steady_timer(node, 1 / workspace.settings.obstacle_rate, self.tick, group)
 
     def close(self) -> None:
         """Stop."""
@@ -132,7 +122,7 @@ class Obstacles:
         chosen: list[int] = []
         for name in names:
             try:
-                chosen += class_ids([name], class_names)
+                chosen += class_ids([name], class_names, "parameter obstacle_classes")
             except SettingsError as error:
-                self._complaints.add(OBSTACLES, f"parameter obstacle_classes: {error}")
+                self._complaints.add(OBSTACLES, str(error))
         return chosen

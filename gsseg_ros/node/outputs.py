@@ -15,7 +15,6 @@ from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode
 from rclpy.publisher import Publisher
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
@@ -24,7 +23,7 @@ from gsseg_ros.conversions import cloud
 from gsseg_ros.node.masks.label_info import label_info, label_info_class
 from gsseg_ros.node.reports import Selection
 from gsseg_ros.object_messages import object_markers
-from gsseg_ros.qos import clear_overrides, latched
+from gsseg_ros.qos import latched, overridable_publisher
 from gsseg_ros.topic_tokens import topic_tokens
 
 InvalidHandle = rclpy_implementation.InvalidHandle
@@ -219,9 +218,7 @@ class Outputs:
             self._node.destroy_publisher(publisher)
 
     def _overridable(self, kind: Any, topic: str) -> Publisher:
-        overridable = QoSOverridingOptions.with_default_policies()
-        with clear_overrides(topic):
-            self._always.append(self._node.create_publisher(kind, topic, latched(), qos_overriding_options=overridable))
+        self._always.append(overridable_publisher(self._node, kind, topic, latched()))
         return self._always[-1]
 
     def _vision_publisher(self) -> tuple[Publisher, Callable[[ObjectArray], Any]] | None:

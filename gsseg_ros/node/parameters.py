@@ -126,10 +126,7 @@ class Settings:
                 f"{self.obstacle_max_height:g}, the parameter obstacle_max_height"
             )
         if self.class_names and not self.label_map:  # Which may make more.
-            try:
-                class_ids(self.obstacle_classes, dict(enumerate(self.class_names)))
-            except SettingsError as error:
-                raise SettingsError(f"parameter obstacle_classes: {error}") from error
+            class_ids(self.obstacle_classes, dict(enumerate(self.class_names)), "parameter obstacle_classes")
         if self.data_root and not Path(self.data_root).is_dir():
             raise SettingsError(f"parameter data_root: {self.data_root} is no folder; expected one that exists")
 

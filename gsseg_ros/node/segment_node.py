@@ -16,7 +16,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.srv import ChangeState, GetAvailableStates, GetAvailableTransitions, GetState
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
@@ -35,7 +34,7 @@ from gsseg_ros.node.parameters import Settings
 from gsseg_ros.node.scene_changes import SceneChanges
 from gsseg_ros.node.scene_frame import SceneFrame
 from gsseg_ros.node.services import Services, describe
-from gsseg_ros.node.sim_time import SimTime
+from gsseg_ros.node.sim_time import SimTime, steady_timer
 from gsseg_ros.node.viewpoints import Lookup
 from gsseg_ros.node.workspace import Workspace
 from gsseg_ros.shared_memory import make_room
@@ -89,10 +88,8 @@ class SegmentNode(LifecycleNode):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._complaints = Complaints(self.get_logger().warning)
         self._sim_time = SimTime(self)
-        # In a group of its own, since it may wait for the session; and not by /clock: that it does not come is what
-        # there may be to tell.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(1.0, self._tell, callback_group=MutuallyExclusiveCallbackGroup(), clock=steady)
+        # In a group of its own, since it may wait for the session. That /clock does not come, it may have to tell.
+        steady_timer(self, 1.0, self._tell, MutuallyExclusiveCallbackGroup())
         self.add_on_set_parameters_callback(self._check_parameters)
         self._told_after = hasattr(self, "add_post_set_parameters_callback")  # Humble has the one before alone.
         if self._told_after:

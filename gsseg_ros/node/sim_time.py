@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from builtin_interfaces.msg import Time
+from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType, JumpHandle, JumpThreshold
 from rclpy.duration import Duration
 
@@ -58,6 +59,12 @@ class SimTime:
         """Give the time for diagnostics: that of the wall as long as no /clock has come, for zero means "not set"."""
         now = self._node.get_clock().now()
         return (now if now.nanoseconds else Clock(clock_type=ClockType.SYSTEM_TIME).now()).to_msg()
+
+
+def steady_timer(node: Any, period_s: float, callback: Callable[[], None], group: CallbackGroup) -> Any:
+    """Make a timer that goes on whatever /clock does, which may stand still."""
+    steady = Clock(clock_type=ClockType.STEADY_TIME)
+    return node.create_timer(period_s, callback, callback_group=group, clock=steady)
 
 
 def on_set_back(node: Any, heard: Callable[[int], None]) -> JumpHandle:
