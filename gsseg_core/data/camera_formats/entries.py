@@ -74,22 +74,6 @@ def entries(path: Path, content: object, expected: str) -> list[Entry]:
     return [Entry(f"{path}, entry {i}", entry) for i, entry in enumerate(content)]
 
 
-def camera_of(
-    where: str,
-    name: str,
-    size: tuple[int, int],  # width, height
-    focal: tuple[float, float],
-    principal: tuple[float, float],
-    pose: npt.NDArray[np.float64],  # (4, 4) world to camera
-) -> Camera:
-    """Make a camera; its errors say where it stands."""
-    K = np.array([[focal[0], 0, principal[0]], [0, focal[1], principal[1]], [0, 0, 1]], np.float64)
-    try:
-        return Camera(name, *size, K, pose)
-    except (PoseError, IntrinsicsError) as error:
-        raise type(error)(f"{where}: {error}") from None
-
-
 class Intrinsics(NamedTuple):
     """What a file says of the lens of an image; coefficients by name, those that are left out being 0."""
 
@@ -97,7 +81,7 @@ class Intrinsics(NamedTuple):
     size: tuple[int, int]  # width, height
     focal: tuple[float, float]
     principal: tuple[float, float]
-    coefficients: Mapping[str, float]
+    coefficients: Mapping[str, float] = {}
 
 
 def cameras_of(
@@ -108,9 +92,10 @@ def cameras_of(
 ) -> list[Camera]:
     """Make the camera of an image, or, where a lens bent it, those of its pinhole views; errors say where it stands."""
     model, size, focal, principal, coefficients = intrinsics
-    if model.projection is Projection.PERSPECTIVE and not any(coefficients.values()):
-        return [camera_of(where, name, size, focal, principal, pose)]
     try:
+        if model.projection is Projection.PERSPECTIVE and not any(coefficients.values()):
+            K = np.array([[focal[0], 0, principal[0]], [0, focal[1], principal[1]], [0, 0, 1]], np.float64)
+            return [Camera(name, *size, K, pose)]
         views = undistortions(Lens(model, *size, focal, principal, model.order(coefficients)))
         return [undistorted_camera(name, view, pose) for view in views]
     except (PoseError, IntrinsicsError) as error:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gsseg_core.data.camera_formats.entries import camera_of, entries, inverse_pose
+from gsseg_core.data.camera_formats.entries import Intrinsics, cameras_of, entries, inverse_pose
 from gsseg_core.errors import CameraFileError
 from gsseg_core.files.json_files import read_json
 from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.lens import MODELS_BY_NAME
 
 
 def read_3dgs(path: Path, within: Path | None) -> list[Camera]:
@@ -17,6 +18,6 @@ def read_3dgs(path: Path, within: Path | None) -> list[Camera]:
         width, height = entry.size("width"), entry.size("height")
         focal = entry.number("fx"), entry.number("fy")
         pose = inverse_pose(entry.array("rotation", (3, 3)), entry.array("position", (3,)))
-        name = entry.stem("img_name")
-        cameras.append(camera_of(entry.where, name, (width, height), focal, (width / 2, height / 2), pose))
+        intrinsics = Intrinsics(MODELS_BY_NAME["PINHOLE"], (width, height), focal, (width / 2, height / 2))
+        cameras += cameras_of(entry.where, entry.stem("img_name"), intrinsics, pose)
     return cameras

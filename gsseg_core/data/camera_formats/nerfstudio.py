@@ -47,7 +47,7 @@ def _intrinsics(entry: Entry) -> Intrinsics:
         raise IntrinsicsError(f"{where}: the image size is missing; expected 'w' and 'h', here or for all frames")
     width, height = entry.size("w"), entry.size("h")
     if model.projection is Projection.PANORAMA:
-        return Intrinsics(model, (width, height), (1.0, 1.0), (0.0, 0.0), {})
+        return Intrinsics(model, (width, height), (1.0, 1.0), (0.0, 0.0))
     fx, fy = _focal(entry, "fl_x", "camera_angle_x", width), _focal(entry, "fl_y", "camera_angle_y", height)
     if fx is None:
         raise IntrinsicsError(f"{where}: the focal length is missing; expected 'fl_x' or 'camera_angle_x'")
