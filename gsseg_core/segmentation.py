@@ -371,7 +371,7 @@ class Segmentation:
         """
         path = Path(path)
         settle(path.parent)
-        with open_npz(path, "a segmentation.npz", FORMAT, scene.digest) as (file, header):
+        with open_npz(path, "a segmentation.npz", (FORMAT,), scene.digest) as (file, header):
             names, temperature = class_names_of(header), temperature_of(header)
             if 0 not in names:
                 raise UnfitError(f"class_names lack 0, the background; found {clipped(list(names))}")

@@ -8,7 +8,7 @@ import os
 import sys
 import tokenize
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -202,9 +202,9 @@ def read_json_header(arrays: NpzArrays) -> dict[str, Any]:
 
 @contextmanager
 def open_npz(
-    path: Path, what: str, file_format: str, digest: str | None, within: Path | None = None
+    path: Path, what: str, formats: Sequence[str], digest: str | None, within: Path | None = None
 ) -> Iterator[tuple[NpzArrays, Any]]:
-    """Open an npz with a JSON header, which must say `file_format` as "format" and `digest`, if given, as "scene".
+    """Open an npz whose JSON header must say one of `formats`, the newest first, and `digest`, if given, as "scene".
 
     What is yielded, the arrays and the header, is as safe as that of `open_arrays`.
 
@@ -219,8 +219,8 @@ def open_npz(
     """
     with open_arrays(path, what, StateFileError, within) as arrays:
         header = read_json_header(arrays)
-        if header.get("format") != file_format:
-            raise StateFileError(f"{path}: format is {quoted(header.get('format'))}; expected {file_format!r}")
+        if header.get("format") not in formats:
+            raise StateFileError(f"{path}: format is {quoted(header.get('format'))}; expected {formats[0]!r}")
         if digest is not None:
             check_scene(path, header, digest)
         yield arrays, header

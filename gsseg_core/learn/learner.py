@@ -19,6 +19,7 @@ from gsseg_core.learn.em.em_kernels import normalise_votes, weigh_votes
 from gsseg_core.learn.learner_state import State
 from gsseg_core.learn.prepared_views import PreparedViews, default_budget
 from gsseg_core.learn.vote_resolution import impute_probabilities
+from gsseg_core.learn.whole_rays import votes_cast_anew
 from gsseg_core.progress import Progress as Progress
 from gsseg_core.progress import silent as silent
 from gsseg_core.progress import with_progress
@@ -231,11 +232,13 @@ class Learner(ABC):
         return State(self._votes.copy(), list(self.views.values()), len(self.views))
 
     def adopt(self, state: State) -> None:
-        """Replace views, votes and number of classes by those of a state of the same scene."""
+        """Replace views, votes and number of classes by a state's, of the same scene; votes of old are cast anew."""
         self.views, self._votes = {view.name: view for view in state.views}, state.votes
         self.num_classes = state.votes.shape[1]
         self.rejected.clear()
         self._prepared.clear()
+        if state.whole_rays:
+            self._votes = votes_cast_anew(state, self._operator_of, self._used_labels, UNITS)
 
     def vote_codes(self) -> np.ndarray:
         """Votes as probabilities, (N, K) float32; a row of zeros where no labelled pixel saw the Gaussian."""

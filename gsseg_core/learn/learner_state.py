@@ -41,7 +41,8 @@ from gsseg_core.scene.living_scene import LivingScene
 from gsseg_core.scene.scene_delta import MAX_ID
 from gsseg_core.text import clipped, quoted
 
-FORMAT = "gsseg-state-1"
+FORMAT, WHOLE_RAYS = "gsseg-state-2", "gsseg-state-1"
+"""What states say that they are: of this version; and of those whose rays went on behind surfaces."""
 
 OBJECTS_OF_ONE_SESSION = "holds objects that its own session found and numbered (ids per-view)"
 """What errors say of a state with `per_view`, where classes are expected that mean the same to others."""
@@ -72,6 +73,7 @@ class State:
     learnt: Learnt | None = None  # the best codes
     living: LivingScene | None = None  # the scene, if it changes and so is in the file
     per_view: bool = False  # whether its classes are objects that its session found and numbered itself
+    whole_rays: bool = False  # whether a version has cast the votes whose rays went on behind surfaces
 
     @property
     def num_classes(self) -> int:
@@ -93,10 +95,10 @@ class State:
             The file cannot be written; an earlier one is unchanged.
         """
         path = Path(path)
-        check_replaceable(path, "saved state", npz_format(path) == FORMAT)
+        check_replaceable(path, "saved state", npz_format(path) in (FORMAT, WHOLE_RAYS))
         seen = np.flatnonzero(self.votes.any(axis=1))
         header: dict[str, Any] = {
-            "format": FORMAT,
+            "format": WHOLE_RAYS if self.whole_rays else FORMAT,
             "scene": digest,
             "shape": list(self.votes.shape),
             "views": [_entry(view) for view in self.views],
@@ -122,7 +124,7 @@ class State:
         with write_atomically(path) as temporary, open(temporary, "wb") as file:
             # Without allow_pickle=False, which NumPy 1.26 would take for one more array.
             np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
-            check_replaceable(path, "saved state", npz_format(path) == FORMAT)  # To save takes long.
+            check_replaceable(path, "saved state", npz_format(path) in (FORMAT, WHOLE_RAYS))  # To save takes long.
 
     @classmethod
     def load(
@@ -144,7 +146,7 @@ class State:
             The file lies outside `within`.
         """
         path = Path(path)
-        with open_npz(path, "a saved state", FORMAT, None if first else digest, within) as (file, header):
+        with open_npz(path, "a saved state", (FORMAT, WHOLE_RAYS), None if first else digest, within) as (file, header):
             living = living_files.read(file, header)
             if first is not None and header.get("scene") == first.scene.digest:
                 living = living or first
@@ -157,7 +159,7 @@ class State:
     @classmethod
     def load_alone(cls, path: str | os.PathLike[str]) -> tuple[str, State]:
         """Read a state without its scene: the scene's digest, and the state; raises `StateFileError` as `load` does."""
-        with open_npz(Path(path), "a saved state", FORMAT, None) as (file, header):
+        with open_npz(Path(path), "a saved state", (FORMAT, WHOLE_RAYS), None) as (file, header):
             living = living_files.read(file, header)
             n, k = (whole_number(side, "a side of the votes", 1, LIMITS.max_gaussians) for side in header["shape"])
             if 8 * n * k > LIMITS.max_npz_bytes or (living is not None and len(living) != n):
@@ -190,7 +192,8 @@ class State:
             check_shares("codes", codes)
             num_views = whole_number(entry["num_views"], "num_views of what was learnt", 0, _MOST_VIEWS)
             learnt = Learnt(str(entry["learner"]), codes, num_views, temperature_of(entry))
-        return cls(votes, views, num_fused, class_names_of(header), learnt, living, header.get("ids") == PER_VIEW)
+        names, per_view, whole = class_names_of(header), header.get("ids") == PER_VIEW, header["format"] == WHOLE_RAYS
+        return cls(votes, views, num_fused, names, learnt, living, per_view, whole)
 
 
 def _entry(view: View) -> dict[str, Any]:

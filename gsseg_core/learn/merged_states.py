@@ -36,7 +36,7 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
         They are of different scenes.
     StateFileError
         They have different names for one class, or ids that each session gave to the objects that it found; or two are
-        the same, whose votes would count twice.
+        the same, whose votes would count twice; or some have votes of whole rays, and some have not.
     """
     first = saved[0]
     names: dict[int, str] = {}
@@ -47,6 +47,12 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
             raise StateMismatchError(
                 f"{one.source}: belongs to the scene {one.scene[:12]}; expected {first.scene[:12]}, that of "
                 f"{first.source}, with the same groups"
+            )
+        if one.state.whole_rays != first.state.whole_rays:
+            older, newer = (one, first) if one.state.whole_rays else (first, one)
+            raise StateFileError(
+                f"{older.source}: an older gsseg has saved it, whose rays went on behind surfaces; expected votes as "
+                f"in {newer.source}: load it in a session, which casts them anew, and save it"
             )
         if one.state.per_view and len(saved) > 1:
             raise StateFileError(
@@ -66,7 +72,8 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
     num_fused = sum(one.state.num_fused for one in saved)
     class_names = dict(sorted(names.items()))
     # One state alone stays of its kind.
-    return State(votes, [*views.values()], num_fused, class_names, None, first.state.living, first.state.per_view)
+    merged = replace(first.state, votes=votes, views=[*views.values()], num_fused=num_fused)
+    return replace(merged, class_names=class_names, learnt=None)
 
 
 def _add_names(names: dict[int, str], one: Saved) -> None:

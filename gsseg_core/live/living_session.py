@@ -223,8 +223,9 @@ class LivingSession(LiveSession):
     def _read_state(self, path: Path, within: Path | None) -> State:
         state = State.load(path, self.scene.digest, len(self.scene), within, self._first)
         saved = state.living
-        if saved is None:
+        if saved is None and not state.whole_rays:
             return state
+        saved = saved or self._living
         votes = LivingVotes(saved, state.votes.shape[1], device=self.device)
         votes.adopt(state)
         change = SceneChange(saved, self._living, self._places_in(saved, path))
@@ -232,7 +233,7 @@ class LivingSession(LiveSession):
         votes.change(change, {view.name: None for view in state.views if view.group in gone})
         learnt = state.learnt and replace(state.learnt, codes=change.carry(state.learnt.codes))
         now = votes.state()
-        return replace(state, votes=now.votes, views=now.views, living=now.living, learnt=learnt)
+        return replace(state, votes=now.votes, views=now.views, living=now.living, learnt=learnt, whole_rays=False)
 
     def _places_in(self, saved: LivingScene, path: Path) -> np.ndarray:
         if saved is self._first or not self._numbered:

@@ -78,8 +78,7 @@ class LiveSession:
                 raise SettingsError(f"{name} is {value}; expected at least 1")
         self.scene, self.max_views, self.device, self.max_classes = scene, max_views, device, max_classes
         self.rejected: Counter[str] = Counter()
-        self._declared = bool(class_names)
-        self._names = {0: BACKGROUND_NAME, **(class_names or {})}
+        self._declared, self._names = bool(class_names), {0: BACKGROUND_NAME, **(class_names or {})}
         self._lock, self._version = threading.RLock(), 0
         self._scenes: WeakKeyDictionary[Segmentation, GaussianScene] = WeakKeyDictionary()
         self._forget({})
@@ -242,8 +241,7 @@ class LiveSession:
             codes, learnt = self._live.vote_codes(), self._learnt
         if learnt is not None:
             known = learnt.codes.any(axis=1)
-            codes[known] = 0.0
-            codes[known, : learnt.codes.shape[1]] = learnt.codes[known]
+            codes[known] = np.pad(learnt.codes[known], ((0, 0), (0, codes.shape[1] - learnt.codes.shape[1])))
         return codes
 
     def segmentation(self, settings: RefineSettings | None = None, watch: Stopwatch | None = None) -> Segmentation:
@@ -326,9 +324,11 @@ class LiveSession:
         """
         state = self._read_state(Path(path), within)
         self._check_classes(path, state)
+        votes = self._no_votes(state.votes.shape[1])
+        votes.adopt(state)  # To cast votes of old anew takes long.
         with self._lock:
             self._forget(state.class_names)
-            self._live.adopt(state)
+            self._live = votes
             self._live.resize(max(state.num_classes, max(self._names) + 1 if self._declared else 1))
             self.num_fused, self._learnt = state.num_fused, state.learnt
             self._drop_old_views()
