@@ -31,6 +31,7 @@ from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu import label_pairs
 from gsseg_core.raster.observation import Observation
 from gsseg_core.refine.settings import UNREFINED, RefineSettings
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import UNOBSERVED, Segmentation
 
 LEARNERS = [VoteLearner, EMLearner, GradientLearner]
@@ -379,3 +380,17 @@ def test_progress_is_told_from_start_to_end(kind: type[Learner]) -> None:
     taught(kind(SCENE, NUM_CLASSES), VIEWS[:2]).fit(lambda *call: calls.append(call))
     assert all(0 <= done <= total for _, done, total in calls)
     assert not calls or calls[-1][1] == calls[-1][2]
+
+
+def test_what_stands_behind_glass_has_evidence_if_a_tenth_of_the_light_comes_through() -> None:
+    """The mask names the thing behind, as a person would."""
+    camera = look_at("front", np.array([0.0, 0.0, 4.0]))
+    view = View.from_arrays(camera, np.ones((camera.height, camera.width), np.int32))
+    for opacity, is_known in ((0.85, True), (0.95, False)):
+        scene = GaussianScene.from_arrays(
+            np.array([[0.0, 0, 1], [0, 0, 0]]), np.tile([1.0, 0, 0, 0], (2, 1)), np.array([[50, 50, 0.01], [0.1] * 3]),
+            np.array([opacity, 0.95]), np.zeros((2, 1, 3)),
+        )  # fmt: skip
+        learner = taught(VoteLearner(scene, 2), [view])
+        assert (learner.evidence()[1] > 0) == is_known and learner.evidence()[0] > 0
+        assert learner.fit().codes_[0, 1] == 1 and learner.observed_[1] == is_known
