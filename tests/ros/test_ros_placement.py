@@ -29,7 +29,6 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
-from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, Quaternion
 from gsseg_msgs.msg import ObjectArray, SegmentationReport
 from rcl_interfaces.msg import SetParametersResult
@@ -40,13 +39,12 @@ from sensor_msgs.msg import PointCloud2
 from gsseg_core.scene.group_frames import is_same
 from gsseg_core.scene.scene_delta import GroupMove, SceneDelta
 from gsseg_core.scene.similarity import Similarity as CoreSimilarity
-from gsseg_ros.conversions import arrays_from_cloud, matrix_from_transform, viewpoint_messages
+from gsseg_ros.conversions import arrays_from_cloud, viewpoint_messages
 from gsseg_ros.delta_messages import message_from_delta
 from gsseg_ros.errors import BusyError
 from gsseg_ros.frames import Similarity
 from gsseg_ros.node import services, viewpoints
 from gsseg_ros.node.placement import Placement
-from gsseg_ros.node.scene_frame import SceneFrame, transform
 from gsseg_ros.node.services import AT_WORK, WAITING
 from gsseg_ros.node.workspace import Workspace
 
@@ -396,42 +394,3 @@ def test_what_happens_before_all_views_have_followed_leaves_them_where_they_were
         assert [view.group for view in kept] == [None, 0, None]
         expected = [view.camera.world_to_camera for view in placed_views(views, place)]
         np.testing.assert_allclose([view.camera.world_to_camera for view in kept], expected, atol=1e-6)
-
-
-def test_the_static_transform_is_the_pose_of_the_scene_without_its_scale() -> None:
-    similarity = Similarity.from_parameters(2.5, [4.0, -1.0, 0.5], [0.0, 0.0, 0.6, 0.8])
-    sent = transform("map", "scene", similarity, Time(sec=7))
-    assert (sent.header.frame_id, sent.child_frame_id, sent.header.stamp.sec) == ("map", "scene", 7)
-    matrix = matrix_from_transform(sent.transform, "tf")
-    np.testing.assert_allclose(matrix[:3, :3], similarity.rotation, atol=1e-12)
-    np.testing.assert_allclose(matrix[:3, 3], similarity.translation)
-
-
-def test_it_is_broadcast_latched_where_tf2_msgs_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    import sys
-    from types import ModuleType
-
-    sent: list[Any] = []
-
-    class Node:
-        def create_publisher(self, kind: Any, topic: str, quality: Any) -> Any:
-            assert topic == "/tf_static" and quality.durability.name == "TRANSIENT_LOCAL"
-            return SimpleNamespace(publish=sent.append)
-
-        def destroy_publisher(self, publisher: Any) -> None:
-            sent.clear()
-
-    def message(transforms: list[Any]) -> list[Any]:
-        return transforms
-
-    module: Any = ModuleType("tf2_msgs.msg")
-    module.TFMessage = message
-    monkeypatch.setitem(sys.modules, "tf2_msgs", ModuleType("tf2_msgs"))
-    monkeypatch.setitem(sys.modules, "tf2_msgs.msg", module)
-    frame = SceneFrame(Node(), "map", "scene")
-    frame.publish(ASIDE, Time())
-    assert [one.child_frame_id for (one,) in sent] == ["scene"]
-    frame.close()
-    assert not sent
-    SceneFrame(Node(), "map", "").publish(ASIDE, Time())
-    assert not sent
