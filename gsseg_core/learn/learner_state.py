@@ -44,6 +44,8 @@ from gsseg_core.text import clipped, quoted
 FORMAT, WHOLE_RAYS = "gsseg-state-2", "gsseg-state-1"
 """What states say that they are: of this version; and of those whose rays went on behind surfaces."""
 
+_FORMATS = FORMAT, WHOLE_RAYS
+
 OBJECTS_OF_ONE_SESSION = "holds objects that its own session found and numbered (ids per-view)"
 """What errors say of a state with `per_view`, where classes are expected that mean the same to others."""
 
@@ -95,7 +97,7 @@ class State:
             The file cannot be written; an earlier one is unchanged.
         """
         path = Path(path)
-        check_replaceable(path, "saved state", npz_format(path) in (FORMAT, WHOLE_RAYS))
+        check_replaceable(path, "saved state", npz_format(path) in _FORMATS)
         seen = np.flatnonzero(self.votes.any(axis=1))
         header: dict[str, Any] = {
             "format": WHOLE_RAYS if self.whole_rays else FORMAT,
@@ -124,7 +126,7 @@ class State:
         with write_atomically(path) as temporary, open(temporary, "wb") as file:
             # Without allow_pickle=False, which NumPy 1.26 would take for one more array.
             np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
-            check_replaceable(path, "saved state", npz_format(path) in (FORMAT, WHOLE_RAYS))  # To save takes long.
+            check_replaceable(path, "saved state", npz_format(path) in _FORMATS)  # To save takes long.
 
     @classmethod
     def load(
@@ -146,7 +148,7 @@ class State:
             The file lies outside `within`.
         """
         path = Path(path)
-        with open_npz(path, "a saved state", (FORMAT, WHOLE_RAYS), None if first else digest, within) as (file, header):
+        with open_npz(path, "a saved state", _FORMATS, None if first else digest, within) as (file, header):
             living = living_files.read(file, header)
             if first is not None and header.get("scene") == first.scene.digest:
                 living = living or first
@@ -159,7 +161,7 @@ class State:
     @classmethod
     def load_alone(cls, path: str | os.PathLike[str]) -> tuple[str, State]:
         """Read a state without its scene: the scene's digest, and the state; raises `StateFileError` as `load` does."""
-        with open_npz(Path(path), "a saved state", (FORMAT, WHOLE_RAYS), None) as (file, header):
+        with open_npz(Path(path), "a saved state", _FORMATS, None) as (file, header):
             living = living_files.read(file, header)
             n, k = (whole_number(side, "a side of the votes", 1, LIMITS.max_gaussians) for side in header["shape"])
             if 8 * n * k > LIMITS.max_npz_bytes or (living is not None and len(living) != n):

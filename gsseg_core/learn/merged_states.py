@@ -72,8 +72,9 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
     num_fused = sum(one.state.num_fused for one in saved)
     class_names = dict(sorted(names.items()))
     # One state alone stays of its kind.
-    merged = replace(first.state, votes=votes, views=[*views.values()], num_fused=num_fused)
-    return replace(merged, class_names=class_names, learnt=None)
+    return replace(
+        first.state, votes=votes, views=[*views.values()], num_fused=num_fused, class_names=class_names, learnt=None
+    )
 
 
 def _add_names(names: dict[int, str], one: Saved) -> None:

@@ -25,15 +25,16 @@ def votes_cast_anew(
     Votes of views that are not kept stay as they are. What the kept ones had cast is taken from the sum; it is not what
     was added bit for bit, so of a vote that nobody else has cast nothing is left.
     """
-    left, anew, taken = state.votes.copy(), np.zeros_like(state.votes), np.zeros(state.votes.shape, np.float32)
     all_kept = state.num_fused == len(state.views)
+    left = np.zeros_like(state.votes) if all_kept else state.votes.copy()
+    anew, taken = np.zeros_like(state.votes), np.zeros(state.votes.shape, np.float32)
     for view in state.views:
         operator = operator_of(view)
         seen = used(view.read_seen(), operator)
         operator.vote(*seen, anew, units)
         if not all_kept:
             _take(left, taken, operator, seen, units)
-    left[all_kept | (np.abs(left) <= _ROUNDING * taken)] = 0
+    left[np.abs(left) <= _ROUNDING * taken] = 0
     return left + anew
 
 
