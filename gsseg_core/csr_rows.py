@@ -81,6 +81,11 @@ class CSRRows(NamedTuple):
         _normalise(self)
         return self
 
+    def sums(self) -> np.ndarray:
+        """Sum of each row of whole numbers, (N,) int64."""
+        ends = starts(self.data)[self.indptr]
+        return np.asarray(ends[1:] - ends[:-1])
+
     def nonzero(self) -> CSRRows:
         """Drop entries that have become zero."""
         kept = self.data != 0

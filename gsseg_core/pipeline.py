@@ -39,7 +39,7 @@ from gsseg_core.learn.prepared_views import default_budget
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.objects.object_table import ObjectTable, find_objects
 from gsseg_core.progress import Progress, Stopwatch, silent, with_progress
-from gsseg_core.refine.label_propagation import GraphSettings, propagate, scarce_evidence
+from gsseg_core.refine.label_propagation import UNKNOWN, GraphSettings, propagate
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.report.findings import Evidence
 from gsseg_core.report.page import load_templates, write_report_page
@@ -185,15 +185,17 @@ def segment(
                 with watch.stage("associate"):
                     inputs = _associate(inputs, device, progress)
             run.claim(settings.places(inputs.class_names, inputs.pictured))
-            fitted, evidence = _learn(inputs, settings, client, watch, progress)
+            fitted = _learn(inputs, settings, client, watch, progress)
             assessment = _assess(fitted, inputs.class_names, watch, progress)
-        codes, graph_settings = fitted.codes_, None if evidence is None else settings.graph
-        settings = replace(settings, graph=graph_settings, learner_settings=getattr(fitted, "settings", None))
+        codes, evidence = fitted.codes_, fitted.evidence()
+        spreads = settings.graph if assessment.calibration.unknown > UNKNOWN else None
+        settings = replace(settings, graph=spreads, learner_settings=getattr(fitted, "settings", None))
         del fitted  # Its votes take as much memory as all that follows.
         with watch.stage("refine"):
-            if evidence is not None:
+            if settings.graph:
                 codes = propagate(graph_of(inputs.scene), codes, evidence)
-            result = Segmentation.from_codes(inputs.scene, codes, inputs.class_names, settings.refine, copy=False)
+            names = inputs.class_names
+            result = Segmentation.from_codes(inputs.scene, codes, names, settings.refine, evidence, copy=False)
             del codes
         drawn: dict[str, Drawn] = {}
         if settings.refine.carve:
@@ -265,8 +267,8 @@ def _associate(inputs: Inputs, device: str, progress: Progress) -> Inputs:
 
 def _learn(
     inputs: Inputs, settings: RunSettings, client: Client | None, watch: Stopwatch, progress: Progress
-) -> tuple[Learner, np.ndarray | None]:
-    """Fit the learner that the settings name to the train views; beside it, (N,) px, evidence to spread codes by."""
+) -> Learner:
+    """Fit the learner that the settings name to the train views."""
     with watch.stage("observe"):
         learner = make_learner(
             settings.learner, inputs.scene, max(inputs.class_names) + 1, seed=settings.seed, device=settings.device,
@@ -274,7 +276,6 @@ def _learn(
         )  # fmt: skip
         learner.observe_all([view.smaller(QUALITIES[settings.quality]) for view in inputs.train], progress)
     with watch.stage("learn"):
-        evidence = scarce_evidence(inputs.scene, learner.evidence(), settings.refine.k) if settings.graph else None
         try:
             learner.fit(progress)
         except NoUsableViewsError as error:
@@ -282,7 +283,7 @@ def _learn(
             hint = FRAME_HINT if why == {SEES_NOTHING} else ""
             hint = mask_hint(inputs.root, settings.labels, names) if why == {NO_MASK} else hint
             raise NoUsableViewsError(f"{inputs.root}: {error}{hint}") from error
-    return learner, evidence
+    return learner
 
 
 def _assess(learner: Learner, class_names: Mapping[int, str], watch: Stopwatch, progress: Progress) -> Assessment:

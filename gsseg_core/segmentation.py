@@ -104,6 +104,7 @@ class Segmentation:
         codes: np.ndarray,
         class_names: Mapping[int, str],
         settings: RefineSettings | None = None,
+        evidence: np.ndarray | None = None,
         copy: bool = True,
     ) -> Segmentation:
         """Refine learnt codes by their neighbours, and label every Gaussian by its largest entry.
@@ -119,30 +120,35 @@ class Segmentation:
             Classes without a name get one like "class_07".
         settings : RefineSettings, optional
             Without the filter by default. What needs views is left to `carved`.
+        evidence : (N,) float32, optional
+            Px that each code stands on, `Learner.evidence`: neighbours weigh by it; else all weigh the same.
         copy : bool
             Whether the codes stay as they are; else they are changed, and no memory is taken for others.
         """
         settings = settings or RefineSettings()
         codes = np.array(codes, np.float32, order="C") if copy else np.ascontiguousarray(codes, np.float32)
-        if codes.ndim != 2 or len(codes) != len(scene):
-            raise StateMismatchError(f"codes are {codes.shape}; expected ({len(scene)}, K), of the scene that is given")
+        n, px = len(scene), np.zeros(len(scene)) if evidence is None else evidence
+        if codes.ndim != 2 or len(codes) != n or px.shape != (n,):
+            raise StateMismatchError(f"codes are {codes.shape}, evidence {px.shape}; expected ({n}, K) and ({n},)")
         check_shares("codes", codes, SettingsError)
-        result = cls.unfiltered(scene, codes, class_names, settings)
+        result = cls.unfiltered(scene, codes, class_names, settings, evidence)
         return result.filtered(scene, settings) if settings.filter else result
 
     @classmethod
     def unfiltered(
-        cls, scene: GaussianScene, codes: np.ndarray, class_names: Mapping[int, str], settings: RefineSettings
-    ) -> Segmentation:
+        cls, scene: GaussianScene, codes: np.ndarray, class_names: Mapping[int, str], settings: RefineSettings,
+        evidence: np.ndarray | None = None,
+    ) -> Segmentation:  # fmt: skip
         """Label learnt codes (N, K), after KNN clustering unless that is off, and leave the filter to the caller.
 
-        The codes, contiguous float32, become the probabilities: they are taken over, and changed.
+        The codes, contiguous float32, become the probabilities: they are taken over, and changed. Evidence is (N,) px.
         """
         names = {k: class_name(class_names, k) for k in range(codes.shape[1])}
         clustered, learnt = np.zeros(len(codes), bool), codes[:0].copy()
         if settings.cluster:
             observed, neighbours = largest(codes)[0] > 0, neighbours_of(scene, settings.k)
-            clustered, learnt = cluster_in_place(scene.means, codes, observed, settings.k, settings.beta, neighbours)
+            px, means = evidence if settings.weigh else None, scene.means
+            clustered, learnt = cluster_in_place(means, codes, observed, settings.k, settings.beta, neighbours, px)
         _, labels = largest(codes)  # -1, which is UNOBSERVED, where nothing is known
         return cls(labels, codes, names, scene.digest, clustered, learnt, ids=scene.ids)
 

@@ -74,8 +74,9 @@ def run(options: argparse.Namespace) -> int:
 
     outer = None if options.no_filter else options.refine
     refine = RefineSettings(
-        k=options.k, beta=options.beta, cluster=not options.no_knn, filter=outer == "paper", carve=outer == "carve"
-    )
+        k=options.k, beta=options.beta, weigh=options.refine != "paper", cluster=not options.no_knn,
+        filter=outer == "paper", carve=outer == "carve",
+    )  # fmt: skip
     load_kernels(options.quiet, options.device)
     with progress_bars(options.quiet) as progress:
         report = pipeline.segment(

@@ -22,11 +22,12 @@ class Calibration(NamedTuple):
     temperature: float  # for `Segmentation.calibrated`
     views: int  # whose masks it was fitted to
     pixels: int  # of these
+    unknown: float  # share of their labelled pixels of which little is predicted, and that were left out
     held_out: bool  # whether the masks were predicted without learning from them
 
     def as_dict(self) -> dict[str, Any]:
         """Give it as `report.json` does."""
-        return {**self._asdict(), "temperature": round(self.temperature, 4)}
+        return {**self._asdict(), "temperature": round(self.temperature, 4), "unknown": round(self.unknown, 4)}
 
 
 def calibrate(learner: Learner, checker: MaskChecker | None = None, progress: Progress = silent) -> Calibration:
@@ -36,5 +37,6 @@ def calibrate(learner: Learner, checker: MaskChecker | None = None, progress: Pr
     """
     views, checker = spread(list(learner.views.values()), VIEWS), checker or MaskChecker(learner)
     samples = [checker.sample(view) for view in with_progress(progress, "calibrate", views)]
-    pixels = sum(len(sample.seen) for sample in samples)
-    return Calibration(fit_temperature(samples), len(views), pixels, learner.leaves_out)
+    pixels, unknown = (sum(counts) for counts in zip(*((len(one.seen), one.unknown) for one in samples), strict=True))
+    share = unknown / max(pixels + unknown, 1)
+    return Calibration(fit_temperature(samples), len(views), pixels, share, learner.leaves_out)

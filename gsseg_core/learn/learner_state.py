@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -62,6 +62,12 @@ class Learnt:
     codes: np.ndarray  # (N, K) float32: class probabilities; a row of zeros where no labelled pixel saw the Gaussian
     num_views: int  # that it learnt from
     temperature: float = 1.0  # at which the codes are probabilities, see `gsseg_core.learn.calibrate`
+    evidence: np.ndarray | None = None  # (N,) float32: px that the codes stand on; an older state does not say
+
+    def carried(self, carry: Callable[[np.ndarray], np.ndarray]) -> Learnt:
+        """Take it along as a scene changes: `carry` does that to the rows of an array."""
+        evidence = None if self.evidence is None else carry(self.evidence)
+        return replace(self, codes=carry(self.codes), evidence=evidence)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,8 +117,10 @@ class State:
             header["ids"] = PER_VIEW
         arrays = {"seen": seen.astype(np.int64), "votes": self.votes[seen]}
         if self.learnt is not None:
-            header["learnt"] = {name: value for name, value in vars(self.learnt).items() if name != "codes"}
+            header["learnt"] = {name: getattr(self.learnt, name) for name in ("learner", "num_views", "temperature")}
             arrays["codes"] = self.learnt.codes
+            if self.learnt.evidence is not None:
+                arrays["evidence"] = self.learnt.evidence
         if self.living is not None:
             header["frames"] = living_files.frame_entries(self.living)
             arrays |= living_files.arrays(self.living)
@@ -193,7 +201,7 @@ class State:
                 raise UnfitError(f"array codes is of {codes.shape[1]} classes; expected 1 to {k}")
             check_shares("codes", codes)
             num_views = whole_number(entry["num_views"], "num_views of what was learnt", 0, _MOST_VIEWS)
-            learnt = Learnt(str(entry["learner"]), codes, num_views, temperature_of(entry))
+            learnt = Learnt(str(entry["learner"]), codes, num_views, temperature_of(entry), _read_px(file, n))
         names, per_view, whole = class_names_of(header), header.get("ids") == PER_VIEW, header["format"] == WHOLE_RAYS
         return cls(votes, views, num_fused, names, learnt, living, per_view, whole)
 
@@ -222,6 +230,16 @@ def _read_votes(file: NpzArrays, shape: tuple[int, int], num_kept: int, num_fuse
     votes = np.zeros(shape, np.int64)
     votes[seen] = given
     return votes
+
+
+def _read_px(file: NpzArrays, num_gaussians: int) -> np.ndarray | None:
+    """Read the evidence of what was learnt, (N,) float32, unless a version that did not keep it saved the state."""
+    if "evidence" not in file.names:
+        return None
+    evidence = file.expect("evidence", np.float32, (num_gaussians,))
+    if not (evidence >= 0).all() or not np.isfinite(evidence).all():
+        raise UnfitError("array evidence holds what is no number of px; expected finite ones, 0 or more")
+    return evidence
 
 
 def _read_view(file: NpzArrays, i: int, entry: dict[str, Any], num_classes: int) -> View:

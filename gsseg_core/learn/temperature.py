@@ -84,6 +84,7 @@ class Sample(NamedTuple):
 
     shares: np.ndarray  # (P, C) float32: of the C classes that occur in the prediction or the mask; rows sum to 1
     seen: np.ndarray  # (P,) int64: label of each pixel, as its column in `shares`, ascending
+    unknown: int  # pixels with a label of which little is predicted, and which are left out
 
 
 def grid_of(height: int, width: int) -> PixelGrid:
@@ -101,14 +102,15 @@ def sample_grid(image: np.ndarray, labels: np.ndarray) -> Sample:
     are those of `grid_of`.
     """
     shares, seen = image.reshape(-1, image.shape[2]), labels.ravel()
-    total = shares.sum(axis=1)
-    known = np.flatnonzero((seen >= 0) & (total > 0.5))
+    total, labelled = shares.sum(axis=1), seen >= 0
+    known = np.flatnonzero(labelled & (total > 0.5))
+    unknown = int(labelled.sum()) - len(known)
     known = known[np.argsort(seen[known], kind="stable")]
     shares, seen = shares[known] / total[known, None], seen[known]
     occurs = shares.max(axis=0, initial=0) > 1e-6
     occurs[seen] = True
     columns = np.flatnonzero(occurs)
-    return Sample(np.ascontiguousarray(shares[:, columns]), np.searchsorted(columns, seen))
+    return Sample(np.ascontiguousarray(shares[:, columns]), np.searchsorted(columns, seen), unknown)
 
 
 def fit_temperature(samples: Sequence[Sample]) -> float:

@@ -151,7 +151,7 @@ class LivingSession(LiveSession):
         if self._first is self._living:
             self._first = without_colours(self._living)
         if self._learnt is not None:
-            self._learnt = replace(self._learnt, codes=change.carry(self._learnt.codes))
+            self._learnt = self._learnt.carried(change.carry)
         self._past[self.scene] = np.arange(len(before))
         for scene, places in self._past.items():
             self._past[scene] = np.where(origin >= 0, places[origin], -1)
@@ -216,7 +216,7 @@ class LivingSession(LiveSession):
         scene = self.scene
 
         def carry(learnt: Learnt) -> Learnt:
-            return learnt if scene is self.scene else replace(learnt, codes=carried(learnt.codes, self._past[scene]))
+            return learnt if scene is self.scene else learnt.carried(lambda rows: carried(rows, self._past[scene]))
 
         return carry
 
@@ -231,7 +231,7 @@ class LivingSession(LiveSession):
         change = SceneChange(saved, self._living, self._places_in(saved, path))
         gone = {group for group in saved.frames if group not in self._living.frames or change.has_flattened(group)}
         votes.change(change, {view.name: None for view in state.views if view.group in gone})
-        learnt = state.learnt and replace(state.learnt, codes=change.carry(state.learnt.codes))
+        learnt = state.learnt and state.learnt.carried(change.carry)
         now = votes.state()
         return replace(state, votes=now.votes, views=now.views, living=now.living, learnt=learnt, whole_rays=False)
 

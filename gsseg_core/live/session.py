@@ -20,6 +20,7 @@ from gsseg_core.learn.learner_state import OBJECTS_OF_ONE_SESSION, Learnt, State
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.class_numbers import add_names, ids_by_name, most_classes, require_affordable
+from gsseg_core.live.current_codes import current_codes, current_evidence
 from gsseg_core.live.fitting import Report, check_names_of, fitted, names_with, num_classes_with
 from gsseg_core.live.results import SCENE_CHANGED, Outcome, Rejection
 from gsseg_core.progress import Stopwatch
@@ -238,11 +239,7 @@ class LiveSession:
         with self._lock:
             if not self.has_codes:
                 raise NoCodesError("no view has been fused and nothing learnt; expected at least one posed mask")
-            codes, learnt = self._live.vote_codes(), self._learnt
-        if learnt is not None:
-            known = learnt.codes.any(axis=1)
-            codes[known] = np.pad(learnt.codes[known], ((0, 0), (0, codes.shape[1] - learnt.codes.shape[1])))
-        return codes
+            return current_codes(self._live, self._learnt)
 
     def segmentation(self, settings: RefineSettings | None = None, watch: Stopwatch | None = None) -> Segmentation:
         """Refine the class probabilities and label every Gaussian; kept until they or the settings change.
@@ -264,9 +261,9 @@ class LiveSession:
             # Those of a dataset's views and of those that are kept; a state without either has nothing carved.
             cameras = [*self._cameras, *(view.camera for view in self._posed_views())]
             with watch.stage("codes"):
-                codes = self.codes()
+                codes, evidence = self.codes(), current_evidence(self._live, self._learnt)
         with watch.stage("knn"):
-            result = Segmentation.unfiltered(scene, codes, names, settings)
+            result = Segmentation.unfiltered(scene, codes, names, settings, evidence)
         if settings.filter:
             with watch.stage("filter"):
                 result = result.filtered(scene, settings)

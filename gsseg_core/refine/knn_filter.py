@@ -11,7 +11,7 @@ import numpy as np
 from gsseg_core.csr_rows import CSRRows, largest
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.spatial.class_distances import class_distances
-from gsseg_core.spatial.neighbourhood import Neighbours
+from gsseg_core.spatial.neighbourhood import Neighbours, neighbour_weights
 
 
 def cluster_in_place(
@@ -21,6 +21,7 @@ def cluster_in_place(
     k: int = RefineSettings.k,
     beta: float = RefineSettings.beta,
     neighbours: Neighbours | None = None,
+    evidence: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Give every unsure and every unobserved Gaussian the mean code of the observed ones among its k nearest.
 
@@ -43,6 +44,9 @@ def cluster_in_place(
         Threshold of the largest probability.
     neighbours : Neighbours, optional
         Those of `means` for this k, if they are known already.
+    evidence : array (N,) of float, optional
+        Px that each code stands on, for `gsseg_core.spatial.neighbourhood.neighbour_weights`. Without, as in the paper,
+        all observed ones weigh the same.
 
     Returns
     -------
@@ -62,7 +66,8 @@ def cluster_in_place(
     if len(means) < 2 or not wanted.any() or not observed.any():
         return np.zeros(len(codes), bool), np.empty((0, codes.shape[1]), np.float32)
     known, before = neighbours or Neighbours.among(means, k), CSRRows.from_dense(codes)
-    changed = known.average_into(codes, before, observed, wanted)
+    weights = observed if evidence is None else neighbour_weights(observed, evidence)
+    changed = known.average_into(codes, before, weights, wanted)
     return changed, before.take(np.flatnonzero(changed)).dense(codes.shape[1])
 
 

@@ -22,17 +22,18 @@ import numpy as np
 from gsseg_core.csr_rows import largest
 from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.kernels.compiler import kernel
-from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.simd import LANES, add_scaled, apart, divided, empty_rows, load_row, nothing, prefetch, store_row
 from gsseg_core.spatial.knn import CHUNK
 from gsseg_core.spatial.neighbour_graph import NEIGHBOURS, Graph
-from gsseg_core.spatial.neighbourhood import list_nearest
 
 SETTLED = np.float32(1e-3)
 """A Gaussian is left alone while no probability around it changes by more than this in a step."""
 
-SCARCE = 1 / 6
-"""Share of Gaussians seen with less px than all neighbours count, from which on the graph is worth its time."""
+UNKNOWN = 1 / 100
+"""Share of each view's labelled pixels that all other views leave unknown, from which on the graph is worth its time.
+
+docs/few_views.md has what it gives on either side of this.
+"""
 
 NEVER = 2**31 - 1
 
@@ -53,22 +54,6 @@ class GraphSettings:
             raise SettingsError(f"graph: k is {self.k}, steps {self.steps}; expected at least 1 and 0")
         if not 0 <= self.strength < float("inf"):
             raise SettingsError(f"graph: strength is {self.strength} px; expected 0 or more, finite")
-
-
-def is_scarce(evidence: np.ndarray) -> bool:  # (N,) px
-    """Tell whether evidence is scarce in enough of a scene for the graph to matter.
-
-    Of what is seen often it changes nothing, yet takes as long to build; docs/few_views.md has figures of both cases.
-    """
-    return len(evidence) > 0 and float((evidence < GraphSettings.strength).mean()) > SCARCE
-
-
-def scarce_evidence(scene: GaussianScene, evidence: np.ndarray, k: int) -> np.ndarray | None:  # (N,) px
-    """Give evidence to `propagate` by, if it is scarce; then whoever looks for all k nearest lists the graph's, too."""
-    if not is_scarce(evidence):
-        return None
-    list_nearest(scene, k, GraphSettings.k)
-    return evidence
 
 
 def propagate(

@@ -22,6 +22,8 @@ class RefineSettings:
     filter_sigmas : float
         A Gaussian is removed where its mean neighbour distance is more than this many standard deviations, 0 or more,
         above the mean of its class.
+    weigh : bool
+        Whether neighbours weigh by how well they were seen, where that is known; not in the paper.
     cluster, filter : bool
         Whether to take each of the paper's two steps, KNN clustering and the statistical filter.
     carve : bool
@@ -39,6 +41,7 @@ class RefineSettings:
     k: int = 50
     beta: float = 0.65
     filter_sigmas: float = 1.0
+    weigh: bool = True
     cluster: bool = True
     filter: bool = False
     carve: bool = True
@@ -58,7 +61,7 @@ class RefineSettings:
             raise SettingsError("refinement: found both carve and filter; expected one of them")
 
 
-PAPER = RefineSettings(filter=True, carve=False)
+PAPER = RefineSettings(weigh=False, filter=True, carve=False)
 """KNN clustering and the statistical filter."""
 
 UNREFINED = RefineSettings(cluster=False, carve=False)

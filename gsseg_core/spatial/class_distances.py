@@ -46,7 +46,7 @@ def class_distances(neighbours: Neighbours, labels: np.ndarray, num_classes: int
         # Where other classes are among the neighbours, more of its own are looked for, farther away.
         if len(members) > 1 and len(mixed):
             places, nearest = members[mixed], min(k, len(members) - 1)
-            radii[places], found[places] = knn.nearest(tree.part(members), mixed, nearest, 0)[:2]
+            radii[places], found[places] = knn.nearest(tree.part(members), mixed, nearest, False)[:2]
     neighbours.by_class[:] = [Found(of_point, radii, found)]
     out = np.empty(len(labels))
     out[tree.order] = found

@@ -29,7 +29,6 @@ LEAST = np.finfo(np.float32).tiny  # a bound that even points in one place are b
 class Lists(NamedTuple):
     """The nearest others of M points, one point after the other."""
 
-    radii: np.ndarray  # (M,) float32: squared distance to the last of them
     counts: np.ndarray  # (M,) int64: how many of each point are listed
     room: np.ndarray  # (M most,) int32: their places, those of each chunk of points from CHUNK * most on
 
@@ -45,28 +44,25 @@ class Lists(NamedTuple):
 
 
 @kernel(parallel=True)
-def nearest(tree: Tree, places: np.ndarray, k: int, listed: int) -> tuple[np.ndarray, np.ndarray, Lists]:
+def nearest(tree: Tree, places: np.ndarray, k: int, listed: bool) -> tuple[np.ndarray, np.ndarray, Lists]:
     """Find the squared distance to the k-th nearest other point, (M,) float32, and the mean of the k, (M,) float64.
 
     They are looked for from the points at ascending places, (M,) int32. By the triangle inequality the radius of one
     point bounds those of all others in its leaf.
 
-    If so many of them, at most k, are to be `listed`, these are told, too, and with those tied for the last place up to
-    twice as many. If all are, no means are told.
+    If they are to be `listed`, these are told in place of the means, with those tied for the last place up to twice as
+    many.
     """
     points, boxes = tree.points, tree.boxes
-    m, n, leaves, most = places.shape[0], points.shape[1], boxes.shape[0] // 2, 2 * listed
-    radii, distances = np.empty(m, np.float32), np.empty(m if listed < k else 0, np.float64)
+    m, n, leaves, most = places.shape[0], points.shape[1], boxes.shape[0] // 2, 2 * k if listed else 0
+    radii, distances = np.empty(m, np.float32), np.empty(0 if listed else m, np.float64)
     bits, skip = radii.view(np.int32), np.empty(0, np.int32)
-    of_listed = np.empty(m if listed > 0 else 0, np.float32)
-    listed_bits = of_listed.view(np.int32)
-    counts = np.zeros(len(of_listed), np.int64)
-    room = np.empty(len(of_listed) * most, np.int32)  # of which what no list fills is not touched
+    counts = np.zeros(m if listed else 0, np.int64)
+    room = np.empty(m * most, np.int32)  # of which what no list fills is not touched
     for chunk in nb.prange((m + CHUNK - 1) // CHUNK):
         gaps, close, candidates = np.empty(DEPTH, np.float32), np.empty(3 * k + 2 * LEAF, np.float32), scratch_for(128)
-        box, both = np.empty(6, np.float32), np.empty((4, LEAF), np.float32)
-        bounds, near_bounds = both[:2], both[2:]
-        bound_bits, near_bound_bits = bounds.view(np.int32), near_bounds.view(np.int32)
+        box, bounds = np.empty(6, np.float32), np.empty((2, LEAF), np.float32)
+        bound_bits = bounds.view(np.int32)
         before, first, end = -1, chunk * CHUNK, chunk * CHUNK * most
         while first < min((chunk + 1) * CHUNK, m):
             last = end_of_group(tree, places, first)
@@ -77,9 +73,6 @@ def nearest(tree: Tree, places: np.ndarray, k: int, listed: int) -> tuple[np.nda
             found = _search(points, boxes, own, k, bound, close, candidates.nodes, gaps)
             bits[middle] = _smallest_of(close, found, k)
             reach = _bound(points, places, first, last, middle, radii[middle], bounds)
-            if listed > 0:
-                listed_bits[middle] = _smallest_of(close, found, listed)
-                _bound(points, places, first, last, middle, of_listed[middle], near_bounds)
             candidates, found = find_leaves(boxes, box, reach, skip, np.int32(0), candidates)
             near = candidates.near.reshape(-1)
             near_bits = near.view(np.int32)
@@ -88,15 +81,13 @@ def nearest(tree: Tree, places: np.ndarray, k: int, listed: int) -> tuple[np.nda
                 rows = measure(tree, own, bounds[1, q - first], found, candidates)
                 _leave_out(own, leaf_of(own, leaves, n), leaves, n, rows, candidates)
                 bits[q] = _smallest(near_bits, rows, k, bound_bits[0, q - first], bound_bits[1, q - first])
-                if listed < k:
-                    distances[q] = _mean_root(near, LEAF * rows, k, radii[q])
-                if listed > 0:
-                    low, high = near_bound_bits[0, q - first], min(near_bound_bits[1, q - first], bits[q])
-                    listed_bits[q] = bits[q] if listed == k else _smallest(near_bits, rows, listed, low, high)
-                    counts[q] = _list(candidates, rows, of_listed[q], leaves, n, room[end : end + most])
+                if listed:
+                    counts[q] = _list(candidates, rows, radii[q], leaves, n, room[end : end + most])
                     end += counts[q]
+                else:
+                    distances[q] = _mean_root(near, LEAF * rows, k, radii[q])
             before, first = middle, last
-    return radii, distances, Lists(of_listed, counts, room)
+    return radii, distances, Lists(counts, room)
 
 
 @called_by_kernels

@@ -20,8 +20,7 @@ from gsseg_core.kernels.compiler import kernel
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 from gsseg_core.spatial.kd_tree import Tree, scaled, tree_of
-from gsseg_core.spatial.knn import Lists, nearest
-from gsseg_core.spatial.neighbourhood import take_lists
+from gsseg_core.spatial.knn import nearest
 
 _PARTS = 16  # of many numbers, that are counted beside each other
 _HALF = 16  # bits of a float32
@@ -41,20 +40,19 @@ class Graph:
 
     @classmethod
     def build(
-        cls, means: np.ndarray, colors: np.ndarray, k: int = NEIGHBOURS, tree: Tree | None = None,
-        lists: Lists | None = None,
+        cls, means: np.ndarray, colors: np.ndarray, k: int = NEIGHBOURS, tree: Tree | None = None
     ) -> Graph:  # fmt: skip
         """Link points, (N, 3) float32 as their colours are, with their k nearest others, or with all there are.
 
-        The tree, if one is at hand, is that of the scaled points, and the lists are those of all of them.
+        The tree, if one is at hand, is that of the scaled points.
         """
         if len(means) < 2:
             return cls(k, np.arange(len(means), dtype=np.int32), np.zeros(len(means) + 1, np.int64),
                        np.empty(0, np.int32), np.empty(0, np.float32))  # fmt: skip
         tree, num = tree or Tree.build(scaled(means)), min(k, len(means) - 1)
         # A thousand points in one place are all tied: without a limit, each would have a thousand neighbours.
-        lists = lists or nearest(tree, np.arange(len(means), dtype=np.int32), num, num)[2]
-        radii, indptr, indices = lists.radii, starts(lists.counts), lists.joined()
+        radii, _, lists = nearest(tree, np.arange(len(means), dtype=np.int32), num, True)
+        indptr, indices = starts(lists.counts), lists.joined()
         del lists
         contrast = _compare(np.ascontiguousarray(colors[tree.order], np.float32), indptr, indices)
         # Painted scenes have areas of one colour; where there is only one, it tells nothing.
@@ -71,7 +69,7 @@ def graph_of(scene: GaussianScene, k: int = NEIGHBOURS) -> Graph:
 
     def build() -> Graph:
         tree = tree_of(scene) if len(scene) else None
-        return Graph.build(scene.means, scene.colors(), k, tree, take_lists(scene, k))
+        return Graph.build(scene.means, scene.colors(), k, tree)
 
     return _KNOWN.of(scene, build, lambda known: known.k == k)
 

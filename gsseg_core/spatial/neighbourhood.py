@@ -30,6 +30,11 @@ from gsseg_core.spatial.kd_tree import LEAF, Tree, leaf_range, scaled, tree_of
 CODE_UNIT = 2.0**-24  # codes are summed in steps of this, which is the precision of a float32 near 1
 ROWS_AT_ONCE = 1 << 16  # points whose mean codes are written out at once
 
+HALF = 3.0
+"""Evidence in px by which a Gaussian weighs half as much for its neighbours as by any amount of it."""
+
+_LEAST_WEIGHT = np.float32(2.0**-10)  # of one with a code: where all have next to no evidence, something still counts
+
 
 class Found(NamedTuple):
     """Mean distances of points to others of their class, and what they go by; all arrays are (N,), in tree order."""
@@ -52,8 +57,6 @@ class Neighbours:
     tree: Tree  # the points, all arrays here being in its order
     radii: np.ndarray  # (N,) float32: squared distance to the k-th nearest other, NaN where nobody has asked for it
     distances: np.ndarray  # (N,) float64: mean distance to the k nearest others, both in units of the scaled points
-    listed: int = 0  # of the nearest, how many are to be listed once all points are looked for
-    lists: knn.Lists | None = field(default=None, repr=False)  # these
     by_class: list[Found] = field(default_factory=list, repr=False)  # What `class_distances` found last, if anything.
     _looking: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
@@ -72,20 +75,17 @@ class Neighbours:
             missing = np.isnan(self.radii)
             places = np.flatnonzero(missing if wanted is None else missing & wanted).astype(np.int32)
             if len(places):
-                listed = self.listed if len(places) == len(missing) and self.listed < self.k else 0
-                found = knn.nearest(self.tree, places, self.k, listed)
-                self.radii[places], self.distances[places] = found[:2]
-                self.lists, self.listed = (found[2] if listed else self.lists), 0
+                self.radii[places], self.distances[places], _ = knn.nearest(self.tree, places, self.k, False)
         return self
 
     def mean_codes(
         self,
         codes: CSRRows,  # N rows of K classes, float32 in [0, 1]
-        counted: np.ndarray,  # (N,) bool
+        weights: np.ndarray,  # (N,) float32 in [0, 1], or bool
         num_classes: int,
     ) -> CSRRows:
-        """Mean codes of those of the k nearest others that are counted, N rows; one without entries if none is."""
-        asked, means_of = self._asked(codes, counted, np.ones(len(counted), bool))
+        """Weighted mean codes of the k nearest others, N rows; one without entries where none weighs anything."""
+        asked, means_of = self._asked(codes, weights, np.ones(len(weights), bool))
         # A block at a time is written out in full, so that of all the codes only what is not zero is ever in memory.
         parts = []
         for first in range(0, len(asked), ROWS_AT_ONCE):
@@ -99,31 +99,41 @@ class Neighbours:
         self,
         out: np.ndarray,  # (N, K) float32
         codes: CSRRows,  # N rows of K classes, float32 in [0, 1]
-        counted: np.ndarray,  # (N,) bool
+        weights: np.ndarray,  # (N,) float32 in [0, 1], or bool
         wanted: np.ndarray,  # (N,) bool
     ) -> np.ndarray:
         """Replace the rows wanted by mean codes, as in `mean_codes`, where there are any; tell which, (N,) bool."""
-        asked, means_of = self._asked(codes, counted, wanted)
+        asked, means_of = self._asked(codes, weights, wanted)
         changed = np.zeros(len(out), bool)
         means_of(asked, self.tree.order[asked], out, changed)
         return changed
 
     def _asked(
-        self, codes: CSRRows, counted: np.ndarray, wanted: np.ndarray
+        self, codes: CSRRows, weights: np.ndarray, wanted: np.ndarray
     ) -> tuple[np.ndarray, Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], None]]:
         """Find the places in the tree that are wanted, and prepare `average` for all but its last four arguments."""
         order = self.tree.order
         selected = wanted[order]
         # In the order of the tree, neighbours lie beside each other.
-        ordered, counted = codes.take(order), counted[order]
-        read = np.repeat(counted, np.diff(ordered.indptr))
-        units = np.rint(ordered.data * np.float32(1 / CODE_UNIT), where=read, out=np.zeros_like(ordered.data))
-        rows = ordered.with_data(units.astype(np.int32))
+        ordered, weights = codes.take(order), weights[order]
+        units = np.repeat(weights * np.float32(1 / CODE_UNIT), np.diff(ordered.indptr))
+        np.multiply(units, ordered.data, where=units > 0, out=units)
+        rows, counted = ordered.with_data(np.rint(units, out=units).astype(np.int32)), weights > 0
         self.look_for(selected)
         empty = nodes_without(counted, len(self.tree.blocks))
         below = np.nextafter(self.radii, np.float32(-np.inf))
         means_of = partial(average, self.tree, rows, counted, empty, self.radii, below, self.k)
         return np.flatnonzero(selected).astype(np.int32), means_of
+
+
+def neighbour_weights(known: np.ndarray, evidence: np.ndarray) -> np.ndarray:  # (N,) bool, (N,) px
+    """Weigh Gaussians that have a code by how well each was seen, for means over neighbours: (N,) float32 in [0, 1).
+
+    It is the share of the code that its own evidence holds beside a spatial prior of `HALF` px: what is hardly seen is
+    known by its neighbours alone, and has nothing to tell them.
+    """
+    evidence = evidence.astype(np.float32)
+    return known * np.maximum(evidence / (evidence + np.float32(HALF)), _LEAST_WEIGHT)
 
 
 _KNOWN: PerScene[Neighbours] = PerScene()
@@ -135,21 +145,6 @@ def neighbours_of(scene: GaussianScene, k: int) -> Neighbours | None:
         return None
     k = min(k, len(scene) - 1)
     return _KNOWN.of(scene, lambda: Neighbours.among(scene.means, k, tree_of(scene)), lambda known: known.k == k)
-
-
-def list_nearest(scene: GaussianScene, k: int, listed: int) -> None:
-    """Have so many of the nearest Gaussians listed on the way when all are looked for, for `take_lists` to give."""
-    if (neighbours := neighbours_of(scene, k)) is not None:
-        neighbours.listed = listed
-
-
-def take_lists(scene: GaussianScene, listed: int) -> knn.Lists | None:
-    """Give the lists of a scene's Gaussians, if there are any of this length, and keep them no longer."""
-    known = _KNOWN.known(scene)
-    if known is None or known.lists is None or known.lists.most != 2 * listed:
-        return None
-    lists, known.lists = known.lists, None
-    return lists
 
 
 def find_neighbours(scene: GaussianScene, k: int) -> None:
@@ -175,7 +170,7 @@ def average(
     skip = np.empty(0, np.int32)
     for chunk in nb.prange((m + knn.CHUNK - 1) // knn.CHUNK):
         sums = np.empty((2, num_classes), np.int64)  # inside the radius, and on it
-        counts = np.empty((2, 2), np.int64)  # the same, and of these the ones that count
+        counts = np.empty(2, np.int64)  # the same
         box, candidates = np.empty(6, np.float32), knn.scratch_for(128)
         begin = chunk * knn.CHUNK
         while begin < min((chunk + 1) * knn.CHUNK, m):
@@ -197,12 +192,14 @@ def average(
                     near = load_row(candidates.near, h)
                     inside = at_most(near, below[own]) & others
                     tied = at_most(near, radii[own]) & others & ~inside
-                    _add(codes, counted, start, inside, sums[0], counts[0])
+                    counts[0] += _add(codes, counted, start, inside, sums[0])
                     if tied:
-                        _add(codes, counted, start, tied, sums[1], counts[1])
-                if counts[0, 1] + counts[1, 1] > 0:
-                    share = (k - counts[0, 0]) / counts[1, 0]
-                    total = (counts[0, 1] + share * counts[1, 1]) / CODE_UNIT
+                        counts[1] += _add(codes, counted, start, tied, sums[1])
+                # The k-th nearest lies on the radius, so that there is always one.
+                share, total = (k - counts[0]) / counts[1], 0.0
+                for c in range(num_classes):
+                    total += sums[0, c] + share * sums[1, c]
+                if total > 0:
                     changed[rows[q]] = True
                     for c in range(num_classes):
                         out[rows[q], c] = (sums[0, c] + share * sums[1, c]) / total
@@ -210,16 +207,17 @@ def average(
 
 
 @nb.njit(inline="always")
-def _add(codes: CSRRows, counted: np.ndarray, start: int, lanes: int, sums: np.ndarray, counts: np.ndarray) -> None:
-    """Add up the codes of some points of a leaf, by the bits of their lanes: of those that count."""
+def _add(codes: CSRRows, counted: np.ndarray, start: int, lanes: int, sums: np.ndarray) -> int:
+    """Add up the codes of some points of a leaf, by the bits of their lanes, where they count; tell how many it is."""
+    count = 0
     while lanes:
         place = start + first_bit(lanes)
         lanes &= lanes - 1
-        counts[0] += 1
+        count += 1
         if counted[place]:
-            counts[1] += 1
             for e in range(codes.indptr[place], codes.indptr[place + 1]):
                 sums[codes.indices[e]] += codes.data[e]
+    return count
 
 
 @kernel(parallel=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ from gsseg_core.data.class_names import class_ids
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.live.session import LiveSession
 from gsseg_core.objects.occupied_cells import OPAQUE, occupied_cells
-from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.refine.settings import PAPER
 from gsseg_core.scene.quaternions import half_axes
 from gsseg_ros.conversions import points_cloud
 from gsseg_ros.node.complaints import OBSTACLES, Complaints
@@ -104,7 +105,7 @@ class Obstacles:
 
     def _found(self, session: LiveSession, settings: Settings) -> Cells:
         """Find the cells, from what a request of ~/segment left at its defaults would publish now."""
-        refine = RefineSettings(k=settings.k, beta=settings.beta, filter=True, carve=False)
+        refine = replace(PAPER, k=settings.k, beta=settings.beta)
         result, place = session.segmentation(refine), settings.scene_to_map
         scene = session.scene_of(result)
         chosen = self._chosen(settings.obstacle_classes, result.class_names)

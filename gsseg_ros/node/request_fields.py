@@ -84,6 +84,7 @@ def refinement(request: Any, settings: Settings) -> RefineSettings:
     return RefineSettings(
         k=settings.k,
         beta=settings.beta,
+        weigh=outer != PAPER,
         cluster=not request.skip_refinement,
         filter=outer == PAPER,
         carve=outer == CARVE,

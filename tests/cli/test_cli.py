@@ -17,7 +17,7 @@ from small_scenes import look_at, many_classes, write_dataset
 from gsseg_core.cli.arguments import build_parser
 from gsseg_core.cli.main import main
 from gsseg_core.data.label_images import read_mask, write_mask
-from gsseg_core.learn.learner import Learner
+from gsseg_core.refine.label_propagation import UNKNOWN
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 
@@ -91,16 +91,17 @@ def test_the_other_learners_and_settings_can_be_chosen(place: Path, learner: str
     assert report["settings"]["refine"]["k"] == 9 and report["settings"]["refine"]["beta"] == 0.5
 
 
-def test_what_was_seen_of_each_gaussian_is_summed_once_and_only_for_the_graph(
-    place: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[Learner] = []
-    evidence = Learner.evidence
-    monkeypatch.setattr(Learner, "evidence", lambda learner: asked.append(learner) or evidence(learner))
-    assert main(segment(place, "--learner", "votes")) == 0
-    assert len(asked) == 1
-    assert main(segment(place, "--learner", "votes", "--no-graph")) == 0
-    assert len(asked) == 1
+@pytest.mark.parametrize("learner", ["votes", "em"])
+def test_codes_are_spread_where_views_leave_much_of_each_other_unknown(place: Path, learner: str) -> None:
+    def run(*options: str) -> tuple[float, bool]:
+        assert main(segment(place, "--learner", learner, *options)) == 0
+        report = json.loads((place / "out/report.json").read_text())
+        return report["calibration"]["unknown"], report["settings"]["graph"] is not None
+
+    for options, expected in ((["--views", "1"], True), (["--views", "1", "--no-graph"], False), ([], False)):
+        unknown, spread = run(*options)
+        assert (unknown > 0.5) if options else (unknown < UNKNOWN)
+        assert spread is expected
 
 
 def test_views_without_use_are_skipped_and_counted(place: Path, capsys: pytest.CaptureFixture[str]) -> None:

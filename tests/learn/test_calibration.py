@@ -46,7 +46,7 @@ def draw(probabilities: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def as_sample(shares: np.ndarray, seen: np.ndarray) -> Sample:
     order = np.argsort(seen, kind="stable")
-    return Sample(shares[order].astype(np.float32), seen[order])
+    return Sample(shares[order].astype(np.float32), seen[order], unknown=0)
 
 
 # The temperature
@@ -113,6 +113,14 @@ def test_pixels_are_sampled_evenly_and_not_too_many(shape: tuple[int, int]) -> N
     assert min(np.prod(shape) - 1, PIXELS / 16) <= len(sample.seen) <= PIXELS
     assert sample.shares.shape[1] == 3 and (sample.shares.argmax(axis=1) == sample.seen).all()
     assert (np.diff(sample.seen) >= 0).all()
+    assert sample.unknown == 0
+
+
+def test_labelled_pixels_of_which_little_is_predicted_are_left_out_and_counted() -> None:
+    labels = np.array([[0, 1, 2, UNKNOWN, UNKNOWN]])
+    image = np.eye(3, dtype=np.float32)[labels] * np.array([1, 0.4, 0.6, 1, 0.1], np.float32)[:, None]
+    sample = sample_grid(image, labels)
+    assert sample.seen.tolist() == [0, 1] and sample.unknown == 1
 
 
 # Learners

@@ -37,6 +37,7 @@ from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.constants import BLOCK
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.spatial.neighbourhood import neighbour_weights
 
 SCENE, TRUTH = balls_on_a_table()
 
@@ -69,7 +70,8 @@ def slow_em(
     distances = np.linalg.norm(scene.means[:, None].astype(np.float64) - scene.means, axis=2)
     np.fill_diagonal(distances, np.inf)
     nearest = np.argsort(distances, axis=1)[:, : settings.prior_k]
-    prior = settings.prior_weight * scaled(scaled(votes)[nearest].mean(axis=1))
+    weights = neighbour_weights(votes.any(axis=1), votes.sum(axis=1))[nearest]
+    prior = settings.prior_weight * scaled(np.einsum("nj,njk->nk", weights, scaled(votes)[nearest]))
     q = scaled(votes + prior)
 
     def estimated(v: int, counts: np.ndarray, otherwise: np.ndarray) -> np.ndarray:

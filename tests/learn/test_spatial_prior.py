@@ -15,7 +15,8 @@ from gsseg_core.data.view import View
 from gsseg_core.learn.em import em_learner
 from gsseg_core.learn.em.em_kernels import m_step
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
-from gsseg_core.learn.em.spatial_prior import with_prior
+from gsseg_core.learn.em.spatial_prior import spatial_prior, with_prior
+from gsseg_core.spatial.neighbourhood import HALF
 
 SCENE, TRUTH = balls_on_a_table()
 
@@ -23,9 +24,9 @@ SCENE, TRUTH = balls_on_a_table()
 class PriorOfVotes(EMLearner):
     """A learner whose prior stays what the votes of the neighbours say."""
 
-    def _spatial_prior(self, shares: CSRRows) -> CSRRows:
+    def _spatial_prior(self, of: CSRRows, evidence: np.ndarray) -> CSRRows:
         if not self.history_:
-            self._first = super()._spatial_prior(shares)
+            self._first = super()._spatial_prior(of, evidence)
         return self._first
 
 
@@ -89,3 +90,22 @@ def test_another_prior_keeps_what_was_learnt_and_brings_its_classes_with_the_nex
     np.testing.assert_array_equal(prior.dense(5), other)
     m_step(kept, gained, prior.data)
     np.testing.assert_array_equal(kept.dense(5) > 0, (shares > 0) | (other > 0))
+
+
+@given(st.integers(0, 2**31 - 1), st.integers(1, 20))
+@settings(max_examples=20)
+def test_the_better_a_neighbour_was_seen_the_more_it_counts_and_one_that_was_not_counts_nothing(
+    seed: int, k: int
+) -> None:
+    rng, n = np.random.default_rng(seed), len(SCENE)
+    codes = rng.dirichlet(np.full(NUM_CLASSES, 0.5), n).astype(np.float32)
+    evidence = rng.exponential(2.0, n) * (rng.random(n) < 0.7)
+    found = spatial_prior(CSRRows.from_dense(codes), evidence, SCENE, k, 3.0, NUM_CLASSES).dense(NUM_CLASSES)
+    means = SCENE.means.astype(np.float64)
+    for i in rng.choice(n, 20, replace=False):
+        distances = np.linalg.norm(means - means[i], axis=1)
+        distances[i] = np.inf
+        near = np.argsort(distances)[:k]
+        weights = np.maximum(evidence[near] / (evidence[near] + HALF), 2.0**-10) * (evidence[near] > 0)
+        expected = 3.0 * weights @ codes[near] / max(weights.sum(), 1e-9)
+        np.testing.assert_allclose(found[i], expected, atol=1e-3)

@@ -28,13 +28,16 @@ from gsseg_core.errors import (
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live import class_numbers
+from gsseg_core.live.current_codes import current_evidence
 from gsseg_core.live.living_session import LivingSession
 from gsseg_core.live.session import LiveSession
 from gsseg_core.refine.settings import UNREFINED, RefineSettings
+from gsseg_core.segmentation import Segmentation
 from gsseg_core.spatial.neighbourhood import neighbours_of
 
 SCENE, TRUTH = balls_on_a_table()
 VIEWS = clean_views(6)
+UNCARVED = RefineSettings(carve=False)
 
 
 def fed(session: LiveSession, views: list[View] = VIEWS) -> LiveSession:
@@ -208,6 +211,9 @@ def test_learning_gives_what_the_learner_gives_on_the_same_views() -> None:
     told: list[tuple[str, int, int, float]] = []
     outcome = session.learn(report=lambda *what: told.append(what))
     np.testing.assert_array_equal(outcome.learnt.codes, learner.codes_)
+    np.testing.assert_array_equal(outcome.learnt.evidence, learner.evidence())
+    refined = Segmentation.from_codes(SCENE, learner.codes_, NAMES, evidence=learner.evidence())
+    np.testing.assert_array_equal(session.segmentation(UNCARVED).labels, refined.labels)
     assert outcome.num_steps == len(learner.history_) and outcome.converged
     assert outcome.loss == -learner.history_[-1] and outcome.learnt.num_views == 8
     assert all(0 <= done <= total for _, done, total, _ in told) and math.isnan(told[0][3])
@@ -226,6 +232,34 @@ def test_after_learning_its_codes_hold_and_votes_speak_for_the_gaussians_that_it
     assert known.any() and not known.all() and (votes.any(axis=1) & ~known).any()
     np.testing.assert_array_equal(codes[known], learnt[known])
     np.testing.assert_array_equal(codes[~known], votes[~known])
+    evidence = current_evidence(session._live, session.learnt)
+    np.testing.assert_array_equal(evidence[known], session.learnt.evidence[known])
+    np.testing.assert_array_equal(evidence[~known], session._live.evidence()[~known])
+
+
+def test_what_an_older_version_has_learnt_comes_without_its_evidence_and_all_neighbours_weigh_the_same(
+    tmp_path: Path,
+) -> None:
+    session, restored = fed(LiveSession(SCENE, NAMES), wrong_views(8)), LiveSession(SCENE, NAMES)
+    learnt = session.learn().learnt
+    session.save(tmp_path / "state.npz")
+    restored.load(tmp_path / "state.npz")
+    np.testing.assert_array_equal(restored.learnt.evidence, learnt.evidence)
+    with np.load(tmp_path / "state.npz") as file:
+        arrays = {name: file[name] for name in file.files if name != "evidence"}
+    np.savez(tmp_path / "state.npz", **arrays)
+    restored.load(tmp_path / "state.npz")
+    assert restored.learnt.evidence is None
+    refined = Segmentation.from_codes(SCENE, learnt.codes, NAMES)
+    np.testing.assert_array_equal(restored.segmentation(UNCARVED).labels, refined.labels)
+    for wrong in (
+        np.full(len(SCENE), np.nan, np.float32),
+        np.full(len(SCENE), -1, np.float32),
+        np.zeros(3, np.float32),
+    ):
+        np.savez(tmp_path / "state.npz", **arrays, evidence=wrong)
+        with pytest.raises(StateFileError, match=r"state\.npz: .*array evidence .*expected"):
+            restored.load(tmp_path / "state.npz")
 
 
 def test_learning_from_a_folder_takes_its_train_views_and_its_names(tmp_path: Path) -> None:

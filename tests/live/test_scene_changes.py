@@ -144,9 +144,10 @@ def test_those_that_stay_keep_their_order_and_added_ones_come_behind_with_their_
 def test_what_was_learnt_goes_along_with_its_gaussians_also_while_it_is_learnt() -> None:
     growing = session()
     growing.learn("votes")
-    learnt = growing.codes()
+    learnt = growing.learnt
     growing.update(SceneDelta(removed=np.array([5])))
-    np.testing.assert_array_equal(growing.learnt.codes, np.delete(learnt, 5, axis=0))
+    np.testing.assert_array_equal(growing.learnt.codes, np.delete(learnt.codes, 5, axis=0))
+    np.testing.assert_array_equal(growing.learnt.evidence, np.delete(learnt.evidence, 5))
 
     def remove_once(*_: object) -> None:
         if 6 in growing.living.ids:

@@ -11,10 +11,8 @@ from hypothesis import strategies as st
 from gsseg_core.data.view import View
 from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.learn.em.em_learner import EMLearner
-from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, propagate, scarce_evidence
-from gsseg_core.spatial import neighbour_graph
+from gsseg_core.refine.label_propagation import GraphSettings, propagate
 from gsseg_core.spatial.neighbour_graph import Graph, _median, graph_of
-from gsseg_core.spatial.neighbourhood import find_neighbours, take_lists
 
 FEW = GraphSettings(k=4, steps=60)
 
@@ -156,36 +154,6 @@ def test_the_graph_of_a_scene_is_built_once() -> None:
     scene, _ = small_scenes.balls_on_a_table()
     assert graph_of(scene, 5) is graph_of(scene, 5)
     assert graph_of(scene, 6).k == 6
-
-
-def test_the_graph_takes_what_was_listed_when_all_neighbours_were_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene, _ = small_scenes.balls_on_a_table()
-    expected = graph_of(small_scenes.balls_on_a_table()[0])
-    assert scarce_evidence(scene, np.zeros(len(scene)), 30) is not None
-    find_neighbours(scene, 30)
-    monkeypatch.setattr(neighbour_graph, "nearest", lambda *searched: pytest.fail("the points were searched again"))
-    found = graph_of(scene)
-    for name in ("order", "indptr", "indices", "weights"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
-    assert take_lists(scene, found.k) is None, "they are kept no longer"
-
-
-def test_lists_of_another_length_are_none_for_the_graph() -> None:
-    scene, _ = small_scenes.balls_on_a_table()
-    assert scarce_evidence(scene, np.zeros(len(scene)), 30) is not None
-    find_neighbours(scene, 30)
-    assert take_lists(scene, 5) is None
-    assert graph_of(scene, 5).indptr[-1] >= 5 * len(scene)
-
-
-def test_evidence_is_scarce_where_more_than_a_sixth_was_seen_with_less_than_a_pixel() -> None:
-    scene, _ = small_scenes.balls_on_a_table()
-    evidence = np.full(600, 2.0)
-    assert not is_scarce(evidence[:0])
-    evidence[:100] = 0
-    assert scarce_evidence(scene, evidence, 30) is None
-    evidence[100] = 0.9
-    assert scarce_evidence(scene, evidence, 30) is evidence
 
 
 def test_wrong_settings_and_shapes_are_refused() -> None:

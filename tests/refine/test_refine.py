@@ -17,7 +17,7 @@ from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial import class_distances as class_distances_module
 from gsseg_core.spatial.class_distances import class_distances
-from gsseg_core.spatial.neighbourhood import Neighbours, neighbours_of
+from gsseg_core.spatial.neighbourhood import HALF, Neighbours, neighbours_of
 
 
 class Clustered(NamedTuple):
@@ -30,18 +30,18 @@ def cluster(means, probabilities, observed, *settings, **named):
     return Clustered(codes, cluster_in_place(means, codes, observed, *settings, **named)[0])
 
 
-def slow_cluster(means, probabilities, observed, k, beta):
+def slow_cluster(means, probabilities, each_weighs, k, beta):
     """Readable twin of `cluster_in_place`."""
     refined, changed = probabilities.astype(np.float64), np.zeros(len(means), bool)
     k = min(k, len(means) - 1)
     for i in range(len(means) if k else 0):
-        if observed[i] and probabilities[i].max() >= beta:
+        if each_weighs[i] and probabilities[i].max() >= beta:
             continue
         distances = np.linalg.norm(means.astype(np.float64) - means[i], axis=1)
         distances[i] = np.inf
         radius = np.sort(distances)[k - 1]
         inside, tied = distances < radius, distances == radius
-        weights = (inside + tied * (k - inside.sum()) / tied.sum()) * observed
+        weights = (inside + tied * (k - inside.sum()) / tied.sum()) * each_weighs
         if weights.any():
             refined[i], changed[i] = weights @ probabilities / weights.sum(), True
     return refined, changed
@@ -77,6 +77,12 @@ def test_both_steps_agree_with_their_slow_twins(n, k, on_grid):
     result = cluster(means, probabilities, observed, k, 0.65)
     expected, changed = slow_cluster(means, probabilities, observed, k, 0.65)
     np.testing.assert_allclose(result.probabilities, expected, atol=1e-6)
+    np.testing.assert_array_equal(result.changed, changed)
+    evidence = np.random.default_rng(k).exponential(2, n)
+    result = cluster(means, probabilities, observed, k, 0.65, evidence=evidence)
+    weights = observed * np.maximum(evidence / (evidence + HALF), 2.0**-10)
+    expected, changed = slow_cluster(means, probabilities, weights, k, 0.65)
+    np.testing.assert_allclose(result.probabilities, expected, atol=1e-5)
     np.testing.assert_array_equal(result.changed, changed)
     np.testing.assert_array_equal(statistical_filter(means, labels, k, 1.0, 5), slow_filter(means, labels, k, 1.0, 5))
 

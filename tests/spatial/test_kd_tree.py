@@ -63,23 +63,25 @@ def test_a_tree_holds_every_point_once_inside_the_boxes_of_all_its_nodes(points:
 def test_the_nearest_others_are_as_far_as_scipy_finds_them(points: np.ndarray, k: int) -> None:
     k, tree = min(k, len(points) - 1), Tree.build(points)
     expected = of_others(points, k)
-    radii, means, _ = nearest(tree, np.arange(len(points), dtype=np.int32), k, 0)
+    radii, means, _ = nearest(tree, np.arange(len(points), dtype=np.int32), k, False)
     size = np.abs(points).max()
     np.testing.assert_allclose(np.sqrt(radii), expected[tree.order, -1], rtol=1e-5, atol=1e-6 * size)
     np.testing.assert_allclose(means, expected[tree.order].mean(axis=1), rtol=1e-5, atol=1e-6 * size)
 
 
-@given(points=any_points, listed=st.sampled_from([1, 3, 12]))
-def test_the_nearest_are_listed_beside_more_as_they_are_alone(points: np.ndarray, listed: int) -> None:
-    k, tree, places = min(50, len(points) - 1), Tree.build(points), np.arange(len(points), dtype=np.int32)
-    listed = min(listed, k)
-    beside, alone = nearest(tree, places, k, listed), nearest(tree, places, listed, listed)
-    for ours, theirs in zip(beside[:2], nearest(tree, places, k, 0)[:2], strict=True):
-        if listed < k:
-            np.testing.assert_array_equal(ours, theirs)
-    np.testing.assert_array_equal(beside[2].radii, alone[2].radii)
-    np.testing.assert_array_equal(beside[2].counts, alone[2].counts)
-    np.testing.assert_array_equal(beside[2].joined(), alone[2].joined())
+@given(points=any_points, k=st.sampled_from([1, 3, 12]))
+def test_the_nearest_are_listed_with_those_tied_for_the_last_place(points: np.ndarray, k: int) -> None:
+    k, tree, places = min(k, len(points) - 1), Tree.build(points), np.arange(len(points), dtype=np.int32)
+    radii, means, lists = nearest(tree, places, k, True)
+    np.testing.assert_array_equal(radii, nearest(tree, places, k, False)[0])
+    assert len(means) == 0
+    found, near = np.split(lists.joined(), np.cumsum(lists.counts)[:-1]), tree.points.T
+    for i in places:
+        squared = ((near - near[i]) ** 2).sum(axis=1)
+        squared[i] = np.inf
+        within = np.flatnonzero(squared <= radii[i] * np.float32(1 + 1e-6))
+        assert len(set(found[i])) == len(found[i]) and set(found[i]) <= set(within)
+        assert min(len(within), 2 * k) >= len(found[i]) >= k
 
 
 @given(points=any_points, seed=st.integers(0, 100))
@@ -89,7 +91,7 @@ def test_a_part_of_a_tree_is_a_tree_of_these_points(points: np.ndarray, seed: in
         return
     part = Tree.build(points).part(chosen)
     k = min(3, len(chosen) - 1)
-    radii, *_ = nearest(part, np.arange(len(chosen), dtype=np.int32), k, 0)
+    radii, *_ = nearest(part, np.arange(len(chosen), dtype=np.int32), k, False)
     expected = of_others(part.points.T, k)[:, -1]
     np.testing.assert_allclose(np.sqrt(radii), expected, rtol=1e-5, atol=1e-6 * np.abs(points).max())
 

@@ -9,8 +9,8 @@ label y in view v given class k:
   sum of w_v[p, i] / p_v(y | p) over the pixels p of label y. q * gradient are the expected counts, in px. Not all
   pixels are gone through, and some count for others (`block_weights`).
 - `m_step` sets q_i to normalise(q_i gradient_i + prior_i), the exact maximiser of the usual lower bound, so J never
-  falls. prior_i is `prior_weight` times the mean of the votes' probabilities over the nearest Gaussians
-  (`spatial_prior`), and where masks vote against classes it is taken once more, from the probabilities.
+  falls. prior_i is `prior_weight` times the mean of the votes' probabilities over the nearest Gaussians, the better
+  seen the more (`spatial_prior`); where masks vote against classes it is taken once more, from the probabilities.
 - `predicted_gain` is the slope of J along the step. J is concave, so no step gains more; fitting ends with the first
   step that cannot gain `tolerance`.
 - `_refit_error_models` re-estimates each view's confusion matrix from probabilities that leave this view out, since
@@ -178,8 +178,9 @@ class EMLearner(Learner):
         with meanwhile(search, self.device) if settings.prior_weight else nullcontext():
             votes, rejected = self._reject_regions(votes, tick) if settings.rejects_regions else (votes, {})
         resolved = resolved_votes(votes, self._possible())
-        some_against, self.observed_ = resolved is not votes, np.diff(resolved.indptr) > 0
-        resolved, prior = resolved.united(self._spatial_prior(resolved))
+        some_against, evidence = resolved is not votes, VOTE_UNIT * resolved.sums()
+        self.observed_ = evidence > 0
+        resolved, prior = resolved.united(self._spatial_prior(resolved, evidence))
         # The votes are the first step; with the prior added, J is finite from the start. What is zero now is zero after
         # every step, so the pattern of the probabilities stays, unless the prior is taken anew.
         codes = resolved.with_data(resolved.data.astype(np.float32) * np.float32(VOTE_UNIT) + prior.data).normalised()
@@ -208,7 +209,7 @@ class EMLearner(Learner):
                 self._refit_error_models(codes, gradient, prior.data, models, tick)
                 rounds.append(0)
                 if some_against:  # Then votes were a poor guess of what the neighbours are; EM knows better by now.
-                    codes, gradient, prior = with_prior(codes, gradient, self._spatial_prior(codes))
+                    codes, gradient, prior = with_prior(codes, gradient, self._spatial_prior(codes, evidence))
                     counted = prior.data > 0
             kernels.m_step(codes, gradient, prior.data)
             if self.converged_:
@@ -392,7 +393,7 @@ class EMLearner(Learner):
         dict(self._of_each(refit, models, tick))
         return models
 
-    def _spatial_prior(self, of: CSRRows) -> CSRRows:
-        """Prior of all Gaussians, by the votes or the probabilities of their neighbours."""
+    def _spatial_prior(self, of: CSRRows, evidence: np.ndarray) -> CSRRows:
+        """Prior of all Gaussians, by the votes or the probabilities of their neighbours, and their evidence in px."""
         settings = self.settings
-        return spatial_prior(of, self.observed_, self.scene, settings.prior_k, settings.prior_weight, self.num_classes)
+        return spatial_prior(of, evidence, self.scene, settings.prior_k, settings.prior_weight, self.num_classes)

@@ -13,25 +13,26 @@ import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.spatial.neighbourhood import neighbours_of
+from gsseg_core.spatial.neighbourhood import neighbour_weights, neighbours_of
 
 
 def spatial_prior(
-    shares: CSRRows, observed: np.ndarray, scene: GaussianScene, k: int, weight: float, num_classes: int
+    shares: CSRRows, evidence: np.ndarray, scene: GaussianScene, k: int, weight: float, num_classes: int
 ) -> CSRRows:
-    """Mean probabilities of the k nearest observed Gaussians times a weight; empty rows where none was.
+    """Mean probabilities of the k nearest Gaussians, the better seen the more, times a weight; empty rows if none was.
 
     Parameters
     ----------
     shares : CSRRows
         Of each class, N rows, in any unit: votes of at least 0, or probabilities.
-    observed : (N,) bool
+    evidence : (N,) float
+        By how many px each was seen, 0 where it was not.
     """
     neighbours = neighbours_of(scene, k) if weight else None
     if neighbours is None:
         return CSRRows(np.zeros_like(shares.indptr), np.empty(0, np.uint32), np.empty(0, np.float32))
-    mean = neighbours.mean_codes(shares.with_data(shares.data.astype(np.float32)).normalised(), observed, num_classes)
-    mean = mean.normalised()
+    codes = shares.with_data(shares.data.astype(np.float32)).normalised()
+    mean = neighbours.mean_codes(codes, neighbour_weights(evidence > 0, evidence), num_classes).normalised()
     return mean.with_data(np.float32(weight) * mean.data)
 
 
