@@ -16,7 +16,7 @@ from gsseg_core.kernels.compiler import kernel
 BACKGROUND = (58, 60, 66)  # colour of label 0, a dark neutral grey
 PAPER, INK, FAINT_INK = (255, 255, 255), (32, 34, 38), (128, 131, 138)
 FILL = 0.55  # share of a label's colour in an overlaid pixel
-CELL_PX = 640  # longest side of the pictures of a contact sheet, which is looked at as a whole
+CELL_PX = 480  # longest side of the pictures of a contact sheet, which is looked at as a whole
 LEGEND_ROWS = 24  # lines in a column of a legend, at most
 _LONGEST = 400  # characters of a name that are ever looked at; no picture has room for more
 

@@ -29,7 +29,7 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.several_at_once import each_with_made, several_at_once
 
 WORST = 4  # views that are trusted least, as pictures show them
-_ALL = 1 << 17  # px of the largest views of which all are compared; of others, every second tile
+_ALL = 1 << 17  # px of the largest views of which all are compared; of others, every third tile
 _TILE = 16  # px a side
 
 
@@ -66,7 +66,7 @@ class ViewCheck:
         return self.predicted.unpack()
 
     def completed(self, mask: np.ndarray) -> np.ndarray:  # (H, W) int32
-        """Give what is predicted, and a guess where nothing is, as in every second tile of a large view; (H, W) int32.
+        """Give what is predicted, and a guess where nothing is, as in most tiles of a large view; (H, W) int32.
 
         The guess is the label of the mask if that is predicted a tile further on, in any direction, else what is.
         """
@@ -76,7 +76,9 @@ class ViewCheck:
             return predicted
         around = np.pad(predicted, _TILE, constant_values=UNKNOWN)
         inside, before, behind = slice(_TILE, -_TILE), slice(None, -2 * _TILE), slice(2 * _TILE, None)
-        for place in ((inside, before), (inside, behind), (before, inside), (behind, inside)):
+        # Tiles that are compared lie on diagonals: in these directions every other one has three beside it.
+        straight = (inside, before), (inside, behind), (before, inside), (behind, inside)
+        for place in (*straight, (before, before), (behind, behind)):
             beside = around[place]
             predicted = np.where(unknown & ((predicted == UNKNOWN) | (beside == mask)), beside, predicted)
         return predicted
@@ -125,7 +127,7 @@ class MaskChecker:
         """Compare all masks with their predictions, in the order of the views.
 
         A prediction is unknown where most of a ray ends on Gaussians that only this view has seen; and, but for the
-        `shown_views`, where the mask says nothing, and in every second tile of 16 x 16 pixels of a large view.
+        `shown_views`, where the mask says nothing, and in two of three tiles of 16 x 16 pixels of a large view.
         """
         views, device = self.learner.views, self.learner.device
         checked = each_with_made(self._check, views.values(), device, progress, "check views")
@@ -166,11 +168,11 @@ def _is_of_all(check: ViewCheck, camera: Camera) -> bool:
 
 
 def _compared(labels: np.ndarray) -> np.ndarray:  # (H, W)
-    """Choose the pixels of a mask that are compared, (H, W) bool: large masks tell enough by half of them."""
+    """Choose the pixels of a mask that are compared, (H, W) bool: large masks tell enough by a third of them."""
     wanted: np.ndarray = labels >= 0
     if wanted.size > _ALL:
-        rows, columns = (np.arange(size) // _TILE % 2 for size in wanted.shape)
-        wanted &= np.equal.outer(rows, columns)
+        rows, columns = (np.arange(size) // _TILE for size in wanted.shape)
+        wanted &= np.equal.outer(-rows % 3, columns % 3)
     return wanted
 
 

@@ -88,18 +88,20 @@ def strongest(
     Codes are at most 1. So once one column leads by more than a ray has left, nothing farther changes that, and a block
     in which all rays are so far takes no more codes.
     """
-    out, half = np.empty((tiles.height, tiles.width), np.int32), np.empty((tiles.height, tiles.width), np.bool_)
-    some = np.empty((len(range(first, tiles.height, step)), len(range(first, tiles.width, step)), channels), np.float32)
+    out, half = np.zeros((tiles.height, tiles.width), np.int32), np.zeros((tiles.height, tiles.width), np.bool_)
+    some = np.zeros((len(range(first, tiles.height, step)), len(range(first, tiles.width, step)), channels), np.float32)
     image, left_over = _blank(tiles, beside.shape[1])
     stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
         tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
+        left, top = corner_of(tiles, tile)
+        looked_at = _blocks_with(wanted, left, top) if wanted.size else OPEN
+        if not looked_at:
+            continue
         values, rays = np.zeros((TILE, channels, TILE), np.float32), np.empty((TILE, TILE), np.float32)
         others = np.zeros((TILE, beside.shape[1], TILE), np.float32)
         best, known = np.zeros((TILE, TILE), np.int32), np.empty((TILE, TILE), np.float32)
-        left, top = corner_of(tiles, tile)
         ending = OPEN & ~_blocks_of_grid(first, step, left, top)
-        looked_at = _blocks_with(wanted, left, top) if wanted.size else OPEN
         _blend_codes(tiles, tile, codes, rows, beside, looked_at, ending, values, others, rays)
         _compare(values, rays, background, best, known)
         _put(tiles, tile, others, rays, image, left_over)
