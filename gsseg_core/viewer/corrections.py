@@ -68,7 +68,8 @@ class Corrections:
     They are views like any other, fused by a `LiveSession` that has no others. How much a correction weighs against
     what was learnt before goes by how much of a Gaussian it sees: the sum of its weights over what was drawn, divided
     by that of its opacities over the whole image, which is 1 for one that lies open and inside the drawing, and near 0
-    for what lies behind. With e its sum over the corrections, c their class probabilities and q those learnt before,
+    for what lies behind; 0 without a vote. With e its sum over the corrections, c their class probabilities and q those
+    learnt before,
 
         q' = normalise( q + TRUST e c )
 
@@ -134,7 +135,7 @@ class Corrections:
         num_classes = max(drawn.shape[1], before.probabilities.shape[1])
         probabilities, drawn = _widened(before.probabilities, num_classes), _widened(drawn, num_classes)
         weight: np.ndarray = TRUST * np.stack(self._seen).sum(axis=0)
-        touched = np.flatnonzero((weight > 0) & drawn.any(axis=1))  # What shines through is not what was drawn on.
+        touched = np.flatnonzero(weight)
         mixed = probabilities[touched] + weight[touched, None] * drawn[touched]
         mixed /= mixed.sum(axis=1, keepdims=True)
         probabilities[touched] = mixed
@@ -148,13 +149,14 @@ class Corrections:
 
 
 def share_seen(scene: GaussianScene, view: View, device: str = "cpu") -> np.ndarray:
-    """How much of each Gaussian the labelled pixels of a view see, (N,) float32 in [0, 1]."""
-    operator = make_operator(scene, view.camera, device)
-    drawn = (view.read_labels() != UNKNOWN)[..., None].astype(np.float32)
-    seen = operator.adjoint(drawn)[:, 0]
-    full = np.zeros(len(scene), np.float32)
+    """How much of each Gaussian the labelled pixels of a view see, (N,) float32 in [0, 1]; 0 of one without a vote."""
+    operator, labels = make_operator(scene, view.camera, device), view.read_labels()
+    drawn_on = operator.observe(labels).ids  # What lies behind these shines through, but nobody drew on it.
+    full, share = np.zeros(len(scene), np.float32), np.zeros(len(scene), np.float32)
     full[operator.ids] = operator.footprints()
-    return np.minimum(np.divide(seen, full, out=np.zeros_like(seen), where=full > 0), 1)
+    seen = operator.adjoint((labels != UNKNOWN)[..., None].astype(np.float32))[drawn_on, 0]
+    share[drawn_on] = np.minimum(seen / full[drawn_on], 1)
+    return share
 
 
 def _view(camera: Camera, drawn: np.ndarray, label: int) -> View:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from operator_cases import lifting
+from operator_cases import lifting, make_scene
 from small_scenes import NAMES, balls_on_a_table, clean_views, ring, true_labels
 
 from gsseg_core.data.label_images import UNKNOWN
@@ -117,6 +117,23 @@ def test_a_correction_relabels_what_was_drawn_on_and_nothing_else() -> None:
     assert changed[TRUTH == 1].sum() > 15 and not changed[TRUTH != 1].any()
     assert np.allclose(now.probabilities.sum(axis=1), 1, atol=1e-5)
     assert (true_labels(SCENE, now.labels, CAMERA)[LABELS == 1] == 2).mean() > 0.75
+
+
+def test_what_lies_behind_counts_a_correction_no_more_however_often_something_was_drawn_in_front_of_it() -> None:
+    """Two sheets, one behind the other: twenty strokes on the front one, and then the rear one is just touched."""
+    scene = make_scene([[0, 0, 4], [0, 0, 5]], [[1, 0, 0, 0]] * 2, [[0.3, 0.3, 0.01], [0.3, 0.3, 0.01]], [0.97, 0.97])
+    K = np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
+    front = Camera("front", 64, 48, K, np.eye(4))
+    rear = Camera("rear", 64, 48, K, np.array([[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 9], [0, 0, 0, 1]]))
+    before = Labelling(np.ones(2, np.int32), np.eye(4, dtype=np.float32)[[1, 1]], dict(NAMES))
+    often, once = Corrections(scene), Corrections(scene)
+    for _ in range(20):
+        often.add(disc(front, 32, 24, 1, 2))
+    assert often.apply(before).labels.tolist() == [2, 1]
+    for corrections in (often, once):
+        corrections.add(disc(rear, 37, 24, 0, 3))
+    assert once.apply(before).labels[1] == 1
+    np.testing.assert_array_equal(often.apply(before).probabilities[1], once.apply(before).probabilities[1])
 
 
 def test_a_correction_is_taken_back_exactly_and_the_ones_before_it_stay() -> None:
