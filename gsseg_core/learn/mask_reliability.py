@@ -76,9 +76,9 @@ class ViewCheck:
             return predicted
         around = np.pad(predicted, _TILE, constant_values=UNKNOWN)
         inside, before, behind = slice(_TILE, -_TILE), slice(None, -2 * _TILE), slice(2 * _TILE, None)
-        # Tiles that are compared lie on diagonals: in these directions every other one has three beside it.
+        # Tiles that are compared lie on diagonals: in these directions, each of the others has three of them beside it.
         straight = (inside, before), (inside, behind), (before, inside), (behind, inside)
-        for place in (*straight, (before, before), (behind, behind)):
+        for place in (*straight, (before, behind), (behind, before)):
             beside = around[place]
             predicted = np.where(unknown & ((predicted == UNKNOWN) | (beside == mask)), beside, predicted)
         return predicted
@@ -171,8 +171,9 @@ def _compared(labels: np.ndarray) -> np.ndarray:  # (H, W)
     """Choose the pixels of a mask that are compared, (H, W) bool: large masks tell enough by a third of them."""
     wanted: np.ndarray = labels >= 0
     if wanted.size > _ALL:
-        rows, columns = (np.arange(size) // _TILE for size in wanted.shape)
-        wanted &= np.equal.outer(-rows % 3, columns % 3)
+        # Those on the main diagonal are among them, and so is some of every grid of `grid_of`, whatever its step.
+        rows, columns = (np.arange(size) // _TILE % 3 for size in wanted.shape)
+        wanted &= np.equal.outer(rows, columns)
     return wanted
 
 

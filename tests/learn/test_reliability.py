@@ -18,6 +18,7 @@ from gsseg_core.export.view_pictures import draw_worst_views
 from gsseg_core.learn import mask_reliability
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.mask_reliability import ViewCheck, check_views, compare_mask, reliability_report, worst_views
+from gsseg_core.learn.temperature import grid_of
 from gsseg_core.report.pictures import ViewImages
 
 SCENE, _ = balls_on_a_table()
@@ -113,6 +114,12 @@ def test_of_large_views_a_third_is_compared_which_tells_the_same(monkeypatch: py
         np.testing.assert_array_equal(shown[shown != UNKNOWN], whole.prediction()[shown != UNKNOWN])
         if third.name in BAD:  # They are shown to people, in full.
             np.testing.assert_array_equal(shown, whole.prediction())
+
+
+@pytest.mark.parametrize("size", [(480, 640), (1080, 1920), (1152, 2048), (1536, 3072), (1856, 2464), (2160, 3840)])
+def test_of_what_is_compared_in_a_large_view_of_any_size_some_is_sampled(size: tuple[int, int]) -> None:
+    sampled = grid_of(*size).of(mask_reliability._compared(np.zeros(size, np.int32)))
+    assert sampled.mean() > 0.3
 
 
 def test_views_of_which_nothing_is_known_come_last_and_have_no_figure() -> None:

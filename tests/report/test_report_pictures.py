@@ -99,7 +99,7 @@ def test_thumbnails_of_large_views_have_no_holes_where_nothing_was_compared() ->
     predicted = np.where(np.arange(480)[:, None] < 320, labels, 0)
     camera = look_at("a", np.array([3.0, 0, 3]), 640, 480)
     view = View.from_arrays(camera, labels)
-    compared = np.add.outer(np.arange(480) // 16, np.arange(640) // 16) % 3 == 0
+    compared = np.subtract.outer(np.arange(480) // 16, np.arange(640) // 16) % 3 == 0
     evidence = Evidence([compare_mask(view, np.where(compared, predicted, UNKNOWN), 2)], {"a": view}, True)
     images = ViewImages(SCENE)
     images.keep(view, np.full((480, 640, 3), 200, np.uint8))
