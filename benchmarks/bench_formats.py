@@ -135,7 +135,7 @@ def mean_iou(scene: GaussianScene, folder: Path, name: str) -> float:
     learner = make_learner(name, scene, data.num_classes)
     for view in data.views("train"):
         learner.observe(view)
-    result = Segmentation.from_codes(scene, learner.fit().codes_, data.class_names)
+    result = Segmentation.from_codes(scene, learner.fit().codes_, data.class_names, evidence=learner.evidence())
     return score(result, scene, Dataset(folder).views("test")).mean_iou
 
 

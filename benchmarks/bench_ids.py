@@ -126,7 +126,8 @@ def parts(data: Path) -> str:
         views = [replace(view, class_names=None) for view in Dataset(folder, "labels_parts").views("train")]
         tests = truth.views("test")
         learner, seconds = learnt(scene, views, True)
-        result = Segmentation.from_codes(scene, learner.codes_, {}).calibrated(calibrate(learner).temperature)
+        result = Segmentation.from_codes(scene, learner.codes_, {}, evidence=learner.evidence())
+        result = result.calibrated(calibrate(learner).temperature)
         found = label_maps(scene, result, tests)
         ious, objects = object_ious(labels_of(tests), found)
         lines.append([
@@ -184,7 +185,8 @@ def measure(scene: GaussianScene, data: Dataset, rows: list[Case]) -> str:
         views = [view for view in data.views("train") if view.name in case.labels]
         views = [View.from_arrays(view.camera, case.labels[view.name]) for view in views]
         learner, seconds = learnt(scene, views, case.find)
-        found = label_maps(scene, Segmentation.from_codes(scene, learner.codes_, {}), data.views("test"))
+        result = Segmentation.from_codes(scene, learner.codes_, {}, evidence=learner.evidence())
+        found = label_maps(scene, result, data.views("test"))
         score = overlaps(case.truth, found)
         shown = len(np.unique(np.concatenate([labels.ravel() for labels in found.values()])))
         true = len(np.unique(np.concatenate([labels.ravel() for labels in case.truth.values()])))

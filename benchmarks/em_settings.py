@@ -99,7 +99,8 @@ def learnt(
                 learner = EMLearner(bench.scene, bench.data.num_classes, settings)
                 learner.observe_all(views)
             learner.settings = settings
-            result = Segmentation.from_codes(bench.scene, learner.fit().codes_, bench.data.class_names)
+            codes, evidence, names = learner.fit().codes_, learner.evidence(), bench.data.class_names
+            result = Segmentation.from_codes(bench.scene, codes, names, evidence=evidence)
         yield what, round(100 * score(result, bench.scene, bench.truth).mean_iou, 3)
 
 

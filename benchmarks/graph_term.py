@@ -4,7 +4,8 @@ Usage: python benchmarks/graph_term.py [--data FOLDER] [--out results_out/graph_
 
 Views are spread evenly over the train views, of which every seventh is held out and scored; test views are not looked
 at. A quarter of the objects of the wrong masks are missed or carry another's id, and edges are off by up to 3 px. The
-share of Gaussians seen with less than 1 px is what `gsseg_core.refine.label_propagation.is_scarce` goes by.
+share of their labelled pixels that views leave unknown to each other is what the command goes by (`UNKNOWN` in
+`gsseg_core.refine.label_propagation`); beside it stands the share of Gaussians seen with less than 1 px.
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ from pathlib import Path
 import numpy as np
 from few_views import Bench, split
 from machine import DATA, REPOSITORY
+from regret import NO_BACKGROUND
 from reliability_diagrams import ReliabilityDiagram
-from results import markdown
+from results import SCENES, markdown
 from wrong_masks import WrongMasks, corrupt
 
 from gsseg_core.data.dataset import Dataset
@@ -29,8 +31,7 @@ from gsseg_core.files.atomic import write_atomically
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.metrics import Evaluation
-from gsseg_core.refine.label_propagation import GraphSettings, is_scarce, propagate
-from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.refine.label_propagation import UNKNOWN, GraphSettings, propagate
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.spatial.neighbour_graph import graph_of
@@ -38,25 +39,29 @@ from gsseg_core.warm_up import warm_up
 
 COUNTS = (4, 8, 16, 32)
 SEED = 5
-COLUMNS = ["scene", "masks", "views", "seen < 1 px", "used", "mIoU without", "with", "ECE without", "with"]
+COLUMNS = [
+    "scene", "masks", "views", "seen < 1 px", "left unknown", "used", "mIoU without", "with", "ECE without", "with"
+]  # fmt: skip
 
 
 def main() -> int:
     """Measure and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default=DATA, type=Path, help="folder that holds replica_apartment/")
+    parser.add_argument("--data", default=DATA, type=Path, help="folder that holds the scenes")
     parser.add_argument("--out", default=REPOSITORY / "results_out/graph_term.md", type=Path, help="table to write")
     options = parser.parse_args()
     warm_up()
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         rows += compare(split("Demo scene", build_demo(folder).scene, Dataset(folder, "labels_true"), {}, True), 0)
-    real = options.data / "replica_apartment"
-    if real.is_dir():
-        scene = GaussianScene.load(real / "scene.ply")
-        rows += compare(split("Replica apartment", scene, Dataset(real), {}, True), None)
-    else:
-        print(f"{real}: not there; set GSSEG_DATA or --data to the folder that holds replica_apartment/")
+    for name in SCENES:
+        real = options.data / name
+        if real.is_dir():
+            scene = GaussianScene.load(real / "scene.ply")
+            missed = None if name in NO_BACKGROUND else 0
+            rows += compare(split(name.replace("_", " ").capitalize(), scene, Dataset(real), {}, True), missed)
+        else:
+            print(f"{real}: not there; set GSSEG_DATA or --data to the folder that holds it")
     with write_atomically(options.out) as temporary:
         temporary.write_text(markdown(COLUMNS, rows) + "\n", encoding="utf-8")
     print(options.out)
@@ -76,14 +81,14 @@ def compare(bench: Bench, missed_label: int | None) -> Iterator[list[str]]:
 
 
 def score(bench: Bench, views: Sequence[View]) -> list[str]:
-    """Cells of one row: how scarce evidence is, mIoU and ECE."""
+    """Cells of one row: how scarce evidence is, how much views leave unknown, mIoU and ECE."""
     learner = EMLearner(bench.scene, bench.num_classes)
     learner.observe_all(views)
     codes = learner.fit().codes_
-    temperature, evidence = calibrate(learner).temperature, learner.evidence()
+    calibration, evidence = calibrate(learner), learner.evidence()
     iou, ece = [], []
     for tried in (codes, propagate(graph_of(bench.scene), codes, evidence)):
-        result = Segmentation.from_codes(bench.scene, tried, {}, RefineSettings()).calibrated(temperature)
+        result = Segmentation.from_codes(bench.scene, tried, {}, evidence=evidence).calibrated(calibration.temperature)
         evaluation, diagram = Evaluation(), ReliabilityDiagram()
         for operator, truth in bench.scored:
             found, known = result.render(operator), truth >= 0
@@ -92,7 +97,8 @@ def score(bench: Bench, views: Sequence[View]) -> list[str]:
         iou.append(f"{evaluation.mean_iou:.4f}")
         ece.append(f"{diagram.ece:.4f}")
     share = float((evidence < GraphSettings().strength).mean())
-    return [f"{share:.3f}", "yes" if is_scarce(evidence) else "no", *iou, *ece]
+    used = "yes" if calibration.unknown > UNKNOWN else "no"
+    return [f"{share:.3f}", f"{calibration.unknown:.4f}", used, *iou, *ece]
 
 
 if __name__ == "__main__":

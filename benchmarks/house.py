@@ -163,7 +163,8 @@ def follow_a_mask() -> None:
         learner = EMLearner(scene, dataset.num_classes)
         for view in dataset.views("train"):
             learner.observe(view)
-        result = Segmentation.from_codes(scene, learner.fit().codes_, dataset.class_names)
+        codes = learner.fit().codes_
+        result = Segmentation.from_codes(scene, codes, dataset.class_names, evidence=learner.evidence())
         result.save(Path(folder) / "segmentation.npz")
         sys.setprofile(None)
     print(*(entered | set(kernel_files())))

@@ -68,7 +68,7 @@ def grow(folder: str, views: int, steps: int) -> dict[str, float]:
     observed = time.perf_counter()
     learner.fit()
     learnt = time.perf_counter()
-    Segmentation.from_codes(scene, learner.codes_, data.class_names)
+    Segmentation.from_codes(scene, learner.codes_, data.class_names, evidence=learner.evidence())
     end = time.perf_counter()
     return {
         "load": loaded - start,

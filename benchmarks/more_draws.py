@@ -66,7 +66,7 @@ def learnt(scene: GaussianScene, data: Dataset, views: Sequence[View], edge_px: 
     """Learn from views, and return mIoU in the test views."""
     learner = EMLearner(scene, data.num_classes, EMSettings(edge_px=edge_px))
     learner.observe_all(views)
-    result = Segmentation.from_codes(scene, learner.fit().codes_, data.class_names)
+    result = Segmentation.from_codes(scene, learner.fit().codes_, data.class_names, evidence=learner.evidence())
     return score(result, scene, data.views("test")).mean_iou
 
 

@@ -27,6 +27,7 @@ from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.export.pictures import contact_sheet, save_png
 from gsseg_core.export.view_pictures import background_image
 from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.learn.learner import Learner
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.depth import surface
 from gsseg_core.refine.settings import PAPER, UNREFINED, RefineSettings
@@ -102,7 +103,7 @@ def measure(
         learner.observe_all(train)
         true_masks = {view.name: view for view in truth.views("train")}
         looked_at = spread([true_masks[view.name] for view in train], RefineSettings.carve_views)
-        labels = refined(scene, learner.fit().codes_, data.class_names, looked_at)
+        labels = refined(learner.fit(), data.class_names, looked_at)
         labels[BEFORE] = best_selection(scene, labels["KNN"], looked_at, scene)
         labels[CEILING] = best_selection(scene, labels["KNN"], scored, scene)
         scores = score(labels, scene, data.num_classes, scored)
@@ -116,13 +117,16 @@ def measure(
     return rows
 
 
-def refined(scene: GaussianScene, codes: np.ndarray, names: dict[int, str], looked_at: Sequence[View]) -> Labels:
+def refined(learner: Learner, names: dict[int, str], looked_at: Sequence[View]) -> Labels:
     """Make every kind of refinement from the same codes; views that carving looks at come with their true masks."""
+    scene, codes, evidence = learner.scene, learner.codes_, learner.evidence()
 
     def true_silhouette(view: View) -> Silhouette:
         return Silhouette.of(scene, make_operator(scene, view.camera), view.read_labels())
 
-    made = {way: Segmentation.from_codes(scene, codes, names, settings) for way, settings in WITHOUT_VIEWS.items()}
+    made = {
+        way: Segmentation.from_codes(scene, codes, names, settings, evidence) for way, settings in WITHOUT_VIEWS.items()
+    }
     made[CARVED] = made["KNN"].carved(scene, [view.camera for view in looked_at])
     made[TRUE_SILHOUETTES] = made["KNN"].carved_by(scene, looked_at, true_silhouette)
     return {way: each.labels for way, each in made.items()}

@@ -79,7 +79,8 @@ def learn(bench: Bench, views: Sequence[View], share: float) -> tuple[float, flo
     start = time.perf_counter()
     learner.fit()
     seconds = time.perf_counter() - start
-    result = Segmentation.from_codes(bench.scene, learner.codes_, bench.data.class_names)
+    names, evidence = bench.data.class_names, learner.evidence()
+    result = Segmentation.from_codes(bench.scene, learner.codes_, names, evidence=evidence)
     return score(result, bench.scene, bench.test).mean_iou, seconds
 
 

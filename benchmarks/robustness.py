@@ -145,7 +145,8 @@ def learn(bench: Bench, views: Sequence[View], names: Sequence[str] = LEARNERS) 
     for name in names:
         learner = taught(name, bench, views)
         codes = hard_votes(learner.codes_, 0.0) if name == HARD else learner.codes_
-        result = Segmentation.from_codes(bench.scene, codes, bench.data.class_names)
+        names, evidence = bench.data.class_names, learner.evidence()
+        result = Segmentation.from_codes(bench.scene, codes, names, evidence=evidence)
         mious[name] = score(result, bench.scene, bench.test).mean_iou
     return mious
 
@@ -334,7 +335,7 @@ def measure_occluder(benches: Sequence[Bench]) -> str:
             scores = {}
             for title, seen in sets.items():
                 learner = taught(name, bench, seen, person + 1)
-                result = Segmentation.from_codes(bench.scene, learner.codes_, names)
+                result = Segmentation.from_codes(bench.scene, learner.codes_, names, evidence=learner.evidence())
                 # Over the classes of the scene, to which the person does not belong.
                 scores[title] = float(np.nanmean(score(result, bench.scene, bench.test).iou[:person]))
             print(f"{bench.name}, somebody in front: {name} {scores}", flush=True)

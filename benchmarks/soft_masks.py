@@ -107,7 +107,8 @@ def learn(bench: Bench, draws: Sequence[Sequence[View]]) -> list[str]:
         for views in draws:
             learner = make_learner(name, bench.scene, bench.data.num_classes)
             learner.observe_all(views)
-            result = Segmentation.from_codes(bench.scene, learner.fit().codes_, bench.data.class_names)
+            codes, evidence, names = learner.fit().codes_, learner.evidence(), bench.data.class_names
+            result = Segmentation.from_codes(bench.scene, codes, names, evidence=evidence)
             scores.append(score(result, bench.scene, bench.data.views("test")).mean_iou)
         print(f"{bench.name}, {name}: {scores}", flush=True)
         out.append(points(float(np.mean(scores))))

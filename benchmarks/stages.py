@@ -131,17 +131,21 @@ def _refinement(path: Path, data: Dataset, runs: int) -> Times:
     for view in data.views("train"):
         learner.observe(view)
     codes = learner.fit().codes_
-    observed, names = learner.observed_, data.class_names
+    observed, evidence, names = learner.observed_, learner.evidence(), data.class_names
     # The first call on a scene finds the neighbours; the later ones have them.
     fresh = [GaussianScene.load(path) for _ in range(runs)]
-    times["segment, first call"] = [once(lambda s=s: Segmentation.from_codes(s, codes, names)) for s in fresh]
+
+    def refine(scene: GaussianScene) -> Segmentation:
+        return Segmentation.from_codes(scene, codes, names, evidence=evidence)
+
+    times["segment, first call"] = [once(lambda s=s: refine(s)) for s in fresh]
     del fresh
-    times["segment, later calls"] = timed(lambda: Segmentation.from_codes(scene, codes, names), runs)
-    result = Segmentation.from_codes(scene, codes, names)
+    times["segment, later calls"] = timed(lambda: refine(scene), runs)
+    result = refine(scene)
     known = Neighbours.among(scene.means, settings.k).look_for()
     times["neighbours"] = timed(lambda: Neighbours.among(scene.means, settings.k).look_for(), runs)
     times["KNN"] = timed(
-        lambda: cluster_in_place(scene.means, codes.copy(), observed, settings.k, settings.beta, known), runs
+        lambda: cluster_in_place(scene.means, codes.copy(), observed, settings.k, settings.beta, known, evidence), runs
     )
     times["filter"] = timed(
         lambda: statistical_filter(

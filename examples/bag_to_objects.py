@@ -99,9 +99,9 @@ def main() -> None:
         names = dict(zip(labels, ["background", *options.class_names], strict=False))
         learner = EMLearner(scene, len(labels))
         learner.observe_all(views)
-        result = Segmentation.from_codes(
-            scene, learner.fit().codes_, {label: names.get(label, f"class_{label:02d}") for label in labels}
-        )
+        names = {label: names.get(label, f"class_{label:02d}") for label in labels}
+        learner.fit()
+        result = Segmentation.from_codes(scene, learner.codes_, names, evidence=learner.evidence())
         result = result.carved(scene, [view.camera for view in views])  # cut to the silhouettes
         files = export_classes(scene, result, options.out)
     except (GssegError, AnyReaderError) as error:

@@ -25,7 +25,7 @@ try:
     for view in data.views("train"):
         learner.observe(view)
     learner.fit()
-    result = Segmentation.from_codes(scene, learner.codes_, data.class_names)
+    result = Segmentation.from_codes(scene, learner.codes_, data.class_names, evidence=learner.evidence())
     result = result.carved(scene, [view.camera for view in data.views("train")])  # cut to the silhouettes
     files = export_classes(scene, result, options.out)
 except GssegError as error:

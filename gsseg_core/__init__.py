@@ -5,7 +5,8 @@
 >>> learner = EMLearner(scene, data.num_classes)  # doctest: +SKIP
 >>> for view in data.views("train"):  # doctest: +SKIP
 ...     learner.observe(view)
->>> result = Segmentation.from_codes(scene, learner.fit().codes_, data.class_names)  # doctest: +SKIP
+>>> codes = learner.fit().codes_  # doctest: +SKIP
+>>> result = Segmentation.from_codes(scene, codes, data.class_names, evidence=learner.evidence())  # doctest: +SKIP
 >>> export_classes(scene, result, "classes")  # doctest: +SKIP
 """
 
