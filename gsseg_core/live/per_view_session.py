@@ -14,6 +14,7 @@ import numpy as np
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, SettingsError
+from gsseg_core.learn.learner import VOTE_UNIT
 from gsseg_core.learn.learner_state import Learnt, State
 from gsseg_core.live.results import Outcome, Rejection
 from gsseg_core.live.session import LiveSession
@@ -154,6 +155,12 @@ class PerViewSession(LiveSession):
             for view in self._live.views.values():
                 self._table.adopt(view)
             self._table.reserve(self._live.num_classes - 1)
+            if self.num_fused > self.num_views:  # What views that are gone have shown is not new.
+                gone = self._no_votes(1)
+                gone.adopt(self._live.state())
+                for name in self.view_names:
+                    gone.retract(name)
+                self._table.recall(gone.state().votes * VOTE_UNIT)
         return loaded
 
     def _forget(self, class_names: Mapping[int, str]) -> None:

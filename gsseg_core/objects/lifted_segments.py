@@ -29,16 +29,14 @@ class Lifted:
         segments, ids, weights = observation.labels, observation.ids[observation.rows], observation.votes()
         order = np.lexsort([ids, -weights, segments])
         segments, ids, weights = segments[order], ids[order], weights[order]
-        count = np.bincount(segments, minlength=len(observation.classes))
-        size = np.bincount(segments, weights, len(count))
-        above = np.cumsum(weights, dtype=np.float64) - weights - np.repeat(np.cumsum(size) - size, count)
-        heavy = (above < kept * size[segments]) & (weights > 0)
+        size = np.bincount(segments, weights, len(observation.classes))
+        heavy = _heaviest(segments, weights, size, kept)
         segments, ids, weights = segments[heavy], ids[heavy], weights[heavy]
         # An order that the ids have no part in: by weight, then by the first Gaussian.
-        first = np.full(len(count), np.iinfo(np.int64).max)
+        first = np.full(len(size), np.iinfo(np.int64).max)
         np.minimum.at(first, segments, ids)
         order = np.lexsort([first, -size])[: np.count_nonzero(size)]
-        row = np.zeros(len(count), np.int64)
+        row = np.zeros(len(size), np.int64)
         row[order] = np.arange(len(order))
         gaussians, column = np.unique(ids, return_inverse=True)
         lifted = sparse.csr_matrix((weights, (row[segments], column)), shape=(len(order), len(gaussians)))
@@ -63,6 +61,15 @@ class Profiles:
     def empty(cls, num_gaussians: int) -> Profiles:
         """Start without any segment."""
         return cls(sparse.csr_matrix((num_gaussians, 1)))
+
+    @classmethod
+    def of(cls, votes: np.ndarray, kept: float) -> Profiles:
+        """Make those of votes for objects, (N, K) in px; of each, only the heaviest Gaussians, as `Lifted.of` does."""
+        objects, ids = np.nonzero(votes.T > 0)
+        weights = votes[ids, objects]
+        order = np.lexsort([ids, -weights, objects])
+        heavy = order[_heaviest(objects[order], weights[order], np.bincount(objects, weights, votes.shape[1]), kept)]
+        return cls(sparse.csr_matrix((weights[heavy], (ids[heavy], objects[heavy])), shape=votes.shape))
 
     def add(self, segments: Lifted, objects: np.ndarray) -> None:  # (L,)
         """Add the segments of a view to their objects."""
@@ -114,6 +121,13 @@ class Profiles:
         overlap = np.nan_to_num(iou(common, known[:, None], common.sum(axis=0)))
         whole = sums(segments.weights, 1)
         return overlap.argmax(axis=1), np.divide(known, whole, out=np.zeros_like(known), where=whole > 0)
+
+
+def _heaviest(segments: np.ndarray, weights: np.ndarray, size: np.ndarray, kept: float) -> np.ndarray:
+    """Find the weights that make up a share of the size of their segment, which come heaviest first, (P,) bool."""
+    before = np.repeat(np.cumsum(size) - size, np.bincount(segments, minlength=len(size)))
+    above = np.cumsum(weights, dtype=np.float64) - weights - before
+    return np.asarray((above < kept * size[segments]) & (weights > 0))
 
 
 def _by_object(segments: Lifted, objects: np.ndarray, num: int) -> sparse.csr_matrix:

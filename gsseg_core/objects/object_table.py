@@ -141,6 +141,11 @@ class ObjectTable:
         """Give no new object a number up to this one."""
         self._largest = max(self._largest, number)
 
+    def recall(self, votes: np.ndarray) -> None:
+        """Have the votes of views that are gone, (N, K) in px, count for `match`, as those of views that it forgot."""
+        self._forgotten = Profiles.of(votes, self.settings.kept)
+        self._fill()
+
     def remove(self, name: str) -> None:
         """Take a view back, with all its evidence."""
         del self.views[name]

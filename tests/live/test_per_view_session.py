@@ -32,6 +32,12 @@ SCENE, TRUTH = balls_on_a_table()
 VIEWS = clean_views(8)
 
 
+def without(view: View, label: int) -> View:
+    """The view of a mask that says nothing of an object."""
+    labels = view.read_labels()
+    return with_labels(view, np.where(labels == label, UNKNOWN, labels))
+
+
 def test_a_live_session_finds_the_objects_as_views_arrive_and_repairs_them_when_it_learns() -> None:
     session = PerViewSession(SCENE, max_views=6)
     for view in [in_halves(VIEWS[0], 1), *VIEWS[1:]]:
@@ -171,6 +177,21 @@ def test_a_repair_that_finds_too_many_objects_changes_nothing() -> None:
     assert session.num_views == session.num_fused == len(VIEWS)
     session.max_classes = 256
     assert session.repair().changed, "which has not been done yet"
+
+
+def test_an_object_that_only_views_show_that_are_gone_keeps_its_number_after_loading(tmp_path: Path) -> None:
+    session = PerViewSession(SCENE, max_views=2)
+    for view in [*VIEWS[:3], *(without(view, 1) for view in VIEWS[3:6])]:
+        assert session.fuse(shuffled(view)) is None
+    session.save(tmp_path / "state.npz")
+    other = PerViewSession(SCENE, max_views=2)
+    other.load(tmp_path / "state.npz")
+    for each in (session, other):
+        for view in VIEWS[6:]:
+            assert each.fuse(shuffled(view)) is None
+        each.repair()
+    assert other.class_names == session.class_names
+    np.testing.assert_array_equal(other.codes(), session.codes())
 
 
 def test_a_view_that_was_set_aside_is_saved_and_loaded_and_comes_back(tmp_path: Path) -> None:
