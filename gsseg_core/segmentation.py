@@ -19,6 +19,7 @@ from gsseg_core.data.view import spread
 from gsseg_core.errors import SettingsError, StateMismatchError
 from gsseg_core.files.npz_files import (
     UnfitError,
+    check_px,
     check_shares,
     class_names_of,
     open_npz,
@@ -52,8 +53,7 @@ _FIRST_ONE = threading.Lock()  # of several threads that ask for what is blended
 class LabelMap(NamedTuple):
     """Class (H, W) int32 and confidence (H, W) float32 of every pixel of a rendered view.
 
-    The confidence is the probability of the class; of a calibrated segmentation, the share of pixels so sure in which
-    it is right.
+    The confidence is the class's probability: once calibrated, the share of pixels so sure in which it is right.
     """
 
     labels: np.ndarray
@@ -121,17 +121,18 @@ class Segmentation:
         settings : RefineSettings, optional
             Without the filter by default. What needs views is left to `carved`.
         evidence : (N,) float32, optional
-            Px that each code stands on, `Learner.evidence`: neighbours weigh by it; else all weigh the same.
+            Px that each code stands on, `Learner.evidence`: neighbours weigh by it, else all alike. Raises as codes do.
         copy : bool
             Whether the codes stay as they are; else they are changed, and no memory is taken for others.
         """
         settings = settings or RefineSettings()
         codes = np.array(codes, np.float32, order="C") if copy else np.ascontiguousarray(codes, np.float32)
-        n, px = len(scene), np.zeros(len(scene)) if evidence is None else evidence
+        n, px = len(scene), np.asarray(np.zeros(len(scene)) if evidence is None else evidence, np.float32)
         if codes.ndim != 2 or len(codes) != n or px.shape != (n,):
             raise StateMismatchError(f"codes are {codes.shape}, evidence {px.shape}; expected ({n}, K) and ({n},)")
         check_shares("codes", codes, SettingsError)
-        result = cls.unfiltered(scene, codes, class_names, settings, evidence)
+        check_px("evidence", px, SettingsError)
+        result = cls.unfiltered(scene, codes, class_names, settings, None if evidence is None else px)
         return result.filtered(scene, settings) if settings.filter else result
 
     @classmethod
@@ -233,8 +234,7 @@ class Segmentation:
 
     def numbered(self) -> Segmentation:
         """Give the classes numbers without gaps, in the order of their ids, so that column k is class k."""
-        ids = self.class_ids
-        if self.num_classes == len(ids):
+        if self.num_classes == len(ids := self.class_ids):
             return self
         labels = np.where(self.labels >= 0, np.searchsorted(ids, self.labels).astype(np.int32), self.labels)
         return replace(self, labels=labels, class_names=dict(enumerate(self.class_names.values())))

@@ -156,6 +156,17 @@ def test_codes_that_are_no_probabilities_are_refused_and_not_taken_for_unobserve
         Segmentation.from_codes(SCENE, codes, NAMES)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -0.5, -3.0, -4.0])
+def test_evidence_that_is_no_number_of_pixels_is_refused_and_codes_stay_as_they_are(value: float) -> None:
+    codes, evidence = CODES.copy(), np.ones(len(SCENE), np.float32)
+    evidence[7] = value
+    with pytest.raises(SettingsError, match=r"array evidence holds .* in row 7 \(1 of .* unusable\); expected"):
+        Segmentation.from_codes(SCENE, codes, NAMES, evidence=evidence, copy=False)
+    np.testing.assert_array_equal(codes, CODES)
+    listed = Segmentation.from_codes(SCENE, CODES, NAMES, evidence=[1.0] * len(SCENE))
+    np.testing.assert_array_equal(listed.labels, Segmentation.from_codes(SCENE, CODES, NAMES).labels)
+
+
 def test_a_missing_truncated_or_foreign_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "segmentation.npz"
     with pytest.raises(StateFileError, match="does not exist"):

@@ -162,6 +162,14 @@ def check_shares(name: str, rows: npt.NDArray[np.float32], unfit: type[Exception
         )
 
 
+def check_px(name: str, px: npt.NDArray[np.float32], unfit: type[Exception] = UnfitError) -> None:  # (N,)
+    """Raise `unfit` unless all are numbers of pixels: finite, 0 or more."""
+    bad = np.flatnonzero(~((px >= 0) & (px < np.inf)))
+    if bad.size:
+        found = f"array {name} holds {px[bad[0]]:g} in row {bad[0]} ({bad.size:,} of {len(px):,} rows are unusable)"
+        raise unfit(f"{found}; expected finite numbers of px, 0 or more")
+
+
 def write_npz(path: str | os.PathLike[str], header: dict[str, Any], **arrays: npt.ArrayLike) -> None:
     """Write arrays and a JSON header as one compressed npz, atomically; raises `WriteError`."""
     # Two fifths of the time of NumPy's own level, and files 9 % larger.

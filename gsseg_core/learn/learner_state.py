@@ -27,6 +27,7 @@ from gsseg_core.files.limits import LIMITS, MAX_LABEL
 from gsseg_core.files.npz_files import (
     NpzArrays,
     UnfitError,
+    check_px,
     check_scene,
     check_shares,
     class_names_of,
@@ -237,8 +238,7 @@ def _read_px(file: NpzArrays, num_gaussians: int) -> np.ndarray | None:
     if "evidence" not in file.names:
         return None
     evidence = file.expect("evidence", np.float32, (num_gaussians,))
-    if not (evidence >= 0).all() or not np.isfinite(evidence).all():
-        raise UnfitError("array evidence holds what is no number of px; expected finite ones, 0 or more")
+    check_px("evidence", evidence)
     return evidence
 
 
