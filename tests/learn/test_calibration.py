@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, ring, taught, write_dataset, wrong_views
 
 from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.view import View
 from gsseg_core.export.class_files import export_classes
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.em.em_learner import EMLearner
@@ -137,6 +138,16 @@ def test_votes_without_a_view_are_those_of_a_learner_that_never_saw_it() -> None
     others = taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS[1:]).fit()
     np.testing.assert_array_equal(learner.vote_codes_without(VIEWS[0].name), others.codes_)
     np.testing.assert_array_equal(learner._votes, before)
+
+
+def test_where_no_labelled_pixel_is_sampled_all_is_unknown_and_probabilities_stay_as_they_are() -> None:
+    between = (np.arange(VIEWS[0].camera.height) % 2 == 0)[:, None]  # The grid takes the rows beside these.
+    scribbled = [View.from_arrays(view.camera, np.where(between, view.read_labels(), UNKNOWN)) for view in VIEWS]
+    for found in (
+        calibrate(taught(VoteLearner(SCENE, NUM_CLASSES), scribbled).fit()),
+        calibrate(VoteLearner(SCENE, NUM_CLASSES)),
+    ):
+        assert found.temperature == 1 and found.pixels == 0 and found.unknown == 1
 
 
 @pytest.mark.parametrize("kind", [EMLearner, VoteLearner])
