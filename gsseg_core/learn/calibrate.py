@@ -22,7 +22,7 @@ class Calibration(NamedTuple):
     temperature: float  # for `Segmentation.calibrated`
     views: int  # whose masks it was fitted to
     pixels: int  # of these
-    unknown: float  # share of their labelled pixels of which little is predicted, and that were left out
+    unknown: float  # share of their labelled pixels, as far as sampled, of which little is predicted; 1 if none was
     held_out: bool  # whether the masks were predicted without learning from them
 
     def as_dict(self) -> dict[str, Any]:
@@ -37,6 +37,6 @@ def calibrate(learner: Learner, checker: MaskChecker | None = None, progress: Pr
     """
     views, checker = spread(list(learner.views.values()), VIEWS), checker or MaskChecker(learner)
     samples = [checker.sample(view) for view in with_progress(progress, "calibrate", views)]
-    pixels, unknown = (sum(counts) for counts in zip(*((len(one.seen), one.unknown) for one in samples), strict=True))
-    share = unknown / max(pixels + unknown, 1)
-    return Calibration(fit_temperature(samples), len(views), pixels, share, learner.leaves_out)
+    pixels = sum(len(sample.seen) for sample in samples)
+    unknown = 1 - pixels / max(pixels + sum(sample.unknown for sample in samples), 1)
+    return Calibration(fit_temperature(samples), len(views), pixels, unknown, learner.leaves_out)
