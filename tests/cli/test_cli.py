@@ -104,16 +104,6 @@ def test_codes_are_spread_where_views_leave_much_of_each_other_unknown(place: Pa
         assert spread is expected
 
 
-def test_codes_that_have_learnt_from_every_mask_are_spread_since_nobody_knows_what_views_leave_unknown(
-    place: Path,
-) -> None:
-    for options in ([], ["--no-graph"]):
-        assert main(segment(place, "--learner", "gradient", "--views", "2", *options)) == 0
-        report = json.loads((place / "out/report.json").read_text())
-        assert report["calibration"]["unknown"] < UNKNOWN and not report["calibration"]["held_out"]
-        assert (report["settings"]["graph"] is None) == bool(options)
-
-
 def test_views_without_use_are_skipped_and_counted(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (place / "data/labels/view0.png").unlink()
     Image.fromarray(np.full((48, 64), 255, np.uint8)).save(place / "data/labels/view1.png")
