@@ -144,6 +144,21 @@ def test_votes_of_classes_that_are_no_more_are_gone_and_the_others_stay() -> Non
     assert learner._votes.flags.c_contiguous and learner.num_classes == NUM_CLASSES
 
 
+@pytest.mark.parametrize("memory_budget", [None, 0])
+def test_no_class_goes_that_a_view_shows_and_its_votes_can_be_taken_back(memory_budget: int | None) -> None:
+    learner = taught(VoteLearner(SCENE, NUM_CLASSES, memory_budget=memory_budget), VIEWS)
+    before = learner._votes.copy()
+    message = f"num_classes is {NUM_CLASSES - 1}; expected more than {NUM_CLASSES - 1}, which a view shows"
+    with pytest.raises(SettingsError, match=message):
+        learner.resize(NUM_CLASSES - 1)
+    assert learner.num_classes == NUM_CLASSES
+    np.testing.assert_array_equal(learner._votes, before)
+    for view in VIEWS:
+        learner.retract(view.name)
+    assert not learner._votes.any()
+    learner.resize(1)
+
+
 def test_a_view_that_cannot_be_moved_keeps_its_votes_and_its_camera() -> None:
     learner = taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS)
     before, view = learner._votes.copy(), VIEWS[0]
