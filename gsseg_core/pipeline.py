@@ -187,9 +187,8 @@ def segment(
             run.claim(settings.places(inputs.class_names, inputs.pictured))
             fitted = _learn(inputs, settings, client, watch, progress)
             assessment = _assess(fitted, inputs.class_names, watch, progress)
-        codes, evidence, told = fitted.codes_, fitted.evidence(), assessment.calibration
-        # Of a mask that was learnt from, too, next to nothing is unknown, however few the views are.
-        spreads = settings.graph if told.unknown > UNKNOWN or not told.held_out else None
+        codes, evidence = fitted.codes_, fitted.evidence()
+        spreads = settings.graph if assessment.calibration.unknown > UNKNOWN else None
         settings = replace(settings, graph=spreads, learner_settings=getattr(fitted, "settings", None))
         del fitted  # Its votes take as much memory as all that follows.
         with watch.stage("refine"):

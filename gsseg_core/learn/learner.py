@@ -185,7 +185,10 @@ class Learner(ABC):
         self._prepared.drop(name)
 
     def resize(self, num_classes: int) -> None:
-        """Have this many classes; votes for classes that are no more are gone."""
+        """Have this many classes, more than any label of `views` (`SettingsError`); votes for the others are gone."""
+        shrinks = num_classes < self.num_classes
+        if shrinks and num_classes <= (largest := max([0, *(view.largest_label for view in self.views.values())])):
+            raise SettingsError(f"num_classes is {num_classes}; expected more than {largest}, which a view shows")
         if num_classes != self.num_classes:
             added = max(num_classes - self.num_classes, 0)
             self._votes, self.num_classes = np.pad(self._votes[:, :num_classes], ((0, 0), (0, added))), num_classes
@@ -260,8 +263,7 @@ class Learner(ABC):
     def evidence(self) -> np.ndarray:
         """Weight of the labelled pixels that saw each Gaussian, over all views, in px, (N,) float32."""
         # Votes against a class are evidence as much as votes for one.
-        evidence: np.ndarray = (weigh_votes(self._votes)[0] * VOTE_UNIT).astype(np.float32)
-        return evidence
+        return np.asarray(weigh_votes(self._votes)[0] * VOTE_UNIT, np.float32)
 
     def reject_summary(self) -> dict[str, int]:
         """Count the rejected views by reason."""
@@ -349,10 +351,9 @@ class Learner(ABC):
     def _read(self, view: View) -> SeenLabels:
         """Read a mask; raise `UnknownLabelError` where it has labels beyond the classes, which have no votes."""
         seen = view.read_seen()
-        largest = int(seen.labels.max()) if seen.evidence is None else seen.evidence.largest
-        if largest >= self.num_classes:
+        if seen.largest >= self.num_classes:
             raise UnknownLabelError(
-                f"{view.source}: mask holds the label {largest}; expected at most "
+                f"{view.source}: mask holds the label {seen.largest}; expected at most "
                 f"{self.num_classes - 1}, since there are {self.num_classes} classes"
             )
         return seen
