@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 
 from gsseg_core.data.class_names import BACKGROUND_NAME, class_name
-from gsseg_core.errors import UnknownLabelError
+from gsseg_core.errors import StateFileError, UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
+from gsseg_core.learn.learner_state import State
 
 VOTES_LIMIT = 2 << 30
 """Bytes of votes up to which classes without declared names are added as their labels turn up."""
@@ -33,6 +35,17 @@ def most_classes(max_classes: int, num_gaussians: int, num_declared: int = 0) ->
     if max_classes <= affordable:
         return max_classes, f", as max_classes is {max_classes}"
     return affordable, f" for a scene of {num_gaussians} Gaussians"
+
+
+def check_classes_of(
+    state: State, path: str | os.PathLike[str], declared: Mapping[int, str], max_classes: int, num_gaussians: int
+) -> None:
+    """Raise `StateFileError` if a state has too many classes, or other names than were declared, if any were."""
+    most, why = most_classes(max_classes, num_gaussians, max(declared) + 1 if declared else 0)
+    if state.num_classes > most:
+        raise StateFileError(f"{path}: holds {state.num_classes} classes; expected at most {most}{why}")
+    if declared:
+        state.check_names(declared, path, "the names that were given")
 
 
 def ids_by_name(

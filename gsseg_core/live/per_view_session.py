@@ -16,6 +16,7 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.learn.learner import VOTE_UNIT
 from gsseg_core.learn.learner_state import Learnt, State
+from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.results import Outcome, Rejection
 from gsseg_core.live.session import LiveSession
 from gsseg_core.objects.object_table import ObjectTable, Repair, object_name
@@ -163,8 +164,8 @@ class PerViewSession(LiveSession):
                 self._table.recall(gone.state().votes * VOTE_UNIT)
         return loaded
 
-    def _forget(self, class_names: Mapping[int, str]) -> None:
-        super()._forget(class_names)
+    def _forget(self, class_names: Mapping[int, str], votes: VoteLearner) -> None:
+        super()._forget(class_names, votes)
         self._table = ObjectTable(self.scene, device=self.device)
         self._with_tree = None
         self._repairs: list[np.ndarray] = []  # successors of each repair that gave objects other numbers

@@ -19,8 +19,8 @@ from gsseg_core.errors import GssegError, NoCodesError, NoUsableViewsError, Sett
 from gsseg_core.learn.learner_state import OBJECTS_OF_ONE_SESSION, Learnt, State
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.learn.vote_learner import VoteLearner
-from gsseg_core.live.class_numbers import add_names, ids_by_name, most_classes, require_affordable
-from gsseg_core.live.current_codes import current_codes, current_evidence
+from gsseg_core.live.class_numbers import add_names, check_classes_of, ids_by_name, require_affordable
+from gsseg_core.live.current_codes import Known, current_codes
 from gsseg_core.live.fitting import Report, check_names_of, fitted, names_with, num_classes_with
 from gsseg_core.live.results import SCENE_CHANGED, Outcome, Rejection
 from gsseg_core.progress import Stopwatch
@@ -80,9 +80,10 @@ class LiveSession:
         self.scene, self.max_views, self.device, self.max_classes = scene, max_views, device, max_classes
         self.rejected: Counter[str] = Counter()
         self._declared, self._names = bool(class_names), {0: BACKGROUND_NAME, **(class_names or {})}
-        self._lock, self._version = threading.RLock(), 0
+        self._lock = threading.RLock()
+        self._version = 0
         self._scenes: WeakKeyDictionary[Segmentation, GaussianScene] = WeakKeyDictionary()
-        self._forget({})
+        self._forget({}, self._no_votes(self._least))
 
     @property
     def class_names(self) -> dict[int, str]:
@@ -254,24 +255,16 @@ class LiveSession:
         """
         settings, watch = settings or RefineSettings(), watch or Stopwatch()
         with self._lock:
-            key, known, names, scene = (self._version, settings), self._segmented, self.class_names, self.scene
-            temperature = 1.0 if self._learnt is None else self._learnt.temperature
-            if known is not None and known[0] == key:
-                return known[1]
-            # Those of a dataset's views and of those that are kept; a state without either has nothing carved.
+            key = self._version, settings
+            if self._segmented is not None and self._segmented[0] == key:
+                return self._segmented[1]
+            # Of a dataset's views and of those that are kept; a state without either has nothing carved.
             cameras = [*self._cameras, *(view.camera for view in self._posed_views())]
             with watch.stage("codes"):
-                codes, evidence = self.codes(), current_evidence(self._live, self._learnt)
-        with watch.stage("knn"):
-            result = Segmentation.unfiltered(scene, codes, names, settings, evidence)
-        if settings.filter:
-            with watch.stage("filter"):
-                result = result.filtered(scene, settings)
-        if settings.carve:
-            with watch.stage("carve"):
-                result = result.carved(scene, cameras, self.device, settings.carve_views)
-        result = result.calibrated(temperature)
-        self._segmented, self._scenes[result] = (key, result), scene
+                known = Known.of(self.scene, self.codes(), self.class_names, cameras, self._live, self._learnt)
+        result = known.segmentation(settings, self.device, watch)
+        self._segmented = key, result
+        self._scenes[result] = known.scene
         return result
 
     def unrefined(self) -> Segmentation:
@@ -324,22 +317,21 @@ class LiveSession:
         votes = self._no_votes(state.votes.shape[1])
         votes.adopt(state)  # To cast votes of old anew takes long.
         with self._lock:
-            self._forget(state.class_names)
-            self._live = votes
-            self._live.resize(max(state.num_classes, max(self._names) + 1 if self._declared else 1))
-            self.num_fused, self._learnt = state.num_fused, state.learnt
+            self._forget(state.class_names, votes)
+            self._live.resize(max(state.num_classes, self._least))
+            self.num_fused = state.num_fused
+            self._learnt = state.learnt
             self._drop_old_views()
         return state.learnt.num_views if state.learnt is not None else state.num_fused
 
     def prepare(self, settings: RefineSettings) -> None:
         """Find what the first request needs of the scene, in a thread of its own: its digest, and all neighbours."""
-        scene = self.scene
 
-        def find() -> None:
+        def find(scene: GaussianScene) -> None:
             _ = scene.digest  # It is kept.
             find_neighbours(scene, settings.k)
 
-        threading.Thread(target=find, name="neighbours").start()
+        threading.Thread(target=find, args=(self.scene,), name="neighbours").start()
 
     def retire(self) -> None:
         """Begin another `era`, so that what is still being fused or learnt is refused; what is known stays."""
@@ -350,14 +342,22 @@ class LiveSession:
         with self._lock:
             dropped = self.num_fused
             self.rejected.clear()
-            self._forget({})
+            self._forget({}, self._no_votes(self._least))
         return dropped
 
-    def _forget(self, class_names: Mapping[int, str]) -> None:
+    @property
+    def _least(self) -> int:
+        """How many classes there are in any case."""
+        return max(self._names) + 1 if self._declared else 1
+
+    def _forget(self, class_names: Mapping[int, str], votes: VoteLearner) -> None:
+        """Know nothing any more, but for these names and votes, which come in place of what was known."""
         if not self._declared:
             self._names = {0: BACKGROUND_NAME, **class_names}
-        self._live = self._no_votes(max(self._names) + 1 if self._declared else 1)
-        self._learnt, self._segmented, self.num_fused, self._cameras = None, None, 0, []
+        self._live = votes
+        self._learnt = self._segmented = None
+        self._cameras = []
+        self.num_fused = 0
         self._version += 1
         self.retire()
 
@@ -372,11 +372,7 @@ class LiveSession:
         """Raise `StateFileError` if a state has too many classes, other names than were declared, or objects."""
         if state.per_view and not self._PER_VIEW:
             raise StateFileError(f"{path}: {OBJECTS_OF_ONE_SESSION}; expected classes, or a session with ids per-view")
-        most, why = most_classes(self.max_classes, len(self.scene), max(self._names) + 1 if self._declared else 0)
-        if state.num_classes > most:
-            raise StateFileError(f"{path}: holds {state.num_classes} classes; expected at most {most}{why}")
-        if self._declared:
-            state.check_names(self._names, path, "the names that were given")
+        check_classes_of(state, path, self._names if self._declared else {}, self.max_classes, len(self.scene))
 
     def _posed_views(self) -> list[View]:
         """List the views that are kept, posed in the scene as it is now."""

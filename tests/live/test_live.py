@@ -367,6 +367,16 @@ def test_a_saved_session_comes_back_whole(tmp_path: Path) -> None:
     assert LiveSession(SCENE, NAMES).load(tmp_path / "state.npz") == 4
 
 
+def test_loading_makes_no_sum_of_votes_but_the_one_that_is_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fed(LiveSession(SCENE), VIEWS[:2]).save(tmp_path / "state.npz")
+    session, made, no_votes = LiveSession(SCENE), [], LiveSession._no_votes
+    monkeypatch.setattr(LiveSession, "_no_votes", lambda *asked: made.append(no_votes(*asked)) or made[-1])
+    session.load(tmp_path / "state.npz")
+    assert made == [session._live]
+
+
 def test_classes_whose_declared_ids_have_gaps_are_saved_loaded_and_go_on(tmp_path: Path) -> None:
     gaps = {**NAMES, 9: "chair"}
     session = fed(LiveSession(SCENE, gaps))
