@@ -84,7 +84,7 @@ def refinement(request: Any, settings: Settings) -> RefineSettings:
     return RefineSettings(
         k=settings.k,
         beta=settings.beta,
-        weigh=outer != PAPER,
+        weigh=PAPER not in (request.refine, outer),
         cluster=not request.skip_refinement,
         filter=outer == PAPER,
         carve=outer == CARVE,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,11 @@ from gsseg_core.segmentation import REMOVED, Segmentation
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from gsseg_msgs.msg import ObjectArray, SegmentationReport
+from gsseg_msgs.srv import Export, Segment
 from sensor_msgs.msg import Image, PointCloud2
 
 from gsseg_ros.conversions import arrays_from_cloud, labels_from_image
+from gsseg_ros.node.request_fields import refinement
 
 
 @pytest.fixture
@@ -72,6 +75,15 @@ def test_refinement_is_left_out_when_asked(robot: Robot, scene: GaussianScene) -
     assert raw.num_unobserved == (~observed).sum() > 0
     clustered = robot.done("segment", skip_filter=True).report
     assert (clustered.k, clustered.filtered, clustered.num_removed) == (50, False, 0)
+
+
+@pytest.mark.parametrize("kind", [Segment, Export])
+def test_neighbours_weigh_alike_where_the_papers_way_is_asked_for_with_its_filter_or_without(kind: Any) -> None:
+    def weighs(**fields: Any) -> bool:
+        return refinement(kind.Request(**fields), SimpleNamespace(k=50, beta=0.65)).weigh
+
+    assert not weighs(refine="paper") and not weighs(refine="paper", skip_filter=True)
+    assert weighs(refine="carve") and weighs(refine="carve", skip_filter=True) and weighs(skip_filter=True)
 
 
 def test_min_confidence_leaves_out_what_is_less_sure(robot: Robot, scene: GaussianScene) -> None:
