@@ -39,7 +39,6 @@ from gsseg_core.objects.pick import Pick, pick_clicks, pick_mask, pick_masks
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.refine.label_propagation import GraphSettings, propagate
-from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.spatial.neighbour_graph import graph_of
@@ -159,15 +158,15 @@ def measure_curve(bench: Bench, counts: Sequence[int], draws: int) -> Curve:
             for name, codes in zip(VARIANTS[::2], (learner.codes_, votes, hard_votes(votes, 0.0)), strict=True):
                 spread = propagate(graph_of(bench.scene), codes, evidence)
                 for variant, result in ((name, codes), (f"{name} + graph", spread)):
-                    curve[variant].setdefault(count, []).append(score_codes(bench, result))
+                    curve[variant].setdefault(count, []).append(score_codes(bench, result, evidence))
         print(bench.name, count, {v: points(float(np.mean(curve[v][count]))) for v in VARIANTS}, flush=True)
     return curve
 
 
-def score_codes(bench: Bench, codes: np.ndarray) -> float:
+def score_codes(bench: Bench, codes: np.ndarray, evidence: np.ndarray) -> float:
     """Mean IoU of label maps of the scored views, after KNN."""
     # Rendered label maps do not depend on the filter.
-    result = Segmentation.from_codes(bench.scene, codes, {}, RefineSettings())
+    result = Segmentation.from_codes(bench.scene, codes, {}, evidence=evidence)
     evaluation = Evaluation()
     for operator, truth in bench.scored:
         evaluation.add(truth, result.render(operator).labels)
