@@ -32,7 +32,7 @@ them, one view among many. In all cases 2,048 pixels of a view are enough, and t
 |---|---|
 | `segmentation.npz` | `probabilities`, `confidence`; the temperature is in the header |
 | class PLYs | the property `confidence`, beside `label` |
-| `report.json` | mean confidences; `calibration`: temperature, views and pixels it was fitted to, and the share left `unknown` |
+| `report.json` | mean confidences; `calibration`: temperature, its views and pixels, the share left `unknown` |
 | `Segmentation` | `probabilities`, `confidence`, `render(...).confidence`; `blend` gives the shares |
 | ROS, after `~/learn` | clouds, reports, `~/render_view`, `min_confidence`: by the temperature of what was learnt |
 | ROS, votes alone, before `~/learn` | not calibrated: shares, less sure than they might be |
