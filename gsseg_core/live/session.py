@@ -316,9 +316,9 @@ class LiveSession:
         self._check_classes(path, state)
         votes = self._no_votes(state.votes.shape[1])
         votes.adopt(state)  # To cast votes of old anew takes long.
+        votes.resize(max(state.num_classes, self._least))  # Where that takes too much memory, nothing is forgotten.
         with self._lock:
             self._forget(state.class_names, votes)
-            self._live.resize(max(state.num_classes, self._least))
             self.num_fused = state.num_fused
             self._learnt = state.learnt
             self._drop_old_views()

@@ -80,7 +80,7 @@ def codes(robot: Robot) -> np.ndarray:
 def expected(scene: GaussianScene, views: list[View], learner: str = "em", **settings: Any) -> Segmentation:
     """What the core's own learner comes to, before objects are cut to their silhouettes."""
     fitted = taught(make_learner(learner, scene, len(CLASSES), **settings), views).fit()
-    result = Segmentation.from_codes(scene, fitted.codes_, dict(enumerate(CLASSES)))
+    result = Segmentation.from_codes(scene, fitted.codes_, dict(enumerate(CLASSES)), evidence=fitted.evidence())
     return result.calibrated(calibrate(fitted).temperature)
 
 

@@ -50,7 +50,7 @@ def test_live_codes_are_those_of_the_node_wherever_the_scene_lies_in_the_map(ros
             client.wait_until_active(PATIENCE)
             client.learn("data")
             update = next_update(source)
-            client.export("out", filter=False)
+            client.export("out", refine="paper", filter=False)
         truth = Segmentation.load(tmp_path / "out/segmentation.npz", scene)
         labels, probabilities, names, _ = update.labelling
         assert names == NAMES and update.num_views == 4
