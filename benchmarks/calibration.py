@@ -170,7 +170,7 @@ def at_their_word(samples: Sequence[Sample]) -> float:
 
     def loss(log_temperature: float) -> float:
         total = 0.0
-        for shares, seen in samples:
+        for shares, seen, _ in samples:
             told = tempered(shares, float(np.exp(log_temperature)))[np.arange(len(seen)), seen]
             total -= float(np.log((1 - OUTLIERS) * told + OUTLIERS / shares.shape[1]).sum())
         return total
