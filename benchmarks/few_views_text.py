@@ -22,7 +22,7 @@ shows. All have KNN clustering; "+ graph" is `gsseg_core.refine.label_propagatio
 leave more than a hundredth of a view's labelled pixels unknown (`--no-graph`: never);
 [method.md](method.md#the-graph) has its formula.
 `python benchmarks/graph_term.py` measures what the rule stands on, true and wrong masks, mIoU and calibration, on train
-views that are held out. Where views leave each other less unknown, the graph changed mIoU there by -0.1 to 0.1 points.
+views that are held out. Where views leave each other less unknown, the graph changed mIoU there by -0.1 to 0.3 points.
 
 The live session and the ROS node do without the graph: from so few views their labels differ from the command's.
 """
