@@ -22,7 +22,7 @@ class Known:
 
     scene: GaussianScene
     codes: np.ndarray  # (N, K) float32
-    evidence: np.ndarray | None  # (N,) float32
+    evidence: np.ndarray | None  # (N,) float32; None where it is not known, or all neighbours weigh the same
     class_names: Mapping[int, str]
     cameras: Sequence[Camera]  # by which objects are carved
     temperature: float
@@ -30,11 +30,12 @@ class Known:
     @classmethod
     def of(
         cls, scene: GaussianScene, codes: np.ndarray, names: Mapping[int, str], cameras: Sequence[Camera],
-        votes: Learner, learnt: Learnt | None,
+        votes: Learner, learnt: Learnt | None, settings: RefineSettings,
     ) -> Known:  # fmt: skip
-        """Put together what is known, with the evidence and the temperature of its `current_codes`."""
+        """Put together what is known, with the temperature of its `current_codes`, and their evidence if it is read."""
         temperature = 1.0 if learnt is None else learnt.temperature
-        return cls(scene, codes, current_evidence(votes, learnt), names, cameras, temperature)
+        evidence = current_evidence(votes, learnt) if settings.cluster and settings.weigh else None
+        return cls(scene, codes, evidence, names, cameras, temperature)
 
     def segmentation(self, settings: RefineSettings, device: str, watch: Stopwatch) -> Segmentation:
         """Refine the class probabilities, label every Gaussian, and calibrate; `watch` gets the seconds of each."""

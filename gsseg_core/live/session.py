@@ -261,7 +261,8 @@ class LiveSession:
             # Of a dataset's views and of those that are kept; a state without either has nothing carved.
             cameras = [*self._cameras, *(view.camera for view in self._posed_views())]
             with watch.stage("codes"):
-                known = Known.of(self.scene, self.codes(), self.class_names, cameras, self._live, self._learnt)
+                names, votes, learnt = self.class_names, self._live, self._learnt
+                known = Known.of(self.scene, self.codes(), names, cameras, votes, learnt, settings)
         result = known.segmentation(settings, self.device, watch)
         self._segmented = key, result
         self._scenes[result] = known.scene
