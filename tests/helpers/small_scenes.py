@@ -13,6 +13,7 @@ from gsseg_core.data.label_images import write_mask
 from gsseg_core.data.view import View
 from gsseg_core.export.pictures import palette
 from gsseg_core.learn.learner import Learner
+from gsseg_core.live.session import LiveSession
 from gsseg_core.metrics import Evaluation
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
@@ -119,6 +120,13 @@ def taught(learner: Learner, views: list[View]) -> Learner:
     for view in views:
         assert learner.observe(view)
     return learner
+
+
+def fed(session: LiveSession, views: list[View] | None = None) -> LiveSession:
+    """A session with views fused, six clean ones unless others are given."""
+    for view in clean_views(6) if views is None else views:
+        assert session.fuse(view) is None
+    return session
 
 
 def mean_iou(learner: Learner) -> float:
