@@ -6,7 +6,7 @@ import os
 import threading
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -28,12 +28,11 @@ from gsseg_core.files.npz_files import (
 )
 from gsseg_core.files.run_folder import settle
 from gsseg_core.learn.temperature import tempered
-from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import Blended
 from gsseg_core.refine.knn_filter import cluster_in_place, statistical_filter
 from gsseg_core.refine.settings import RefineSettings
-from gsseg_core.refine.silhouette_carving import Silhouette, carve, looked_from
+from gsseg_core.refine.silhouette_carving import Silhouette, carve
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import neighbours_of
@@ -50,14 +49,11 @@ FORMAT = "gsseg-segmentation-1"
 _FIRST_ONE = threading.Lock()  # of several threads that ask for what is blended, one computes it
 
 
-class LabelMap(NamedTuple):
-    """Class (H, W) int32 and confidence (H, W) float32 of every pixel of a rendered view.
+class RenderedLabels(NamedTuple):
+    """What a rendered view shows in every pixel."""
 
-    The confidence is the class's probability: once calibrated, the share of pixels so sure in which it is right.
-    """
-
-    labels: np.ndarray
-    confidence: np.ndarray
+    labels: np.ndarray  # (H, W) int32: ids of classes
+    confidence: np.ndarray  # (H, W) float32: their probability; once calibrated, the share of pixels so sure as right
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +117,8 @@ class Segmentation:
         settings : RefineSettings, optional
             Without the filter by default. What needs views is left to `carved`.
         evidence : (N,) float32, optional
-            Px that each code stands on, `Learner.evidence`: neighbours weigh by it, else all alike. Raises as codes do.
+            Weight of the pixels that each code was learnt from, in px, finite and at least 0: `Learner.evidence`.
+            Neighbours weigh by it; without, all weigh the same. Raises as codes do.
         copy : bool
             Whether the codes stay as they are; else they are changed, and no memory is taken for others.
         """
@@ -269,7 +266,7 @@ class Segmentation:
         """Count the Gaussians of each class by id, (num_classes,) int64."""
         return np.bincount(self.labels[self.labels >= 0], minlength=self.num_classes)
 
-    def render(self, operator: ViewOperator) -> LabelMap:
+    def render(self, operator: ViewOperator) -> RenderedLabels:
         """Label map of a view: the class of the largest blended probability in each pixel.
 
         Here refinement has no say. A Gaussian across an edge is rightly a mixture: neighbours decide to which object it
@@ -278,15 +275,12 @@ class Segmentation:
         nothing.
         """
         image = self.blend(operator)
-        return LabelMap(self.class_ids[image.argmax(axis=2)], tempered(image, self.temperature).max(axis=2))
+        return RenderedLabels(self.class_ids[image.argmax(axis=2)], tempered(image, self.temperature).max(axis=2))
 
     def carved(
-        self,
-        scene: GaussianScene,
-        cameras: Sequence[Camera],
-        device: str = "cpu",
+        self, scene: GaussianScene, cameras: Sequence[Camera], device: str = "cpu",
         num_views: int = RefineSettings.carve_views,
-    ) -> Segmentation:
+    ) -> Segmentation:  # fmt: skip
         """Take out of each object what sticks out of its silhouettes in some views; these Gaussians become `REMOVED`.
 
         What the views show are the label maps that the segmentation itself renders, not the masks: they are learnt from
@@ -294,17 +288,16 @@ class Segmentation:
         spread evenly. Raises `StateMismatchError` for another scene.
         """
         self.require(scene)
-
-        def look(camera: Camera) -> Silhouette:
-            operator = make_operator(scene, looked_from(camera), device)
-            return Silhouette.of(scene, operator, self.label_map(operator), view=camera)
-
+        look = partial(Silhouette.rendered, scene, self.label_map, device)
         return self.carved_by(scene, spread(cameras, num_views), look, device)
 
     def carved_by(
         self, scene: GaussianScene, views: Iterable[T], look: Callable[[T], Silhouette], device: str = "cpu"
     ) -> Segmentation:
-        """Take out of each object what sticks out of silhouettes, of which `look` makes one of a view; as `carved`."""
+        """Take out of each object what sticks out of silhouettes, as `carved` does, of views of any kind.
+
+        Of each, `look` tells what it shows.
+        """
         return self._without(carve(scene, self.labels, views, look, device=device))
 
     def label_map(self, operator: ViewOperator) -> np.ndarray:
@@ -313,7 +306,10 @@ class Segmentation:
         return np.asarray(self.class_ids[operator.strongest(codes, len(self.class_names), shows_background).classes])
 
     def label_map_beside(self, operator: ViewOperator, others: np.ndarray) -> tuple[np.ndarray, Blended]:
-        """Do the same, and blend in one pass what else Gaussians carry, (M, C) of the operator's `ids`, as colours."""
+        """Tell the class of every pixel, as `label_map` does, and blend in one pass what else Gaussians carry.
+
+        That is (M, C) of the operator's `ids`, such as their colours.
+        """
         codes, shows_background = self._codes_to_blend()
         found = operator.strongest(codes, len(self.class_names), shows_background, beside=others)
         assert found.beside is not None
@@ -325,12 +321,10 @@ class Segmentation:
         `gsseg_core.learn.temperature.tempered` at `temperature` makes probabilities of them.
         """
         codes, shows_background = self._codes_to_blend()
-        image, left_over = operator.blend_rows(codes, len(self.class_names))
-        if shows_background:
-            image[..., 0] += left_over
-        return image
+        return operator.blend_probabilities(codes, len(self.class_names), shows_background)
 
     def _codes_to_blend(self) -> tuple[CSRRows, bool]:
+        """Codes as they were learnt, and whether any is of the background, to which then goes what rays leave over."""
         with _FIRST_ONE:
             return self._blended
 

@@ -107,19 +107,28 @@ class ViewRenderer(ABC):
         """
         return self.blend_seen(codes.take(self._rows(of)).dense(num_classes))
 
-    def strongest(
-        self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid | None = None,
-        of: np.ndarray | None = None, beside: np.ndarray | None = None, wanted: np.ndarray | None = None,
-    ) -> Strongest:  # fmt: skip
-        """Find the class of each pixel, from codes in [0, 1] as `blend_rows` takes them.
+    def blend_probabilities(
+        self, codes: CSRRows, num_classes: int, background: bool, of: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Blend class probabilities, as `blend_rows` takes codes: (H, W, K) float32.
 
-        What a ray has left over is `background`, class 0, or else nothing. Codes `beside` these, (M, C) of `ids`, as
-        colours, are blended in the same pass, as `blend_seen` does. If only some pixels are `wanted`, (H, W) bool,
-        others may have any value.
+        What a ray has left over is `background`, class 0, or else nothing, so that a pixel sums to what is known of it.
         """
         image, left_over = self.blend_rows(codes, num_classes, of)
         if background:
             image[..., 0] += left_over
+        return image
+
+    def strongest(
+        self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid | None = None,
+        of: np.ndarray | None = None, beside: np.ndarray | None = None, wanted: np.ndarray | None = None,
+    ) -> Strongest:  # fmt: skip
+        """Find the class of each pixel: that of the largest of `blend_probabilities`.
+
+        Codes `beside` these, (M, C) of `ids`, as colours, are blended in the same pass, as `blend_seen` does. If only
+        some pixels are `wanted`, (H, W) bool, others may have any value.
+        """
+        image = self.blend_probabilities(codes, num_classes, background, of)
         return Strongest.of(image, grid, None if beside is None else self.blend_seen(beside))
 
     def _rows(self, of: np.ndarray | None) -> np.ndarray:

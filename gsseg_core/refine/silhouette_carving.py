@@ -88,6 +88,14 @@ class Silhouette(NamedTuple):
         stands_for = 1.0 if view is None else view.width * view.height / labels.size
         return cls(operator, labels.astype(np.int32), depth, stands_for)
 
+    @classmethod
+    def rendered(
+        cls, scene: GaussianScene, label_map: Callable[[ViewOperator], np.ndarray], device: str, camera: Camera
+    ) -> Silhouette:
+        """Render what a view shows, from where it is `looked_from`: `label_map` gives classes (H, W) of an operator."""
+        operator = make_operator(scene, looked_from(camera), device)
+        return cls.of(scene, operator, label_map(operator), view=camera)
+
 
 def kept_shares(
     scene: GaussianScene,

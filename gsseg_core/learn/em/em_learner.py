@@ -225,10 +225,7 @@ class EMLearner(Learner):
         The spatial prior is left out, too, so rows sum to less where no other view has seen anything.
         """
         codes, _, background, operator = self._without(view, only_labelled=False)
-        image, left_over = operator.blend_rows(codes, self.num_classes)
-        if background:
-            image[..., 0] += left_over
-        return image
+        return operator.blend_probabilities(codes, self.num_classes, background)
 
     def strongest_without(
         self, view: View, wanted: np.ndarray | None = None, grid: PixelGrid | None = None
