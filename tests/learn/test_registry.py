@@ -7,9 +7,12 @@ import json
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
+import numpy as np
 import pytest
-from small_scenes import NUM_CLASSES, balls_on_a_table, write_dataset
+from doc_blocks import blocks_of
+from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, write_dataset
 
 from gsseg_core.cli.arguments import build_parser
 from gsseg_core.errors import SettingsError
@@ -43,6 +46,19 @@ def test_classes_in_the_table_are_learners(place: str) -> None:
 
 def test_a_learner_in_the_table_is_made_by_its_name(toy: None) -> None:
     assert type(make_learner("toy", SCENE, NUM_CLASSES, max_steps=3, seed=1, memory_budget=0)) is ToyLearner
+
+
+def test_the_learner_that_contributing_adds_learns_from_views() -> None:
+    (block,) = [block for block in blocks_of("CONTRIBUTING.md") if block.title.endswith("sharp_learner.py")]
+    names: dict[str, Any] = {}
+    exec(block.code, names)
+    sharp, votes = names["SharpLearner"](SCENE, NUM_CLASSES), VoteLearner(SCENE, NUM_CLASSES)
+    for learner in (sharp, votes):
+        learner.observe_all(clean_views(3))
+        learner.fit()
+    np.testing.assert_array_equal(sharp.codes_.argmax(axis=1), votes.codes_.argmax(axis=1))
+    np.testing.assert_array_equal(sharp.observed_, votes.observed_)
+    assert (sharp.codes_.max(axis=1) >= votes.codes_.max(axis=1) - 1e-6).all()
 
 
 @pytest.mark.parametrize("name", ["em", "gradient"])
