@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import bench
+import calibration
 import children
 import growth
 import jobs
@@ -23,7 +24,8 @@ from lift_rate import count_work
 from operator_cases import lifting
 from plain_torch import PlainTorch
 from report import Bar, Report, short
-from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, ring
+from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, ring
+from view_errors import WrongMasks, corrupt_views
 from workloads import SIZES, RoomSize, make_room, split
 
 from gsseg_core.learn.gradient_learner import GradientLearner, GradientSettings
@@ -200,3 +202,26 @@ def test_true_codes_score_one() -> None:
     codes = np.eye(NUM_CLASSES, dtype=np.float32)[TRUTH]
     assert jobs.score(SCENE, clean_views(2), codes) == 1.0
     assert jobs.score(SCENE, clean_views(2), np.roll(codes, 1, axis=1)) < 0.1
+
+
+def test_every_learner_is_calibrated_and_every_way_to_do_so_compared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learners = [calibration.EM, calibration.VOTES, calibration.HARD, calibration.GRADIENT]
+    clean, test = clean_views(calibration.HELD_OUT), clean_views(2, "test", 0.3)
+    train = {calibration.CLEAN: clean, calibration.WRONG: corrupt_views(clean, 0, WrongMasks())}
+    balls = calibration.Bench("balls", SCENE, NAMES, train, test, learners)
+    monkeypatch.setattr(calibration, "open_benches", lambda folder, real: iter([balls]))
+    monkeypatch.setattr(calibration, "warm_up", lambda: None)
+    monkeypatch.setattr(sys, "argv", ["calibration.py", "--out", str(tmp_path / "calibration.md")])
+    assert calibration.main() == 0
+    page = (tmp_path / "calibration.md").read_text(encoding="utf-8")
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if "| balls, " in line]
+    scores, ways = ([row for row in rows if len(row) == columns] for columns in (11, 7))
+    assert [row[1] for row in scores] == [*learners, *learners] and [row[1] for row in ways] == 2 * learners[:3]
+    assert all(row[3] == "0" for row in scores), "calibration changes no label"
+    for _, _, right, *errors in ways:
+        assert 0.5 < float(right) <= 1 and all(0 <= float(error.split()[0]) < 0.5 for error in errors)
+        assert "T = 1.00" in errors[0]
+    for name in ("calibration.svg", "risk_coverage.svg"):
+        assert (tmp_path / "pictures" / name).exists()
