@@ -41,7 +41,7 @@ from gsseg_core.objects.object_table import ObjectTable, find_objects
 from gsseg_core.progress import Progress, Stopwatch, silent, with_progress
 from gsseg_core.refine.label_propagation import UNKNOWN, GraphSettings, propagate
 from gsseg_core.refine.settings import RefineSettings
-from gsseg_core.report.findings import Evidence
+from gsseg_core.report.findings import MaskChecks
 from gsseg_core.report.page import load_templates, write_report_page
 from gsseg_core.report.pictures import ViewImages
 from gsseg_core.report.sections import PageInputs
@@ -322,7 +322,7 @@ def _write(
     with watch.stage("pictures"):
         images = ViewImages(scene, settings.device, drawn.values())
         shown = [drawn[view.name] for view in inputs.pictured]
-        evidence, pictures = _picture(run, inputs, assessment, result, level, shown, images, behind)
+        checked, pictures = _picture(run, inputs, assessment, result, level, shown, images, behind)
     with watch.stage("report page"):
         report = RunReport.of(
             scene, exported, run=run.id, views=assessment.report, settings=settings.as_dict(), seconds=watch.seconds,
@@ -334,14 +334,14 @@ def _write(
             pictures=[str(path.relative_to(folder)) for path in pictures],
         )  # fmt: skip
         told = report if level is result else replace(report, classes=class_table(scene, result))
-        write_report_page(folder / "report.html", PageInputs(told.as_dict(), scene, result, evidence, images))
+        write_report_page(folder / "report.html", PageInputs(told.as_dict(), scene, result, checked, images))
     return replace(report, page="report.html", seconds=watch.seconds)
 
 
 def _picture(
     run: StagedRun, inputs: Inputs, assessment: Assessment, result: Segmentation, level: Segmentation,
     shown: Iterable[Drawn], images: ViewImages, behind: WriteBehind[...],
-) -> tuple[Evidence, list[Path]]:  # fmt: skip
+) -> tuple[MaskChecks, list[Path]]:  # fmt: skip
     """Write the pictures; images of views that are rendered for them are kept for the report page."""
     views, folder, checks = assessment.views, run.folder / "pictures", list(assessment.checks or ())
     if assessment.checks is None:  # What is compared then is drawn in full size.
@@ -355,7 +355,7 @@ def _picture(
     if assessment.checks:
         pictures.append(folder / "worst_views.png")
         save(pictures[-1], draw_worst_views(images.rendered, views, assessment.checks, device=images.device), run.id)
-    return Evidence(checks, views, assessment.checks is not None), pictures
+    return MaskChecks(checks, views, assessment.checks is not None), pictures
 
 
 def render(

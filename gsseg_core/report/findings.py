@@ -25,7 +25,7 @@ NOTED = 5  # names in a warning, at most
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class MaskChecks:
     """Masks beside predictions of them."""
 
     checks: Sequence[ViewCheck]  # with what was predicted; of all views that were learnt from, or of some

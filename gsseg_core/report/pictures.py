@@ -13,11 +13,11 @@ from PIL import Image
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.photos import read_photo
 from gsseg_core.data.view import View
-from gsseg_core.export.pictures import outline, overlay, shown_at, shrunk
+from gsseg_core.export.pictures import FAINT_INK, outline, overlay, shown_at, shrunk
 from gsseg_core.export.view_pictures import Drawn, background_image
 from gsseg_core.learn.mask_reliability import ViewCheck
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.report.findings import Evidence
+from gsseg_core.report.findings import MaskChecks
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.several_at_once import several_at_once
 
@@ -28,7 +28,7 @@ SMALLEST_CROP_PX = 32
 ENOUGH = THUMBNAIL_PX**2  # pixels of a class that fill its thumbnail: more of them show no more
 CUT = 0.3  # what a view in which the margin cuts an object counts, beside one that shows it whole
 UNSEEN = 0.5  # what a view counts whose image would have to be rendered, beside one whose image is at hand
-_AGREE, _DIFFER, _UNKNOWN = (40, 44, 52), (236, 72, 60), (128, 131, 138)
+_AGREE, _DIFFER, _UNKNOWN = (40, 44, 52), (236, 72, 60), FAINT_INK
 
 
 class Triple(NamedTuple):
@@ -85,7 +85,7 @@ def draw_triple(check: ViewCheck, view: View, images: ViewImages, colors: np.nda
 
 
 def thumbnails(
-    classes: Iterable[int], evidence: Evidence, images: ViewImages, colors: np.ndarray
+    classes: Iterable[int], checked: MaskChecks, images: ViewImages, colors: np.ndarray
 ) -> dict[int, tuple[str, np.ndarray]]:
     """Cut classes out of the views that show them best, outlined in their colours (K, 3), several views at once.
 
@@ -93,14 +93,14 @@ def thumbnails(
     being `THUMBNAIL_PX`.
     """
     chosen: dict[int, list[int]] = {}
-    best = _best_views(evidence, images, len(colors))
+    best = _best_views(checked, images, len(colors))
     for k in classes:
         if k in best:
             chosen.setdefault(best[k], []).append(k)
 
     def cut_from(place: int) -> dict[int, tuple[str, np.ndarray]]:
-        check = evidence.checks[place]
-        view = evidence.views[check.name]
+        check = checked.checks[place]
+        view = checked.views[check.name]
         image, mask = images.of(view), view.read_labels()
         predicted = check.completed(mask)
         return {k: (view.name, _crop(image, (mask == k) & (predicted == k), colors[k])) for k in chosen[place]}
@@ -116,21 +116,21 @@ def jpeg_uri(image: np.ndarray, largest: int) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
-def _best_views(evidence: Evidence, images: ViewImages, num_classes: int) -> dict[int, int]:
+def _best_views(checked: MaskChecks, images: ViewImages, num_classes: int) -> dict[int, int]:
     """Find the check of the view that shows each class best, by class; of those that some view shows.
 
     That is the one with most pixels on which mask and prediction agree, but `ENOUGH` are as good as more. It counts
     less if the margin cuts the object, or if the view's image would have to be rendered. A small rest of an object that
     is large elsewhere is not looked at, though nothing cuts it.
     """
-    checks = evidence.checks
+    checks = checked.checks
     pixels, cut = (np.zeros((len(checks), num_classes), kind) for kind in (np.int64, np.bool_))
     for place, check in enumerate(checks):
         named = np.flatnonzero(check.classes >= 0)
         known = check.classes[named]
         pixels[place, known] = check.counts[known, named]
         cut[place, check.cut] = True
-    at_hand = np.array([images.at_hand(evidence.views[check.name]) for check in checks], bool)
+    at_hand = np.array([images.at_hand(checked.views[check.name]) for check in checks], bool)
     worth = np.minimum(pixels, ENOUGH) * np.where(cut, CUT, 1) * np.where(at_hand, 1, UNSEEN)[:, None]
     worth[pixels < np.minimum(ENOUGH, CUT * pixels.max(axis=0, initial=0))] = 0
     best = np.where(worth == worth.max(axis=0, initial=0), pixels, -1)

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from gsseg_core.data.object_tree import ObjectTree
-from gsseg_core.export.pictures import overlay, palette, shown_at
+from gsseg_core.export.pictures import FAINT_INK, overlay, palette, shown_at
 from gsseg_core.learn.mask_reliability import ranked_examples
-from gsseg_core.report.findings import TRUSTED, Evidence, class_ious, largest_confusions, most_confused
+from gsseg_core.report.findings import TRUSTED, MaskChecks, class_ious, largest_confusions, most_confused
 from gsseg_core.report.pictures import PICTURE_PX, THUMBNAIL_PX, ViewImages, draw_triple, jpeg_uri, thumbnails
 from gsseg_core.report.preview import look_from, make_preview, up_of
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -27,7 +27,7 @@ MATRIX_CLASSES = 24  # the matrix shows so many of the classes that are confused
 PAIRS = 10
 WORST = 8
 
-_NO_CLASS = ((UNOBSERVED, "seen by no mask", (128, 131, 138)), (REMOVED, "taken out", (128, 131, 138)))
+_NO_CLASS = {UNOBSERVED: "seen by no mask", REMOVED: "taken out"}
 
 Content = Mapping[str, Any]
 
@@ -39,7 +39,7 @@ class PageInputs:
     report: Mapping[str, Any]  # what `report.json` holds
     scene: GaussianScene  # what was segmented
     segmentation: Segmentation  # what came out
-    evidence: Evidence  # masks beside predictions of them
+    checked: MaskChecks  # masks beside predictions of them
     images: ViewImages  # what was seen from the views
 
     @cached_property
@@ -50,7 +50,7 @@ class PageInputs:
     @cached_property
     def confusion(self) -> np.ndarray | None:
         """Pixels by class predicted and label of the mask, (K, K) int64; None where no mask was checked."""
-        return self.evidence.confusion(self.segmentation.num_classes) if self.evidence.checks else None
+        return self.checked.confusion(self.segmentation.num_classes) if self.checked.checks else None
 
     @cached_property
     def ious(self) -> np.ndarray | None:
@@ -75,7 +75,7 @@ class PageInputs:
 
 def preview(run: PageInputs) -> Content:
     """Gaussians to look at in 3D, what to colour and hide, and where to look from."""
-    scene, segmentation, views, tree = run.scene, run.segmentation, run.evidence.views, run.segmentation.tree
+    scene, segmentation, views, tree = run.scene, run.segmentation, run.checked.views, run.segmentation.tree
     first, colors, levels = segmentation.num_classes, run.colors, list[dict[str, Any]]()
     if tree is not None and len(tree.granularities) > 1:
         first, colors = len(tree), palette(len(tree))
@@ -83,7 +83,7 @@ def preview(run: PageInputs) -> Content:
     shown = make_preview(scene, segmentation.at(1.0) if levels else segmentation, first=first)
     # The more classes a view shows, the better it is to begin with.
     ranked = sorted(
-        run.evidence.checks, key=lambda check: (-check.counts.any(axis=1).sum(), -np.nan_to_num(check.reliability))
+        run.checked.checks, key=lambda check: (-check.counts.any(axis=1).sum(), -np.nan_to_num(check.reliability))
     )
     cameras = [views[check.name].camera for check in ranked[:LOOKS]]
     poster = None
@@ -95,16 +95,16 @@ def preview(run: PageInputs) -> Content:
         {"label": k, "name": name, "color": colors[k].tolist(), "count": count, "now": k < segmentation.num_classes}
         for k, name, count in run.nodes
     ]
-    for i, (label, name, color) in enumerate(_NO_CLASS):
+    for i, (label, name) in enumerate(_NO_CLASS.items()):
         count = int((segmentation.labels == label).sum())
-        legend.append({"label": first + i, "name": name, "color": color, "count": count, "now": True})
+        legend.append({"label": first + i, "name": name, "color": FAINT_INK, "count": count, "now": True})
     return {
         "data": {
             **shown.header(),
             "cameras": look_from(cameras, shown),
             "up": up_of(view.camera for view in views.values()),
             # What refinement took out is drawn as what it covers most: in a colour of its own it would be a stain.
-            "colors": [*colors.tolist(), _NO_CLASS[0][2], *colors.tolist()],
+            "colors": [*colors.tolist(), FAINT_INK, *colors.tolist()],
             "removed": first + 1,
             "levels": levels,
         },
@@ -128,10 +128,10 @@ def _level(tree: ObjectTree, granularity: float) -> dict[str, Any]:
 def views_shown(run: PageInputs) -> Content | None:
     """Show some views three times: their mask, the prediction, and where the two differ."""
     confusions = {view["name"]: view["confusions"] for view in run.reliability}
-    source = "what the other views predict" if run.evidence.held_out else "what was learnt, from this view too"
+    source = "what the other views predict" if run.checked.held_out else "what was learnt, from this view too"
     views = []
-    for what, check in ranked_examples(run.evidence.checks):
-        triple = draw_triple(check, run.evidence.views[check.name], run.images, run.colors)
+    for what, check in ranked_examples(run.checked.checks):
+        triple = draw_triple(check, run.checked.views[check.name], run.images, run.colors)
         pictures = [jpeg_uri(image, PICTURE_PX) for image in triple]
         views.append((what, check, pictures, confusions.get(check.name, [])))
     return {"views": views, "captions": ("its mask", source, "red where the two differ")} if views else None
@@ -139,10 +139,10 @@ def views_shown(run: PageInputs) -> Content | None:
 
 def classes(run: PageInputs) -> Content:
     """Size, confidence, agreement with the masks, and a picture of each class."""
-    entries, evidence, ious, tree = run.report["classes"], run.evidence, run.ious, run.segmentation.tree
+    entries, checked, ious, tree = run.report["classes"], run.checked, run.ious, run.segmentation.tree
     largest = sorted(range(len(entries)), key=lambda k: -entries[k]["gaussians"])[:MOST_THUMBNAILS]
-    found = thumbnails(largest, evidence, run.images, run.colors)
-    views = evidence.views_showing(len(run.colors)) if evidence.checks else None
+    found = thumbnails(largest, checked, run.images, run.colors)
+    views = checked.views_showing(len(run.colors)) if checked.checks else None
     rows = [
         {
             **entry,
@@ -156,7 +156,7 @@ def classes(run: PageInputs) -> Content:
         for k, entry in enumerate(entries)
         if k or entry["gaussians"]  # Masks need not show any background.
     ]
-    return {"classes": rows, "many": MANY, "num_views": len(evidence.checks), "held_out": evidence.held_out}
+    return {"classes": rows, "many": MANY, "num_views": len(checked.checks), "held_out": checked.held_out}
 
 
 def confusion(run: PageInputs) -> Content | None:

@@ -9,7 +9,7 @@ from report_cases import minimal_report
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.learn.mask_reliability import ViewCheck, ranked_examples
 from gsseg_core.report.findings import (
-    Evidence,
+    MaskChecks,
     class_ious,
     largest_confusions,
     most_confused,
@@ -25,7 +25,7 @@ def check(name: str, classes: list[int], counts: list[list[int]]) -> ViewCheck:
 def test_confusion_is_the_sum_over_views_and_ignores_what_is_no_class() -> None:
     one = check("one", [0, 2], [[50, 3], [10, 0], [7, 30]])
     other = check("other", [1, UNKNOWN], [[4, 1], [5, 1], [0, 1]])
-    confusion = Evidence([one, other], {}, True).confusion(3)
+    confusion = MaskChecks([one, other], {}, True).confusion(3)
     np.testing.assert_array_equal(confusion, [[50, 4, 3], [10, 5, 0], [7, 0, 30]])
     np.testing.assert_allclose(class_ious(confusion), [50 / 74, 5 / 19, 30 / 40])
     assert largest_confusions(confusion, 3) == [(1, 0, 10), (2, 0, 7), (0, 1, 4)]
@@ -40,7 +40,7 @@ def test_iou_of_a_class_that_is_nowhere_is_not_a_number() -> None:
 
 def test_a_view_shows_what_fills_more_than_a_few_of_its_pixels() -> None:
     checks = [check("a", [0], [[9_998], [2], [0]]), check("b", [0], [[9_000], [1_000], [0]])]
-    assert Evidence(checks, {}, True).views_showing(3).tolist() == [2, 1, 0]
+    assert MaskChecks(checks, {}, True).views_showing(3).tolist() == [2, 1, 0]
 
 
 def test_examples_are_the_worst_the_median_and_the_best_view() -> None:

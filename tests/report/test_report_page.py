@@ -16,7 +16,7 @@ from report_cases import NASTY, Outline, run_with_nasty_names, segmented
 from small_scenes import balls_on_a_table
 
 from gsseg_core.errors import WriteError
-from gsseg_core.report.findings import Evidence
+from gsseg_core.report.findings import MaskChecks
 from gsseg_core.report.page import environment, report_page, write_report_page
 from gsseg_core.report.pictures import ViewImages
 from gsseg_core.report.sections import PageInputs
@@ -108,7 +108,7 @@ def test_a_run_of_which_no_mask_can_be_shown_gets_a_page_too(out: Path) -> None:
     report = json.loads((out / "report.json").read_text())
     del report["views"]["reliability"]
     result, _ = segmented()
-    page = Outline(report_page(PageInputs(report, SCENE, result, Evidence([], {}, False), ViewImages(SCENE))))
+    page = Outline(report_page(PageInputs(report, SCENE, result, MaskChecks([], {}, False), ViewImages(SCENE))))
     sections = {section["id"] for section in page.tagged("section")}
     assert sections == {"preview", "classes", "confidence", "time", "settings"}
     assert not page.tagged("img")
@@ -118,8 +118,8 @@ def test_a_page_that_cannot_be_written_leaves_the_earlier_one(
     out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     report = json.loads((out / "report.json").read_text())
-    result, evidence = segmented()
-    path, inputs = tmp_path / "report.html", PageInputs(report, SCENE, result, evidence, ViewImages(SCENE))
+    result, checked = segmented()
+    path, inputs = tmp_path / "report.html", PageInputs(report, SCENE, result, checked, ViewImages(SCENE))
     write_report_page(path, inputs)
     before = path.read_bytes()
 

@@ -17,7 +17,7 @@ from gsseg_core.data.view import View
 from gsseg_core.export.pictures import palette
 from gsseg_core.learn.mask_reliability import compare_mask
 from gsseg_core.report import pictures
-from gsseg_core.report.findings import Evidence
+from gsseg_core.report.findings import MaskChecks
 from gsseg_core.report.pictures import THUMBNAIL_PX, ViewImages, draw_triple, jpeg_uri, thumbnails
 
 SCENE, TRUTH = balls_on_a_table()
@@ -32,11 +32,11 @@ def test_thumbnail_is_cut_from_the_view_that_shows_the_class_whole() -> None:
     whole = view_of("whole", painted((1, slice(10, 26), slice(20, 44))))
     tiny = view_of("tiny", painted((1, slice(10, 12), slice(20, 22))))
     views = {view.name: view for view in (cut_off, whole, tiny)}
-    evidence = Evidence([compare_mask(view, view.read_labels(), 3) for view in views.values()], views, True)
+    checked = MaskChecks([compare_mask(view, view.read_labels(), 3) for view in views.values()], views, True)
     images = ViewImages(SCENE)
     for view in views.values():
         images.keep(view, np.where(view.read_labels()[..., None] == 1, np.uint8(200), np.uint8(100)).repeat(3, axis=2))
-    found = thumbnails(range(3), evidence, images, palette(3))
+    found = thumbnails(range(3), checked, images, palette(3))
     assert set(found) == {0, 1}
     name, picture = found[1]
     assert name == "whole" and picture.shape == (THUMBNAIL_PX, THUMBNAIL_PX, 3)
@@ -46,9 +46,9 @@ def test_thumbnail_is_cut_from_the_view_that_shows_the_class_whole() -> None:
     assert (picture[:8] < 100).all() and (picture == palette(3)[1]).all(axis=2).any()
 
 
-def evidence_of(*views: View) -> Evidence:
+def checks_of(*views: View) -> MaskChecks:
     checks = [compare_mask(view, view.read_labels(), 3) for view in views]
-    return Evidence(checks, {view.name: view for view in views}, True)
+    return MaskChecks(checks, {view.name: view for view in views}, True)
 
 
 def test_enough_pixels_at_hand_are_as_good_as_more_that_would_have_to_be_rendered(
@@ -57,13 +57,13 @@ def test_enough_pixels_at_hand_are_as_good_as_more_that_would_have_to_be_rendere
     most = view_of("most", painted((1, slice(10, 40), slice(10, 50))))
     enough = view_of("enough", painted((1, slice(10, 22), slice(10, 22))))
     few = view_of("few", painted((1, slice(10, 17), slice(10, 17))))
-    evidence, grey = evidence_of(few, most, enough), np.full((48, 64, 3), 120, np.uint8)
+    checked, grey = checks_of(few, most, enough), np.full((48, 64, 3), 120, np.uint8)
 
     def shown_with(*at_hand: View) -> str:
         images = ViewImages(SCENE)
         for view in at_hand:
             images.keep(view, grey)
-        return thumbnails([1], evidence, images, palette(3))[1][0]
+        return thumbnails([1], checked, images, palette(3))[1][0]
 
     assert shown_with(few, enough) == "most"
     monkeypatch.setattr(pictures, "ENOUGH", 144)
@@ -75,7 +75,7 @@ def test_enough_pixels_at_hand_are_as_good_as_more_that_would_have_to_be_rendere
 def test_a_small_rest_is_not_shown_because_nothing_cuts_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pictures, "ENOUGH", 100)
     views = view_of("large", painted((1, slice(0, 30), slice(0, 50)))), view_of("rest", painted((1, 9, slice(9, 59))))
-    assert thumbnails([1], evidence_of(*views), ViewImages(SCENE), palette(3))[1][0] == "large"
+    assert thumbnails([1], checks_of(*views), ViewImages(SCENE), palette(3))[1][0] == "large"
 
 
 def test_views_that_have_to_be_rendered_for_thumbnails_are_so_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,7 +88,7 @@ def test_views_that_have_to_be_rendered_for_thumbnails_are_so_at_once(monkeypatc
 
     monkeypatch.setattr(ViewImages, "rendered", rendered)
     views = [view_of(str(k), painted((k, slice(10, 20), slice(10, 20)))) for k in (1, 2)]
-    found = thumbnails([1, 2], evidence_of(*views), ViewImages(SCENE), palette(3))
+    found = thumbnails([1, 2], checks_of(*views), ViewImages(SCENE), palette(3))
     assert {k: name for k, (name, _) in found.items()} == {1: "1", 2: "2"}
 
 
@@ -100,13 +100,13 @@ def test_thumbnails_of_large_views_have_no_holes_where_nothing_was_compared() ->
     camera = look_at("a", np.array([3.0, 0, 3]), 640, 480)
     view = View.from_arrays(camera, labels)
     compared = np.subtract.outer(np.arange(480) // 16, np.arange(640) // 16) % 3 == 0
-    evidence = Evidence([compare_mask(view, np.where(compared, predicted, UNKNOWN), 2)], {"a": view}, True)
+    checked = MaskChecks([compare_mask(view, np.where(compared, predicted, UNKNOWN), 2)], {"a": view}, True)
     images = ViewImages(SCENE)
     images.keep(view, np.full((480, 640, 3), 200, np.uint8))
-    _, picture = thumbnails([1], evidence, images, palette(2))[1]
+    _, picture = thumbnails([1], checked, images, palette(2))[1]
     bright = (picture == 200).all(axis=2)
     assert bright[28:100, 28:100].all() and not bright[112:].any() and not bright[:, :16].any()
-    np.testing.assert_array_equal(evidence.checks[0].completed(labels)[32:-32, 32:-32] == 1,
+    np.testing.assert_array_equal(checked.checks[0].completed(labels)[32:-32, 32:-32] == 1,
                                   (predicted == 1)[32:-32, 32:-32])  # fmt: skip
 
 
@@ -125,8 +125,8 @@ def test_what_is_rendered_is_kept_beside_a_photo(tmp_path: Path) -> None:
 def test_what_only_the_mask_says_is_on_no_thumbnail() -> None:
     view = view_of("a", painted((1, slice(10, 20), slice(10, 20)), (2, slice(30, 40), slice(10, 20))))
     predicted = painted((1, slice(10, 20), slice(10, 20)))
-    evidence = Evidence([compare_mask(view, predicted, 3)], {"a": view}, True)
-    assert set(thumbnails(range(3), evidence, ViewImages(SCENE), palette(3))) == {0, 1}
+    checked = MaskChecks([compare_mask(view, predicted, 3)], {"a": view}, True)
+    assert set(thumbnails(range(3), checked, ViewImages(SCENE), palette(3))) == {0, 1}
 
 
 def test_differences_are_red_and_only_they() -> None:
