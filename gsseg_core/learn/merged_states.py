@@ -104,7 +104,7 @@ def _is_same_map(one: LivingScene | None, other: LivingScene | None) -> bool:
 
 
 def _is_same_state(one: State, other: State) -> bool:
-    """Whether two states are of the same views, with the same poses and masks, and so have the same votes, not none."""
+    """Whether two states hold the same votes, and some, of the same views with the same poses and masks."""
     return (
         (one.num_fused, len(one.views)) == (other.num_fused, len(other.views))
         and all(_is_same_view(*views) for views in zip(one.views, other.views, strict=True))

@@ -22,20 +22,10 @@ class Known:
 
     scene: GaussianScene
     codes: np.ndarray  # (N, K) float32
-    evidence: np.ndarray | None  # (N,) float32; None where it is not known, or all neighbours weigh the same
+    evidence: np.ndarray | None  # (N,) float32, px; None where it is not known, or not asked for
     class_names: Mapping[int, str]
     cameras: Sequence[Camera]  # by which objects are carved
     temperature: float
-
-    @classmethod
-    def of(
-        cls, scene: GaussianScene, codes: np.ndarray, names: Mapping[int, str], cameras: Sequence[Camera],
-        votes: Learner, learnt: Learnt | None, settings: RefineSettings,
-    ) -> Known:  # fmt: skip
-        """Put together what is known, with the temperature of its `current_codes`, and their evidence if it is read."""
-        temperature = 1.0 if learnt is None else learnt.temperature
-        evidence = current_evidence(votes, learnt) if settings.cluster and settings.weigh else None
-        return cls(scene, codes, evidence, names, cameras, temperature)
 
     def segmentation(self, settings: RefineSettings, device: str, watch: Stopwatch) -> Segmentation:
         """Refine the class probabilities, label every Gaussian, and calibrate; `watch` gets the seconds of each."""

@@ -87,12 +87,6 @@ class LivingSession(LiveSession):
         with self._lock:
             return list(self._live.views.values())
 
-    @property
-    def view_names(self) -> list[str]:
-        """Names of the views that are kept."""
-        with self._lock:
-            return list(self._live.views)
-
     def move_view(self, name: str, moved: Callable[[Camera], Camera], era: object) -> bool:
         """Have a view seen from another camera, so that votes are as if it had been fused from there.
 

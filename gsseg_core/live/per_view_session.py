@@ -54,12 +54,6 @@ class PerViewSession(LiveSession):
             undo()
         return rejection
 
-    @property
-    def view_names(self) -> list[str]:
-        """Names of the views that are kept."""
-        with self._lock:
-            return list(self._live.views)
-
     def move_view(self, name: str, moved: Callable[[Camera], Camera], era: object) -> bool:
         """Have a view seen from another camera, as a `LivingSession` does; its ids are matched to the objects anew."""
         with self._lock:

@@ -20,7 +20,7 @@ from gsseg_core.learn.learner_state import OBJECTS_OF_ONE_SESSION, Learnt, State
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.class_numbers import add_names, check_classes_of, ids_by_name, require_affordable
-from gsseg_core.live.current_codes import Known, current_codes
+from gsseg_core.live.current_codes import Known, current_codes, current_evidence
 from gsseg_core.live.fitting import Report, check_names_of, fitted, names_with, num_classes_with
 from gsseg_core.live.results import SCENE_CHANGED, Outcome, Rejection
 from gsseg_core.progress import Stopwatch
@@ -60,6 +60,7 @@ class LiveSession:
         Views in the votes.
     """
 
+    # How the error of one class too many begins and ends; whether classes are objects that the session found itself.
     _LABEL, _REMEDY, _PER_VIEW = "mask holds the label", ", or class_names that declare it", False
     _learnt: Learnt | None
     _segmented: tuple[object, Segmentation] | None
@@ -83,7 +84,7 @@ class LiveSession:
         self._lock = threading.RLock()
         self._version = 0
         self._scenes: WeakKeyDictionary[Segmentation, GaussianScene] = WeakKeyDictionary()
-        self._forget({}, self._no_votes(self._least))
+        self._forget({}, self._no_votes(self._min_classes))
 
     @property
     def class_names(self) -> dict[int, str]:
@@ -105,6 +106,12 @@ class LiveSession:
     def num_views(self) -> int:
         """Views that are kept for `learn`."""
         return len(self._live.views)
+
+    @property
+    def view_names(self) -> list[str]:
+        """Names of the views that are kept, in the order in which they came."""
+        with self._lock:
+            return list(self._live.views)
 
     @property
     def learnt(self) -> Learnt | None:
@@ -261,8 +268,10 @@ class LiveSession:
             # Of a dataset's views and of those that are kept; a state without either has nothing carved.
             cameras = [*self._cameras, *(view.camera for view in self._posed_views())]
             with watch.stage("codes"):
-                names, votes, learnt = self.class_names, self._live, self._learnt
-                known = Known.of(self.scene, self.codes(), names, cameras, votes, learnt, settings)
+                weighs, codes, learnt = settings.cluster and settings.weigh, self.codes(), self._learnt
+                evidence = current_evidence(self._live, learnt) if weighs else None
+                temperature = 1.0 if learnt is None else learnt.temperature
+                known = Known(self.scene, codes, evidence, self.class_names, cameras, temperature)
         result = known.segmentation(settings, self.device, watch)
         self._segmented = key, result
         self._scenes[result] = known.scene
@@ -317,7 +326,7 @@ class LiveSession:
         self._check_classes(path, state)
         votes = self._no_votes(state.votes.shape[1])
         votes.adopt(state)  # To cast votes of old anew takes long.
-        votes.resize(max(state.num_classes, self._least))  # Where that takes too much memory, nothing is forgotten.
+        votes.resize(max(state.num_classes, self._min_classes))  # If that takes too much memory, nothing is forgotten.
         with self._lock:
             self._forget(state.class_names, votes)
             self.num_fused = state.num_fused
@@ -343,16 +352,16 @@ class LiveSession:
         with self._lock:
             dropped = self.num_fused
             self.rejected.clear()
-            self._forget({}, self._no_votes(self._least))
+            self._forget({}, self._no_votes(self._min_classes))
         return dropped
 
     @property
-    def _least(self) -> int:
-        """How many classes there are in any case."""
+    def _min_classes(self) -> int:
+        """How many classes there are before any view has come: those declared, or the background alone."""
         return max(self._names) + 1 if self._declared else 1
 
     def _forget(self, class_names: Mapping[int, str], votes: VoteLearner) -> None:
-        """Know nothing any more, but for these names and votes, which come in place of what was known."""
+        """Replace all that is known by names of classes and the votes of a state, or of none."""
         if not self._declared:
             self._names = {0: BACKGROUND_NAME, **class_names}
         self._live = votes
@@ -380,7 +389,7 @@ class LiveSession:
         return list(self._live.views.values())
 
     def _carrier(self) -> Callable[[Learnt], Learnt]:
-        """Return what will carry over to the session as it is then what has been learnt of it as it is now."""
+        """Return what brings that which is learnt of the session as it is now up to date, whenever it is called."""
         return lambda learnt: learnt
 
     def _grow_for(self, view: View) -> None:
