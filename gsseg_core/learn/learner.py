@@ -218,7 +218,7 @@ class Learner(ABC):
 
     def strongest_without(
         self, view: View, wanted: np.ndarray | None = None, grid: PixelGrid | None = None
-    ) -> Strongest:  # fmt: skip
+    ) -> Strongest:
         """Tell the class of each pixel of a view by `predict_without`, and the probabilities of the pixels of a grid.
 
         Little is known where most of a ray ends on Gaussians that only this view has seen. If only some pixels with a
@@ -294,11 +294,12 @@ class Learner(ABC):
         return operator.vote(*self._used_labels(seen, operator), self._votes, UNITS, sign)
 
     def _opened(self, view: View) -> Observation | UnusableViewError:
-        """Prepare a view that is new; what is wrong with it is returned."""
+        """Prepare a view that is new; what makes it unusable is returned."""
         try:
-            return self._open(view)
+            observation = self._prepare(view, self._read_usable(view))
         except UnusableViewError as why:
             return why
+        return observation if observation.num_pairs else UnusableViewError(SEES_NOTHING)
 
     def _add(self, view: View, opened: Observation | UnusableViewError | None, total: Any = None) -> bool:
         """Count a view, and add its votes if it is prepared, to a total if there is one; or say why it is of no use."""
@@ -332,12 +333,6 @@ class Learner(ABC):
             for name in names:
                 tick()
                 yield name, next(made)
-
-    def _open(self, view: View) -> Observation:
-        observation = self._prepare(view, self._read_usable(view))
-        if not observation.num_pairs:
-            raise UnusableViewError(SEES_NOTHING)
-        return observation
 
     def _read_usable(self, view: View) -> SeenLabels:
         """Read the mask of a view that is new; raise `UnusableViewError` where it tells nothing."""

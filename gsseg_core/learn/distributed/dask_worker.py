@@ -91,11 +91,12 @@ def prepare(
         for view, digest in views:
             if digest is not None and view.mask_path is not None and digest_of(view.mask_path) != digest:
                 raise NotHereError(str(view.mask_path))
-            try:
-                shard._prepared.keep(view.name, shard._open(view))
+            opened = shard._opened(view)
+            if isinstance(opened, UnusableViewError):
+                shard.rejected[view.name] = str(opened)
+            else:
+                shard._prepared.keep(view.name, opened)
                 shard.views[view.name] = view
-            except UnusableViewError as why:
-                shard.rejected[view.name] = str(why)
     return shard
 
 

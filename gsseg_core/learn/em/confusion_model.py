@@ -57,7 +57,7 @@ class ErrorModel:
 
     @property
     def named_pixels(self) -> int:
-        """Those of them whose label says which class, not only which ones it is not."""
+        """Pixels with a label that says which class they are of, not only of which they are not."""
         return int(self.areas[self.evidence.informative & (self.evidence.named() != UNKNOWN)].sum())
 
     @property

@@ -42,7 +42,7 @@ def pairs_of(observation: Observation) -> ViewPairs:
 
 
 def by_row(pairs: ViewPairs) -> ViewPairs:
-    """Count the Gaussians of a view by their own rows."""
+    """Replace ids in the scene by places among the Gaussians of the view: rows of arrays that hold these alone."""
     return pairs._replace(ids=np.arange(len(pairs.ids), dtype=np.int32))
 
 

@@ -202,9 +202,9 @@ class EMLearner(Learner):
             small = kernels.predicted_gain(codes, gradient, prior.data) < tolerance
             self.converged_ = small and last_round
             if self.converged_ or len(history) == settings.max_steps:
-                here, on_device = rows_on(codes.with_data(codes.data.copy()), self.device)
+                before, backend = rows_on(codes.with_data(codes.data.copy()), self.device)
                 background = bool((codes.indices == 0).any())
-                self._last_step_ = here, on_device.put(gradient, self.device), background
+                self._last_step_ = before, backend.put(gradient, self.device), background
             elif small:
                 self._refit_error_models(codes, gradient, prior.data, models, tick)
                 rounds.append(0)
@@ -229,7 +229,7 @@ class EMLearner(Learner):
 
     def strongest_without(
         self, view: View, wanted: np.ndarray | None = None, grid: PixelGrid | None = None
-    ) -> Strongest:  # fmt: skip
+    ) -> Strongest:
         """Tell the class of each pixel by `predict_without`, without an image of all classes."""
         codes, of, background, operator = self._without(view, only_labelled=wanted is not None)
         return operator.strongest(codes, self.num_classes, background, grid, of, wanted=wanted)
@@ -240,9 +240,9 @@ class EMLearner(Learner):
         If only its labelled pixels count, what they see is at hand, and the codes are those of these Gaussians, whose
         ids come second; else of all. Third is told whether any code has a share of the background.
         """
-        model, observation, on_device = self._model_of(view), self.observation(view.name), kernels_on(self.device)
+        model, observation, backend = self._model_of(view), self.observation(view.name), kernels_on(self.device)
         codes, gradient, background = self._last_step_
-        no_prior, ids = on_device.zeros(codes, np.float32), on_device.pairs_of(observation).ids
+        no_prior, ids = backend.zeros(codes, np.float32), backend.pairs_of(observation).ids
         stepped = codes_without(observation, model, codes, gradient, no_prior, self.device)
         if only_labelled:
             return stepped, ids, background, observation.operator(view.camera, len(self.scene))
@@ -305,19 +305,19 @@ class EMLearner(Learner):
             Which they are; views without any are left out.
         """
         possible, device = self._possible(), self._device_of(votes)
-        here, on_device = rows_on(votes, device)
-        remaining, rejected = on_device.zeros(here, np.int64), {}
+        votes, backend = rows_on(votes, device)
+        remaining, rejected = backend.zeros(votes, np.int64), {}
 
         def find(name: str, observation: Observation) -> tuple[np.ndarray, Observation]:
             least = self.settings.least_agreement
-            return find_rejected(here, observation, possible, least, device, doubted[name]), observation
+            return find_rejected(votes, observation, possible, least, device, doubted[name]), observation
 
         for name, (labels, observation) in self._of_each(find, doubted, tick):
             if labels.any():
                 rejected[name] = labels
                 rejected_votes = observation.evidence.without_names(~labels).votes
-                on_device.subtract_votes(here.with_data(remaining), observation, rejected_votes)
-        return -on_device.returned(remaining), rejected
+                backend.subtract_votes(votes.with_data(remaining), observation, rejected_votes)
+        return -backend.returned(remaining), rejected
 
     def _device_of(self, votes: CSRRows) -> str:
         """Where votes are counted: what is voted against, the CPU alone resolves."""
@@ -331,7 +331,7 @@ class EMLearner(Learner):
         The votes, int64, are without those of labels that are `rejected`: (L,) bool, of views that have any.
         """
         settings, possible = self.settings, self._possible()
-        here, on_device = rows_on(votes, self._device_of(votes))
+        votes, backend = rows_on(votes, self._device_of(votes))
 
         def estimate(name: str, observation: Observation) -> ErrorModel:
             evidence, outliers = observation.evidence, settings.outliers
@@ -339,7 +339,7 @@ class EMLearner(Learner):
                 return ErrorModel.without_errors(evidence, self.num_classes, outliers, observation.areas)
             if name in rejected:
                 evidence = evidence.without_names(rejected[name])
-            counts = on_device.leave_one_out_counts(here, observation, possible, evidence, settings.majority)
+            counts = backend.leave_one_out_counts(votes, observation, possible, evidence, settings.majority)
             return ErrorModel.from_counts(evidence, counts, settings.error_prior, outliers, observation.areas)
 
         models = dict(self._of_each(estimate, names, tick))
@@ -355,33 +355,33 @@ class EMLearner(Learner):
         log_likelihoods : dict of str to float
             Of each view's labels, in nats.
         """
-        here, on_device = rows_on(codes, self.device)
+        codes, backend = rows_on(codes, self.device)
 
         def share(name: str, observation: Observation) -> tuple[ViewPairs, np.ndarray, VoteShares]:
-            (likelihood, used), pairs = models[name].by_label, on_device.pairs_of(observation)
-            said = on_device.pair_likelihood(here, pairs, likelihood)
-            return pairs, used, on_device.shares(observation, said, likelihood[:, 0])
+            (likelihood, used), pairs = models[name].by_label, backend.pairs_of(observation)
+            of_pairs = backend.pair_likelihood(codes, pairs, likelihood)
+            return pairs, used, backend.shares(observation, of_pairs, likelihood[:, 0])
 
-        gradient, log_likelihoods = on_device.zeros(here, np.int64), {}
+        gradient, log_likelihoods = backend.zeros(codes, np.int64), {}
         for name, (pairs, used, shares) in self._of_each(share, models, tick):
             log_likelihoods[name] = shares.log_likelihood
-            on_device.accumulate(here.with_data(gradient), pairs, used, shares.pairs)
-        return on_device.returned(gradient), log_likelihoods
+            backend.accumulate(codes.with_data(gradient), pairs, used, shares.pairs)
+        return backend.returned(gradient), log_likelihoods
 
     def _refit_error_models(
         self, codes: CSRRows, gradient: np.ndarray, prior: np.ndarray, models: dict[str, ErrorModel], tick: Tick
     ) -> dict[str, ErrorModel]:
         """Re-estimate each view's error model, in place, from the step without this view; see `codes_without`."""
-        here, on_device = rows_on(codes, self.device)
-        all_gained, all_prior = (on_device.put(array, self.device) for array in (gradient, prior))
+        codes, backend = rows_on(codes, self.device)
+        gradient, prior = (backend.put(array, self.device) for array in (gradient, prior))
 
         def refit(name: str, observation: Observation) -> None:
-            model, pairs = models[name], on_device.pairs_of(observation)
-            without = codes_without(observation, model, here, all_gained, all_prior, self.device)
+            model, pairs = models[name], backend.pairs_of(observation)
+            without = codes_without(observation, model, codes, gradient, prior, self.device)
             likelihood, _ = model.by_label
-            said = on_device.pair_likelihood(without, on_device.by_row(pairs), likelihood)
-            shares = on_device.shares(observation, said, likelihood[:, 0])
-            counts = on_device.confusion_counts(without, pairs, shares.pairs, self.num_classes, len(likelihood))
+            of_pairs = backend.pair_likelihood(without, backend.by_row(pairs), likelihood)
+            shares = backend.shares(observation, of_pairs, likelihood[:, 0])
+            counts = backend.confusion_counts(without, pairs, shares.pairs, self.num_classes, len(likelihood))
             counts[0] += shares.rest
             # Only some pixels of each label were gone through: they count for all of them.
             counts *= observation.areas / np.maximum(observation.weighted_areas, 1)

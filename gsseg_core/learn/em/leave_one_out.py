@@ -27,9 +27,9 @@ def leave_one_out_counts(
     Probabilities are raised to a power, and normalised, before they are counted: above 1, majorities stand out. A
     Gaussian counts at most `most` times the pixels that the other views saw of it.
     """
-    pairs, own, classes = pairs_of(observation), observation.votes(), np.flatnonzero(possible)
+    pairs, own, class_ids = pairs_of(observation), observation.votes(), np.flatnonzero(possible)
     parts = np.zeros((BLOCKS, len(possible), evidence.votes.indptr.shape[0] - 1))
-    _count(votes, pairs, own, evidence.votes, classes, power, most, parts)
+    _count(votes, pairs, own, evidence.votes, class_ids, power, most, parts)
     return np.asarray(parts.sum(axis=0))
 
 
@@ -78,13 +78,13 @@ def _raised(x: np.float32, power: float) -> np.float32:
 
 @kernel(parallel=True)
 def _count(
-    votes: CSRRows, pairs: ViewPairs, own: np.ndarray, label_votes: CSRRows, possible: np.ndarray,
+    votes: CSRRows, pairs: ViewPairs, own: np.ndarray, label_votes: CSRRows, class_ids: np.ndarray,
     power: float, most: float, parts: np.ndarray,
 ) -> None:  # fmt: skip
     """Count as `leave_one_out_counts` does, row by row, so that the votes of the other views are never stored.
 
-    The counts are the sum of `parts`, (BLOCKS, K, L) float64, which come as zeros. Here `possible` are the ids that
-    are classes, ascending; other arrays are those of `_subtract_votes`.
+    The counts are the sum of `parts`, (BLOCKS, K, L) float64, which come as zeros. The ids of classes are ascending;
+    other arrays are those of `_subtract_votes`.
     """
     indptr, classes, data = votes
     ids, start, labels = pairs
@@ -103,7 +103,7 @@ def _count(
             for z in range(count):
                 least = min(least, remaining[z])
             if least < 0:
-                count = resolve_row(which[:count], remaining[:count], possible, kept_which, kept_votes)
+                count = resolve_row(which[:count], remaining[:count], class_ids, kept_which, kept_votes)
                 which[:count], remaining[:count] = kept_which[:count], kept_votes[:count]
             total, largest = np.int64(0), np.int64(0)
             for z in range(count):

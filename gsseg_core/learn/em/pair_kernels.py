@@ -20,8 +20,8 @@ def kernels_on(device: str) -> ModuleType:
 
 def rows_on(rows: CSRRows, device: str) -> tuple[Any, ModuleType]:
     """Put rows on a device, and tell what works on them there."""
-    on_device = kernels_on(device)
-    return on_device.put_rows(rows, device), on_device
+    backend = kernels_on(device)
+    return backend.put_rows(rows, device), backend
 
 
 def codes_without(
@@ -33,9 +33,9 @@ def codes_without(
     The gradient is that of all views at these codes and models; see `gsseg_core.learn.em.em_kernels` for the arrays,
     which are on the device.
     """
-    on_device = kernels_on(device)
-    (likelihood, used), pairs = model.by_label, on_device.pairs_of(observation)
-    shares = on_device.shares(observation, on_device.pair_likelihood(codes, pairs, likelihood), likelihood[:, 0])
-    stepped: CSRRows = on_device.rows_like(codes, pairs.ids)
-    on_device.m_step_without_view(codes, gradient, prior, pairs, used, shares.pairs, stepped)
+    backend = kernels_on(device)
+    (likelihood, used), pairs = model.by_label, backend.pairs_of(observation)
+    shares = backend.shares(observation, backend.pair_likelihood(codes, pairs, likelihood), likelihood[:, 0])
+    stepped: CSRRows = backend.rows_like(codes, pairs.ids)
+    backend.m_step_without_view(codes, gradient, prior, pairs, used, shares.pairs, stepped)
     return stepped
