@@ -15,7 +15,7 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import StateMismatchError
 from gsseg_core.learn.learner_state import Learnt, State
 from gsseg_core.learn.merged_states import Saved, merge_states
-from gsseg_core.live.living_votes import LivingVotes
+from gsseg_core.live.living_votes import LivingVotes, carried_over
 from gsseg_core.live.matching_scenes import Matching, match_scenes, places_in_saved
 from gsseg_core.live.scene_change import SceneChange, carried
 from gsseg_core.live.session import LiveSession
@@ -220,14 +220,10 @@ class LivingSession(LiveSession):
         if saved is None and not state.whole_rays:
             return state
         saved = saved or self._living
-        votes = LivingVotes(saved, state.votes.shape[1], device=self.device)
-        votes.adopt(state)
         change = SceneChange(saved, self._living, self._places_in(saved, path))
         gone = {group for group in saved.frames if group not in self._living.frames or change.has_flattened(group)}
-        votes.change(change, {view.name: None for view in state.views if view.group in gone})
-        learnt = state.learnt and state.learnt.carried(change.carry)
-        now = votes.state()
-        return replace(state, votes=now.votes, views=now.views, living=now.living, learnt=learnt, whole_rays=False)
+        joining = {view.name: None for view in state.views if view.group in gone}
+        return carried_over(state, change, joining, self.device)
 
     def _places_in(self, saved: LivingScene, path: Path) -> np.ndarray:
         if saved is self._first or not self._numbered:

@@ -133,3 +133,12 @@ class LivingVotes(VoteLearner):
 
     def _operator_of(self, view: View) -> ViewOperator:
         return make_operator(self.living.seen_from(view.group), view.camera, self.device)
+
+
+def carried_over(state: State, change: SceneChange, joining: Mapping[str, int | None], device: str) -> State:
+    """Take what was saved of the scene before a change over to that after it; `joining` as for `LivingVotes.change`."""
+    votes = LivingVotes(change.before, state.votes.shape[1], device=device)
+    votes.adopt(state)
+    votes.change(change, joining)
+    now, learnt = votes.state(), state.learnt and state.learnt.carried(change.carry)
+    return replace(state, votes=now.votes, views=now.views, living=now.living, learnt=learnt, whole_rays=False)

@@ -22,7 +22,9 @@ from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.class_numbers import add_names, check_classes_of, ids_by_name, require_affordable
 from gsseg_core.live.current_codes import Known, current_codes, current_evidence
 from gsseg_core.live.fitting import Report, check_names_of, fitted, names_with, num_classes_with
+from gsseg_core.live.living_votes import carried_over
 from gsseg_core.live.results import SCENE_CHANGED, Outcome, Rejection
+from gsseg_core.live.scene_change import SceneChange
 from gsseg_core.progress import Stopwatch
 from gsseg_core.refine.settings import UNREFINED, RefineSettings
 from gsseg_core.scene.camera import Camera
@@ -376,7 +378,11 @@ class LiveSession:
         return VoteLearner(self.scene, num_classes, device=self.device, memory_budget=0)
 
     def _read_state(self, path: Path, within: Path | None) -> State:
-        return State.load(path, self.scene.digest, len(self.scene), within)
+        state = State.load(path, self.scene.digest, len(self.scene), within)
+        if state.living is None or all(view.group is None for view in state.views):
+            return state
+        flat = SceneChange(state.living, state.living.flat(), np.arange(len(self.scene)))  # Here no group moves.
+        return carried_over(state, flat, {view.name: None for view in state.views}, self.device)
 
     def _check_classes(self, path: str | os.PathLike[str], state: State) -> None:
         """Raise `StateFileError` if a state has too many classes, other names than were declared, or objects."""

@@ -21,6 +21,8 @@ from gsseg_core.errors import (
 )
 from gsseg_core.learn.learner import VOTE_UNIT
 from gsseg_core.live.living_session import LivingSession
+from gsseg_core.live.per_view_session import PerViewSession
+from gsseg_core.live.session import LiveSession
 from gsseg_core.raster.constants import T_LIFTED
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.living_scene import LivingScene
@@ -275,6 +277,25 @@ def test_a_state_of_a_changed_scene_loads_in_a_session_that_begins_with_a_file_o
     assert expected.any()
     # Seen from where the group has gone, and not in its frame, numbers are rounded in another way: a ray may end later.
     np.testing.assert_allclose(votes(began), expected, rtol=0, atol=2 * T_LIFTED / VOTE_UNIT)
+
+
+@pytest.mark.parametrize("kind", [LiveSession, PerViewSession])
+def test_a_session_without_groups_has_the_views_of_a_state_where_these_have_gone_with_their_groups(
+    tmp_path: Path, kind: type[LiveSession]
+) -> None:
+    changed = session(group=0)
+    changed.update(SceneDelta(removed=np.arange(40), moves=(GroupMove(0, FAR),)))
+    changed.save(tmp_path / "state.npz")
+    plain = kind(changed.scene)
+    assert plain.load(tmp_path / "state.npz") == 4
+    fused, posed = LiveSession(changed.scene, NAMES), changed._posed_views()
+    for view in posed:
+        assert fused.fuse(view) is None
+    np.testing.assert_array_equal(plain.codes(), fused.codes())
+    assert plain.learn("votes").learnt.num_views == 4, "all are seen from where they are"
+    for view in posed:
+        assert plain.fuse(view) is None, "which takes back what was loaded, and adds the same"
+    np.testing.assert_array_equal(plain._live._votes, fused._live._votes)
 
 
 def test_a_state_of_another_scene_with_ids_is_refused_where_ids_are_but_numbers(tmp_path: Path) -> None:
