@@ -36,7 +36,7 @@ class Job:
             It was.
         """
         if self._canceled.is_set():
-            raise CanceledError(f"{self.name} was canceled; all is as it was before")
+            raise CanceledError(f"{self.name} was canceled; what was known before is kept")
 
 
 class JobSlot:

@@ -34,15 +34,18 @@ MAX_STEPS = 1_000_000
 
 
 class LearnAction:
-    """Runs one learn job at a time; a second goal is aborted with BUSY. Canceled or failed, it changes nothing.
+    """Runs one learn job at a time; a second goal is aborted with BUSY.
 
     A goal is rejected while the node is not active.
 
-    When it is done, the learnt objects are published, before refinement as in its report.
+    When it is done, the learnt objects are published, before refinement as in its report. Canceled or failed, it has
+    learnt nothing; objects of ids per-view that it had repaired by then stay so, and are shown as after a view.
     """
 
-    def __init__(self, node: LifecycleNode, workspace: Workspace, outputs: Callable[[], Outputs]) -> None:
-        self._node, self._workspace, self._outputs = node, workspace, outputs
+    def __init__(
+        self, node: LifecycleNode, workspace: Workspace, outputs: Callable[[], Outputs], show: Callable[[], None]
+    ) -> None:
+        self._node, self._workspace, self._outputs, self._show = node, workspace, outputs, show
         self._server = ActionServer(
             node,
             Learn,
@@ -94,14 +97,20 @@ class LearnAction:
                 dataset = self._dataset(request)
         elif request.labels or request.label_map:
             raise InvalidRequestError("labels and label_map are those of a dataset; expected dataset_path beside them")
-        outcome = session.learn(
-            learner,
-            dataset,
-            num_views=request.num_views or None,
-            max_steps=request.max_steps or None,
-            report=_Feedback(goal, job),
-            watch=run.watch,
-        )
+        version = session.version
+        try:
+            outcome = session.learn(
+                learner,
+                dataset,
+                num_views=request.num_views or None,
+                max_steps=request.max_steps or None,
+                report=_Feedback(goal, job),
+                watch=run.watch,
+            )
+        except Exception:
+            if session.version != version:
+                self._show()
+            raise
         self._workspace.number(run)
         result.num_steps, result.converged, result.loss = outcome.num_steps, outcome.converged, outcome.loss
         result.report = self._report(session, outcome, run)

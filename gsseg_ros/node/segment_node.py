@@ -84,7 +84,7 @@ class SegmentNode(LifecycleNode):
         self._changes = SceneChanges(
             self._requests, lambda message: self._complaints.add(SCENE_DELTA, message), self._await_fused
         )
-        self._learn = LearnAction(self, self.workspace, self._require_outputs)
+        self._learn = LearnAction(self, self.workspace, self._require_outputs, self._show_change)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._complaints = Complaints(self.get_logger().warning)
         self._sim_time = SimTime(self)

@@ -242,7 +242,7 @@ def test_cancel_ends_it_at_once_and_keeps_the_codes_from_before(
     halfway(robot, goal, stage, done)
     status, result = robot.cancel(goal)
     assert (status, result.error_code) == (GoalStatus.STATUS_CANCELED, Learn.Result.CANCELED)
-    assert result.error_msg == "learn was canceled; all is as it was before"
+    assert result.error_msg == "learn was canceled; what was known before is kept"
     np.testing.assert_array_equal(codes(robot), before)
     after = robot.done("segment").report
     assert (after.learner, after.num_views) == (report.learner, report.num_views) == ("votes", 8)

@@ -163,7 +163,7 @@ CASES = [
     Case("learn", "PATH_NOT_ALLOWED", "main", NOT_BELOW, {"dataset_path": ".."}),
     Case("learn", "FILE_NOT_FOUND", "main", "nothing: does not exist", {"dataset_path": "nothing"}),
     Case("learn", "INVALID_FILE", "main", "broken/labels/view1.png: broken PNG", {"dataset_path": "broken"}),
-    Case("learn", "CANCELED", "busy", "learn was canceled; all is as it was before"),
+    Case("learn", "CANCELED", "busy", "learn was canceled; what was known before is kept"),
     Case("learn", "UNKNOWN", "starved", "unexpected MemoryError"),
 ]  # fmt: skip
 MORE_CASES = [

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 from parts_of_balls import views_in_halves
+from per_view_ids import in_halves
 from ros_fixtures import running_fixture, shared_fixture  # noqa: F401
-from ros_helpers import Ros, ros_fixture  # noqa: F401
-from ros_robot import Robot
+from ros_helpers import Ros, ros_fixture, wait_until  # noqa: F401
+from ros_node_here import node_here
+from ros_robot import LATCHED, Robot
 from small_scenes import balls_on_a_table, clean_views, write_dataset
 
 from gsseg_core.data.view import View
@@ -22,7 +24,7 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from action_msgs.msg import GoalStatus
 from gsseg_msgs.action import Learn
-from gsseg_msgs.msg import SegmentationReport
+from gsseg_msgs.msg import ObjectArray, SegmentationReport
 from gsseg_msgs.srv import Segment
 
 from gsseg_ros.node.services import Services
@@ -104,6 +106,22 @@ def test_learning_repairs_and_keeps_the_numbers_of_the_objects(robot: Robot) -> 
     assert_objects_are_the_balls(after)
     both = (before.labels > 0) & (after.labels > 0)
     assert (before.labels[both] == after.labels[both]).mean() > 0.95
+
+
+def test_objects_that_a_canceled_learn_has_repaired_are_shown(ros: Ros, parameters: dict[str, Any]) -> None:
+    views, heard = clean_views(8), ros.collect(ObjectArray, "/gsseg/objects", LATCHED)
+    canceled: Any = SimpleNamespace(request=Learn.Goal(), is_cancel_requested=True, canceled=lambda: None)
+    with node_here(ros, parameters) as here:
+        wait_until(lambda: here.outputs.wants_objects, "somebody to listen")
+        here.fuse([in_halves(view, 1) for view in views[:2]])
+        here.fuse(views[2:])
+        here.inputs.live.show_objects()
+        wait_until(lambda: heard, "the objects of the views")
+        successors: list[np.ndarray] = here.node.workspace.session._repairs  # type: ignore[attr-defined]
+        assert here.node._learn._execute(canceled).error_code == Learn.Result.CANCELED
+        assert len(successors) == 1, "two pieces have become one object"
+        wait_until(lambda: len(heard) == 2, "the objects after the repair", pause=here.inputs.live.tick)
+        assert here.done("segment").report.learner == "votes"
 
 
 def test_a_saved_state_comes_back_and_later_masks_are_matched_to_its_objects(robot: Robot) -> None:
