@@ -124,17 +124,18 @@ class RosSource:
 
     def _labelling(self, report: Any, before: Mapping[str, PointCloud2 | None]) -> Labelling:
         names = {summary.class_id: summary.name for summary in report.classes}
-        names = {k: class_name(names, k) for k in range(max(names, default=0) + 1)}
-        labels = np.full(len(self._scene), UNOBSERVED, np.int32)
-        probabilities = np.zeros((len(self._scene), len(names)), np.float32)
+        labels, confidence = np.full(len(self._scene), UNOBSERVED, np.int32), np.zeros(len(self._scene), np.float32)
         # ~/cloud has all objects; the background is in a cloud of its own.
         topics = [f"{self._name}/cloud", *(s.topic for s in report.classes if s.class_id == 0 and s.topic)]
         for topic in topics:
             self._listen(topic)
             cloud = self._cloud(topic, stamp_ns(report.header.stamp), before.get(topic))
             index = self._places.find(cloud.points, topic)
-            labels[index] = cloud.labels
-            probabilities[index, cloud.labels] = cloud.confidence
+            labels[index], confidence[index] = cloud.labels, cloud.confidence
+        # A later run's cloud may have classes that turned up after this one.
+        names = {k: class_name(names, k) for k in range(max(*names, 0, int(labels.max())) + 1)}
+        probabilities, known = np.zeros((len(labels), len(names)), np.float32), np.flatnonzero(labels >= 0)
+        probabilities[known, labels[known]] = confidence[known]
         return Labelling(labels, probabilities, names)
 
     def _listen(self, topic: str) -> None:

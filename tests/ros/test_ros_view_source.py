@@ -128,6 +128,16 @@ def test_a_scene_that_the_node_puts_elsewhere_is_found_there() -> None:
     assert source.wait(0.1) is None
 
 
+def test_a_class_that_turned_up_in_a_run_for_somebody_else_is_shown() -> None:
+    scene, _ = many_classes(30)
+    report = SimpleNamespace(scene_hash=scene.digest, classes=[], num_views=3, header=Header())
+    source = source_of(scene, "3 views", report, Similarity.from_parameters(1.0, [0.0] * 3, [0.0, 0.0, 0.0, 1.0]))
+    update = source.wait(0.1)
+    assert update is not None and update.labelling.probabilities.shape == (len(scene), 2)
+    assert np.flatnonzero(update.labelling.probabilities[:, 1]).tolist() == [0, 1]
+    assert update.labelling.class_names[1] == "class_01"
+
+
 def test_when_the_node_has_forgotten_all_nothing_is_known_any_more() -> None:
     scene, _ = many_classes(30)
     place = Similarity.from_parameters(1.0, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
