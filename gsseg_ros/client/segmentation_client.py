@@ -91,7 +91,7 @@ class SegmentationClient(SceneRequests):
         Raises
         ------
         SegmentationError
-            Among others BUSY where another job is running, and CANCELED after `cancel`; then nothing has changed.
+            Among others BUSY where another job is running, and CANCELED after `cancel`; then nothing has been learnt.
         """
         for name, count in (("num_views", num_views), ("max_steps", max_steps)):
             if not 0 <= count < 2**32:

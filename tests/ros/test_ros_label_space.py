@@ -96,8 +96,16 @@ def test_classes_by_name_where_class_names_declares_them_and_all_others_are_back
     node = Node(("background", "chair", "floor", "sofa"))
     node.space.hear(ADE)
     assert node.classes([0, 1, 2, 3, -1]) == [0, 2, 0, 1, -1]
-    (said,) = set(node.said)
+    (said,) = node.said
     assert "its classes armchair, person, wall are not among class_names, and become background" in said
+
+
+def test_a_name_that_is_no_class_is_said_once_though_each_image_has_others_beside_it() -> None:
+    node = Node(("background", "chair"))
+    detected = ({1: "cup"}, {1: "cup", 2: "chair"}, {1: "chair", 2: "cup", 3: "dog"}, {1: "dog"}, {1: "dog", 2: "cup"})
+    for names in detected:
+        node.classes(list(names), names)
+    assert [said.split("classes ")[1].split(" are not")[0] for said in node.said] == ["cup", "dog"]
 
 
 def test_a_label_map_renames_merges_and_ignores_what_label_info_names() -> None:

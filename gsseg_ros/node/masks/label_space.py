@@ -63,6 +63,7 @@ class LabelSpace:
         known = dict.fromkeys(class_names)
         self.classes = dict(enumerate(known | dict.fromkeys(made))) if class_names else {}
         self.heard: dict[int, str] | None = None
+        self._said: set[str] = set()  # Names that are none of the classes: detections bring others with every image.
 
     def hear(self, names: Mapping[int, str]) -> bool:
         """Take in the names of labels, and return whether they are news."""
@@ -140,8 +141,9 @@ class LabelSpace:
     ) -> dict[int, int]:
         """Ids of the session's classes by label, `UNKNOWN` where it has no name."""
         named = {k: BACKGROUND_NAME if n.lower() == BACKGROUND_NAME else n for k, n in names.items() if n is not None}
-        others = sorted(set(named.values()) - set(self.classes.values()) - {BACKGROUND_NAME}) if self.classes else []
-        if others:
+        others = sorted({*named.values()} - {*self.classes.values(), BACKGROUND_NAME} - self._said)
+        if others and self.classes:
+            self._said.update(others)
             say(
                 f"{source}: its classes {listed(others)} are not among class_names, and become background; a label map "
                 "can make them unknown (null) or others"
