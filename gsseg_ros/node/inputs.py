@@ -131,6 +131,7 @@ class Inputs:
         self._images: list[CameraImages] = []
         # A simulator's stamps repeat, and views of an earlier activation may come back with a saved state.
         activation = secrets.token_hex(4)
+        workspace.activations.add(activation)
         for name in settings.cameras or ("",):
             prefix = f"{activation}_{name}_" if name else f"{activation}_"
             camera = CameraStreams(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import replace
 from typing import TypeAlias
 
@@ -112,7 +112,7 @@ class SceneChanges:
         try:
             # Between what it is named by, where views are and what is fused, nothing else may happen.
             with self.workspace.placement.fusing:
-                delta = _with_names(delta, session) if stamps else delta
+                delta = _with_names(delta, session, self.workspace.activations) if stamps else delta
                 self.workspace.placement.bring(view for move in delta.moves for view in move.views)
                 changed = session.update(delta)
         except (SceneDeltaError, EmptySceneError) as error:
@@ -128,15 +128,18 @@ class SceneChanges:
             raise InvalidRequestError("another scene was loaded meanwhile, and is unchanged; expected one that stays")
 
 
-def _with_names(delta: SceneDelta, session: LivingSession) -> SceneDelta:
+def _with_names(delta: SceneDelta, session: LivingSession, own: Container[str]) -> SceneDelta:
     """Replace stamps among the views of a change by the names of the views that carry them.
 
-    Where time was set back, or the node was activated again, these are those of the last time of each camera.
+    Where time was set back, or the node was activated again, these are those of the last time of each camera. Views of
+    its own activations go before others, which may be another robot's: in one simulator they carry the same stamps.
     """
     stamped: dict[str, dict[_Key, tuple[_Key, list[str]]]] = {}
     for name in session.view_names:
         camera, time_of, stamp = _taken_apart(name)
         rounds = stamped.setdefault(stamp, {})
+        if camera in rounds and rounds[camera][0][0] in own and time_of[0] not in own:
+            continue
         if camera not in rounds or rounds[camera][0] != time_of:
             rounds[camera] = (time_of, [])
         rounds[camera][1].append(name)

@@ -69,6 +69,8 @@ class Workspace:
         What labels of masks mean.
     active : bool
         Whether the node's lifecycle state is active.
+    activations : set of str
+        Tokens of all its activations, with which the names of their views begin.
     last_job : str
         What the last job was, and how it ended.
     dropped : Counter of str
@@ -85,7 +87,7 @@ class Workspace:
         self.forget_waiting: Callable[[], None] = lambda: None
         self.label_space = LabelSpace(settings.class_names, None, settings.max_classes)
         self._at_start = {name: getattr(settings, name) for name in _PATHS}
-        self.active = False
+        self.active, self.activations = False, set[str]()
         self.last_job = "none"
         self.dropped: Counter[str] = Counter()
         self.changes: Counter[str] = Counter()

@@ -210,7 +210,7 @@ def test_a_stamp_names_the_newest_views_that_carry_it_and_no_round_of_time() -> 
     known: Any = SimpleNamespace(view_names=names)
 
     def named(*views: str) -> tuple[str, ...]:
-        return _with_names(SceneDelta(moves=(GroupMove(0, Similarity(), views),)), known).moves[0].views
+        return _with_names(SceneDelta(moves=(GroupMove(0, Similarity(), views),)), known, {"0a", "0b"}).moves[0].views
 
     assert named("0") == ("0a_1_0",)
     assert named("5000", "x") == ("0b_0_5000", "0b_0_5000_2", "x")
@@ -271,6 +271,25 @@ def test_states_of_other_robots_are_added_exactly(here: NodeHere) -> None:
     np.testing.assert_array_equal(votes(session), more + alone)
     assert here.ask("merge_states").error_code == 11103
     assert here.ask("merge_states", paths=["scene.ply"]).error_code == 11112
+
+
+def test_a_stamp_names_the_nodes_own_views_though_views_of_another_robot_with_that_stamp_were_merged(
+    here: NodeHere, shared: Ros
+) -> None:
+    own, session = here.node.workspace.living_session.view_names, here.node.workspace.living_session
+    stamp = own[0].split("_")[-1]
+    with node_here(shared, {"data_root": root(here), "scene_path": root(here) / "scene.ply"}) as other:
+        other.stamp = int(stamp)
+        other.fuse(clean_views(4))
+        other.done("save_state", path="other.npz")
+    here.done("merge_states", paths=["other.npz"])
+    assert sum(name.endswith(stamp) for name in session.view_names) == 2
+    for again in (False, True):
+        if again:
+            here.node.trigger_deactivate()
+            here.node.trigger_activate()
+        here.done("update_scene", delta=message_from_delta(SceneDelta(moves=(GroupMove(0, Similarity(), (stamp,)),))))
+        assert [view.name for view in session.views if view.group == 0] == own[:1]
 
 
 def test_a_node_that_finds_objects_itself_refuses_changes_and_says_why(shared: Ros, parameters: dict[str, Any]) -> None:
