@@ -106,6 +106,7 @@ class RosSource:
             self._shown = said
             return LiveUpdate(Labelling.unknown(len(self._scene)), 0) if error.name == "NO_CODES" else None
         if report.scene_hash != self._scene.digest:
+            self._shown = said  # To ask again before anything has changed would keep the node at work for nothing.
             raise StateMismatchError(
                 f"{self._name} has the scene {report.scene_path}, which is not {self._scene.path or 'this one'}; "
                 "expected the same file"

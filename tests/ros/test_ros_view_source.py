@@ -128,10 +128,21 @@ def test_a_scene_that_the_node_puts_elsewhere_is_found_there() -> None:
     assert source.wait(0.1) is None
 
 
+def test_a_node_whose_map_is_another_one_by_now_is_not_asked_again_before_anything_has_changed() -> None:
+    scene, _ = many_classes(30)
+    report = SimpleNamespace(scene_hash="that of the map as it has grown", scene_path="map.ply")
+    source = source_of(scene, "3 views", report, Similarity())
+    for said in ("3 views", "4 views"):
+        source._said = (said,)
+        with pytest.raises(StateMismatchError, match=r"has the scene map\.ply, which is not this one"):
+            source.wait(0.1)
+        assert source.wait(0.1) is None
+
+
 def test_a_class_that_turned_up_in_a_run_for_somebody_else_is_shown() -> None:
     scene, _ = many_classes(30)
     report = SimpleNamespace(scene_hash=scene.digest, classes=[], num_views=3, header=Header())
-    source = source_of(scene, "3 views", report, Similarity.from_parameters(1.0, [0.0] * 3, [0.0, 0.0, 0.0, 1.0]))
+    source = source_of(scene, "3 views", report, Similarity())
     update = source.wait(0.1)
     assert update is not None and update.labelling.probabilities.shape == (len(scene), 2)
     assert np.flatnonzero(update.labelling.probabilities[:, 1]).tolist() == [0, 1]
