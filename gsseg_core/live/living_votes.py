@@ -142,3 +142,11 @@ def carried_over(state: State, change: SceneChange, joining: Mapping[str, int | 
     votes.change(change, joining)
     now, learnt = votes.state(), state.learnt and state.learnt.carried(change.carry)
     return replace(state, votes=now.votes, views=now.views, living=now.living, learnt=learnt, whole_rays=False)
+
+
+def without_groups(state: State, device: str) -> State:
+    """Have the views of a state stay where they are in the scene, for a session in which no group moves."""
+    if state.living is None or all(view.group is None for view in state.views):
+        return state
+    flat = SceneChange(state.living, state.living.flat(), np.arange(len(state.living)))
+    return carried_over(state, flat, {view.name: None for view in state.views}, device)

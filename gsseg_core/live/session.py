@@ -22,9 +22,8 @@ from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.class_numbers import add_names, check_classes_of, ids_by_name, require_affordable
 from gsseg_core.live.current_codes import Known, current_codes, current_evidence
 from gsseg_core.live.fitting import Report, check_names_of, fitted, names_with, num_classes_with
-from gsseg_core.live.living_votes import carried_over
+from gsseg_core.live.living_votes import without_groups
 from gsseg_core.live.results import SCENE_CHANGED, Outcome, Rejection
-from gsseg_core.live.scene_change import SceneChange
 from gsseg_core.progress import Stopwatch
 from gsseg_core.refine.settings import UNREFINED, RefineSettings
 from gsseg_core.scene.camera import Camera
@@ -83,8 +82,7 @@ class LiveSession:
         self.scene, self.max_views, self.device, self.max_classes = scene, max_views, device, max_classes
         self.rejected: Counter[str] = Counter()
         self._declared, self._names = bool(class_names), {0: BACKGROUND_NAME, **(class_names or {})}
-        self._lock = threading.RLock()
-        self._version = 0
+        self._lock, self._version = threading.RLock(), 0
         self._scenes: WeakKeyDictionary[Segmentation, GaussianScene] = WeakKeyDictionary()
         self._forget({}, self._no_votes(self._min_classes))
 
@@ -331,8 +329,7 @@ class LiveSession:
         votes.resize(max(state.num_classes, self._min_classes))  # If that takes too much memory, nothing is forgotten.
         with self._lock:
             self._forget(state.class_names, votes)
-            self.num_fused = state.num_fused
-            self._learnt = state.learnt
+            self.num_fused, self._learnt = state.num_fused, state.learnt
             self._drop_old_views()
         return state.learnt.num_views if state.learnt is not None else state.num_fused
 
@@ -366,10 +363,8 @@ class LiveSession:
         """Replace all that is known by names of classes and the votes of a state, or of none."""
         if not self._declared:
             self._names = {0: BACKGROUND_NAME, **class_names}
-        self._live = votes
+        self._live, self._cameras, self.num_fused = votes, [], 0
         self._learnt = self._segmented = None
-        self._cameras = []
-        self.num_fused = 0
         self._version += 1
         self.retire()
 
@@ -378,11 +373,7 @@ class LiveSession:
         return VoteLearner(self.scene, num_classes, device=self.device, memory_budget=0)
 
     def _read_state(self, path: Path, within: Path | None) -> State:
-        state = State.load(path, self.scene.digest, len(self.scene), within)
-        if state.living is None or all(view.group is None for view in state.views):
-            return state
-        flat = SceneChange(state.living, state.living.flat(), np.arange(len(self.scene)))  # Here no group moves.
-        return carried_over(state, flat, {view.name: None for view in state.views}, self.device)
+        return without_groups(State.load(path, self.scene.digest, len(self.scene), within), self.device)
 
     def _check_classes(self, path: str | os.PathLike[str], state: State) -> None:
         """Raise `StateFileError` if a state has too many classes, other names than were declared, or objects."""
