@@ -14,7 +14,7 @@ import numpy as np
 
 from gsseg_core.csr_rows import CSRRows, largest
 from gsseg_core.data.class_names import class_name
-from gsseg_core.data.object_tree import ObjectTree, check_granularity
+from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.data.view import spread
 from gsseg_core.errors import SettingsError, StateMismatchError
 from gsseg_core.files.npz_files import (
@@ -186,19 +186,16 @@ class Segmentation:
         """
         if granularity is None:
             return self
-        check_granularity(granularity)
         if (tree := self.tree) is None:
             raise SettingsError("granularity is for objects that were found from ids of each view's own; found no tree")
         names = tree.names(self.class_names)
-        probabilities, nodes = tree.shares_at(granularity, self.probabilities, tree.leaves)
+        # What blends into a view of a whole is the sum of what its objects do, as it was learnt.
+        probabilities, nodes = tree.shares_at(granularity, self.calibrated(1.0).probabilities, tree.leaves)
         return replace(
-            self,
-            labels=tree.labels_at(granularity, self.labels),
-            probabilities=probabilities,
-            class_names={node: names[node] for node in nodes},
+            self, labels=tree.labels_at(granularity, self.labels), probabilities=probabilities,
+            class_names={node: names[node] for node in nodes}, temperature=1.0, tree=None,
             learnt=tree.shares_at(granularity, self.learnt, tree.leaves[self.clustered])[0],
-            tree=None,
-        )
+        ).calibrated(self.temperature)  # fmt: skip
 
     @property
     def node_names(self) -> dict[int, str]:
@@ -237,13 +234,16 @@ class Segmentation:
         return replace(self, labels=labels, class_names=dict(enumerate(self.class_names.values())))
 
     def with_ids(self, ids: Sequence[int]) -> Segmentation:
-        """Give classes that are numbered without gaps ids of their own, (K,) different ones in any order."""
+        """Give classes that are numbered without gaps, and have no tree, (K,) different ids, 0 first."""
+        names, order = list(self.class_names.values()), np.argsort(ids).tolist()
+        if self.tree or not len(names) == self.num_classes == len(ids) == len({*ids}) or order[0] or ids[0]:
+            expected = f"{len(names)} different ones, 0 first, for classes that have neither gaps nor a tree"
+            raise SettingsError(f"ids are {clipped(list(ids))}; expected {expected}")
         labels = np.where(self.labels >= 0, np.array(ids, np.int32)[np.maximum(self.labels, 0)], self.labels)
-        order, names = np.argsort(ids).tolist(), list(self.class_names.values())
-        result = replace(self, labels=labels, class_names={ids[k]: names[k] for k in order})
-        if order == list(range(len(ids))):
-            return result
-        return replace(result, probabilities=self.probabilities[:, order], learnt=self.learnt[:, order])
+        columns = slice(None) if order == sorted(order) else order
+        probabilities, learnt = self.probabilities[:, columns], self.learnt[:, columns]
+        known = {int(ids[k]): names[k] for k in order}
+        return replace(self, labels=labels, probabilities=probabilities, class_names=known, learnt=learnt)
 
     def in_order_of(self, digest: str, places: np.ndarray) -> Segmentation:
         """Give the result for the Gaussians in the order of the scene of a digest: places (N,) of these in this one."""

@@ -239,6 +239,33 @@ def test_levels_are_segmentations_whose_classes_are_the_nodes_there() -> None:
     assert (objects.counts()[2] + objects.counts()[3]) == coarse.counts()[6]
 
 
+def test_a_level_is_the_same_before_and_after_calibration_and_its_label_maps_do_not_depend_on_it() -> None:
+    codes = np.random.default_rng(0).dirichlet(np.full(NUM_CLASSES, 0.7), len(SCENE)).astype(np.float32)
+    objects = replace(Segmentation.from_codes(SCENE, codes, NAMES), tree=tree_of_balls())
+    operator = make_operator(SCENE, ring(1)[0])
+    for granularity in (0.2, 0.5, 0.9):
+        level, calibrated = objects.at(granularity), objects.calibrated(2.5).at(granularity)
+        np.testing.assert_allclose(calibrated.blend(operator), level.blend(operator), atol=1e-5)
+        np.testing.assert_allclose(calibrated.probabilities, level.calibrated(2.5).probabilities, atol=1e-5)
+        assert calibrated.temperature == 2.5
+
+
+@pytest.mark.parametrize("ids", [[0, 5, 9], [0, 5, 5, 9], [5, 0, 7, 9], [0, -1, 7, 9], [1, 5, 7, 9]])
+def test_ids_that_are_not_one_for_each_class_with_0_the_background_are_refused(ids: list[int]) -> None:
+    result = Segmentation.from_codes(SCENE, CODES, NAMES)
+    with pytest.raises(SettingsError, match=r"ids are .*; expected 4 different ones, 0 first"):
+        result.with_ids(ids)
+
+
+def test_classes_with_ids_of_their_own_or_a_tree_get_no_other_ids() -> None:
+    result = Segmentation.from_codes(SCENE, CODES, NAMES).with_ids([0, 9, 5, 7])
+    assert result.class_names == {0: NAMES[0], 5: NAMES[2], 7: NAMES[3], 9: NAMES[1]}
+    np.testing.assert_array_equal(result.class_ids[result.probabilities.argmax(axis=1)], result.labels)
+    for taken in (result, with_parts()):
+        with pytest.raises(SettingsError, match="neither gaps nor a tree"):
+            taken.with_ids([0, 9, 5, 7])
+
+
 def test_parts_and_wholes_can_be_asked_for_and_removed_by_name() -> None:
     objects = with_parts()
     assert objects.node_names == {**NAMES, 4: f"{NAMES[1]}.1", 5: f"{NAMES[1]}.2", 6: "whole_001"}
