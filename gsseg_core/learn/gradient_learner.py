@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from gsseg_core.errors import SettingsError
-from gsseg_core.learn.learner import Learner, Progress, all_or_nothing, silent
+from gsseg_core.learn.fitted import all_or_nothing
+from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.learn.vote_resolution import is_resolved
 from gsseg_core.raster.observation import Observation
 from gsseg_core.scene.gaussian_scene import GaussianScene

@@ -7,8 +7,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
-from functools import wraps
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -36,7 +35,6 @@ UNITS = 1 / VOTE_UNIT  # units per px
 NO_MASK, SEES_NOTHING, ALL_UNKNOWN = "no mask", "sees no Gaussian", "all pixels unknown"
 
 Self = TypeVar("Self", bound="Learner")
-P = ParamSpec("P")
 R = TypeVar("R")
 
 _ALONE = threading.Lock()  # of two threads at work on a view each, one at a time lends out the votes
@@ -44,24 +42,6 @@ _ALONE = threading.Lock()  # of two threads at work on a view each, one at a tim
 
 class UnusableViewError(Exception):
     """A view that nothing can be learnt from; the message says why, in the words above."""
-
-
-def all_or_nothing(fit: Callable[P, R]) -> Callable[P, R]:
-    """Make a `fit` that leaves what an earlier one has set, all that ends with "_", if an error ends it half-way."""
-
-    @wraps(fit)
-    def whole(*args: P.args, **kwargs: P.kwargs) -> R:
-        fitted = vars(args[0])
-        before = {name: value for name, value in fitted.items() if name.endswith("_")}
-        try:
-            return fit(*args, **kwargs)
-        except BaseException:  # Ctrl-C in a notebook, too.
-            for name in [name for name in fitted if name.endswith("_") and name not in before]:
-                del fitted[name]
-            fitted.update(before)
-            raise
-
-    return whole
 
 
 class Learner(ABC):
@@ -118,7 +98,7 @@ class Learner(ABC):
         self.scene, self.num_classes, self.device, self.memory_budget = scene, num_classes, device, memory_budget
         self.views: dict[str, View] = {}
         self.rejected: dict[str, str] = {}
-        self.history_: list[float] = []
+        self._unfit()
         self._votes = np.zeros((len(scene), num_classes), np.int64)
         self._prepared = PreparedViews(memory_budget, with_file=device == "cpu")  # what lies on a GPU is not for a file
         self._turned = False
@@ -180,15 +160,21 @@ class Learner(ABC):
         self.forget(name)
 
     def forget(self, name: str) -> None:
-        """Drop a view and its mask; its votes stay. `fit` learns from the views that are left."""
+        """Drop a view and its mask; its votes stay. `fit` learns from the views that are left. Raises as `retract`."""
+        self._observed(name)
         del self.views[name]
         self._prepared.drop(name)
 
     def resize(self, num_classes: int) -> None:
-        """Have this many classes, more than any label of `views` (`SettingsError`); votes for the others are gone."""
+        """Have this many classes, more than any label of `views` (`SettingsError`).
+
+        Votes for others are gone, and so is what `fit` has learnt of them.
+        """
         shrinks = num_classes < self.num_classes
         if shrinks and num_classes <= (largest := max([0, *(view.largest_label for view in self.views.values())])):
             raise SettingsError(f"num_classes is {num_classes}; expected more than {largest}, which a view shows")
+        if shrinks:
+            self._unfit()
         if num_classes != self.num_classes:
             added = max(num_classes - self.num_classes, 0)
             self._votes, self.num_classes = np.pad(self._votes[:, :num_classes], ((0, 0), (0, added))), num_classes
@@ -214,6 +200,8 @@ class Learner(ABC):
         After `fit`, for one of its views; what `leaves_out` its mask raises `SettingsError` for others. Nothing of the
         learner changes. Rows sum to less where little is known.
         """
+        if not hasattr(self, "codes_"):
+            raise SettingsError(f"view {view.name!r} was not learnt from; expected it after fit()")
         return self._blend_codes(self.codes_, view)
 
     def strongest_without(
@@ -235,7 +223,11 @@ class Learner(ABC):
         return State(self._votes.copy(), list(self.views.values()), len(self.views))
 
     def adopt(self, state: State) -> None:
-        """Replace views, votes and number of classes by a state's, of the same scene; votes of old are cast anew."""
+        """Replace views, votes and number of classes by a state's, of the same scene; votes of old are cast anew.
+
+        What `fit` has learnt of other views is gone.
+        """
+        self._unfit()
         self.views, self._votes = {view.name: view for view in state.views}, state.votes
         self.num_classes = state.votes.shape[1]
         self.rejected.clear()
@@ -281,6 +273,12 @@ class Learner(ABC):
     def prepared_bytes(self) -> tuple[int, int]:
         """Tell how many bytes of prepared views are kept, in memory and in the temporary file."""
         return self._prepared.nbytes
+
+    def _unfit(self) -> None:
+        """Take away what `fit` has set: it is of views or classes that are gone."""
+        for name in [name for name in vars(self) if name.endswith("_")]:
+            delattr(self, name)
+        self.history_: list[float] = []
 
     def _observed(self, name: str) -> View:
         """Return a view by name; raise `SettingsError` where there is none."""

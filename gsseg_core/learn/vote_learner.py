@@ -31,7 +31,7 @@ class VoteLearner(Learner):
 
         A view that sees nothing of the scene from there stays, without votes. On any error, nothing has changed.
         """
-        before = self.views[name]
+        before = self._observed(name)
         after, seen = replace(before, camera=camera), self._read(before)
         self._lift(after, seen, 1)
         self._lift(before, seen, -1)

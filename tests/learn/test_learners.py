@@ -240,6 +240,22 @@ def test_a_mask_that_came_after_the_fit_has_no_part_in_what_was_fitted_under_its
     learner.predict_without(VIEWS[1])
 
 
+@pytest.mark.parametrize("kind", [EMLearner, GradientLearner])
+def test_what_was_fitted_to_views_or_classes_that_are_gone_predicts_nothing(kind: type[Learner]) -> None:
+    """Two classes, where four were fitted: what is predicted of masks was counted beyond the table of the two."""
+    two = [View.from_arrays(view.camera, view.read_labels().clip(max=1)) for view in VIEWS]
+    another = taught(kind(SCENE, NUM_CLASSES), VIEWS).fit()
+    another.adopt(taught(kind(SCENE, 2), two).state())
+    fewer = taught(kind(SCENE, NUM_CLASSES), [*two[:4], VIEWS[4]]).fit()
+    fewer.retract(VIEWS[4].name)
+    fewer.resize(2)
+    for learner in (another, fewer):
+        assert not hasattr(learner, "codes_") and learner.history_ == []
+        with pytest.raises(SettingsError, match=r"view 'view0' was not learnt from; expected .* fit\(\)"):
+            check_views(learner)
+        assert min(check.reliability for check in check_views(learner.fit())) > 0.9
+
+
 @pytest.mark.parametrize("budget", [0, 1 << 30])
 @every_learner
 def test_views_that_cannot_be_used_are_counted_by_reason_and_change_nothing(kind: type[Learner], budget: int) -> None:
@@ -292,8 +308,10 @@ def test_a_label_beyond_the_classes_is_refused_and_changes_nothing() -> None:
 def test_impossible_requests_are_refused() -> None:
     with pytest.raises(SettingsError, match="num_classes is 0; expected at least 1"):
         VoteLearner(SCENE, 0)
-    with pytest.raises(SettingsError, match="'ghost' was not observed"):
-        VoteLearner(SCENE, 2).retract("ghost")
+    learner = VoteLearner(SCENE, 2)
+    for ask in (learner.retract, learner.forget, lambda name: learner.move(name, VIEWS[0].camera)):
+        with pytest.raises(SettingsError, match="'ghost' was not observed"):
+            ask("ghost")
 
 
 @every_learner

@@ -41,7 +41,8 @@ from gsseg_core.learn.em.confusion_model import ErrorModel
 from gsseg_core.learn.em.pair_kernels import codes_without, kernels_on, rows_on
 from gsseg_core.learn.em.rejected_regions import find_rejected, split_regions
 from gsseg_core.learn.em.spatial_prior import spatial_prior, with_prior
-from gsseg_core.learn.learner import VOTE_UNIT, Learner, Progress, all_or_nothing, silent
+from gsseg_core.learn.fitted import all_or_nothing
+from gsseg_core.learn.learner import VOTE_UNIT, Learner, Progress, silent
 from gsseg_core.learn.vote_resolution import resolved_votes
 from gsseg_core.raster.observation import Observation, ViewPairs, VoteShares
 from gsseg_core.raster.view_operator import ViewOperator
@@ -137,6 +138,9 @@ class EMLearner(Learner):
     """
 
     leaves_out = checks_masks = True
+    error_models_: Mapping[str, ErrorModel] = {}
+    # Probabilities before it and the gradient of all views, both on the device; whether any are of the background.
+    _last_step_: Any = None
 
     def __init__(
         self,
@@ -149,9 +153,6 @@ class EMLearner(Learner):
     ) -> None:
         super().__init__(scene, num_classes, device=device, memory_budget=memory_budget)
         self.settings = settings or EMSettings()
-        self.error_models_: dict[str, ErrorModel] = {}
-        # Probabilities before it and the gradient of all views, both on the device; whether any are of the background.
-        self._last_step_: Any = None
 
     @classmethod
     def default_settings(cls, max_steps: int | None, seed: int) -> tuple[EMSettings]:
@@ -256,7 +257,7 @@ class EMLearner(Learner):
     def forget(self, name: str) -> None:
         """Drop a view, its mask and its error model: what comes under its name has another."""
         super().forget(name)
-        self.error_models_.pop(name, None)
+        self.error_models_ = {known: model for known, model in self.error_models_.items() if known != name}
 
     def _model_of(self, view: View) -> ErrorModel:
         if view.name not in self.error_models_:

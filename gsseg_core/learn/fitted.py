@@ -1,0 +1,28 @@
+"""What `fit` sets, all that ends with "_": an error half-way leaves it as it was."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from typing import ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def all_or_nothing(fit: Callable[P, R]) -> Callable[P, R]:
+    """Make a `fit` that leaves what an earlier one has set, all that ends with "_", if an error ends it half-way."""
+
+    @wraps(fit)
+    def whole(*args: P.args, **kwargs: P.kwargs) -> R:
+        fitted = vars(args[0])
+        before = {name: value for name, value in fitted.items() if name.endswith("_")}
+        try:
+            return fit(*args, **kwargs)
+        except BaseException:  # Ctrl-C in a notebook, too.
+            for name in [name for name in fitted if name.endswith("_") and name not in before]:
+                del fitted[name]
+            fitted.update(before)
+            raise
+
+    return whole
