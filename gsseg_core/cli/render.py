@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from gsseg_core.cli.shared import add_scene, load_kernels
+from gsseg_core.cli.shared import add_scene, load_kernels, note_frame
 from gsseg_core.cli.terminal import tell
 from gsseg_core.progress import progress_bars
 from gsseg_core.text import counted
@@ -40,5 +40,6 @@ def run(options: argparse.Namespace) -> int:
             split=options.split, device=options.device, align=options.align,
             dataparser=options.dataparser, progress=progress,
         )  # fmt: skip
+    note_frame(options)
     tell(f"{counted(len(paths), 'label map')} in {options.out}, overlays in {options.out}/overlays")
     return 0

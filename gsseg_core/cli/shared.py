@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 
 from gsseg_core.cli.terminal import note
-from gsseg_core.errors import PathTakenError, SettingsError
+from gsseg_core.errors import GssegError, PathTakenError, SettingsError
 from gsseg_core.raster.backends import devices, rasteriser_of
 from gsseg_core.scene.scene_writers import SCENE_WRITERS
 
@@ -65,6 +67,17 @@ def labels_path(options: argparse.Namespace) -> str:
     is_elsewhere = not os.path.exists(os.path.join(options.data, labels)) and os.path.exists(labels)
     # The default is a folder of the dataset only: masks that lie here by chance were not asked for.
     return os.path.abspath(labels) if is_elsewhere and labels != LABELS else labels
+
+
+def note_frame(options: argparse.Namespace) -> None:
+    """Say so where the run of a segmentation has moved the cameras by `--align`, and this command does not."""
+    from gsseg_core.files.json_files import read_object
+
+    report = Path(options.segmentation).parent / "report.json"
+    with suppress(GssegError, KeyError, TypeError):  # Without a report of a run that moved any, nothing is to be said.
+        found = "; ".join(read_object(report, GssegError, "a report")["frame"]["alignment"]["found"])
+        if found and not options.align:
+            note(f"{report}: that run moved the cameras by --align ({found}), and here they are not; try --align")
 
 
 def load_kernels(quiet: bool, device: str = "cpu") -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from gsseg_core.cli.shared import add_device, add_frame, add_quiet, load_kernels
+from gsseg_core.cli.shared import add_device, add_frame, add_quiet, load_kernels, note_frame
 from gsseg_core.cli.terminal import note, tell
 from gsseg_core.errors import SettingsError
 from gsseg_core.progress import progress_bars
@@ -73,6 +73,8 @@ def _show(options: argparse.Namespace, listener: Listener, viewer_module: Module
     learnt = LearntFrom.read(Path(options.segmentation).parent / "report.json") if segmentation else LearntFrom()
     dataset = learnt.dataset(options.data) if options.data else None
     if dataset:
+        if segmentation:
+            note_frame(options)
         with progress_bars(options.quiet) as progress:
             dataset = place(
                 scene, dataset, align=options.align, dataparser=options.dataparser, device=options.device,

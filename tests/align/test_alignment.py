@@ -304,6 +304,11 @@ def test_segment_warns_in_one_line_of_cameras_that_do_not_fit_and_align_mends_it
     assert frame["agreement"]["agrees"] is True
     np.testing.assert_allclose(frame["alignment"]["world_axes"], AXIS_ROTATIONS[9].T)
 
+    found = ["--segmentation", str(tmp_path / "out/segmentation.npz"), "--out", str(tmp_path / "maps")]
+    for given, notes in (([], 1), (["--align"], 0)):  # Without, it renders the scene from where no camera was.
+        assert main(["render", scene, "--data", str(turned), *found, "--quiet", *given]) == 0
+        assert capsys.readouterr().err.count("that run moved the cameras by --align (") == notes
+
 
 def test_a_missing_pycolmap_is_one_error_that_says_what_to_type(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
