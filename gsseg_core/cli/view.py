@@ -86,14 +86,12 @@ def _show(options: argparse.Namespace, listener: Listener, viewer_module: Module
     views = learnt.views(dataset) if dataset else []
     if dataset and not views:
         note(f"there are no views to jump to: found no mask of a train view in {Path(options.data) / learnt.labels}")
-    if segmentation:
-        labelling = Labelling.of(segmentation.numbered())
-    else:
-        labelling = Labelling.unknown(len(scene), dataset.class_names if dataset else None)
+    read = segmentation.numbered() if segmentation else None
+    labelling = Labelling.of(read) if read else Labelling.unknown(len(scene), dataset.class_names if dataset else None)
     source = open_source("ros", scene) if options.ros else None
     mode = BY_CLASS if options.segmentation or options.ros else TRUE_COLOURS
-    tree = segmentation.tree if segmentation and not options.ros else None  # A node tells labels alone.
-    model = ViewModel(scene, labelling, mode=mode, class_ids=tuple(class_ids or ()), tree=tree)
+    tree = read.tree if read else None  # A node tells labels alone.
+    model = ViewModel(scene, labelling, mode=mode, class_ids=tuple(class_ids or ()), tree=tree, read=read)
     viewer = viewer_module.Viewer(
         model, views, learnt.reliability, source, listener=listener, draw=options.draw, device=options.device
     )

@@ -94,6 +94,7 @@ class ViewModel:
     removed: set[int] = field(default_factory=set)  # labels that are off the list, too
     class_ids: tuple[int, ...] = ()  # ids by label, as many as were given: labels are numbers without gaps
     tree: ObjectTree | None = None  # parts and wholes of the classes
+    read: Segmentation | None = None  # what the labelling is of, if it is of one, its classes without gaps
 
     def ids(self) -> list[int]:
         """Ids of all classes, by label; those that were added in the viewer have the smallest free ones."""

@@ -186,9 +186,15 @@ class ViewerState:
 
     def segmentation_npz(self) -> tuple[str, bytes]:
         """Write labels and class probabilities, corrections included: the name `segmentation.npz`, and its bytes."""
-        (labels, probabilities, names, _), tree = self.objects, self.model.tree
+        (labels, probabilities, names, _), tree, read = self.objects, self.model.tree, self.model.read
         nothing, none = np.zeros(len(labels), bool), np.empty((0, probabilities.shape[1]), np.float32)
         result = Segmentation(labels, completed(probabilities), names, self.model.scene.digest, nothing, none)
+        if read is not None:  # What blends into views is what was learnt, but for what was corrected.
+            added = len(names) - len(read.class_names)
+            before, learnt = (np.pad(shares, ((0, 0), (0, added))) for shares in (read.probabilities, read.learnt))
+            same = (probabilities == before).all(axis=1)
+            learnt = learnt[same[read.clustered]]
+            result = replace(result, clustered=read.clustered & same, learnt=learnt, temperature=read.temperature)
         if tree is None:
             result = result.with_ids(self.model.ids())
         elif tree.num_classes == len(names):  # Classes that were added are in no tree.

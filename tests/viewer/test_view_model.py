@@ -16,6 +16,7 @@ from small_scenes import NAMES, balls_on_a_table, ring
 
 from gsseg_core.errors import SettingsError, UnknownLabelError
 from gsseg_core.export.pictures import FILL
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 from gsseg_core.viewer.model import (
     BY_CLASS,
@@ -302,6 +303,25 @@ def test_corrections_are_of_objects_on_every_level_and_the_tree_is_saved(tmp_pat
     assert all(state.node_of(int(i)) is None for i in np.flatnonzero(spoon)[:3])
     (tmp_path / "s.npz").write_bytes(state.segmentation_npz()[1])
     assert Segmentation.load(tmp_path / "s.npz", SCENE).tree is None
+
+
+def test_what_is_saved_blends_into_views_as_what_was_read_but_for_what_was_corrected(tmp_path: Path) -> None:
+    codes = np.random.default_rng(0).dirichlet(np.full(K, 0.7), len(SCENE)).astype(np.float32)
+    read, camera = Segmentation.from_codes(SCENE, codes, NAMES).calibrated(0.3), ring(1)[0]
+    operator = make_operator(SCENE, camera)
+    state = ViewerState(ViewModel(SCENE, Labelling.of(read), class_ids=tuple(NAMES), read=read), [], {}, "cpu")
+
+    def saved() -> Segmentation:
+        (tmp_path / "s.npz").write_bytes(state.segmentation_npz()[1])
+        return Segmentation.load(tmp_path / "s.npz", SCENE)
+
+    for found, expected in zip(saved().render(operator), read.render(operator), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    (uv,), _ = camera.project(SCENE.means[TRUTH == 1].mean(axis=0, keepdims=True))
+    state.added_names[K] = "spoon"
+    assert state.correct(disc(camera, *uv, 3, K)) > 0
+    labels = saved().label_map(operator)
+    assert labels[int(uv[1]), int(uv[0])] == K and (labels == read.label_map(operator)).mean() > 0.9
 
 
 def test_a_class_that_was_added_stays_apart_from_those_that_turn_up_in_a_live_source_and_joins_its_namesake() -> None:
