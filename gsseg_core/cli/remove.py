@@ -33,16 +33,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Remove, and say what is left."""
     from dataclasses import replace
+    from pathlib import Path
 
     import numpy as np
 
     from gsseg_core.data.class_names import class_ids, listed
     from gsseg_core.export.class_files import write_selection
     from gsseg_core.export.collision import check_collision, collision_meshes
-    from gsseg_core.files.atomic import check_writable
+    from gsseg_core.files.atomic import check_replaceable, check_writable
     from gsseg_core.objects.removal import left_without
     from gsseg_core.scene.gaussian_scene import GaussianScene
-    from gsseg_core.scene.scene_writers import check_format, format_of
+    from gsseg_core.scene.scene_formats import find_format
+    from gsseg_core.scene.scene_writers import SCENE_WRITERS, check_format, format_of
     from gsseg_core.segmentation import REMOVED, Segmentation
     from gsseg_core.text import clipped, counted
 
@@ -50,6 +52,9 @@ def run(options: argparse.Namespace) -> int:
     check_not_read(options.out, "scene", options.scene)
     check_not_read(options.out, "segmentation", options.segmentation)
     scene_format = format_of(options.out, options.format)
+    path, suffixes = Path(options.out), SCENE_WRITERS[scene_format].suffixes
+    is_scene = path.name.lower().endswith(suffixes) or find_format(path) is not None
+    check_replaceable(path, "scene", is_scene or not (path.exists() and path.stat().st_size))
     check_format(scene_format)
     check_collision(options.collision)
     scene = GaussianScene.load(options.scene)

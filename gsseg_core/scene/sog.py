@@ -35,9 +35,9 @@ Load = Callable[[str, int], bytes]  # a file by its name, of so many bytes at mo
 
 
 def is_sog(head: bytes) -> bool:
-    """Whether a file begins as SOG: a zip that is no checkpoint of PyTorch, or a `meta.json`."""
+    """Whether a file begins as SOG: a zip that is neither PyTorch's checkpoint nor NumPy's npz, or a `meta.json`."""
     if head.startswith(b"PK\x03\x04"):
-        return b"data.pkl" not in head[:256]
+        return not any(member in head[:256] for member in (b"data.pkl", b".npy"))
     return head.lstrip()[:1] == b"{" and b'"means"' in head and b'"quats"' in head
 
 

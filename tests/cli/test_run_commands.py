@@ -219,6 +219,18 @@ def test_single_files_replace_no_device_and_keep_links(place: Path, capsys: pyte
     assert (place / "link.ply").is_symlink() and len(GaussianScene.load(place / "rest.ply")) > 0
 
 
+@pytest.mark.parametrize("saved", ["out/report.json", "out/pictures/legend.png", "state.npz"])
+def test_remove_replaces_nothing_but_scenes(place: Path, capsys: pytest.CaptureFixture[str], saved: str) -> None:
+    shutil.copy(place / "out/segmentation.npz", place / "state.npz")
+    before = (place / saved).read_bytes()
+    remove = ["remove", f"{place}/data/scene.ply", "--segmentation", f"{place}/out/segmentation.npz", "--class", "1"]
+    assert main([*remove, "--out", str(place / saved)]) == 2 and (place / saved).read_bytes() == before
+    assert_one_line(capsys.readouterr().err, f"{saved}: is there and is no scene; expected a new file, or a scene")
+    (place / "empty").touch()
+    for name in ("empty", "empty", "rest.spz", "rest.spz"):  # The second time, over what it has written.
+        assert main([*remove, "--out", str(place / name)]) == 0
+
+
 @pytest.mark.parametrize("read", ["data/scene.ply", "out/segmentation.npz"])
 def test_remove_never_writes_over_what_it_reads(place: Path, capsys: pytest.CaptureFixture[str], read: str) -> None:
     before = (place / read).read_bytes()
