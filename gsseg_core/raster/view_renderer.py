@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sized
 from typing import NamedTuple
 
 import numpy as np
@@ -104,8 +105,9 @@ class ViewRenderer(ABC):
         """Do the same for codes (N, K) of which only the entries that are not zero are at hand.
 
         If they are those of some Gaussians, (R, K), `of` says of which, (R,) distinct: all of `ids` are among them.
+        Raises as `render` does.
         """
-        return self.blend_seen(codes.take(self._rows(of)).dense(num_classes))
+        return self.blend_seen(codes.take(self._rows(codes, of)).dense(num_classes))
 
     def blend_probabilities(
         self, codes: CSRRows, num_classes: int, background: bool, of: np.ndarray | None = None
@@ -131,10 +133,16 @@ class ViewRenderer(ABC):
         image = self.blend_probabilities(codes, num_classes, background, of)
         return Strongest.of(image, grid, None if beside is None else self.blend_seen(beside))
 
-    def _rows(self, of: np.ndarray | None) -> np.ndarray:
+    def _rows(self, codes: CSRRows, of: np.ndarray | None) -> np.ndarray:
         """Tell which row of such codes each of `ids` has, (M,) int32."""
+        self._check_rows(len(codes.indptr) - 1, of)
         if of is None:
             return self.ids
         place = np.empty(self.num_gaussians, np.int32)
         place[of] = np.arange(len(of), dtype=np.int32)
         return np.asarray(place[self.ids])
+
+    def _check_rows(self, count: int, of: Sized | None) -> None:
+        expected = self.num_gaussians if of is None else len(of)
+        if count != expected:
+            raise SceneValueError(f"view {self.camera.name!r}: codes are of {count} Gaussians; expected {expected}")

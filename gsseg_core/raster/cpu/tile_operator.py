@@ -75,7 +75,7 @@ class TileOperator(ViewOperator):
 
     def blend_rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None = None) -> Blended:
         """Blend codes without their zeros."""
-        return Blended(*products.render(self._tiles, codes, self._rows(of), num_classes))
+        return Blended(*products.render(self._tiles, codes, self._rows(codes, of), num_classes))
 
     def strongest(
         self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid | None = None,
@@ -85,7 +85,7 @@ class TileOperator(ViewOperator):
         first, step = grid or (1 << 30, 1 << 30)  # of which no image has a pixel
         others = np.ascontiguousarray(np.empty((len(self.ids), 0)) if beside is None else beside, np.float32)
         classes, known, some, image, left_over = products.strongest(
-            self._tiles, codes, self._rows(of), num_classes, background, first, step, others,
+            self._tiles, codes, self._rows(codes, of), num_classes, background, first, step, others,
             _ALL_WANTED if wanted is None else wanted,
         )  # fmt: skip
         return Strongest(classes, known, some, None if beside is None else Blended(image, left_over))

@@ -97,6 +97,7 @@ class GPUOperator(ViewOperator):
         self, codes: CSRRows | RowTensors, num_classes: int, of: np.ndarray | torch.Tensor | None
     ) -> torch.Tensor:
         """Write codes of `ids` out by class on the GPU, (M, K); `of` as in `blend_rows`. Both may be there already."""
+        self._check_rows(len(codes.indptr) - 1, of)
         rows = RowTensors.kept(codes, self._device) if isinstance(codes, CSRRows) else codes
         ids = self.tiles.ids.long()
         if of is not None:
