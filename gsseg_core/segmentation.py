@@ -45,7 +45,6 @@ UNOBSERVED, REMOVED = -1, -2
 """Labels of Gaussians of which nothing is known, and of those that the filter or carving took out."""
 
 FORMAT = "gsseg-segmentation-1"
-
 _FIRST_ONE = threading.Lock()  # of several threads that ask for what is blended, one computes it
 
 
@@ -157,7 +156,8 @@ class Segmentation:
             raise StateMismatchError(f"segmentation: belongs to the scene {found}; expected {given}, the one given")
 
     def filtered(self, scene: GaussianScene, settings: RefineSettings) -> Segmentation:
-        """Take the outliers out of each object: the paper's statistical filter."""
+        """Take the outliers out of each object: the paper's statistical filter; `StateMismatchError` as in `carved`."""
+        self.require(scene)
         neighbours, classes = neighbours_of(scene, settings.k), self.probabilities.shape[1]
         out = statistical_filter(scene.means, self.labels, settings.k, settings.filter_sigmas, classes, neighbours)
         return self._without(out)
@@ -240,10 +240,10 @@ class Segmentation:
             expected = f"{len(names)} different ones, 0 first, for classes that have neither gaps nor a tree"
             raise SettingsError(f"ids are {clipped(list(ids))}; expected {expected}")
         labels = np.where(self.labels >= 0, np.array(ids, np.int32)[np.maximum(self.labels, 0)], self.labels)
-        columns = slice(None) if order == sorted(order) else order
-        probabilities, learnt = self.probabilities[:, columns], self.learnt[:, columns]
-        known = {int(ids[k]): names[k] for k in order}
-        return replace(self, labels=labels, probabilities=probabilities, class_names=known, learnt=learnt)
+        result = replace(self, labels=labels, class_names={int(ids[k]): names[k] for k in order})
+        if order == sorted(order):
+            return result
+        return replace(result, probabilities=self.probabilities[:, order], learnt=self.learnt[:, order])
 
     def in_order_of(self, digest: str, places: np.ndarray) -> Segmentation:
         """Give the result for the Gaussians in the order of the scene of a digest: places (N,) of these in this one."""

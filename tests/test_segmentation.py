@@ -137,6 +137,7 @@ def test_a_segmentation_is_neither_made_nor_used_with_another_scene(tmp_path: Pa
         lambda: object_boxes(other, result),
         lambda: without_objects(other, result, [1]),
         lambda: result.carved(other, [view.camera]),
+        lambda: result.filtered(other, PAPER),
     ):
         with pytest.raises(StateMismatchError, match=r"segmentation: belongs to the scene .* expected"):
             use()

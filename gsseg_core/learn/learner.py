@@ -13,7 +13,7 @@ import numpy as np
 
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
-from gsseg_core.errors import NoUsableViewsError, SettingsError, UnknownLabelError
+from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
 from gsseg_core.learn.em.em_kernels import normalise_votes, weigh_votes
 from gsseg_core.learn.learner_state import State
 from gsseg_core.learn.prepared_views import PreparedViews, default_budget
@@ -225,8 +225,10 @@ class Learner(ABC):
     def adopt(self, state: State) -> None:
         """Replace views, votes and number of classes by a state's, of the same scene; votes of old are cast anew.
 
-        What `fit` has learnt of other views is gone.
+        What `fit` has learnt of other views is gone. Raises `StateMismatchError` where its scene has another size.
         """
+        if (found := len(state.votes)) != len(self.scene):
+            raise StateMismatchError(f"state is of {found} Gaussians; expected {len(self.scene)}, as the scene has")
         self._unfit()
         self.views, self._votes = {view.name: view for view in state.views}, state.votes
         self.num_classes = state.votes.shape[1]

@@ -17,7 +17,7 @@ from small_scenes import NAMES, NUM_CLASSES, OUT_OF_SIGHT, balls_on_a_table, cle
 from gsseg_core.data.label_images import UNKNOWN, write_mask
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
-from gsseg_core.errors import MaskSizeError, NoUsableViewsError, SettingsError, UnknownLabelError
+from gsseg_core.errors import MaskSizeError, NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
 from gsseg_core.learn.em import em_learner, spatial_prior
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.gradient_learner import GradientLearner
@@ -308,7 +308,9 @@ def test_a_label_beyond_the_classes_is_refused_and_changes_nothing() -> None:
 def test_impossible_requests_are_refused() -> None:
     with pytest.raises(SettingsError, match="num_classes is 0; expected at least 1"):
         VoteLearner(SCENE, 0)
-    learner = VoteLearner(SCENE, 2)
+    learner, state = VoteLearner(SCENE, 2), taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS).state()
+    with pytest.raises(StateMismatchError, match="state is of 626 Gaussians; expected 600, as the scene has"):
+        EMLearner(SCENE.subset(np.arange(600)), NUM_CLASSES).adopt(state)
     for ask in (learner.retract, learner.forget, lambda name: learner.move(name, VIEWS[0].camera)):
         with pytest.raises(SettingsError, match="'ghost' was not observed"):
             ask("ghost")
