@@ -98,8 +98,17 @@ class ViewOperator(ViewRenderer):
         -------
         bool
             Whether a labelled pixel sees any Gaussian.
+
+        Raises
+        ------
+        SceneValueError
+            The total has another number of rows, or too few classes.
         """
         self._check_size(labels, 2)
+        most = int((labels if evidence is None else evidence.votes.indices).max(initial=0))
+        if len(total) != self.num_gaussians or most >= total.shape[1]:
+            expected = f"({self.num_gaussians}, K), with K above {most}"
+            raise SceneValueError(f"view '{self.camera.name}': votes have shape {total.shape}; expected {expected}")
         return self._vote(labels, evidence, total, units, sign)
 
     def without(self, hidden: np.ndarray) -> ViewOperator:

@@ -322,6 +322,10 @@ def test_codes_of_another_scene_are_refused(backend):
     for shape in [(119, 3), (121, 3), (120,), (120, 3, 1)]:
         with pytest.raises(SceneValueError, match=r"codes have shape .* expected \(120, K\)"):
             operator.render(np.zeros(shape))
+    labels = np.full(operator.camera.image_size[::-1], 2, np.int32)
+    for shape in [(119, 3), (120, 2)]:
+        with pytest.raises(SceneValueError, match=r"votes have shape .* expected \(120, K\), with K above 2"):
+            operator.vote(labels, None, np.zeros(shape, np.int64), 1.0)
     for count, of in [(119, None), (5000, None), (3, np.arange(2))]:  # Kernels would read beyond the end.
         codes, expected = CSRRows.from_dense(np.ones((count, 3), np.float32)), 120 if of is None else 2
         with pytest.raises(SceneValueError, match=f"view 'view': codes are of {count} Gaussians; expected {expected}"):
