@@ -316,7 +316,7 @@ def _write(
             run.claim(settings.places(level.class_names, inputs.pictured))
         in_file = named if inputs.places is None else named.in_order_of(inputs.digest, inputs.places)
         behind(in_file.save, folder / "segmentation.npz", run.id)
-        meshes = collision_meshes(scene, exported, settings.collision) if settings.collision else {}
+        meshes = collision_meshes(scene, exported.labels, exported.confidence, settings.collision)
         files = class_paths(exported, folder / "classes", settings.scene_format)
         behind(write_classes, scene, exported, folder / "classes", run.id, settings.scene_format, meshes, inputs.places)
     with watch.stage("pictures"):

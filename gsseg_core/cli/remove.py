@@ -32,7 +32,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Remove, and say what is left."""
-    from dataclasses import replace
     from pathlib import Path
 
     import numpy as np
@@ -62,8 +61,8 @@ def run(options: argparse.Namespace) -> int:
     names = segmentation.node_names
     chosen = class_ids(options.classes, names, options.segmentation)
     rest = left_without(scene, segmentation, chosen)
-    left = replace(segmentation, labels=np.where(rest, segmentation.labels, np.int32(REMOVED)))
-    meshes = collision_meshes(scene, left, options.collision) if options.collision else {}
+    left = np.where(rest, segmentation.labels, REMOVED)
+    meshes = collision_meshes(scene, left, segmentation.confidence, options.collision)
     write_selection(scene, rest, segmentation.labels, segmentation.class_names, options.out, scene_format, meshes)
     removed = listed(f"{k} ({clipped(names[k])})" for k in chosen)
     tell(f"without {removed}: {int(rest.sum()):,} of {counted(len(scene), 'Gaussian')} in {options.out}")

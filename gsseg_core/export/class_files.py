@@ -72,7 +72,7 @@ def export_classes(
     segmentation.require(scene)
     folder = Path(folder)
     with staged_run(folder, "classes") as run:
-        meshes = collision_meshes(scene, segmentation, collision) if collision else {}
+        meshes = collision_meshes(scene, segmentation.labels, segmentation.confidence, collision)
         written = write_classes(scene, segmentation, run.folder, run.id, scene_format, meshes)
     return {k: folder / path.name for k, path in written.items()}
 

@@ -21,7 +21,6 @@ from gsseg_core.objects.oriented_boxes import without_floaters
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.quaternions import half_axes
 from gsseg_core.scene.triangle_mesh import TriangleMesh
-from gsseg_core.segmentation import Segmentation
 
 HULL, SURFACE, POISSON = "hull", "surface", "poisson"
 KINDS = (HULL, SURFACE, POISSON)
@@ -44,19 +43,20 @@ def check_collision(kind: str | None) -> None:
             ) from error
 
 
-def collision_meshes(scene: GaussianScene, segmentation: Segmentation, kind: str) -> dict[int, TriangleMesh]:
-    """Make a mesh for every object of a segmentation, by class id, ascending; raises what `check_collision` does.
+def collision_meshes(
+    scene: GaussianScene,
+    labels: npt.NDArray[np.integer],  # (N,): the object of each Gaussian; what is not above 0 is of none
+    confidence: npt.NDArray[np.floating],  # (N,)
+    kind: str | None,
+) -> dict[int, TriangleMesh]:
+    """Make a mesh of a kind for every object, by its label, ascending; none where the kind is None.
 
-    There is none for the background, which is around the objects, nor for objects without an opaque Gaussian or a
-    volume.
+    There is none for objects without an opaque Gaussian or a volume. Raises what `check_collision` does.
     """
     check_collision(kind)
-    found = {
-        k: collision_mesh(scene, np.flatnonzero(segmentation.labels == k), segmentation.confidence, kind)
-        for k in np.flatnonzero(segmentation.counts()).tolist()
-        if k
-    }
-    return {k: mesh for k, mesh in found.items() if mesh is not None}
+    present = np.unique(labels[labels > 0]).tolist() if kind else []
+    made = {k: collision_mesh(scene, np.flatnonzero(labels == k), confidence, str(kind)) for k in present}
+    return {k: mesh for k, mesh in made.items() if mesh is not None}
 
 
 def collision_mesh(

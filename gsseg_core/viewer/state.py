@@ -16,8 +16,8 @@ from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
 from gsseg_core.export.class_files import write_selection
-from gsseg_core.export.collision import check_collision, collision_mesh
-from gsseg_core.learn.learner import Progress, silent
+from gsseg_core.export.collision import check_collision, collision_meshes
+from gsseg_core.progress import Progress, silent
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.scene_writers import SCENE_WRITERS, check_format
@@ -175,11 +175,7 @@ class ViewerState:
         name = f"selection{SCENE_WRITERS[scene_format].suffixes[0]}"
         given = np.array([*ids, REMOVED, UNOBSERVED])[labels]  # labels -1 and -2 are its last two
         known = {ids[k]: text for k, text in names.items()}
-        meshes = {}
-        for k in np.unique(given[shown & (given > 0)]).tolist() if collision else []:
-            mesh = collision_mesh(scene, np.flatnonzero(shown & (given == k)), self.model.confidence, str(collision))
-            if mesh is not None:
-                meshes[k] = mesh
+        meshes = collision_meshes(scene, np.where(shown, given, REMOVED), self.model.confidence, collision)
         return name, _as_file(
             lambda path: write_selection(scene, shown, given, known, path, scene_format, meshes), name
         )

@@ -296,7 +296,7 @@ class Services:
             result = selection.result.selected(selection.chosen, selection.min_confidence)
             with run.watch.stage("write"), staged_export(directory, self.workspace.root) as staged:
                 result.save(staged.folder / "segmentation.npz", staged.id)
-                meshes = collision_meshes(selection.scene, result, collision) if collision else {}
+                meshes = collision_meshes(selection.scene, result.labels, result.confidence, collision)
                 classes = staged.folder / "classes"
                 files = write_classes(selection.scene, result, classes, staged.id, scene_format, meshes)
                 names = {k: str(path.relative_to(staged.folder)) for k, path in files.items()}

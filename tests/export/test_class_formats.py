@@ -36,15 +36,19 @@ def segmented(names: Mapping[int, str] = NAMES, scene: GaussianScene = SCENE) ->
     return Segmentation.from_codes(scene, codes, names, RefineSettings(cluster=False, filter=False))
 
 
+def meshes_in(scene: GaussianScene, result: Segmentation, kind: str) -> dict[int, TriangleMesh]:
+    return collision_meshes(scene, result.labels, result.confidence, kind)
+
+
 @functools.cache
-def meshes_of(kind: str) -> dict[int, TriangleMesh]:
-    return collision_meshes(SCENE, segmented(), kind)
+def meshes_of(kind: str | None) -> dict[int, TriangleMesh]:
+    return {} if kind is None else meshes_in(SCENE, segmented(), kind)
 
 
 @pytest.fixture
 def meshes_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the meshes of SCENE made once, which takes most of the time; for tests of what is written of them."""
-    monkeypatch.setattr(class_files, "collision_meshes", lambda scene, segmentation, kind: meshes_of(kind))
+    monkeypatch.setattr(class_files, "collision_meshes", lambda *of: meshes_of(of[-1]))
 
 
 def visible(folder: Path) -> list[str]:
@@ -129,7 +133,7 @@ def test_a_surface_follows_a_hollow_that_a_hull_closes() -> None:
     ring = Segmentation.from_codes(scene, codes, {0: "background", 1: "ring"}, RefineSettings(cluster=False))
     volumes = {}
     for kind in KINDS:
-        mesh = collision_meshes(scene, ring, kind)[1]
+        mesh = meshes_in(scene, ring, kind)[1]
         closed = trimesh.Trimesh(mesh.points, mesh.triangles)
         assert closed.is_watertight and closed.euler_number == (2 if kind == HULL else 0)
         volumes[kind] = closed.volume
@@ -164,7 +168,7 @@ def test_a_poisson_surface_closes_a_box_without_a_bottom_and_leaves_a_bowl_hollo
     for points, scale, volume in (
         (np.concatenate(walls), 0.04, 8 * 1.04**3), (bowl, 0.03, 2 / 3 * np.pi * (1.03**3 - 0.82**3))
     ):  # fmt: skip
-        mesh = collision_meshes(*shells(points, scale), POISSON)[1]
+        mesh = meshes_in(*shells(points, scale), POISSON)[1]
         closed = trimesh.Trimesh(mesh.points, mesh.triangles)
         assert closed.is_watertight and closed.body_count == 1 and closed.volume == pytest.approx(volume, rel=0.1)
 
@@ -172,7 +176,7 @@ def test_a_poisson_surface_closes_a_box_without_a_bottom_and_leaves_a_bowl_hollo
 def test_a_sheet_that_is_seen_from_both_sides_gets_the_surface_around_it() -> None:
     x, y = (side.ravel() for side in np.meshgrid(np.linspace(-1, 1, 30), np.linspace(-1, 1, 30)))
     sheet = shells(np.stack([x, y, 0 * x], axis=1), (0.05, 0.05, 0.002))
-    around, found = (collision_meshes(*sheet, kind)[1] for kind in (SURFACE, POISSON))
+    around, found = (meshes_in(*sheet, kind)[1] for kind in (SURFACE, POISSON))
     np.testing.assert_array_equal(around.points, found.points)
 
 
@@ -200,7 +204,7 @@ def test_floaters_and_haze_do_not_blow_a_mesh_up() -> None:
     opacities[ball[1]], far[ball[1]] = 0.01, far[ball[2]] + 1
     scene = GaussianScene.from_arrays(far, SCENE.quats, SCENE.scales, opacities, SCENE.sh)
     for kind in KINDS:
-        points = collision_meshes(scene, segmented(), kind)[1].points
+        points = meshes_in(scene, segmented(), kind)[1].points
         assert np.ptp(points, axis=0).max() < 1.1
 
 
@@ -211,7 +215,7 @@ def test_an_object_without_a_volume_has_no_hull_and_a_surface_of_its_voxels() ->
     scales[0] = (0.1, 0.1, np.exp(-40))
     scene = GaussianScene.from_arrays(SCENE.means, SCENE.quats, scales, SCENE.opacities, SCENE.sh)
     flat = replace(segmented(), labels=labels)
-    assert collision_meshes(scene, flat, HULL) == {} and list(collision_meshes(scene, flat, SURFACE)) == [1]
+    assert meshes_in(scene, flat, HULL) == {} and list(meshes_in(scene, flat, SURFACE)) == [1]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -221,7 +225,7 @@ def test_an_object_of_one_gaussian_has_a_mesh_and_one_that_is_not_opaque_has_non
     opacities = SCENE.opacities.copy()
     opacities[0], labels[0] = 0.01, 2
     scene = GaussianScene.from_arrays(SCENE.means, SCENE.quats, SCENE.scales, opacities, SCENE.sh)
-    assert list(collision_meshes(scene, replace(segmented(), labels=labels), kind)) == [1]
+    assert list(meshes_in(scene, replace(segmented(), labels=labels), kind)) == [1]
 
 
 def test_a_selection_in_usd_keeps_its_classes_apart(tmp_path: Path) -> None:
