@@ -203,14 +203,11 @@ class _Window(NamedTuple):
 
     def cut(self, image: Image.Image, resampling: Image.Resampling) -> np.ndarray:
         """Cut the square out of the camera's image, (S, S); black where it shows nothing."""
-        shrunk = max(1, int((self.box[2] - self.box[0]) / self.camera.width))
-        if resampling == Image.Resampling.NEAREST or shrunk == 1:
-            shrunk = 1
-        else:
-            image = image.reduce(shrunk)
-        box = tuple(edge / shrunk for edge in self.box)
         size = self.camera.width, self.camera.height
-        return np.asarray(image.transform(size, Image.Transform.EXTENT, box, resampling))
+        averages = resampling != Image.Resampling.NEAREST
+        shrunk = max(1, int((self.box[2] - self.box[0]) / size[0])) if averages else 1
+        box = tuple(edge / shrunk for edge in self.box)
+        return np.asarray(image.reduce(shrunk).transform(size, Image.Transform.EXTENT, box, resampling))
 
 
 def _edges(picture: np.ndarray) -> np.ndarray:  # (S, S)

@@ -130,24 +130,20 @@ def find_convention(
 ) -> Convention:
     """Find the convention that agrees best with some views, at least one."""
     scene = thinned(scene, settings.gaussians)
-    tried = [
-        (inverted, world, looking)
-        for looking, inverted, world in product(range(len(_LOOKING)), (False, True), AXIS_ROTATIONS)
-    ]
+    every = product(_LOOKING, (False, True), AXIS_ROTATIONS)
+    tried = [Convention(inverted, world, looking) for looking, inverted, world in every]
     scores = np.zeros((len(tried), 4))  # by quarter turns of the camera
     left = list(range(len(tried)))
     for number, view in enumerate(shown):
         for i in with_progress(progress, f"try conventions on view {number + 1} of {len(shown)}", left):
-            inverted, world, looking = tried[i]
-            rendered = render(scene, Convention(inverted, world, _LOOKING[looking]).camera(view.camera), device)
+            rendered = render(scene, tried[i].camera(view.camera), device)
             turned = np.array([view.score(rendered.turned(quarters)) for quarters in range(4)])
             scores[i] += turned - np.roll(turned, 2)  # above that of the same upside down
         kept = max(_LEAST, round(settings.survivors * len(left)))
         left = sorted(left, key=lambda i: -float(scores[i].max()))[:kept]
     best = max(left, key=lambda i: float(scores[i].max()))
-    inverted, world, looking = tried[best]
     turn = np.linalg.matrix_power(_QUARTER, int(scores[best].argmax()))
-    return Convention(inverted, world, _LOOKING[looking] @ turn)
+    return replace(tried[best], camera_axes=tried[best].camera_axes @ turn)
 
 
 def _named(axes: np.ndarray) -> list[str]:  # (3, 3)

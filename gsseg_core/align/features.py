@@ -82,7 +82,7 @@ class PhotosInScene:
         for view in spread([view for view in views if view.image_path is not None], settings.photos):
             taken = read_photo(view)
             if taken is not None:
-                camera = at_most(view.camera, settings.photo_px)
+                camera = _shrunk(view.camera, settings.photo_px)
                 grey = Image.fromarray(taken).convert("L").resize((camera.width, camera.height), Image.Resampling.BOX)
                 photos.append(Photo(camera, extractor.photo(np.asarray(grey, np.float32) / 255)))
         return cls(photos, scene, extractor, settings, device)
@@ -120,8 +120,8 @@ def matches(photo: Features, rendering: Features, ratio: float, within_px: float
     return np.column_stack([rows[kept], best[kept]])
 
 
-def at_most(camera: Camera, longer_px: int) -> Camera:
+def _shrunk(camera: Camera, longer_px: int) -> Camera:
     """Shrink a camera's picture so that its longer side is at most so many px."""
-    shrunk = min(1.0, longer_px / max(camera.width, camera.height))
-    width, height = (max(round(shrunk * side), 1) for side in (camera.width, camera.height))
+    scale = min(1.0, longer_px / max(camera.width, camera.height))
+    width, height = (max(round(scale * side), 1) for side in (camera.width, camera.height))
     return resized_camera(camera, width, height)

@@ -21,6 +21,7 @@ from gsseg_core.errors import AlignmentError, CameraFileError
 from gsseg_core.files.input_files import is_there
 from gsseg_core.progress import Progress, silent
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.similarity import Similarity
 
 _CLOSE_PX = 1.0  # photos and renderings that are nearer than this are as they should be
 
@@ -193,13 +194,12 @@ class _Search:
         from gsseg_core.align.refinement import offset_px, refined
 
         offset = offset_px(self.photos, found.alignment)
-        if offset is None or offset <= _CLOSE_PX:
-            return replace(found, offset_px=offset)
-        alignment = refined(self.photos, found.alignment)
-        closer = offset_px(self.photos, alignment)
-        if closer is None or closer >= offset:
-            return replace(found, offset_px=offset)
-        return Found(alignment, self.through(alignment), found.before, closer)
+        if offset is not None and offset > _CLOSE_PX:
+            alignment = refined(self.photos, found.alignment)
+            closer = offset_px(self.photos, alignment)
+            if closer is not None and closer < offset:
+                return Found(alignment, self.through(alignment), found.before, closer)
+        return replace(found, offset_px=offset)
 
     def through(self, alignment: Alignment) -> Agreement:
         """Compare the scene with the views, of which there are some, after their cameras are moved."""
@@ -211,18 +211,15 @@ class _Search:
 
 def _frame_of_training(
     scene: GaussianScene, dataset: Dataset, given: str | os.PathLike[str] | None
-) -> tuple[Path, Any] | None:
+) -> tuple[Path, Similarity] | None:
     """Find nerfstudio's file, and the similarity that it states; None if there is none, or none is needed."""
-    folders = [] if scene.path is None else [scene.path.parent]
-    paths = [folder / DATAPARSER for folder in (*folders, dataset.root)] if given is None else [Path(given)]
-    for path in paths:
-        if given is None and not is_there(path, CameraFileError):
-            continue
-        similarity = frame_of_training(dataset.root, path)
-        if similarity is not None:
+    folders = [dataset.root] if scene.path is None else [scene.path.parent, dataset.root]
+    beside = (path for folder in folders if is_there(path := folder / DATAPARSER, CameraFileError))
+    for path in beside if given is None else (Path(given),):
+        if (similarity := frame_of_training(dataset.root, path)) is not None:
             return path, similarity
-        if given is not None:
-            raise CameraFileError(
-                f"{path}: says nothing of the cameras of {dataset.root}; expected cameras that nerfstudio trains from"
-            )
+    if given is not None:
+        raise CameraFileError(
+            f"{Path(given)}: says nothing of the cameras of {dataset.root}; expected some that nerfstudio trains from"
+        )
     return None

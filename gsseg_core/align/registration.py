@@ -56,8 +56,9 @@ def candidates(photos: PhotosInScene, progress: Progress) -> Iterator[Alignment]
 
 def virtual_cameras(scene: GaussianScene, like: Camera, count: int) -> Iterator[Camera]:
     """Place cameras with the lens of another one around a scene and inside, some of each kind in turn."""
-    solid = scene.means[scene.opacities > _SOLID] if (scene.opacities > _SOLID).any() else scene.means
-    low, middle, high = np.percentile(solid, (5, 50, 95), axis=0).astype(np.float64)
+    solid = scene.opacities > _SOLID
+    means = scene.means[solid] if solid.any() else scene.means
+    low, middle, high = np.percentile(means, (5, 50, 95), axis=0).astype(np.float64)
     radius = max(float(np.linalg.norm(high - low)) / 2, 1e-9)
     rng = np.random.default_rng(0)
     for i in range(count):
@@ -105,8 +106,7 @@ def fit_poses(photos: Sequence[Photo], found: Mapping[int, Located]) -> Alignmen
         given = _Poses.of([convention.camera(photos[number].camera) for number in found])
         for first, second in combinations(range(len(found)), 2):
             similarity = _between(given, located, first, second)
-            fitting = 0 if similarity is None else _fitting(similarity, given, located)
-            if similarity is not None and fitting > most:
+            if similarity is not None and (fitting := _fitting(similarity, given, located)) > most:
                 best, most = Alignment(convention, similarity), fitting
     return best
 
