@@ -54,7 +54,7 @@ def run(options: argparse.Namespace) -> int:
 
     if options.ros and options.segmentation:
         raise SettingsError("both --ros and --segmentation are given; expected one: the node has codes of its own")
-    with listen(options.host, options.port) as listener:
+    with closing(listen(options.host, options.port)) as listener:
         return _show(options, listener, viewer_module)
 
 
@@ -69,7 +69,7 @@ def _show(options: argparse.Namespace, listener: Listener, viewer_module: Module
     load_kernels(options.quiet, options.device)
     scene = GaussianScene.load(options.scene)
     segmentation = Segmentation.load(options.segmentation, scene) if options.segmentation else None
-    class_ids = segmentation.class_ids.tolist() if segmentation else None
+    class_ids = segmentation.class_ids.tolist() if segmentation else []
     learnt = LearntFrom.read(Path(options.segmentation).parent / "report.json") if segmentation else LearntFrom()
     dataset = learnt.dataset(options.data) if options.data else None
     if dataset:
@@ -91,7 +91,7 @@ def _show(options: argparse.Namespace, listener: Listener, viewer_module: Module
     source = open_source("ros", scene) if options.ros else None
     mode = BY_CLASS if options.segmentation or options.ros else TRUE_COLOURS
     tree = read.tree if read else None  # A node tells labels alone.
-    model = ViewModel(scene, labelling, mode=mode, class_ids=tuple(class_ids or ()), tree=tree, read=read)
+    model = ViewModel(scene, labelling, mode=mode, class_ids=tuple(class_ids), tree=tree, read=read)
     viewer = viewer_module.Viewer(
         model, views, learnt.reliability, source, listener=listener, draw=options.draw, device=options.device
     )

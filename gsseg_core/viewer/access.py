@@ -47,14 +47,6 @@ class Listener:
         # What a browser must show; None where only this machine can connect.
         self.token = None if ip.is_loopback else secrets.token_urlsafe(16)
 
-    def __enter__(self) -> Listener:
-        """Give itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Close."""
-        self.close()
-
     def close(self) -> None:
         """Listen no more."""
         self.socket.close()

@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,8 +24,8 @@ SLOW = 0.3  # seconds more that splats may take a browser than a picture without
 _TRIAL, _TRIAL_SIZE = 2500, 0.1  # splats of the trial, and their standard deviation in halves of the picture's height
 _FAINT = 2  # opacity of the trial, of 255: it is drawn like all others, and hardly seen
 NOTICE: float | None = 8.0  # seconds for which a browser is told why it gets images; None: until closed
-_PATIENCE = 60.0
-_SMALL = (48, 64)
+_PATIENCE = 60.0  # seconds for a browser to draw a picture
+_SMALL = (48, 64)  # rows and columns of the image of it that it sends
 
 
 @dataclass
@@ -90,10 +90,8 @@ class ClientRenderers:
             if self._picture:
                 renderer.show(self._picture)
         if self._drawn_by == AUTO:
-            try:
+            with suppress(RuntimeError, OSError, ValueError):  # It has left.
                 self._decide(client, renderer)
-            except (RuntimeError, OSError, ValueError):  # It has left.
-                return
 
     def _leave(self, client: viser.ClientHandle) -> None:
         with self._lock:
@@ -111,21 +109,19 @@ class ClientRenderers:
                 renderer.nodes = nodes = SplatNodes(client, self._splats)
                 if self._picture:
                     nodes.show(self._picture.nodes)
-            fast = time_of_picture(client) - alone <= SLOW
-            if fast:
+            if time_of_picture(client) - alone <= SLOW:
                 renderer.close()
                 client.scene.set_background_image(None)
                 client.flush()
-            else:
-                with self._lock:
-                    nodes.show({})
-                    renderer.nodes = None
-        if not fast:
-            client.add_notification(
-                "The server draws",
-                "This browser draws slowly, as without a GPU, so it gets images. `--draw browser` leaves it to itself.",
-                auto_close_seconds=NOTICE,
-            )
+                return
+            with self._lock:
+                nodes.show({})
+                renderer.nodes = None
+        client.add_notification(
+            "The server draws",
+            "This browser draws slowly, as without a GPU, so it gets images. `--draw browser` leaves it to itself.",
+            auto_close_seconds=NOTICE,
+        )
 
 
 def time_of_picture(client: viser.ClientHandle) -> float:

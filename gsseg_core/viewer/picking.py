@@ -13,7 +13,7 @@ from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera, pose_looking
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
-_WINDOW = 3
+_WINDOW = 3  # px, each way, of the picture whose middle is the ray
 
 
 class Picked(NamedTuple):

@@ -17,7 +17,7 @@ from gsseg_core.viewer.viewpoint import camera_of
 
 FINE_ROWS, QUICK_ROWS = 720, 320  # rows of an image, at most, once nothing changes any more, and until then
 RESTS = 0.2  # seconds without a change after which an image is drawn finely
-_QUALITY = 90
+_QUALITY = 90  # of JPEG, of 100
 
 
 class Frames:
@@ -63,7 +63,8 @@ class Frames:
 
     def _draw(self, picture: Picture, rows: int) -> None:
         camera, operator = camera_of(self._client, rows), self._operators.get(rows)
-        if operator is None or not _alike(operator.camera, camera):  # While the camera rests, the last one will do.
+        # While the camera rests, the last one will do.
+        if operator is None or not _alike(operator.camera, camera):
             operator = self._operators[rows] = make_operator(picture.scene, camera, self._device)
         image = picture.draw(operator)
         if not self._closing.is_set():
@@ -72,5 +73,4 @@ class Frames:
 
 
 def _alike(a: Camera, b: Camera) -> bool:
-    same = a.width == b.width and np.array_equal(a.K, b.K)
-    return same and np.array_equal(a.world_to_camera, b.world_to_camera)
+    return np.array_equal(a.K, b.K) and np.array_equal(a.world_to_camera, b.world_to_camera)

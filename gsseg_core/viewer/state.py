@@ -119,9 +119,8 @@ class ViewerState:
         # The last channel is for what has no class, so that it is a region as well.
         one_hot = np.eye(labelling.probabilities.shape[1] + 1, dtype=np.float32)[np.maximum(labelling.labels, -1)]
         image = make_operator(self.model.scene, camera, self.device).without(~shown).render(one_hot)
-        labels = np.where(image.max(axis=2) > 0, image.argmax(axis=2), -1)
-        labels[labels == one_hot.shape[1] - 1] = -1
-        return labels
+        labels = image.argmax(axis=2)
+        return np.where((image.max(axis=2) > 0) & (labels < image.shape[2] - 1), labels, -1)
 
     def correct(self, view: View) -> int:
         """Learn what was drawn in a picture; return how many Gaussians that changed.

@@ -13,7 +13,7 @@ from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera, rigid_motion
 from gsseg_core.viewer.state import ViewerState
 
-_OVERLAY_DISTANCE = 0.02
+_OVERLAY_DISTANCE = 0.02  # of a mask from the camera, in halves of the diagonal of the scene
 _MASK = "/mask"
 
 

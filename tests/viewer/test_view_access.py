@@ -6,6 +6,7 @@ import errno
 import socket
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import closing
 
 import pytest
 from patience import PATIENCE
@@ -25,7 +26,7 @@ def values(**headers: str | Sequence[str]) -> Callable[[str], Sequence[str]]:
 
 
 def test_this_machine_is_answered_under_each_of_its_names_and_through_a_forwarded_port() -> None:
-    with listen(port=PORT) as listener:
+    with closing(listen(port=PORT)) as listener:
         assert listener.token is None and listener.url == f"http://localhost:{listener.port}"
         for host in (
             f"localhost:{listener.port}",
@@ -53,7 +54,7 @@ def test_this_machine_is_answered_under_each_of_its_names_and_through_a_forwarde
     ],
 )
 def test_a_name_that_is_not_its_own_is_refused_so_that_nobody_can_make_theirs_point_here(host: str) -> None:
-    with listen(port=PORT) as listener:
+    with closing(listen(port=PORT)) as listener:
         refusal = listener.refusal("/", values(Host=host))
         assert refusal is not None and "expected localhost" in refusal and refusal.isprintable()
         assert listener.refusal("/", values()) and listener.refusal("/", values(Host=["localhost", "localhost"]))
@@ -64,7 +65,7 @@ def test_a_name_that_is_not_its_own_is_refused_so_that_nobody_can_make_theirs_po
     ["http://evil.example", "null", "http://localhost:3000", "http://localhost", "file://", "", "localhost:8080"],
 )
 def test_a_page_from_elsewhere_is_refused_even_one_of_this_machine(origin: str) -> None:
-    with listen(port=PORT) as listener:
+    with closing(listen(port=PORT)) as listener:
         refusal = listener.refusal("/", values(Host="localhost:8080", Origin=origin))
         assert refusal is not None and "expected the page of the viewer itself" in refusal
         twice = values(Host="localhost:8080", Origin=["http://localhost:8080"] * 2)
@@ -72,7 +73,7 @@ def test_a_page_from_elsewhere_is_refused_even_one_of_this_machine(origin: str) 
 
 
 def test_where_others_can_connect_a_token_is_asked_for_that_the_address_holds() -> None:
-    with listen("0.0.0.0", PORT) as listener:
+    with closing(listen("0.0.0.0", PORT)) as listener:
         assert listener.token and len(listener.token) >= 20
         assert listener.url == f"http://localhost:{listener.port}/?token={listener.token}"
         right, host = f"/?token={listener.token}", socket.gethostname()
@@ -91,7 +92,7 @@ def test_where_others_can_connect_a_token_is_asked_for_that_the_address_holds() 
 
 
 def test_every_token_is_another_one() -> None:
-    with listen("0.0.0.0", PORT) as one, listen("0.0.0.0", PORT) as other:
+    with closing(listen("0.0.0.0", PORT)) as one, closing(listen("0.0.0.0", PORT)) as other:
         assert one.port != other.port and one.token != other.token
 
 
@@ -101,7 +102,7 @@ def test_a_taken_port_is_passed_over_and_without_a_free_one_there_is_an_error(mo
 
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with listen(port=port) as listener:
+        with closing(listen(port=port)) as listener:
             assert listener.port > port
     monkeypatch.setattr(socket, "create_server", all_taken)
     with pytest.raises(SettingsError, match=r"ports 65535 to 65535 are all taken; expected a free"):
@@ -152,6 +153,6 @@ def test_addresses_of_version_6_are_written_as_browsers_want_them() -> None:
         opened = socket.create_server(("::1", 0), family=socket.AF_INET6)
     except OSError:
         pytest.skip("no IPv6 here")
-    with Listener(opened, "::1") as listener:
+    with closing(Listener(opened, "::1")) as listener:
         assert listener.url == f"http://[::1]:{listener.port}" and listener.token is None
         assert listener.refusal("/", values(Host=f"[::1]:{listener.port}")) is None

@@ -292,7 +292,8 @@ def test_a_viser_that_cannot_be_guarded_does_not_stay_open(monkeypatch: pytest.M
             stopped.append(True)
 
     monkeypatch.setattr(viser, "ViserServer", Other)
-    with listen(port=PORT) as listener, pytest.raises(SettingsError, match=r"cannot be guarded .*; expected a version"):
+    refused = pytest.raises(SettingsError, match=r"cannot be guarded .*; expected a version")
+    with closing(listen(port=PORT)) as listener, refused:
         view_server.start_server(listener)
     assert stopped == [True]
 
@@ -300,7 +301,7 @@ def test_a_viser_that_cannot_be_guarded_does_not_stay_open(monkeypatch: pytest.M
 def test_a_browser_on_a_busy_machine_is_given_time(monkeypatch: pytest.MonkeyPatch) -> None:
     given: dict[str, Any] = {}
     monkeypatch.setattr(websockets.asyncio.server, "serve", lambda _, **options: given.update(options))
-    with listen(port=PORT) as listener, view_server._guarding(listener):
+    with closing(listen(port=PORT)) as listener, view_server._guarding(listener):
         websockets.asyncio.server.serve(None, open_timeout=1)  # type: ignore[arg-type]
     assert given["open_timeout"] == given["ping_timeout"] == view_server.PATIENCE
 
