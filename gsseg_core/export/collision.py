@@ -26,7 +26,10 @@ HULL, SURFACE, POISSON = "hull", "surface", "poisson"
 KINDS = (HULL, SURFACE, POISSON)
 
 VOXELS = 64  # along the longest side of the object
-_MARGIN, _CLOSED, _SAMPLES, _AT_ONCE = 4, 2, 128, 1 << 14
+_MARGIN = 4  # voxels around the ellipsoids, for closing and smoothing
+_CLOSED = 2  # voxels to either side, by which what is filled is dilated to close gaps, and then eroded
+_SAMPLES = 128  # points of an ellipsoid, by which it fills voxels
+_AT_ONCE = 1 << 14  # so many ellipsoids at a time, to keep memory small
 _ROOM = 16  # voxels around a Poisson surface, whose grid goes on with its other side
 
 
@@ -84,8 +87,8 @@ def _hull(solid: Ellipsoids) -> TriangleMesh | None:
         hull = ConvexHull(ends.astype(np.float64))
     except QhullError:
         return None
-    triangles = np.searchsorted(np.sort(hull.vertices), hull.simplices).astype(np.int32)
-    points = ends[np.sort(hull.vertices)]
+    triangles = np.searchsorted(hull.vertices, hull.simplices).astype(np.int32)
+    points = ends[hull.vertices]
     a, b, c = (points[triangles[:, i]] for i in range(3))
     inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0
     triangles[inwards] = triangles[inwards][:, ::-1]

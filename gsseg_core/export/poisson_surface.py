@@ -16,10 +16,13 @@ import numpy.typing as npt
 
 from gsseg_core.scene.triangle_mesh import TriangleMesh
 
-_DIRECTIONS, _DISC = 96, 32
-_THINNEST = 1e-2  # of the longest half axis
-_SMOOTH, _DENSITY = 1.0, 2.0  # voxels
-_APART = 1e-2  # of the range of values
+_DIRECTIONS = 96  # from which Gaussians are looked at
+_PIXEL, _BEHIND = 1.5, 2.0  # voxels: side of a pixel of such a look; depth behind the front that still counts as seen
+_THINNEST = 1e-2  # of the longest half axis: shorter ones turn normals no further
+_DISC, _RADIUS = 32, 0.7  # samples of a Gaussian's disc; its radius, of the ellipse's: about half the area
+_SMOOTH = 1.0  # voxels, standard deviation by which normals are smoothed
+_DENSITY = 2.0  # voxels, standard deviation over which the area of discs is added up, for all to weigh the same
+_APART = 1e-2  # of the range of values: no voxel is nearer to the level
 _HELD = 0.5  # share of the Gaussians that a surface holds, or it is none of theirs
 
 
@@ -94,7 +97,7 @@ def _normals(ellipsoids: Ellipsoids, voxels: Voxels) -> npt.NDArray[np.float64]:
     """Find unit normals (M, 3), outwards; 0 of a Gaussian that is seen from nowhere."""
     means, half_axes = ellipsoids
     solid = (np.argwhere(voxels.filled) - voxels.margin + 0.5) * voxels.size + voxels.low
-    cell, free = 1.5 * voxels.size, np.zeros(means.shape)
+    cell, free = _PIXEL * voxels.size, np.zeros(means.shape)
     for direction in sphere(_DIRECTIONS):
         across = np.linalg.svd(direction[None])[2][1:]  # (2, 3)
         pixel, own = (np.floor(points @ across.T / cell).astype(np.int64) for points in (solid, means))
@@ -102,7 +105,7 @@ def _normals(ellipsoids: Ellipsoids, voxels: Voxels) -> npt.NDArray[np.float64]:
         front = np.full(pixel.max(axis=0) + 1, -np.inf)
         np.maximum.at(front, tuple(pixel.T), solid @ direction)
         reach = np.linalg.norm(np.einsum("mjk,j->mk", half_axes, direction), axis=1)
-        free += (means @ direction + reach >= front[tuple(own.T)] - 2 * voxels.size)[:, None] * direction
+        free += (means @ direction + reach >= front[tuple(own.T)] - _BEHIND * voxels.size)[:, None] * direction
     lengths = np.linalg.norm(half_axes, axis=1)  # (M, 3)
     turned = np.einsum("mjk,mj->mk", half_axes / np.maximum(lengths, 1e-30)[:, None], free)
     turned /= np.maximum(lengths, _THINNEST * lengths.max(axis=1, keepdims=True) + 1e-30) ** 2
@@ -132,7 +135,7 @@ def sphere(count: int) -> npt.NDArray[np.float64]:
 
 
 def _disc() -> npt.NDArray[np.float64]:
-    """Points (S, 2) spread evenly over a disc of radius 0.7, half as large as the unit disc."""
+    """Points (S, 2) spread evenly over a disc of `_RADIUS`."""
     i = np.arange(_DISC) + 0.5
     turn = np.pi * (1 + 5**0.5) * i
-    return 0.7 * np.sqrt(i / _DISC)[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    return _RADIUS * np.sqrt(i / _DISC)[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)

@@ -88,9 +88,5 @@ def borders(
         sides.append((a[border], b[border], np.maximum(edges.strength[one], edges.strength[other])[border]))
     a, b, strength = (np.concatenate(part) for part in zip(*sides, strict=True))
     at, shape = (np.concatenate([a, b]), np.concatenate([b, a])), (len(ids), len(ids))
-    return Borders(
-        *(
-            sparse.coo_matrix((np.concatenate([value, value]), at), shape=shape).tocsr()
-            for value in (np.ones_like(strength), strength)
-        )
-    )
+    values = (np.ones_like(strength), strength)
+    return Borders(*(sparse.coo_matrix((np.tile(value, 2), at), shape=shape).tocsr() for value in values))

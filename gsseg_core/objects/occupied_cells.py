@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 OPAQUE = 0.1  # opacity from which on a Gaussian is solid
-_MOST_PER_AXIS, _AT_ONCE = 64, 1 << 20
+_MOST_PER_AXIS = 64  # samples of an ellipsoid
+_AT_ONCE = 1 << 20  # so many samples at a time, to keep memory small
 
 
 def occupied_cells(

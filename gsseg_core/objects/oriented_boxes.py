@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,7 +42,7 @@ TRIM = 0.005  # share of the weight that the box leaves out on each side
 ENOUGH = 0.999  # a turn has to make the rectangle smaller than this part of it; else the axes stay
 SAMPLE = 2000  # so many Gaussians of an object are looked at, at most, taken at even steps: that bounds the time
 _TIED = 1e-9  # areas and volumes that differ by less than this part of them differ by rounding
-_STEPS, _PASSES, _SIDES = 50, 4, 3
+_STEPS, _PASSES, _SIDES = 50, 4, 3  # of the median, at most; over the axes, at most; faces that a box is tried on
 _SETTLED = 1e-3  # the median may still move by this part of the largest distance: it only has to lie inside
 
 
@@ -74,7 +74,7 @@ class OrientedBox:
     @property
     def corners(self) -> Array:
         """The eight corners (8, 3)."""
-        signs = np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5], indexing="ij"), axis=-1).reshape(8, 3)
+        signs = np.array(list(product((-0.5, 0.5), repeat=3)))
         return self.center + (signs * self.size) @ self.axes.T
 
     def moved(self, rotation: Array, translation: Array, scale: float) -> OrientedBox:
@@ -230,11 +230,10 @@ def _smallest_rectangle(points: Array) -> tuple[float, float, float]:
     """Direction x, y of a side of the smallest rectangle around points (M, 2); its area by that of the upright one."""
     from scipy.spatial import ConvexHull, QhullError
 
-    try:
-        hull = points[ConvexHull(points).vertices] if len(points) > 2 else points[:0]
-    except QhullError:  # All on one line.
-        hull = points[:0]
-    spans = np.ptp(hull, axis=0) if len(hull) else np.zeros(2)
+    hull = points[:1]
+    with suppress(QhullError):  # All on one line.
+        hull = points[ConvexHull(points).vertices]
+    spans = np.ptp(hull, axis=0)
     if spans.min() <= _TIED * spans.max():  # Seen edge on: there is nothing to make smaller.
         return 1.0, 0.0, 1.0
     upright = spans.prod()
