@@ -348,13 +348,13 @@ def _picture(
         views = {view.name: view for view in inputs.train if view.name in views}
         compared = [drawn for drawn in shown if drawn.view.name in views]
         checks = [compare_mask(views[drawn.view.name], drawn.labels, result.num_classes) for drawn in compared]
-    save = partial(behind, save_png)
+    save = partial(behind, save_png, run=run.id)
     if level is not result:  # What is compared with the masks are objects, as they are.
         shown = draw_views(inputs.scene, level, inputs.pictured, device=images.device)
-    pictures = write_pictures(level, shown, folder, run.id, save)
+    pictures = write_pictures(level, shown, folder, save)
     if assessment.checks:
         pictures.append(folder / "worst_views.png")
-        save(pictures[-1], draw_worst_views(images.rendered, views, assessment.checks, device=images.device), run.id)
+        save(pictures[-1], draw_worst_views(images.rendered, views, assessment.checks, device=images.device))
     return MaskChecks(checks, views, assessment.checks is not None), pictures
 
 
@@ -391,10 +391,10 @@ def render(
     overlays = []
     places = [*names, *(f"overlays/{name}" for name in (*names, "contact_sheet.png", "legend.png"))]
     with staged_run(out, "render", places=places) as run:
-        drawn = draw_views(scene, numbered, views, device=device)
+        drawn, save = draw_views(scene, numbered, views, device=device), partial(save_png, run=run.id)
         for name, (_, labels, image, _) in zip(with_progress(progress, "render", names), drawn, strict=True):
             write_mask(run.folder / name, ids[labels], bits, run.id)
             overlays.append(image)
-            save_png(run.folder / "overlays" / name, image, run.id)
-        write_overview(numbered, overlays, [view.name for view in views], run.folder / "overlays", run.id)
+            save(run.folder / "overlays" / name, image)
+        write_overview(numbered, overlays, [view.name for view in views], run.folder / "overlays", save)
     return [Path(out) / name for name in names]

@@ -12,6 +12,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -82,7 +83,8 @@ def run_demo(out: Path, nodes: ChildNodes, *, seed: int = 0, rate: float = 10.0,
         # As `gsseg render` writes it, so that either demo may go where the other has been.
         with staged_run(out / "rendered", "render") as run:
             overlays = [_write(one, view, run) for one, view in zip(rendered, test, strict=True)]
-            write_overview(segmentation, overlays, [view.name for view in test], run.folder / "overlays", run.id)
+            names, save = [view.name for view in test], partial(save_png, run=run.id)
+            write_overview(segmentation, overlays, names, run.folder / "overlays", save)
         _compare(demo, train, seen, out / "masks_and_result.png")
         scores = evaluate_folders(out / "rendered", demo.root / "labels_true").as_dict(demo.class_names)
         overlap = gaussian_ious(demo, exported.folder / "segmentation.npz")

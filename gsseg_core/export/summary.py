@@ -88,17 +88,17 @@ class RunSettings:
         return settings
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class RunReport:
     """What a run found, from what, with which settings, and how long it took; its fields are those of `report.json`."""
 
     scene: Mapping[str, Any]  # path, size and digest of what was segmented
     views: Mapping[str, Any]  # how many were used, and why others were not
     settings: Mapping[str, Any]  # all that determined the result
-    objective: Sequence[float]  # the learner's objective after each step
+    objective: Sequence[float] = ()  # the learner's objective after each step
     gaussians: Mapping[str, int]  # how many, by what became of them
     classes: Sequence[Mapping[str, Any]]  # id, name, size, mean confidence, file and box of each
-    pictures: Sequence[str]  # files
+    pictures: Sequence[str] = ()  # files
     seconds: Mapping[str, float]  # of each stage
     versions: Mapping[str, str]  # of each package that it ran on
     run: str | None = None  # id of the run
@@ -117,8 +117,6 @@ class RunReport:
         *,
         files: Mapping[int, str],
         meshes: Mapping[int, str] | None = None,
-        objective: Sequence[float] = (),
-        pictures: Sequence[str] = (),
         digest: str | None = None,
         **others: Any,
     ) -> RunReport:
@@ -128,10 +126,8 @@ class RunReport:
         """
         return cls(
             scene={"path": str(scene.path), "gaussians": len(scene), "digest": digest or scene.digest},
-            objective=objective,
             gaussians=gaussian_counts(result),
             classes=class_table(scene, result, files, meshes),
-            pictures=pictures,
             versions={"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
             **others,
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -24,7 +23,7 @@ from gsseg_core.segmentation import Segmentation
 from gsseg_core.several_at_once import several_at_once
 
 _DIFFERENT = np.array([[0, 0, 0], [230, 40, 40]], np.uint8)
-SavePicture = Callable[[Path, np.ndarray, "str | None"], object]  # writes a picture as `save_png` does, now or later
+SavePicture = Callable[[Path, np.ndarray], object]  # writes a picture as `save_png` does, now or later
 _LONGEST_NAME = 255  # bytes of the name of a file, at most, on all file systems
 
 
@@ -99,25 +98,19 @@ def look_at(
 
 
 def write_pictures(
-    segmentation: Segmentation,
-    drawn: Iterable[Drawn],
-    folder: str | os.PathLike[str],
-    run: str | None = None,
-    save: SavePicture = save_png,
+    segmentation: Segmentation, drawn: Iterable[Drawn], folder: Path, save: SavePicture = save_png
 ) -> list[Path]:
     """Write overlays of some views, as `draw_views` gives them, a contact sheet of them, and the legend.
 
-    Pictures are written by `save`, which may do that later. Their files are `overlay_<stem>.png` ...,
-    `contact_sheet.png` and `legend.png`, with the id of the `run` in them, if there is one.
+    Their files are `overlay_<stem>.png` ..., `contact_sheet.png` and `legend.png`.
     """
-    folder = Path(folder)
     images, captions, paths = [], [], []
     for one in drawn:
         images.append(one.overlay)
         captions.append(one.view.name)
         paths.append(folder / view_file_name(one.view.name, "overlay_"))
-        save(paths[-1], one.overlay, run)
-    return paths + write_overview(segmentation, images, captions, folder, run, save)
+        save(paths[-1], one.overlay)
+    return paths + write_overview(segmentation, images, captions, folder, save)
 
 
 def write_overview(
@@ -125,17 +118,16 @@ def write_overview(
     images: Sequence[np.ndarray],
     captions: Sequence[str],
     folder: Path,
-    run: str | None = None,
-    save: SavePicture = save_png,
+    save: SavePicture,
 ) -> list[Path]:
     """Write `contact_sheet.png` of some pictures, if there are any, and `legend.png`."""
     paths = []
     if images:
         paths.append(folder / "contact_sheet.png")
-        save(paths[-1], contact_sheet(images, captions, min(4, len(images))), run)
+        save(paths[-1], contact_sheet(images, captions, 4))
     paths.append(folder / "legend.png")
     colors = palette(result.num_classes)
-    save(paths[-1], legend(result.class_names, colors, result.counts()), run)
+    save(paths[-1], legend(result.class_names, colors, result.counts()))
     return paths
 
 
