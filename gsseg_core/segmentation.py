@@ -19,7 +19,7 @@ from gsseg_core.data.view import spread
 from gsseg_core.errors import SettingsError, StateMismatchError
 from gsseg_core.files.npz_files import (
     UnfitError,
-    check_px,
+    check_evidence,
     check_shares,
     class_names_of,
     open_npz,
@@ -127,7 +127,7 @@ class Segmentation:
         if codes.ndim != 2 or len(codes) != n or px.shape != (n,):
             raise StateMismatchError(f"codes are {codes.shape}, evidence {px.shape}; expected ({n}, K) and ({n},)")
         check_shares("codes", codes, SettingsError)
-        check_px("evidence", px, SettingsError)
+        check_evidence(px, SettingsError)
         result = cls.unfiltered(scene, codes, class_names, settings, None if evidence is None else px)
         return result.filtered(scene, settings) if settings.filter else result
 

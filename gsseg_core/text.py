@@ -7,12 +7,9 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
-_JOINERS = "\u200c\u200d"
-"""They change how their neighbours are written, as in Persian and in emoji, and nothing else."""
-
-
-_LONGEST = 1000
-"""Characters of a message at most."""
+LEAST = 3  # views that are named as those that agree least with the others
+_JOINERS = "\u200c\u200d"  # change how their neighbours are written, as in Persian and in emoji, and nothing else
+_LONGEST = 1000  # characters of a message, at most
 
 
 def printable(text: str) -> str:
@@ -56,10 +53,6 @@ def html_text(value: object) -> str:
 
 def _stays(character: str) -> bool:
     return character.isprintable() or character in _JOINERS or unicodedata.category(character) == "Zs"
-
-
-LEAST = 3
-"""Views that are named as those that agree least with the others."""
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -162,11 +162,11 @@ def check_shares(name: str, rows: npt.NDArray[np.float32], unfit: type[Exception
         )
 
 
-def check_px(name: str, px: npt.NDArray[np.float32], unfit: type[Exception] = UnfitError) -> None:  # (N,)
-    """Raise `unfit` unless all are numbers of pixels: finite, 0 or more."""
+def check_evidence(px: npt.NDArray[np.float32], unfit: type[Exception] = UnfitError) -> None:  # (N,)
+    """Raise `unfit` unless the evidence of every row is a number of pixels: finite, 0 or more."""
     bad = np.flatnonzero(~((px >= 0) & (px < np.inf)))
     if bad.size:
-        found = f"array {name} holds {px[bad[0]]:g} in row {bad[0]} ({bad.size:,} of {len(px):,} rows are unusable)"
+        found = f"array evidence holds {px[bad[0]]:g} in row {bad[0]} ({bad.size:,} of {len(px):,} rows are unusable)"
         raise unfit(f"{found}; expected finite numbers of px, 0 or more")
 
 
@@ -246,5 +246,5 @@ def check_scene(path: Path, header: dict[str, Any], digest: str) -> None:
 def npz_format(path: Path) -> str:
     """Read from the header of an npz what it says that it is; empty if it is missing, damaged or says nothing."""
     with suppress(GssegError), open_arrays(path, "an npz with a header", GssegError) as arrays:
-        return str(json.loads(arrays.text("header"))["format"])
+        return str(read_json_header(arrays)["format"])
     return ""

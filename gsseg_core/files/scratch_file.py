@@ -119,11 +119,10 @@ class ScratchFile:
         return _padded(os.fstat(descriptor).st_size)
 
 
-def _folder() -> str:
+def _folder() -> str | None:
+    """Find where the file goes; None leaves it to Python."""
     asked = os.environ.get("TMPDIR", "")
-    return next((path for path in (asked, "/var/tmp") if os.path.isdir(path) and os.access(path, os.W_OK)), "") or (
-        tempfile.gettempdir()
-    )
+    return next((path for path in (asked, "/var/tmp") if os.path.isdir(path) and os.access(path, os.W_OK)), None)
 
 
 def _padded(size: int) -> int:

@@ -27,7 +27,7 @@ from gsseg_core.files.limits import LIMITS, MAX_LABEL
 from gsseg_core.files.npz_files import (
     NpzArrays,
     UnfitError,
-    check_px,
+    check_evidence,
     check_scene,
     check_shares,
     class_names_of,
@@ -238,7 +238,7 @@ def _read_px(file: NpzArrays, num_gaussians: int) -> np.ndarray | None:
     if "evidence" not in file.names:
         return None
     evidence = file.expect("evidence", np.float32, (num_gaussians,))
-    check_px("evidence", evidence)
+    check_evidence(evidence)
     return evidence
 
 

@@ -26,7 +26,7 @@ _EARLY_GRANULARITY = 0.5  # of the objects before all views were looked at toget
 
 
 @dataclass(frozen=True)
-class Alignment:
+class ViewObjects:
     """Objects that the ids of one view stand for, and ids that fit none."""
 
     objects: dict[int, int]  # by id; 0 is the background in both
@@ -214,7 +214,7 @@ class ObjectTable:
         table[lifted.ids] = self._objects[view.name]
         return replace(View.from_arrays(view.camera, table[labels]), image_path=view.image_path)
 
-    def alignment(self, name: str) -> Alignment:
+    def objects_in(self, name: str) -> ViewObjects:
         """Which object each id of a view stands for, and how many ids do not fit."""
         lifted, objects = self._lifted[name], self._objects[name]
         shown = objects[objects > 0]
@@ -223,7 +223,7 @@ class ObjectTable:
         size = parts.sum(axis=0)
         # Most of an object, as far as this view shows it, lies under an id: more than one, and the id has merged them.
         most = (parts > 0.5 * size) & (size >= self.settings.full_sight_px)
-        return Alignment(
+        return ViewObjects(
             dict(sorted(zip(lifted.ids.tolist(), objects.tolist(), strict=True))),
             merged=int((most.sum(axis=1) > 1).sum()),
             split=len(shown) - len(np.unique(shown)),
@@ -232,15 +232,15 @@ class ObjectTable:
     def summary(self, result: Segmentation) -> dict[str, Any]:
         """Put together what `report.json` says of the ids, and of the parts and wholes of a result."""
         tree = result.tree
-        alignments = {name: asdict(self.alignment(name)) for name in sorted(self._objects)}
+        views = {name: asdict(self.objects_in(name)) for name in sorted(self._objects)}
         return {
             "objects": self.num_objects,
             "granularity": self._agreement,
             "segments": sum(len(lifted) for lifted in self._lifted.values()),
-            "merged": sum(alignment["merged"] for alignment in alignments.values()),
-            "split": sum(alignment["split"] for alignment in alignments.values()),
+            "merged": sum(view["merged"] for view in views.values()),
+            "split": sum(view["split"] for view in views.values()),
             "settings": asdict(self.settings),
-            "views": alignments,
+            "views": views,
             **({} if tree is None else {"tree": tree.describe(result.class_names, tree.sizes(result.labels))}),
         }
 

@@ -71,7 +71,7 @@ def test_an_object_that_some_views_split_is_one() -> None:
     views = [shuffled(in_halves(view, 1) if i % 3 == 0 else view) for i, view in enumerate(VIEWS)]
     table = find_objects(SCENE, views)
     assert table.num_objects == 3 and agreement(table, VIEWS) == 1.0
-    assert [table.alignment(view.name).split for view in VIEWS] == [1, 0, 0, 1, 0, 0, 1, 0]
+    assert [table.objects_in(view.name).split for view in VIEWS] == [1, 0, 0, 1, 0, 0, 1, 0]
     nothing = Segmentation.from_codes(SCENE, np.zeros((len(SCENE), 4), np.float32), table.class_names)
     summary = table.summary(nothing)
     assert summary["split"] == 3 and summary["merged"] == 0 and summary["objects"] == 3
@@ -86,7 +86,7 @@ def test_objects_that_some_views_merge_stay_two() -> None:
     assert table.num_objects == 3
     right = [view for i, view in enumerate(VIEWS) if i % 4]
     assert agreement(table, right) == 1.0
-    assert [table.alignment(view.name).merged for view in VIEWS] == [1, 0, 0, 0, 1, 0, 0, 0]
+    assert [table.objects_in(view.name).merged for view in VIEWS] == [1, 0, 0, 0, 1, 0, 0, 0]
 
 
 def test_clutter_that_one_view_shows_goes_to_the_background() -> None:
@@ -94,7 +94,7 @@ def test_clutter_that_one_view_shows_goes_to_the_background() -> None:
     labels[:6, :10] = np.where(labels[:6, :10] == 0, 9, labels[:6, :10])
     labels[40:, 20:40] = np.where(labels[40:, 20:40] == 0, 9, labels[40:, 20:40])
     table = find_objects(SCENE, [with_labels(VIEWS[0], labels), *VIEWS[1:]])
-    assert table.num_objects == 3 and table.alignment(VIEWS[0].name).objects[9] == 0
+    assert table.num_objects == 3 and table.objects_in(VIEWS[0].name).objects[9] == 0
 
 
 def test_views_that_share_nothing_have_objects_of_their_own() -> None:
@@ -249,7 +249,7 @@ def test_a_view_can_be_replaced_and_what_was_forgotten_still_matches() -> None:
         table.forget(view.name)
     assert table.num_objects == 0
     table.match(shuffled(VIEWS[4]))
-    assert set(table.alignment(VIEWS[4].name).objects.values()) <= {0, 1, 2, 3}
+    assert set(table.objects_in(VIEWS[4].name).objects.values()) <= {0, 1, 2, 3}
 
 
 def test_objects_found_are_learnt_as_well_as_with_true_ids() -> None:

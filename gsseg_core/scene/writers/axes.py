@@ -29,8 +29,7 @@ class Turned(NamedTuple):
 def turned(scene: GaussianScene, signs: tuple[int, int, int]) -> Turned:
     """Turn a scene by half a turn, whose `signs` are those of x, y, z after it."""
     xyz = np.array(signs, np.float32)
-    degree = round(scene.sh.shape[1] ** 0.5) - 1
-    parity = np.diag(spherical_harmonics.turned(np.diag(signs), degree)).astype(np.float32)
+    parity = np.diag(spherical_harmonics.turned(np.diag(signs), scene.sh_degree)).astype(np.float32)
     return Turned(scene.means * xyz, scene.quats * np.array((1, *signs), np.float32), scene.sh * parity[:, None])
 
 

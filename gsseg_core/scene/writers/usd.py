@@ -68,7 +68,7 @@ def _define_splats(stage: Usd.Stage, place: Sdf.Path, scene: GaussianScene) -> U
     splats.CreateOrientationsAttr(Vt.QuatfArray.FromNumpy(np.ascontiguousarray(scene.quats[:, [1, 2, 3, 0]])))
     splats.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(scene.scales))
     splats.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(scene.opacities))
-    splats.CreateRadianceSphericalHarmonicsDegreeAttr(round(scene.sh.shape[1] ** 0.5) - 1)
+    splats.CreateRadianceSphericalHarmonicsDegreeAttr(scene.sh_degree)
     splats.CreateRadianceSphericalHarmonicsCoefficientsAttr(Vt.Vec3fArray.FromNumpy(scene.sh.reshape(-1, 3)))
     spread = covariances(scene.quats, scene.scales)
     reach = _REACH * np.sqrt(np.diagonal(spread, axis1=1, axis2=2))  # (N, 3)
