@@ -121,12 +121,12 @@ class ObjectTable:
     def checkpoint(self) -> Callable[[], None]:
         """Return what goes back to the present state, after `add`, `match`, `remove` or `solve`; not after `forget`."""
         views, lifted, objects = dict(self.views), dict(self._lifted), dict(self._objects)
-        largest, forgotten = self._largest, self._forgotten
+        others = self._largest, self._agreement, self._forgotten
 
         def undo() -> None:
             same = len(objects) == len(self._objects) and all(self._objects.get(n) is objects[n] for n in objects)
             self.views, self._lifted, self._objects = views, lifted, objects
-            self._largest, self._forgotten = largest, forgotten
+            self._largest, self._agreement, self._forgotten = others
             if not same:
                 self._fill()
 

@@ -89,6 +89,18 @@ def test_objects_that_some_views_merge_stay_two() -> None:
     assert [table.objects_in(view.name).merged for view in VIEWS] == [1, 0, 0, 0, 1, 0, 0, 0]
 
 
+def test_undoing_a_solve_brings_back_all_that_the_table_said_before() -> None:
+    table = ObjectTable(SCENE)
+    for view in VIEWS[:3]:
+        table.match(shuffled(view))
+    nothing = Segmentation.from_codes(SCENE, np.zeros((len(SCENE), 4), np.float32), table.class_names)
+    before, undo = table.summary(nothing), table.checkpoint()
+    table.solve()
+    assert table.summary(nothing)["granularity"] is not None
+    undo()
+    assert table.summary(nothing) == before
+
+
 def test_clutter_that_one_view_shows_goes_to_the_background() -> None:
     labels = VIEWS[0].read_labels().copy()
     labels[:6, :10] = np.where(labels[:6, :10] == 0, 9, labels[:6, :10])
