@@ -119,23 +119,24 @@ def _annotation(element: str, attributes: dict[str, str], where: str) -> _Annota
     name = check_name(attributes.get("label"), where)
     z_order = _whole(attributes, "z_order", where, "0")
     if element == "polygon":
-        points = [_numbers(point, ",", where) for point in attributes.get("points", "").split(";")]
+        points = [_numbers(point, where) for point in attributes.get("points", "").split(";")]
         return _Annotation(z_order, name, Polygons.of(points, where))
     left, top, width, height = (_whole(attributes, key, where) for key in ("left", "top", "width", "height"))
     size = Record(where, {"width": width, "height": height}).size("width", "height")
-    runs = run_lengths([int(run) for run in _numbers(attributes.get("rle", ""), ",", where)], where)
+    rle = attributes.get("rle", "").split(",")
+    runs = run_lengths([_whole({"rle": run.strip()}, "rle", where) for run in rle], where)
     return _Annotation(z_order, name, Bitmap(left, top, runs_to_mask(runs, *size, where, order="C")))
 
 
-def _numbers(text: str, separator: str, where: str) -> list[float]:
+def _numbers(text: str, where: str) -> list[float]:
     try:
-        return [float(number) for number in text.split(separator)]
+        return [float(number) for number in text.split(",")]
     except ValueError as cause:
         raise MaskFormatError(f"{where}: has {clipped(repr(text[:200]))}; expected numbers") from cause
 
 
 def _whole(attributes: dict[str, str], key: str, where: str, default: str = "") -> int:
     text = attributes.get(key, default)
-    if not re.fullmatch(r"-?[0-9]{1,9}", text):
+    if not re.fullmatch(r"-?[0-9]{1,18}", text):
         raise MaskFormatError(f"{where}: '{key}' is {quoted(text[:200])}; expected a whole number")
     return int(text)
