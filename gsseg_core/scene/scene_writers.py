@@ -86,15 +86,16 @@ def format_of(path: str | os.PathLike[str], asked: str | None = None) -> str:
     """Name of the format for a file: what is asked for; else what its suffix says, and PLY if that says nothing.
 
     Raises `SettingsError` where the suffix says another format than the one that is asked for, or one that gsseg reads
-    only.
+    only, and as `check_format` does of what is asked for.
     """
     from gsseg_core.scene.scene_formats import SCENE_FORMATS  # `gsseg --help` does without.
 
+    if asked is not None:
+        check_format(asked)
     file = Path(path).name.lower()
-    fits = {max((s for s in writer.suffixes if file.endswith(s)), default="", key=len): name
-            for name, writer in SCENE_WRITERS.items()}  # fmt: skip
-    suffix = max(fits, key=len)
-    said = fits[suffix] if suffix else None
+    fits = {suffix: name for name, writer in SCENE_WRITERS.items() for suffix in writer.suffixes}
+    suffix = max(filter(file.endswith, fits), key=len, default=None)
+    said = None if suffix is None else fits[suffix]
     only_read = None if said else next((known for known in SCENE_FORMATS if file.endswith(known.suffixes)), None)
     if only_read:
         suffixes = ", ".join(writer.suffixes[0] for writer in SCENE_WRITERS.values())

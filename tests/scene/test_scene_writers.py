@@ -197,6 +197,8 @@ def test_the_format_of_a_file_is_what_its_suffix_says() -> None:
         format_of("a.spz", "glb")
     with pytest.raises(SettingsError, match="suffix of the format compressed-ply, but ply"):
         format_of("a.compressed.ply", "ply")
+    with pytest.raises(SettingsError, match="format is 'obj'; expected one of ply, compressed-ply, spz, sog"):
+        format_of("a.ply", "obj")
 
 
 def test_a_format_that_is_not_there_is_refused_by_one_message(monkeypatch: pytest.MonkeyPatch) -> None:
