@@ -12,7 +12,7 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.refine.label_propagation import GraphSettings, propagate
-from gsseg_core.spatial.neighbour_graph import Graph, _median, graph_of
+from gsseg_core.spatial.neighbour_graph import Graph, graph_of
 
 FEW = GraphSettings(k=4, steps=60)
 
@@ -181,10 +181,3 @@ def test_where_most_of_each_object_is_unknown_the_graph_fills_it_in() -> None:
     before, after = ((c.argmax(axis=1) == truth)[balls] & c.any(axis=1)[balls] for c in (codes, spread))
     assert before.mean() < 0.9
     assert after.mean() > before.mean() + 0.05
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 10, 1001])
-@pytest.mark.parametrize("levels", [1, 2, 1 << 20])
-def test_the_typical_difference_of_colours_is_their_median(count: int, levels: int) -> None:
-    values = (np.random.default_rng(count).integers(0, levels, count) / levels).astype(np.float32)
-    assert _median(values) == float(np.median(values))
