@@ -9,10 +9,9 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.kernels.compiler import kernel
-from gsseg_core.simd import prefetch
+from gsseg_core.simd import AHEAD, prefetch
 
 _NONE = np.uint32(2**32 - 1)
-_AHEAD = 12  # rows between the one that is copied and the one that is fetched from memory
 
 
 class CSRRows(NamedTuple):
@@ -174,8 +173,8 @@ def _take(rows: CSRRows, ids: np.ndarray, taken: CSRRows) -> None:
     last = ids.shape[0] - 1
     for m in nb.prange(ids.shape[0]):
         # Rows are anywhere in memory: they are asked for before they are needed.
-        prefetch(indptr, ids[min(m + 2 * _AHEAD, last)])
-        begin = indptr[ids[min(m + _AHEAD, last)]]
+        prefetch(indptr, ids[min(m + 2 * AHEAD, last)])
+        begin = indptr[ids[min(m + AHEAD, last)]]
         prefetch(indices, begin)
         prefetch(data, begin)
         first = indptr[ids[m]]

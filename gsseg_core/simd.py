@@ -26,6 +26,8 @@ intrinsic: Any = typed_intrinsic
 
 LANES = 16
 
+AHEAD = 12  # rows between the one that is worked on and the one to `prefetch`
+
 FAST = {"contract", "nnan", "nsz", "reassoc"}
 """What the compiler may do to sums of weights, none of which is NaN."""
 
@@ -85,9 +87,9 @@ class Builder:
         """Write a row."""
         self.llvm.store(value, address, align=4)
 
-    def spread(self, value: Any) -> Any:
-        """Sixteen times a float32."""
-        undefined, first = ir.Constant(ROW, ir.Undefined), ir.Constant(I32, 0)
+    def spread(self, value: Any, kind: Any = ROW) -> Any:
+        """Sixteen times a float32, or an int32 for `BITS`."""
+        undefined, first = ir.Constant(kind, ir.Undefined), ir.Constant(I32, 0)
         single = self.llvm.insert_element(undefined, value, first)
         return self.llvm.shuffle_vector(single, undefined, ir.Constant(BITS, [0] * LANES))
 
@@ -189,9 +191,7 @@ def count_bits(row: Builder, bits: Any) -> Any:
 def count_at_most(row: Builder, numbers: Any, i: Any, limit: Any) -> Any:
     """Count which of the sixteen int32 in row i are not above a limit."""
     address = row.llvm.bitcast(row.row(0), ir.PointerType(BITS))
-    first = row.llvm.insert_element(ir.Constant(BITS, ir.Undefined), limit, ir.Constant(I32, 0))
-    most = row.llvm.shuffle_vector(first, first, ir.Constant(BITS, [0] * LANES))
-    found = row.llvm.icmp_signed("<=", row.llvm.load(address, align=4, typ=BITS), most)
+    found = row.llvm.icmp_signed("<=", row.llvm.load(address, align=4, typ=BITS), row.spread(limit, BITS))
     return row.llvm.ctpop(row.bits(found))
 
 

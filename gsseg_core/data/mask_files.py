@@ -162,7 +162,7 @@ def _check_claims(path: Path, arrays: NpzArrays, class_names: Mapping[int, str] 
     check_forms(probabilities, classes, unknown, str(path))
     count, height, width = shape
     if camera is not None:
-        camera.check_image_mask_size(width, height, str(path))
+        camera.check_mask_size(width, height, str(path), drawn_on_image=True)
     check_pixels(width, height, str(path), MaskFormatError)
     if classes is None and class_names is not None and count != max(class_names) + 1:
         raise UnknownLabelError(
@@ -192,7 +192,7 @@ def _read_image(path: Path, camera: Camera | None, within: Path | None) -> npt.N
     """Read an image of one class, as probabilities (H, W) float32."""
     with open_image(path, MaskFormatError, "image", "probabilities of one class", ("PNG", "TIFF"), within) as image:
         if camera is not None:
-            camera.check_image_mask_size(*image.size, str(path))
+            camera.check_mask_size(*image.size, str(path), drawn_on_image=True)
         mode, values = image.mode, np.array(image)
     if mode == "L":
         return values.astype(np.float32) / np.float32(2**8 - 1)

@@ -25,7 +25,7 @@ from gsseg_core.progress import with_progress
 from gsseg_core.raster.backends import make_operator, vote_total
 from gsseg_core.raster.observation import Observation
 from gsseg_core.raster.view_operator import ViewOperator
-from gsseg_core.raster.view_renderer import PixelGrid, Strongest
+from gsseg_core.raster.view_renderer import NO_PIXELS, PixelGrid, Strongest
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.several_at_once import each_with_made, several_at_once
 
@@ -204,9 +204,7 @@ class Learner(ABC):
             raise SettingsError(f"view {view.name!r} was not learnt from; expected it after fit()")
         return self._blend_codes(self.codes_, view)
 
-    def strongest_without(
-        self, view: View, wanted: np.ndarray | None = None, grid: PixelGrid | None = None
-    ) -> Strongest:
+    def strongest_without(self, view: View, wanted: np.ndarray | None = None, grid: PixelGrid = NO_PIXELS) -> Strongest:
         """Tell the class of each pixel of a view by `predict_without`, and the probabilities of the pixels of a grid.
 
         Little is known where most of a ray ends on Gaussians that only this view has seen. If only some pixels with a

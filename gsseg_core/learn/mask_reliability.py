@@ -158,7 +158,7 @@ class MaskChecker:
         """Tell the class of each pixel that is compared, (H, W) int32, and keep the probabilities of some."""
         grid = grid_of(view.camera.height, view.camera.width)
         found = self.learner.strongest_without(view, wanted, grid)
-        self._samples[view.name] = sample_grid(found.some, grid.of(np.where(wanted, seen.named(), UNKNOWN)))
+        self._samples[view.name] = sample_grid(found.on_grid, grid.of(np.where(wanted, seen.named(), UNKNOWN)))
         return found.labels()
 
 

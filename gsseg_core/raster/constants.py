@@ -19,7 +19,6 @@ CHANNELS = 32
 """Channels that one pass of an adjoint sums at once: bounds its memory, and fits the shared memory of every GPU."""
 
 BLOCK = 4  # px, side of the square blocks into which tiles are cut: sixteen pixels are one vector
-AHEAD = 12  # entries between the one that is worked on and the one that is fetched from memory
 
 CHUNKS = 16
 """Parts into which Gaussians are cut, to be worked on beside each other; fixed, so that threads change nothing."""

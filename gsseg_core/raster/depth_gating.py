@@ -9,7 +9,7 @@ import numpy as np
 
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
-from gsseg_core.errors import MaskSizeError, SettingsError
+from gsseg_core.errors import SettingsError
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.depth import COVERED, surface
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -90,10 +90,7 @@ def gate_view(
         The mask cannot be read.
     """
     camera, tolerance = view.camera, tolerance or DepthTolerance()
-    if depth.shape != (camera.height, camera.width):
-        raise MaskSizeError(
-            f"view '{camera.name}': depth has shape {depth.shape}; expected ({camera.height}, {camera.width})"
-        )
+    camera.check_image(depth, "depth has")
     seen, measured = view.read_seen(), np.isfinite(depth) & (depth > 0)
     coverage, rendered = surface(scene, make_operator(scene, camera, device))
     # Rays that meet nothing of the scene have no depth to compare with.

@@ -13,10 +13,9 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence, vote_units
 from gsseg_core.errors import SceneValueError
 from gsseg_core.kernels.compiler import kernel
-from gsseg_core.raster.constants import AHEAD
 from gsseg_core.raster.view_renderer import ViewRenderer
 from gsseg_core.scene.camera import Camera
-from gsseg_core.simd import prefetch
+from gsseg_core.simd import AHEAD, prefetch
 
 
 class VoteShares(NamedTuple):

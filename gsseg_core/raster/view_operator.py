@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsseg_core.data.label_evidence import LabelEvidence
-from gsseg_core.errors import MaskSizeError, SceneValueError, SettingsError
+from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.raster.objects_alone import ObjectsAlone
 from gsseg_core.raster.observation import Observation
 from gsseg_core.raster.view_renderer import ViewRenderer
@@ -49,7 +49,7 @@ class ViewOperator(ViewRenderer):
             The residual is not of the camera's size.
         """
         residual = np.asarray(residual)
-        self._check_size(residual, 3)
+        self.camera.check_image(residual, "image has", channels=True)
         return self._adjoint(residual)
 
     def observe(
@@ -72,7 +72,7 @@ class ViewOperator(ViewRenderer):
         MaskSizeError
             The labels are not of the camera's size.
         """
-        self._check_size(labels, 2)
+        self.camera.check_image(labels, "image has")
         observation = self._observe(labels, weights)
         if evidence is not None:
             observation.evidence = evidence
@@ -104,7 +104,7 @@ class ViewOperator(ViewRenderer):
         SceneValueError
             The total has another number of rows, or too few classes.
         """
-        self._check_size(labels, 2)
+        self.camera.check_image(labels, "image has")
         most = int((labels if evidence is None else evidence.votes.indices).max(initial=0))
         if len(total) != self.num_gaussians or most >= total.shape[1]:
             expected = f"({self.num_gaussians}, K), with K above {most}"
@@ -157,8 +157,10 @@ class ViewOperator(ViewRenderer):
                 )
             pixel = row, column
         pixels, rows, weights = self._weights(pixel)
-        # Of each pixel they come nearest first, and a stable sort keeps that order.
-        order = np.argsort(pixels, kind="stable")
+        if pixel is None:  # Of each pixel they come nearest first, and a stable sort keeps that order.
+            order = np.argsort(pixels, kind="stable")
+        else:
+            order = np.flatnonzero(pixels == pixel[0] * width + pixel[1])
         return Weights(pixels[order], self.ids[rows[order]], weights[order])
 
     @abstractmethod
@@ -174,7 +176,10 @@ class ViewOperator(ViewRenderer):
 
     @abstractmethod
     def _weights(self, pixel: tuple[int, int] | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """List pixels and places in `ids`, both (P,) int32, and weights, (P,) float32, nearest first in each pixel."""
+        """List pixels and places in `ids`, both (P,) int32, and weights, (P,) float32, nearest first in each pixel.
+
+        If only a `pixel` is wanted, others may be among them.
+        """
 
     @abstractmethod
     def _observe(self, labels: np.ndarray, weights: np.ndarray | None) -> Observation: ...
@@ -185,9 +190,3 @@ class ViewOperator(ViewRenderer):
         observation = self.observe(labels, evidence)
         observation.vote(total, units, sign)
         return observation.num_pairs > 0
-
-    def _check_size(self, image: np.ndarray, dimensions: int) -> None:
-        height, width = self.camera.height, self.camera.width
-        if image.ndim != dimensions or image.shape[:2] != (height, width):
-            expected = f"({height}, {width}{', K' if dimensions == 3 else ''})"
-            raise MaskSizeError(f"view '{self.camera.name}': image has shape {image.shape}; expected {expected}")

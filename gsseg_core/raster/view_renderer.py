@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sized
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -12,6 +12,8 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import SceneValueError
 from gsseg_core.scene.camera import Camera
+
+Image = TypeVar("Image", bound=Any)  # (H, W, ...), of NumPy or PyTorch
 
 
 class Blended(NamedTuple):
@@ -27,9 +29,13 @@ class PixelGrid(NamedTuple):
     first: int
     step: int
 
-    def of(self, image: np.ndarray) -> np.ndarray:  # (H, W, ...)
+    def of(self, image: Image) -> Image:  # (H, W, ...)
         """Take these pixels of an image."""
         return image[self.first :: self.step, self.first :: self.step]
+
+
+NO_PIXELS = PixelGrid(1 << 30, 1 << 30)
+"""A grid of which no image has a pixel."""
 
 
 class Strongest(NamedTuple):
@@ -37,14 +43,13 @@ class Strongest(NamedTuple):
 
     classes: np.ndarray  # (H, W) int32: the column of the largest blended probability
     known: np.ndarray  # (H, W) bool: whether more than half of the pixel is, by the sum of its probabilities
-    some: np.ndarray  # (R, C, K) float32: all probabilities of the pixels of a grid; R and C are 0 without one
+    on_grid: np.ndarray  # (R, C, K) float32: all probabilities of the pixels of a grid
     beside: Blended | None = None  # what else was blended, if anything
 
     @classmethod
-    def of(cls, image: np.ndarray, grid: PixelGrid | None = None, beside: Blended | None = None) -> Strongest:
+    def of(cls, image: np.ndarray, grid: PixelGrid = NO_PIXELS, beside: Blended | None = None) -> Strongest:
         """Find it in an image of probabilities, (H, W, K)."""
-        some = image[:0, :0] if grid is None else grid.of(image)
-        return cls(image.argmax(axis=2).astype(np.int32), image.sum(axis=2) > 0.5, some, beside)
+        return cls(image.argmax(axis=2).astype(np.int32), image.sum(axis=2) > 0.5, grid.of(image), beside)
 
     def labels(self) -> np.ndarray:
         """Class of each pixel of which more than half is known, (H, W) int32; `UNKNOWN` elsewhere."""
@@ -122,7 +127,7 @@ class ViewRenderer(ABC):
         return image
 
     def strongest(
-        self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid | None = None,
+        self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid = NO_PIXELS,
         of: np.ndarray | None = None, beside: np.ndarray | None = None, wanted: np.ndarray | None = None,
     ) -> Strongest:  # fmt: skip
         """Find the class of each pixel: that of the largest of `blend_probabilities`.

@@ -27,7 +27,6 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from gsseg_core.errors import MaskSizeError
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.depth import BEHIND, depths, surface
 from gsseg_core.raster.objects_alone import ObjectsAlone
@@ -79,11 +78,7 @@ class Silhouette(NamedTuple):
         MaskSizeError
             The labels are not of the camera's size.
         """
-        camera = operator.camera
-        if labels.shape != (camera.height, camera.width):
-            raise MaskSizeError(
-                f"view '{camera.name}': labels have shape {labels.shape}; expected ({camera.height}, {camera.width})"
-            )
+        operator.camera.check_image(labels, "labels have")
         depth = surface(scene, operator).depth if depth is None else depth
         stands_for = 1.0 if view is None else view.width * view.height / labels.size
         return cls(operator, labels.astype(np.int32), depth, stands_for)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -111,18 +112,18 @@ class Camera:
         taken_by = self.undistortion.lens if self.undistortion else self
         return taken_by.width, taken_by.height
 
-    def check_mask_size(self, width: int, height: int, source: str) -> None:
-        """Raise `MaskSizeError` if the mask of this view has another size in pixels."""
-        self._check_size((width, height), (self.width, self.height), source)
+    def check_image(self, image: npt.NDArray[Any], found: str, channels: bool = False) -> None:
+        """Raise `MaskSizeError` unless an image is (H, W) of this view, or (H, W, K); `found` begins "labels have"."""
+        if image.ndim != 2 + channels or image.shape[:2] != (self.height, self.width):
+            expected = f"({self.height}, {self.width}{', K' * channels})"
+            raise MaskSizeError(f"view '{self.name}': {found} shape {image.shape}; expected {expected}")
 
-    def check_image_mask_size(self, width: int, height: int, source: str) -> None:
-        """Raise `MaskSizeError` if a mask drawn on the image has another size in pixels than the image."""
-        self._check_size((width, height), self.image_size, source)
-
-    def _check_size(self, found: tuple[int, int], expected: tuple[int, int], source: str) -> None:
-        if found != expected:
+    def check_mask_size(self, width: int, height: int, source: str, *, drawn_on_image: bool = False) -> None:
+        """Raise `MaskSizeError` if a mask of this view, or one that is drawn on its image, has another size."""
+        expected = self.image_size if drawn_on_image else (self.width, self.height)
+        if (width, height) != expected:
             raise MaskSizeError(
-                f"{source}: mask is {found[0]} x {found[1]} pixels; expected {expected[0]} x {expected[1]}, the size "
+                f"{source}: mask is {width} x {height} pixels; expected {expected[0]} x {expected[1]}, the size "
                 f"of {self._who} (masks are never resized)"
             )
 

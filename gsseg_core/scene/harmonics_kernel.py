@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
-from gsseg_core.simd import prefetch
+from gsseg_core.simd import AHEAD, prefetch
 
 _C0, _C1, _C2 = np.float32(sqrt(1 / (4 * pi))), np.float32(sqrt(3 / (4 * pi))), np.float32(sqrt(15 / (4 * pi)))
 _C2_MIDDLE, _C2_HALF = np.float32(sqrt(5 / (16 * pi))), np.float32(sqrt(15 / (16 * pi)))
@@ -18,7 +18,6 @@ _C3_ALL, _C3_HALF = np.float32(sqrt(105 / (4 * pi))), np.float32(sqrt(105 / (16 
 _TWO, _THREE, _FOUR = np.float32(2), np.float32(3), np.float32(4)
 _LEAST = np.finfo(np.float32).tiny  # of a length
 _CHUNKS = 64
-_AHEAD = 12  # Gaussians between the one that is worked on and the one that is fetched from memory
 
 
 @called_by_kernels
@@ -60,7 +59,7 @@ def seen_colors(
         harmonics = np.empty(bands, np.float32)
         for m in range(chunk * count // _CHUNKS, (chunk + 1) * count // _CHUNKS):
             # A row of coefficients is up to four cache lines, anywhere in memory: it is asked for before it is needed.
-            i, later = ids[m], ids[min(m + _AHEAD, count - 1)]
+            i, later = ids[m], ids[min(m + AHEAD, count - 1)]
             prefetch(means, later)
             prefetch(coefficients, later)
             prefetch(second, later)

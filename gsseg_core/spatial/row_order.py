@@ -10,13 +10,12 @@ import numpy as np
 
 from gsseg_core.kernels.compiler import kernel
 from gsseg_core.scene.gaussian_scene import ACTIVATED, GaussianScene
-from gsseg_core.simd import prefetch
+from gsseg_core.simd import AHEAD, prefetch
 
 _CELLS = 1 << 10  # along each axis: three numbers of ten bits make one of thirty
 _SAMPLE = 1 << 16  # Gaussians by which the box of the curve is found
+_TAIL = 1.0  # percent of these on each side that may lie outside, so that a far floater makes no cell large
 _LINE = 16  # numbers of 32 bits in a cache line
-_AHEAD = 12  # rows between the one that is copied and the one that is fetched from memory
-_TAIL = 1.0  # percent of them on each side that may lie outside, so that a far floater makes no cell large
 
 
 def curve_order(means: np.ndarray) -> np.ndarray:
@@ -71,7 +70,7 @@ def take_rows_into(out: np.ndarray, table: np.ndarray, chosen: np.ndarray) -> No
     """Copy some rows, (M',), of a table (M, K) of 32 bits into the first K columns of another."""
     last = chosen.shape[0] - 1
     for m in nb.prange(chosen.shape[0]):
-        later = table[chosen[min(m + _AHEAD, last)]]
+        later = table[chosen[min(m + AHEAD, last)]]
         for j in range(0, table.shape[1], _LINE):
             prefetch(later, j)
         row, copy = table[chosen[m]], out[m]

@@ -24,8 +24,8 @@ def test_the_strongest_class_is_the_largest_of_all_that_are_rendered(backend, ch
     np.testing.assert_array_equal(found.classes, image.argmax(axis=2))
     sure = np.abs(image.sum(axis=2) - 0.5) > 1e-5
     np.testing.assert_array_equal(found.known[sure], image.sum(axis=2)[sure] > 0.5)
-    np.testing.assert_allclose(found.some, image[2::5, 2::5], atol=1e-6)
-    assert operator.strongest(CSRRows.from_dense(codes), channels, background).some.shape == (0, 0, channels)
+    np.testing.assert_allclose(found.on_grid, image[2::5, 2::5], atol=1e-6)
+    assert operator.strongest(CSRRows.from_dense(codes), channels, background).on_grid.shape == (0, 0, channels)
     np.testing.assert_array_equal(found.labels(), np.where(found.known, found.classes, -1))
 
 

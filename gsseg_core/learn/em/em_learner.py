@@ -46,7 +46,7 @@ from gsseg_core.learn.learner import VOTE_UNIT, Learner, Progress, silent
 from gsseg_core.learn.vote_resolution import resolved_votes
 from gsseg_core.raster.observation import Observation, ViewPairs, VoteShares
 from gsseg_core.raster.view_operator import ViewOperator
-from gsseg_core.raster.view_renderer import PixelGrid, Strongest, ViewRenderer
+from gsseg_core.raster.view_renderer import NO_PIXELS, PixelGrid, Strongest, ViewRenderer
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.several_at_once import meanwhile
 from gsseg_core.spatial.neighbourhood import find_neighbours
@@ -228,9 +228,7 @@ class EMLearner(Learner):
         codes, _, background, operator = self._without(view, only_labelled=False)
         return operator.blend_probabilities(codes, self.num_classes, background)
 
-    def strongest_without(
-        self, view: View, wanted: np.ndarray | None = None, grid: PixelGrid | None = None
-    ) -> Strongest:
+    def strongest_without(self, view: View, wanted: np.ndarray | None = None, grid: PixelGrid = NO_PIXELS) -> Strongest:
         """Tell the class of each pixel by `predict_without`, without an image of all classes."""
         codes, of, background, operator = self._without(view, only_labelled=wanted is not None)
         return operator.strongest(codes, self.num_classes, background, grid, of, wanted=wanted)

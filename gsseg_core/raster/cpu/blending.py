@@ -19,10 +19,9 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.kernels.compiler import called_by_kernels
-from gsseg_core.raster.constants import AHEAD
 from gsseg_core.raster.cpu.splat import OPEN, SIDE, WIDTH, aim, blend_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
-from gsseg_core.simd import first_bit, prefetch, store_row
+from gsseg_core.simd import AHEAD, first_bit, prefetch, store_row
 
 
 class Records(NamedTuple):
@@ -70,6 +69,16 @@ def tile_of_turn(turn: int, columns: int, rows: int, stride: int) -> int:
 def corner_of(tiles: Tiles, tile: int) -> tuple[int, int]:
     """Column and row of the first pixel of a tile."""
     return (tile % tiles.columns) * TILE, (tile // tiles.columns) * TILE
+
+
+@called_by_kernels
+def blocks_with(wanted: np.ndarray, left: int, top: int) -> int:  # (H, W) bool
+    """Which blocks of a tile have pixels that are wanted, as bits."""
+    blocks = 0
+    for r in range(top, min(top + TILE, wanted.shape[0])):
+        for c in range(left, min(left + TILE, wanted.shape[1])):
+            blocks |= wanted[r, c] << in_block(r - top, c - left)[0]
+    return blocks
 
 
 @nb.njit(inline="always")

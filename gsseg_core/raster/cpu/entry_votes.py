@@ -8,10 +8,10 @@ import numpy as np
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence, vote_units
 from gsseg_core.kernels.compiler import kernel
-from gsseg_core.raster.constants import AHEAD, CHUNKS
+from gsseg_core.raster.constants import CHUNKS
 from gsseg_core.raster.cpu.lifting import Lifted
 from gsseg_core.raster.cpu.tiling import Tiles
-from gsseg_core.simd import prefetch
+from gsseg_core.simd import AHEAD, prefetch
 
 WAITING = 64  # votes that are put together before they are counted: where they go has come into the cache by then
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from gsseg_core import simd
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
-from gsseg_core.raster.constants import AHEAD, CHUNKS, TINY
+from gsseg_core.raster.constants import CHUNKS, TINY
 from gsseg_core.raster.cpu.blending import open_rays, stride_of, tile_of_turn
 from gsseg_core.raster.cpu.lifting import Labels, weighted_blocks
 from gsseg_core.raster.cpu.splat import WIDTH, aim, lift_block
@@ -22,8 +22,8 @@ from gsseg_core.raster.cpu.tiling import TILE, Tiles
 _TINY = np.float32(TINY)
 
 # Each chunk of Gaussians counts from 0, and `number_on` makes one count of these.
-_CHUNK = 27  # the bits above these say which chunk a number belongs to
-_NUMBER = (1 << _CHUNK) - 1
+_BITS = 27  # of a number; those above them say which chunk it belongs to
+_NUMBER = (1 << _BITS) - 1
 
 PARTS = 4  # parts of the image whose sums are added up beside each other
 
@@ -74,12 +74,12 @@ def number_pairs(
     for chunk in nb.prange(CHUNKS):
         seen, number = np.full(num_labels, -1, np.int64), np.zeros(num_labels, np.int64)
         first, n = chunk * count // CHUNKS, capacity[chunk]
-        place, tag = first, chunk << _CHUNK
+        place, tag = first, chunk << _BITS
         for g in range(first, (chunk + 1) * count // CHUNKS):
             begin, is_seen = n, False
             for i in range(tiles.gaussian_start[g], tiles.gaussian_start[g + 1]):
-                simd.prefetch(kept, tiles.gaussian_entries[min(i + 2 * AHEAD, last)])
-                later = tiles.gaussian_entries[min(i + AHEAD, last)]
+                simd.prefetch(kept, tiles.gaussian_entries[min(i + 2 * simd.AHEAD, last)])
+                later = tiles.gaussian_entries[min(i + simd.AHEAD, last)]
                 of_tile = facts[kept[later, 2]]
                 simd.prefetch(sums, of_tile[1] + (later - of_tile[0]) * of_tile[5])
                 e = tiles.gaussian_entries[i]
@@ -116,7 +116,7 @@ def number_pairs(
 def number_on(numbers: np.ndarray, before: np.ndarray) -> None:
     """Make one count, in place, of numbers of int32 that begin anew in every chunk, `before`, (CHUNKS,); -1 stays."""
     for i in nb.prange(numbers.shape[0]):
-        number = (numbers[i] & _NUMBER) + before[max(numbers[i], 0) >> _CHUNK]
+        number = (numbers[i] & _NUMBER) + before[max(numbers[i], 0) >> _BITS]
         numbers[i] = number if numbers[i] >= 0 else -1
 
 
@@ -168,7 +168,7 @@ def _blend_likelihood(
     lines = np.empty((2, TILE), np.float32)
     n = 0
     for e in range(entries.shape[0]):
-        later = min(e + AHEAD, entries.shape[0] - 1)
+        later = min(e + simd.AHEAD, entries.shape[0] - 1)
         simd.prefetch(table, entries[later])
         simd.prefetch(likelihood, max(pair[later * label_count], 0))
         g, todo = entries[e], np.int64(blocks[e])
@@ -262,7 +262,7 @@ def add_up(slot_start: np.ndarray, pair: np.ndarray, sums: np.ndarray, num_pairs
     for part in nb.prange(PARTS):
         total = parts[part]
         for i in range(slot_start[part * tiles // PARTS], slot_start[(part + 1) * tiles // PARTS]):
-            simd.prefetch(total, max(pair[min(i + 2 * AHEAD, last)], 0))
+            simd.prefetch(total, max(pair[min(i + 2 * simd.AHEAD, last)], 0))
             if pair[i] >= 0:
                 total[pair[i]] += sums[i]
     return parts

@@ -6,7 +6,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.kernels.compiler import kernel
-from gsseg_core.raster.cpu.blending import aim_next, in_block, open_rays, stride_of, tile_of_turn
+from gsseg_core.raster.cpu.blending import aim_next, blocks_with, corner_of, open_rays, stride_of, tile_of_turn
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.splat import OPEN, WIDTH, lift_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles, assign
@@ -38,7 +38,7 @@ def ray_ends(
     """
     projected = project(scene, camera)
     tiles = assign(projected, camera.width, camera.height)
-    ends = _find_ends(tiles, np.ascontiguousarray(labels, np.int32))
+    ends = _find_ends(tiles, np.greater_equal(labels, 0, order="C"))
     found = _entry_depths(scene, camera, projected.ids, tiles, ends, ends >= 0)
     found[ends == _NO_LABEL] = -np.inf
     return found
@@ -57,7 +57,7 @@ def _entry_depths(
 
 
 @kernel(parallel=True, fastmath=FAST, error_model="numpy")
-def _find_ends(tiles: Tiles, mask: np.ndarray) -> np.ndarray:
+def _find_ends(tiles: Tiles, labelled: np.ndarray) -> np.ndarray:  # (H, W) bool
     """Find the entry of each tile at which its last labelled block ends, as `lifting` would, (T,) int64."""
     ends = np.empty(tiles.rows * tiles.columns, np.int64)
     stride = stride_of(tiles.rows)
@@ -65,12 +65,7 @@ def _find_ends(tiles: Tiles, mask: np.ndarray) -> np.ndarray:
         tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
         rays, lines = np.empty((TILE, TILE), np.float32), np.empty((2, 2, TILE), np.float32)
         left, top, live = open_rays(tiles, tile, rays)
-        labelled = 0
-        for r in range(int(top), min(int(top) + TILE, mask.shape[0])):
-            for c in range(int(left), min(int(left) + TILE, mask.shape[1])):
-                if mask[r, c] >= 0:
-                    labelled |= 1 << in_block(r - int(top), c - int(left))[0]
-        live &= labelled
+        live &= blocks_with(labelled, *corner_of(tiles, tile))
         ends[tile] = _GOES_ON if live else _NO_LABEL
         last = tiles.start[tile + 1]
         ahead = aim_next(tiles, tiles.start[tile] - 1, last, left, top, lines)

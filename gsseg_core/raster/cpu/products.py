@@ -10,10 +10,10 @@ import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
-from gsseg_core.raster.constants import AHEAD
 from gsseg_core.raster.cpu.blending import (
     aim_next,
     blend_tile,
+    blocks_with,
     corner_of,
     in_block,
     in_tile,
@@ -24,6 +24,7 @@ from gsseg_core.raster.cpu.blending import (
 from gsseg_core.raster.cpu.splat import OPEN, SIDE, WIDTH, blend_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
 from gsseg_core.simd import (
+    AHEAD,
     FAST,
     above,
     add_scaled,
@@ -95,7 +96,7 @@ def strongest(
     for turn in nb.prange(tiles.rows * tiles.columns):
         tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
         left, top = corner_of(tiles, tile)
-        looked_at = _blocks_with(wanted, left, top) if wanted.size else OPEN
+        looked_at = blocks_with(wanted, left, top) if wanted.size else OPEN
         if not looked_at:
             continue
         values, rays = np.zeros((TILE, channels, TILE), np.float32), np.empty((TILE, TILE), np.float32)
@@ -117,16 +118,6 @@ def strongest(
                         some[(top + r) // step, (left + c) // step, k] = values[b, k, lane]
                     some[(top + r) // step, (left + c) // step, 0] += rays[b, lane] if background else np.float32(0)
     return out, half, some, image, left_over
-
-
-@called_by_kernels
-def _blocks_with(wanted: np.ndarray, left: int, top: int) -> int:  # (H, W) bool
-    """Which blocks of a tile have pixels that are wanted, as bits."""
-    blocks = 0
-    for r in range(top, min(top + TILE, wanted.shape[0])):
-        for c in range(left, min(left + TILE, wanted.shape[1])):
-            blocks |= wanted[r, c] << ((r - top) // SIDE * SIDE + (c - left) // SIDE)
-    return blocks
 
 
 @called_by_kernels
@@ -244,7 +235,7 @@ def render_few(tiles: Tiles, codes: np.ndarray, wanted: np.ndarray) -> tuple[np.
         rays, lines = np.empty((TILE, TILE), np.float32), np.empty((2, 2, TILE), np.float32)
         values, corner = np.zeros((TILE, channels, TILE), np.float32), corner_of(tiles, tile)
         left, top, live = open_rays(tiles, tile, rays)
-        live &= _blocks_with(wanted, corner[0], corner[1]) if wanted.size else OPEN
+        live &= blocks_with(wanted, corner[0], corner[1]) if wanted.size else OPEN
         ahead = aim_next(tiles, tiles.start[tile] - 1, last, left, top, lines)
         for e in range(tiles.start[tile], last):
             g = tiles.entries[e]

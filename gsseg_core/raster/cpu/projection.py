@@ -56,8 +56,8 @@ class Projected(NamedTuple):
     order: np.ndarray  # (M,) int32: rows of the table, nearest first
 
 
-class _Lens(NamedTuple):
-    """A camera as the kernels take it."""
+class Pinhole(NamedTuple):
+    """A camera as kernels take it."""
 
     viewmat: np.ndarray  # (4, 4) world to camera
     K: np.ndarray  # (3, 3)
@@ -69,7 +69,8 @@ class _Lens(NamedTuple):
     y_high: float
 
     @classmethod
-    def of(cls, camera: Camera) -> _Lens:
+    def of(cls, camera: Camera) -> Pinhole:
+        """Take what is needed of a camera."""
         width, height = float(camera.width), float(camera.height)
         fx, fy, cx, cy = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
         across, down = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
@@ -80,7 +81,7 @@ class _Lens(NamedTuple):
 
 
 class _Splats(NamedTuple):
-    """Gaussians as the kernels take them."""
+    """Gaussians as kernels take them."""
 
     means: np.ndarray  # (N, 3)
     quats: np.ndarray  # (N, 4) w, x, y, z
@@ -96,7 +97,7 @@ def project(scene: GaussianScene, camera: Camera) -> Projected:
     """
     table, depth, ids = _scratch(len(scene))
     splats = _Splats(scene.means, scene.quats, scene.scales, scene.log_opacities)
-    found = _project(splats, _Lens.of(camera), table, depth, ids)
+    found = _project(splats, Pinhole.of(camera), table, depth, ids)
     begins = np.arange(CHUNKS) * len(scene) // CHUNKS
     table, depth, ids = (joined(part, begins, found) for part in (table, depth, ids))
     order, depth = sort_by_depth(depth)
@@ -153,7 +154,7 @@ def _is_before(table: np.ndarray, one: int, other: int) -> bool:
 
 @kernel(parallel=True, error_model="numpy")
 def _project(
-    splats: _Splats, lens: _Lens,
+    splats: _Splats, lens: Pinhole,
     table: np.ndarray, depth: np.ndarray, ids: np.ndarray,  # (N, 8), (N,), (N,) out, where each chunk's part begins
 ) -> np.ndarray:  # fmt: skip
     """Project what is visible; returns how many Gaussians of each chunk that are, (CHUNKS,)."""
@@ -180,7 +181,7 @@ def _project(
 @called_by_kernels(error_model="numpy", fastmath={"contract", "nnan", "ninf", "nsz"})
 def _find_near(
     means: np.ndarray, scales: np.ndarray, log_opacities: np.ndarray,  # (B, 3), (B, 3), (B,)
-    lens: _Lens, near: np.ndarray,  # (BATCH,) bool out
+    lens: Pinhole, near: np.ndarray,  # (BATCH,) bool out
 ) -> None:  # fmt: skip
     """Throw out most of what is off the image before the costly part, by instructions for several Gaussians at once.
 
@@ -231,7 +232,7 @@ def _collect(
 def _project_near(
     count: int,
     lanes: np.ndarray,  # (NUMBERS * BATCH,) in: what `_collect` put there; out: what the table holds, and depth
-    shown: np.ndarray, lens: _Lens,  # (BATCH,) bool out
+    shown: np.ndarray, lens: Pinhole,  # (BATCH,) bool out
 ) -> None:  # fmt: skip
     """Project those that may be visible.
 

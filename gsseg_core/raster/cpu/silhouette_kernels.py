@@ -6,16 +6,25 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
-from gsseg_core.raster.constants import AHEAD, T_MIN
+from gsseg_core.raster.constants import T_MIN
 from gsseg_core.raster.cpu.blending import corner_of, in_block, open_rays, stride_of, tile_of_turn
 from gsseg_core.raster.cpu.splat import WIDTH, aim, alpha_of
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
-from gsseg_core.simd import add_product, add_scaled, first_bit, load_row, nothing, prefetch, store_row, sum_row
+from gsseg_core.simd import (
+    AHEAD,
+    FAST,
+    add_product,
+    add_scaled,
+    first_bit,
+    load_row,
+    nothing,
+    prefetch,
+    store_row,
+    sum_row,
+)
 
 ROUNDING = np.float32(1e-3)  # of 1 - T, below which a pixel is as good as empty
 _UNKNOWN, _MIXED = np.int32(-1), np.int32(-2)  # in place of the one label that a block or a tile shows
-
-_FAST = {"contract", "reassoc", "nnan", "nsz"}
 
 
 @kernel
@@ -46,7 +55,7 @@ def choose(start: np.ndarray, entries: np.ndarray, labels: np.ndarray) -> tuple[
     return kept_start, kept[:e].copy(), former[:n].copy()
 
 
-@kernel(parallel=True, error_model="numpy", fastmath=_FAST)
+@kernel(parallel=True, error_model="numpy", fastmath=FAST)
 def reasons_to_go(
     tiles: Tiles, labels: np.ndarray, depths: np.ndarray,  # (M,) int32 above 0, (M,)
     shown: np.ndarray, hidden_from: np.ndarray,  # (H, W), (H, W)
@@ -85,7 +94,7 @@ def reasons_to_go(
             go[e] = total
 
 
-@kernel(parallel=True, error_model="numpy", fastmath=_FAST)
+@kernel(parallel=True, error_model="numpy", fastmath=FAST)
 def reasons_to_stay(
     tiles: Tiles, labels: np.ndarray, num_labels: int,  # (M,) int32 above 0
     kept: np.ndarray, asked: np.ndarray, shown: np.ndarray,  # (M,) float32, (M,) bool, (H, W)

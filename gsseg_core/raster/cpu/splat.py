@@ -35,8 +35,8 @@ _COLUMNS_OF_BLOCKS = ir.Constant(
 class _Splat(Builder):
     """Reads the table and the lines of one Gaussian."""
 
-    def columns(self, position: int) -> Callable[[int], Any]:
-        """Columns of a row of eight: argument `position` is the array, the next one the row's number."""
+    def projected(self, position: int) -> Callable[[int], Any]:
+        """Columns of a row of the table: argument `position` is the table, the next one the row's number."""
         number = self.arguments[position + 1]
         first = self.llvm.mul(number, ir.Constant(number.type, 8))
 
@@ -56,17 +56,14 @@ class _Splat(Builder):
 
     def alpha(self, first: int) -> tuple[Any, Any]:
         """Alpha in a block, and log2 of it before it is clipped; arguments from `first` on: block, lines and width."""
-        offset = self.llvm.fsub(self.columns_of(first), self.four_of(first + 1, 0, self.arguments[first]))
-        peak, wide = (
-            self.four_of(first + 1, 1, self.arguments[first]),
-            self.spread(self.llvm.fneg(self.arguments[first + 2])),
-        )
+        block, _, width = self.arguments[first : first + 3]
+        offset = self.llvm.fsub(self.pixel_columns(block), self.four_of(first + 1, 0, block))
+        peak, wide = self.four_of(first + 1, 1, block), self.spread(self.llvm.fneg(width))
         power = self.fma(wide, self.llvm.fmul(offset, offset), peak)
         return self.least(self.exp2(power), constant(ALPHA_MAX)), power
 
-    def columns_of(self, position: int) -> Any:
-        """Columns in the tile of the pixels of a block, which is argument `position`."""
-        block = self.arguments[position]
+    def pixel_columns(self, block: Any) -> Any:
+        """Columns in the tile of the pixels of a block."""
         insert: Any = cgutils.global_constant
         table = insert(self.llvm.module, "columns_of_blocks", _COLUMNS_OF_BLOCKS)
         number = self.llvm.and_(block, ir.Constant(block.type, SIDE - 1))
@@ -84,7 +81,7 @@ def aim(typing: Any, table: Any, g: Any, left: Any, top: Any, lines: Any) -> tup
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         row = _Splat(context, builder, signature, arguments)
-        column = row.columns(0)
+        column = row.projected(0)
         dy = builder.fsub(_ROWS, row.spread(builder.fsub(column(V), arguments[3])))
         x = row.fma(row.spread(column(SHEAR)), dy, row.spread(builder.fsub(column(U), arguments[2])))
         high, wide = row.spread(builder.fneg(column(HEIGHT))), row.spread(builder.fneg(column(WIDTH)))
@@ -123,7 +120,7 @@ def blend_block(typing: Any, rays: Any, b: Any, lines: Any, wide: Any) -> tuple[
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return _blended(_Splat(context, builder, signature, arguments), context, signature, lifts=False)
+        return _blended(_Splat(context, builder, signature, arguments), lifts=False)
 
     return _BLENDED(rays, b, lines, types.float32), generate
 
@@ -133,7 +130,7 @@ def lift_block(typing: Any, rays: Any, b: Any, lines: Any, wide: Any) -> tuple[A
     """Blend one Gaussian into block b of rays that lift a mask: as `blend_block`, but they end as `T_LIFTED` says."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return _blended(_Splat(context, builder, signature, arguments), context, signature, lifts=True)
+        return _blended(_Splat(context, builder, signature, arguments), lifts=True)
 
     return _BLENDED(rays, b, lines, types.float32), generate
 
@@ -141,7 +138,7 @@ def lift_block(typing: Any, rays: Any, b: Any, lines: Any, wide: Any) -> tuple[A
 _BLENDED: Any = types.Tuple((row_type, types.int64))  # type: ignore[no-untyped-call]
 
 
-def _blended(row: _Splat, context: Any, signature: Any, lifts: bool) -> Any:
+def _blended(row: _Splat, lifts: bool) -> Any:
     """Weights and bits of `blend_block`, or of `lift_block`; what is left of the rays is stored."""
     llvm = row.llvm
     alpha, power = row.alpha(1)
@@ -157,7 +154,7 @@ def _blended(row: _Splat, context: Any, signature: Any, lifts: bool) -> Any:
         weight, after = llvm.select(goes_on, weight, before), llvm.select(goes_on, after, constant(0.0))
     row.store(after, address)
     bits = llvm.or_(llvm.shl(row.bits(hit), ir.Constant(I64, LANES)), row.bits(goes_on))
-    return context.make_tuple(llvm, signature.return_type, [weight, bits])
+    return row.context.make_tuple(llvm, row.signature.return_type, [weight, bits])
 
 
 @intrinsic

@@ -21,7 +21,7 @@ from gsseg_core.raster.cpu.tiling import TILE, Tiles, assign
 from gsseg_core.raster.objects_alone import ObjectsAlone
 from gsseg_core.raster.observation import Observation, VoteShares
 from gsseg_core.raster.view_operator import ViewOperator
-from gsseg_core.raster.view_renderer import Blended, PixelGrid, Strongest
+from gsseg_core.raster.view_renderer import NO_PIXELS, Blended, PixelGrid, Strongest
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.row_order import take_rows
@@ -78,17 +78,16 @@ class TileOperator(ViewOperator):
         return Blended(*products.render(self._tiles, codes, self._rows(codes, of), num_classes))
 
     def strongest(
-        self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid | None = None,
+        self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid = NO_PIXELS,
         of: np.ndarray | None = None, beside: np.ndarray | None = None, wanted: np.ndarray | None = None,
     ) -> Strongest:  # fmt: skip
         """Find the class of each pixel, tile by tile, without an image of all classes."""
-        first, step = grid or (1 << 30, 1 << 30)  # of which no image has a pixel
         others = np.ascontiguousarray(np.empty((len(self.ids), 0)) if beside is None else beside, np.float32)
-        classes, known, some, image, left_over = products.strongest(
-            self._tiles, codes, self._rows(codes, of), num_classes, background, first, step, others,
+        classes, known, on_grid, image, left_over = products.strongest(
+            self._tiles, codes, self._rows(codes, of), num_classes, background, *grid, others,
             _ALL_WANTED if wanted is None else wanted,
         )  # fmt: skip
-        return Strongest(classes, known, some, None if beside is None else Blended(image, left_over))
+        return Strongest(classes, known, on_grid, None if beside is None else Blended(image, left_over))
 
     def _adjoint(self, residual: np.ndarray) -> np.ndarray:
         out = np.zeros((self.num_gaussians, residual.shape[2]), np.float32)
@@ -108,9 +107,6 @@ class TileOperator(ViewOperator):
         pixels, rows = np.empty(start[-1], np.int32), np.empty(start[-1], np.int32)
         weights = np.empty(start[-1], np.float32)
         products.list_weights(tiles, wanted, start, pixels, rows, weights)
-        if pixel is not None:
-            here = pixels == pixel[0] * tiles.width + pixel[1]
-            return pixels[here], rows[here], weights[here]
         return pixels, rows, weights
 
     def _observe(self, labels: np.ndarray, weights: np.ndarray | None) -> Observation:

@@ -9,10 +9,10 @@ import numpy as np
 
 from gsseg_core.csr_rows import starts
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
-from gsseg_core.raster.constants import AHEAD, CHUNKS
+from gsseg_core.raster.constants import CHUNKS
 from gsseg_core.raster.cpu.projection import Projected, joined
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
-from gsseg_core.simd import LANES, prefetch
+from gsseg_core.simd import AHEAD, LANES, prefetch
 
 TILE = LANES
 """Side of a tile in px. One row of a tile is one vector register of sixteen float32."""

@@ -24,7 +24,7 @@ from gsseg_core.raster.gpu.tensors import RowTensors
 from gsseg_core.raster.objects_alone import ObjectsAlone
 from gsseg_core.raster.observation import Observation
 from gsseg_core.raster.view_operator import ViewOperator
-from gsseg_core.raster.view_renderer import Blended, PixelGrid, Strongest
+from gsseg_core.raster.view_renderer import NO_PIXELS, Blended, PixelGrid, Strongest
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -78,7 +78,7 @@ class GPUOperator(ViewOperator):
         return _to_cpu(*self.blend_there(self._dense(codes, num_classes, of)))
 
     def strongest(
-        self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid | None = None,
+        self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid = NO_PIXELS,
         of: np.ndarray | None = None, beside: np.ndarray | None = None, wanted: np.ndarray | None = None,
     ) -> Strongest:  # fmt: skip
         """Find the class of each pixel, whatever is wanted; the image of all classes stays on the GPU."""
@@ -86,10 +86,8 @@ class GPUOperator(ViewOperator):
         if background:
             image[0] += left_over
         classes, known = image.argmax(dim=0).int(), image.sum(dim=0) > 0.5
-        first, step = grid or (0, 1)
-        some = image[:, first::step, first::step] if grid else image[:, :0, :0]
         return Strongest(
-            to_cpu(classes), to_cpu(known), to_cpu(some.permute(1, 2, 0)),
+            to_cpu(classes), to_cpu(known), to_cpu(grid.of(image.permute(1, 2, 0))),
             None if beside is None else self.blend_seen(beside),
         )  # fmt: skip
 
@@ -153,8 +151,6 @@ class GPUOperator(ViewOperator):
             r, c = (place.ravel() for place in np.mgrid[top:bottom, left:right])
             entries = tiles.entries[begins[tile] : begins[tile + 1]].long()
             here = self._weights_of(entries, on_device(np.stack([c, r], axis=1) + np.float32(0.5), self._device))
-            if pixel is not None:  # Of all pixels at once it comes out as it does among them.
-                here[on_device((r != pixel[0]) | (c != pixel[1]), self._device)] = 0
             p, e = here.nonzero(as_tuple=True)
             listed = (r * tiles.width + c)[to_cpu(p)].astype(np.int32)
             parts.append((listed, to_cpu(entries[e].int()), to_cpu(here[p, e])))

@@ -41,11 +41,9 @@ _NOTHING = np.float32(0)
 
 @gpu_kernel
 def number_labels(
-    mask: np.ndarray,
-    columns: int,  # (H, W) int32: positions of labels, negative where unknown
-    slots: np.ndarray,
-    counts: np.ndarray,  # (T, THREADS) int16 out, -1 where unknown; (T,) int32 out: labels of each
-) -> None:
+    mask: np.ndarray, columns: int,  # (H, W) int32: positions of labels, negative where unknown
+    slots: np.ndarray, counts: np.ndarray,  # (T, THREADS) int16 out, -1 where unknown; (T,) int32 out: labels of each
+) -> None:  # fmt: skip
     """Give numbers to the labels of one tile, in the order of the threads that first see them."""
     labels = cuda.shared.array(THREADS, np.int32)
     begins = cuda.shared.array(THREADS, np.int32)
@@ -72,12 +70,9 @@ def number_labels(
 
 @gpu_kernel
 def list_labels(
-    mask: np.ndarray,
-    columns: int,
-    slots: np.ndarray,
-    label_start: np.ndarray,  # as above; (T + 1,)
+    mask: np.ndarray, columns: int, slots: np.ndarray, label_start: np.ndarray,  # as above; (T + 1,)
     present: np.ndarray,  # (label_start[-1],) int32 out: the labels of each tile
-) -> None:
+) -> None:  # fmt: skip
     """List the labels of one tile by their numbers."""
     tile, t = cuda.blockIdx.x, cuda.threadIdx.x
     row, column = pixel_in(tile, columns, t)

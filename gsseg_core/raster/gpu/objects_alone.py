@@ -149,9 +149,7 @@ def _reasons_to_stay(
 
 
 @called_by_kernels
-def _add_up(
-    weighed: np.ndarray, entries: np.ndarray, first: int, count: int, t: int, sums: np.ndarray
-) -> None:  # fmt: skip
+def _add_up(weighed: np.ndarray, entries: np.ndarray, first: int, count: int, t: int, sums: np.ndarray) -> None:
     """Add what the pixels of a tile weigh of each Gaussian of a batch to its sum, by some threads to each."""
     e, total = t // PARTS, _NOTHING
     if e < count:

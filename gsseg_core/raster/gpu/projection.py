@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from gsseg_core.raster.constants import DILATION, NEAR
-from gsseg_core.raster.cpu.projection import FRUSTUM_MARGIN, HALF_LOG2E, LARGEST_REACH, REACH_MAX, ROOT
+from gsseg_core.raster.cpu.projection import HALF_LOG2E, LARGEST_REACH, REACH_MAX, ROOT, Pinhole
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
 from gsseg_core.raster.cpu.tiling import TILE
 from gsseg_core.raster.gpu.device import called_by_kernels, cuda, gpu_kernel, launch, on_device
@@ -114,11 +114,8 @@ def _nearest_first(
 
 def _lens_of(camera: Camera) -> np.ndarray:
     """Write a camera as the kernel takes it: viewmat, fx, fy, cx, cy, size, and where it is linearised, (22,)."""
-    width, height = float(camera.width), float(camera.height)
-    fx, fy, cx, cy = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-    across, down = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
-    bounds = -cx / fx - across, (width - cx) / fx + across, -cy / fy - down, (height - cy) / fy + down
-    return np.array([*camera.world_to_camera[:3].ravel(), fx, fy, cx, cy, width, height, *bounds], np.float64)
+    pose, K, *size_and_bounds = Pinhole.of(camera)
+    return np.array([*pose[:3].ravel(), *K[[0, 1, 0, 1], [0, 1, 2, 2]], *size_and_bounds], np.float64)
 
 
 @gpu_kernel
