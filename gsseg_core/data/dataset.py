@@ -152,19 +152,17 @@ class Dataset:
             that tells its size is `scaled`, if it is.
         """
         views = [view for view in self.views() if view.has_mask]
-        sizes = ((view.camera, view.mask_size) for view in views)
-        camera, size = next(((camera, size) for camera, size in sizes if size is not None), (None, None))
-        is_scaled = camera is not None and size != camera.image_size
-        if self.masks is None and not is_scaled:
+        sizes = next(((size, view.camera.image_size) for view in views if (size := view.mask_size)), None)
+        scaled = None if sizes is None or sizes[0] == sizes[1] else sizes
+        if self.masks is None and scaled is None:
             return None
         found = {
             "format": LABEL_IMAGES if self.masks is None else self.masks.format,
             "ids": PER_VIEW if self.masks is not None and self.masks.per_view else GLOBAL,
             "views": len(views),
         }
-        if camera is not None and size is not None and is_scaled:
-            width, height = camera.image_size
-            found["scaled"] = f"{size[0]} x {size[1]} to {width} x {height} pixels"
+        if scaled is not None:
+            found["scaled"] = f"{' to '.join(f'{width} x {height}' for width, height in scaled)} pixels"
         return found
 
     @property

@@ -55,9 +55,9 @@ class LabelEvidence:
     @cached_property
     def is_certain(self) -> bool:
         """Whether every label names one class, for certain, and all classes were looked for."""
-        if self.mass is None or self.supervised is not None:
-            return self.supervised is None
-        return bool((self.mass.max(axis=1, initial=0) == 1).all())
+        if self.supervised is not None:
+            return False
+        return self.mass is None or bool((self.mass.max(axis=1, initial=0) == 1).all())
 
     @cached_property
     def informative(self) -> np.ndarray:

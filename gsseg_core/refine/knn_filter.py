@@ -10,7 +10,7 @@ import numpy as np
 
 from gsseg_core.csr_rows import CSRRows, largest
 from gsseg_core.refine.settings import RefineSettings
-from gsseg_core.spatial.class_distances import class_distances
+from gsseg_core.spatial.class_distances import class_distances, members_of_classes
 from gsseg_core.spatial.neighbourhood import Neighbours, neighbour_weights
 
 
@@ -118,12 +118,7 @@ def statistical_filter(
     if len(means) < 3:
         return removed
     known = class_distances(neighbours or Neighbours.among(means, k), labels, limit)
-    # Short numbers are sorted by their digits, in a quarter of the time.
-    short = np.clip(labels, -1, limit).astype(np.int16) if limit < 2**15 else labels
-    by_class = np.argsort(short, kind="stable")
-    bounds = np.searchsorted(short, np.arange(1, limit + 1), sorter=by_class)
-    for first, last in zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True):
-        members = by_class[first:last]
+    for members in members_of_classes(labels, limit):
         if members.size < 3:
             continue
         distances = known[members]

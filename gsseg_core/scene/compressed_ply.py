@@ -35,10 +35,13 @@ def read_compressed_ply(path: Path, within: Path | None = None) -> ReadScene:
     sh = elements.get("sh")
     if sh is not None and len(sh) != n:
         raise SceneFileError(f"{path}: has SH of {len(sh):,} Gaussians for {n:,} vertices; expected as many")
+
+    def pack(block: slice) -> npt.NDArray[np.void]:
+        of_block = chunks[block.start // _BLOCK : block.stop // _BLOCK]
+        return _pack(of_block, vertices[block], None if sh is None else sh[block])
+
     try:
-        packed = pack_in_blocks(
-            n, lambda block: _pack(chunks[block.start // _BLOCK :], vertices[block], None if sh is None else sh[block])
-        )
+        packed = pack_in_blocks(n, pack)
     except (ValueError, TypeError) as error:
         raise SceneFileError(f"{path}: not a compressed PLY ({error}); expected one of PlayCanvas") from error
     return ReadScene(packed)
@@ -53,14 +56,14 @@ def _pack(
     rgba = np.stack([_fraction(color, shift, 8) for shift in (24, 16, 8, 0)], axis=1)
     rgb = rgba[:, :3]
     if "min_r" in (chunks.dtype.names or ()):
-        rgb = _between(chunks, "min_{}", "max_{}", "rgb", rgb)
+        rgb = _between(chunks, ("r", "g", "b"), rgb)
     return pack_vertices(
-        _between(chunks, "min_{}", "max_{}", "xyz", _three(position)),
+        _between(chunks, ("x", "y", "z"), _three(position)),
         _rotations(rotation),
-        _between(chunks, "min_scale_{}", "max_scale_{}", "xyz", _three(scale)),
+        _between(chunks, ("scale_x", "scale_y", "scale_z"), _three(scale)),
         logits(rgba[:, 3]),
         dc_of(rgb),
-        _rest(sh, len(vertices)),
+        None if sh is None else _rest(sh),
     )
 
 
@@ -76,13 +79,12 @@ def _three(bits: npt.NDArray[np.uint32]) -> npt.NDArray[np.float32]:  # (N,)
 
 
 def _between(
-    chunks: npt.NDArray[np.void], low: str, high: str, axes: str, fractions: npt.NDArray[np.float32]
+    chunks: npt.NDArray[np.void], names: tuple[str, ...], fractions: npt.NDArray[np.float32]
 ) -> npt.NDArray[np.float32]:  # (N, 3)
     """Place fractions between the extremes of their chunks."""
     out = np.empty_like(fractions)
-    for i, axis in enumerate(axes):
-        used = -(-len(fractions) // _BLOCK)
-        least, most = (chunks[name.format(axis)][:used].repeat(_BLOCK)[: len(fractions)] for name in (low, high))
+    for i, name in enumerate(names):
+        least, most = (chunks[f"{end}_{name}"].repeat(_BLOCK)[: len(fractions)] for end in ("min", "max"))
         with np.errstate(all="ignore"):  # What is NaN or infinite is reported by the scene.
             out[:, i] = least * (1 - fractions[:, i]) + most * fractions[:, i]
     return out
@@ -93,15 +95,13 @@ def _rotations(bits: npt.NDArray[np.uint32]) -> npt.NDArray[np.float32]:  # (N,)
     return from_smallest_three(bits >> np.uint32(30), (others - 0.5) * np.float32(np.sqrt(2)))
 
 
-def _rest(sh: npt.NDArray[np.void] | None, n: int) -> npt.NDArray[np.float32] | None:
+def _rest(sh: npt.NDArray[np.void]) -> npt.NDArray[np.float32]:  # (N,)
     """Coefficients (N, B, 3) of SH above degree 0; a byte is the middle of one of 256 steps, the ends are exact."""
-    if sh is None:
-        return None
     names = rest_names(len(sh.dtype.names or ()))
-    if len(sh) != n or len(names) not in REST_COUNTS or any(sh.dtype[name] != np.uint8 for name in names):
-        raise ValueError(f"{len(sh):,} rows of {len(names)} SH coefficients, or not of bytes, for {n:,} vertices")
+    if len(names) not in REST_COUNTS or any(sh.dtype[name] != np.uint8 for name in names):
+        raise ValueError(f"{len(names)} SH coefficients, or not of bytes")
     steps = (np.arange(256, dtype=np.float32) + np.float32(0.5)) / 256
     steps[0], steps[255] = 0, 1
     levels = (steps - np.float32(0.5)) * np.float32(_SH_RANGE)
     values: npt.NDArray[np.float32] = levels[np.stack([sh[name] for name in names], axis=1)]
-    return values.reshape(n, 3, -1).transpose(0, 2, 1)
+    return values.reshape(len(sh), 3, -1).transpose(0, 2, 1)

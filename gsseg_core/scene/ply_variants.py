@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.errors import SceneValueError
-from gsseg_core.scene.ply import read_vertices
+from gsseg_core.scene.ply import is_ply, read_vertices
 from gsseg_core.scene.vertices import DC, OPACITY, SCALES, ReadScene, check_properties, columns, dc_of
 
 _RGB = ("red", "green", "blue")
@@ -70,7 +70,7 @@ def read_2dgs(path: Path, within: Path | None = None) -> ReadScene:
 
 def _properties(head: bytes) -> set[bytes]:
     """Names of the properties in the header of a PLY; none if it is no PLY."""
-    if not head.startswith((b"ply\n", b"ply\r\n")):
+    if not is_ply(head):
         return set()
     lines = head.partition(b"end_header")[0].splitlines()
     return {line.split()[-1] for line in lines if line.startswith(b"property ")}

@@ -19,11 +19,6 @@ class PerScene(Generic[T]):
         self._known: WeakKeyDictionary[GaussianScene, T] = WeakKeyDictionary()
         self._making = threading.Lock()
 
-    def known(self, scene: GaussianScene) -> T | None:
-        """Return the value of a scene if it is cached."""
-        with self._making:
-            return self._known.get(scene)
-
     def of(self, scene: GaussianScene, make: Callable[[], T], fits: Callable[[T], bool] = lambda _: True) -> T:
         """Return the value of a scene; `make` computes it where none is cached that fits."""
         with self._making:

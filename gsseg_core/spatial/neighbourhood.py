@@ -57,7 +57,7 @@ class Neighbours:
     tree: Tree  # the points, all arrays here being in its order
     radii: np.ndarray  # (N,) float32: squared distance to the k-th nearest other, NaN where nobody has asked for it
     distances: np.ndarray  # (N,) float64: mean distance to the k nearest others, both in units of the scaled points
-    by_class: list[Found] = field(default_factory=list, repr=False)  # What `class_distances` found last, if anything.
+    by_class: Found | None = field(default=None, repr=False)  # what `class_distances` found last
     _looking: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     @classmethod

@@ -147,9 +147,9 @@ def test_only_what_lies_near_a_changed_label_is_found_anew():
     labels, neighbours = np.digitize(means[:, 0], [-1, 0, 1]).astype(np.int32), Neighbours.among(means, 10)
     class_distances(neighbours, labels, 5)
     of_point = labels[neighbours.tree.order]
-    assert not class_distances_module._to_be_found(neighbours.tree, of_point, neighbours.by_class[0], 10).any()
+    assert not class_distances_module._to_be_found(neighbours.tree, of_point, neighbours.by_class, 10).any()
     of_point[700] = 4 - of_point[700]
-    found = class_distances_module._to_be_found(neighbours.tree, of_point, neighbours.by_class[0], 10)
+    found = class_distances_module._to_be_found(neighbours.tree, of_point, neighbours.by_class, 10)
     assert 0 < found.sum() < 100
 
 

@@ -70,14 +70,9 @@ def segmentation(annotation: Record, width: int, height: int) -> Region:
 
 def _check_meet(whole: Record, annotations: list[Record]) -> None:
     """Raise `MaskFormatError` if no annotation is of an image of the file: all views would be background."""
-    listed, named = (
-        [value for value in values if isinstance(value, (int, str))]
-        for values in (
-            (image.value("id") for image in whole.records("images", "image")),
-            (annotation.value("image_id") for annotation in annotations),
-        )
-    )
-    if annotations and listed and not set(listed) & set(named):
+    listed = [i for image in whole.records("images", "image") if isinstance(i := image.value("id"), (int, str))]
+    named = {i for annotation in annotations if isinstance(i := annotation.value("image_id"), (int, str))}
+    if annotations and listed and named.isdisjoint(listed):
         found = annotations[0]
         raise MaskFormatError(
             f"{found.where}: is of the image {quoted(found.value('image_id'))}, and so is none of the "

@@ -77,7 +77,7 @@ def _attributes(scene: GaussianScene) -> dict[str, npt.NDArray[Any]]:
         f"{EXTENSION}:SCALE": scene.scales,
         f"{EXTENSION}:OPACITY": scene.opacities[:, None],
     }
-    for degree in range(round(sh.shape[1] ** 0.5)):
+    for degree in range(scene.sh_degree + 1):
         for n in range(2 * degree + 1):
             attributes[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{n}"] = sh[:, degree**2 + n]
     return attributes

@@ -58,7 +58,7 @@ def write_sog(path: Path, scene: GaussianScene, run: str | None) -> None:
         rows[: len(palette)] = codes
         images["shN_centroids.webp"] = rows.reshape(-1, _PER_ROW * terms, 3)
         images["shN_labels.webp"] = _pixels(np.stack([index & 255, index >> 8], axis=1))
-        meta["shN"] = {"count": len(palette), "bands": round(math.sqrt(terms + 1)) - 1, "codebook": book,
+        meta["shN"] = {"count": len(palette), "bands": scene.sh_degree, "codebook": book,
                        "files": ["shN_centroids.webp", "shN_labels.webp"]}  # fmt: skip
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("meta.json", json.dumps(meta))
