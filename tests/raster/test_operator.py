@@ -16,6 +16,8 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.errors import MaskSizeError, SceneValueError, SettingsError
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu import blending as blend
+from gsseg_core.raster.cpu import tiling
+from gsseg_core.raster.cpu.projection import project
 from gsseg_core.scene.camera import Camera
 
 SIZES = [(37, 21), (16, 16), (33, 50), (70, 5), (1, 1), (1, 40)]
@@ -363,6 +365,23 @@ def test_a_pixel_outside_the_image_is_refused(backend, pixel):
 def test_a_gaussian_may_be_as_large_as_it_likes(backend, scale):
     operator = backend.make(one_gaussian(scale=scale), make_camera(20, 20))
     np.testing.assert_allclose(operator.transmittance(), 0.5, atol=1e-3)
+
+
+def test_an_endless_needle_is_seen_in_the_rows_that_it_reaches(backend):
+    camera, reach = make_camera(40, 40), np.sqrt(2 * np.log(0.5 * 255) * 0.3)
+    row = 16 + reach + 0.2  # Its alpha falls to 1/255 next to a border between tiles.
+    scene = make_scene([[0, 0.1 * (row - camera.cy) / camera.fy, 0.1]], [[1, 0, 0, 0]], [[2e17, 1e-9, 1e-9]], [0.5])
+    alpha = 0.5 * np.exp(-((np.arange(40) + 0.5 - row) ** 2) / 0.6)
+    expected = np.where(alpha < 1 / 255, 0, alpha)[:, None].repeat(40, axis=1)
+    assert (np.abs(dense(backend.make(scene, camera)).reshape(40, 40) - expected) <= 2 * backend.weight).all()
+
+
+def test_a_view_with_more_entries_than_can_be_numbered_is_refused(monkeypatch):
+    scene, camera = random_view(0)
+    entries = len(tiling.assign(project(scene, camera), *camera.image_size).entries)
+    monkeypatch.setattr(tiling, "MOST_ENTRIES", entries - 1)
+    with pytest.raises(SceneValueError, match=f"touch {entries} tiles .* 37 x 21 pixels.* at most {entries - 1}$"):
+        make_operator(scene, camera)
 
 
 def test_an_unknown_device_is_refused():

@@ -8,6 +8,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.csr_rows import starts
+from gsseg_core.errors import SceneValueError
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.raster.constants import CHUNKS
 from gsseg_core.raster.cpu.projection import Projected, joined
@@ -18,6 +19,8 @@ TILE = LANES
 """Side of a tile in px. One row of a tile is one vector register of sixteen float32."""
 
 TYPICAL = 8  # tiles that a Gaussian touches, at first; where they touch more on average, they are listed once more
+
+MOST_ENTRIES = 2**31 - 1  # their numbers are int32
 
 _LEAST = np.float32(LOG_ALPHA_MIN)
 
@@ -42,7 +45,10 @@ class Tiles(NamedTuple):
 
 
 def assign(projected: Projected, width: int, height: int) -> Tiles:
-    """Sort projected Gaussians into the tiles that their ellipse of alpha >= 1/255 touches."""
+    """Sort projected Gaussians into the tiles that their ellipse of alpha >= 1/255 touches.
+
+    Raises `SceneValueError` where that makes more than `MOST_ENTRIES`.
+    """
     columns, rows = -(-width // TILE), -(-height // TILE)
     count = len(projected.ids)
     gaussian_start = np.zeros(count + 1, np.int64)
@@ -50,6 +56,11 @@ def assign(projected: Projected, width: int, height: int) -> Tiles:
     while True:
         touched = np.empty((CHUNKS, capacity), np.int32)
         needed = _list(projected.table, columns, rows, gaussian_start[1:], touched)
+        if (total := int(needed.sum())) > MOST_ENTRIES:
+            raise SceneValueError(
+                f"scene: its Gaussians touch {total} tiles of a view of {width} x {height} pixels, each counted for "
+                f"each of them; expected at most {MOST_ENTRIES}"
+            )
         if needed.max() <= capacity:
             break
         capacity = int(needed.max())
@@ -87,7 +98,8 @@ def _touched(
 @nb.njit(inline="always")
 def _tile_of(px: np.float32, limit: np.float32) -> np.int32:
     """Tile that a pixel is in, between the first one and a limit; `floor` would be a call of a function."""
-    return np.int32(min(max(px * np.float32(1 / TILE), np.float32(0)), limit))
+    # In this order NaN becomes 0. An endless Gaussian has some: 0 times an infinite 1 / WIDTH.
+    return np.int32(min(max(np.float32(0), px * np.float32(1 / TILE)), limit))
 
 
 @nb.njit(inline="always")
