@@ -103,7 +103,7 @@ class ViewRenderer(ABC):
     def blend_seen(self, codes: np.ndarray, wanted: np.ndarray | None = None) -> Blended:
         """Do the same for codes (M, K) of `ids` alone.
 
-        If only some pixels are `wanted`, (H, W) bool, others may have any value.
+        If only some pixels are `wanted`, (H, W) bool, others may have any value. Raises as `render` does.
         """
 
     def blend_rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None = None) -> Blended:

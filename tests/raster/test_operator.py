@@ -328,6 +328,15 @@ def test_codes_of_another_scene_are_refused(backend):
     for shape in [(119, 3), (120, 2)]:
         with pytest.raises(SceneValueError, match=r"votes have shape .* expected \(120, K\), with K above 2"):
             operator.vote(labels, None, np.zeros(shape, np.int64), 1.0)
+    seen = operator.observe(labels)
+    for shape in [(seen.ids[-1], 3), (120, 2)]:
+        with pytest.raises(SceneValueError, match=rf"votes have shape .* expected \({seen.ids[-1] + 1}, 3\) or more"):
+            seen.vote(np.zeros(shape, np.int64), 1.0)
+    some = np.zeros((len(operator.ids) - 1, 3), np.float32)
+    with pytest.raises(SceneValueError, match=f"codes are of {len(some)} Gaussians; expected {len(some) + 1}"):
+        operator.blend_seen(some)
+    with pytest.raises(SceneValueError, match=f"codes are of {len(some)} Gaussians; expected {len(some) + 1}"):
+        operator.strongest(CSRRows.from_dense(np.ones((120, 3), np.float32)), 3, True, beside=some)
     for count, of in [(119, None), (5000, None), (3, np.arange(2))]:  # Kernels would read beyond the end.
         codes, expected = CSRRows.from_dense(np.ones((count, 3), np.float32)), 120 if of is None else 2
         with pytest.raises(SceneValueError, match=f"view 'view': codes are of {count} Gaussians; expected {expected}"):

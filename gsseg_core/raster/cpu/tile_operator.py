@@ -66,6 +66,7 @@ class TileOperator(ViewOperator):
 
     def blend_seen(self, codes: np.ndarray, wanted: np.ndarray | None = None) -> Blended:
         """Blend codes (M, K) of what is visible."""
+        self._check_rows(len(codes), self.ids)
         codes = np.ascontiguousarray(codes, np.float32)
         if codes.shape[1] <= products.FEW:
             return Blended(*products.render_few(self._tiles, codes, _ALL_WANTED if wanted is None else wanted))
@@ -83,6 +84,7 @@ class TileOperator(ViewOperator):
     ) -> Strongest:  # fmt: skip
         """Find the class of each pixel, tile by tile, without an image of all classes."""
         others = np.ascontiguousarray(np.empty((len(self.ids), 0)) if beside is None else beside, np.float32)
+        self._check_rows(len(others), self.ids)
         classes, known, on_grid, image, left_over = products.strongest(
             self._tiles, codes, self._rows(codes, of), num_classes, background, *grid, others,
             _ALL_WANTED if wanted is None else wanted,

@@ -71,6 +71,7 @@ class GPUOperator(ViewOperator):
     def blend_seen(self, codes: np.ndarray, wanted: np.ndarray | None = None) -> Blended:
         """Blend codes (M, K) of what is visible; all pixels, whatever is wanted."""
         del wanted
+        self._check_rows(len(codes), self.ids)
         return _to_cpu(*self.blend_there(on_device(codes.astype(np.float32, copy=False), self._device)))
 
     def blend_rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None = None) -> Blended:
