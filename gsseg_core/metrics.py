@@ -18,6 +18,7 @@ from gsseg_core.data.class_names import class_name
 from gsseg_core.data.label_images import UNKNOWN, read_mask
 from gsseg_core.data.mask_formats.masks import MaskSet
 from gsseg_core.errors import MaskFormatError, MaskSizeError, NoUsableViewsError
+from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.run_folder import settle
 from gsseg_core.scene.camera import Camera
 
@@ -54,14 +55,17 @@ class Evaluation:
 
         Raises
         ------
-        MaskSizeError
-            The two are not label maps of the same size; the message calls the view `name`.
+        MaskFormatError, MaskSizeError
+            The two hold what is no label, or differ in size; the message calls the view `name`.
         """
         if truth.shape != prediction.shape or truth.ndim != 2:
             raise MaskSizeError(
                 f"{name}: found a prediction of shape {prediction.shape} for a truth of shape {truth.shape}; "
                 "expected two label maps (height, width) of the same size"
             )
+        for labels in (truth, prediction):
+            if labels.dtype.kind not in "iub" or labels.min(initial=0) < UNKNOWN or labels.max(initial=0) > MAX_LABEL:
+                raise MaskFormatError(f"{name}: found {labels.dtype}; expected integers {UNKNOWN} to {MAX_LABEL}")
         known = truth != UNKNOWN
         # What nobody knows is taken as predicted, so that no boundary of the truth runs along the unknown.
         truth, prediction = np.where(known, truth, prediction).astype(np.int32), prediction.astype(np.int32)
@@ -194,7 +198,7 @@ def evaluate_folders(pred_dir: str | Path, truth_dir: str | Path, cameras: Itera
     missing = [f"{image}.png" for image in images if image not in truths]
     if missing:
         raise MaskFormatError(
-            f"{truth_dir}: found no {missing[0]} (and {len(missing) - 1} more of {len(predictions)} are missing); "
+            f"{truth_dir}: found no {missing[0]} ({len(missing)} of {len(predictions)} are missing); "
             f"expected a true mask for every prediction in {pred_dir}"
         )
     evaluation = Evaluation()

@@ -387,14 +387,14 @@ def render(
     if not views:
         raise NoUsableViewsError(f"{data}: split {split!r} has no views; expected at least one to render")
     bits = 8 if max(ids) < 255 else 16  # 255 means unknown in masks of 8 bits
-    names = [view_file_name(view.name) for view in views]
-    overlays = []
-    places = [*names, *(f"overlays/{name}" for name in (*names, "contact_sheet.png", "legend.png"))]
-    with staged_run(out, "render", places=places) as run:
+    names, overlays = [view_file_name(view.name) for view in views], []
+    overview = ("contact_sheet.png", "legend.png")
+    pictures = {name: f"overlays/{'overlay_' * (name in overview)}{name}" for name in names}
+    with staged_run(out, "render", places=[*names, *pictures.values(), *(f"overlays/{k}" for k in overview)]) as run:
         drawn, save = draw_views(scene, numbered, views, device=device), partial(save_png, run=run.id)
         for name, (_, labels, image, _) in zip(with_progress(progress, "render", names), drawn, strict=True):
             write_mask(run.folder / name, ids[labels], bits, run.id)
             overlays.append(image)
-            save(run.folder / "overlays" / name, image)
+            save(run.folder / pictures[name], image)
         write_overview(numbered, overlays, [view.name for view in views], run.folder / "overlays", save)
     return [Path(out) / name for name in names]

@@ -17,6 +17,7 @@ from gsseg_core.data.class_names import class_name
 from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.data.view import spread
 from gsseg_core.errors import SettingsError, StateMismatchError
+from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.npz_files import (
     UnfitError,
     check_evidence,
@@ -112,7 +113,7 @@ class Segmentation:
             Class probabilities, which sum to 1; a row of zeros where nothing is known. Other values raise
             `SettingsError`, and another N `StateMismatchError`.
         class_names : mapping from id to name
-            Classes without a name get one like "class_07".
+            Classes without a name get one like "class_07"; ids that are not 0 to K - 1 raise `SettingsError`.
         settings : RefineSettings, optional
             Without the filter by default. What needs views is left to `carved`.
         evidence : (N,) float32, optional
@@ -122,10 +123,12 @@ class Segmentation:
             Whether the codes stay as they are; else they are changed, and no memory is taken for others.
         """
         settings = settings or RefineSettings()
-        codes = np.array(codes, np.float32, order="C") if copy else np.ascontiguousarray(codes, np.float32)
+        codes = np.array(codes, np.float32, order="C") if copy else np.require(codes, np.float32, ["C", "W"])
         n, px = len(scene), np.asarray(np.zeros(len(scene)) if evidence is None else evidence, np.float32)
         if codes.ndim != 2 or len(codes) != n or px.shape != (n,):
             raise StateMismatchError(f"codes are {codes.shape}, evidence {px.shape}; expected ({n}, K) and ({n},)")
+        if not (columns := range(codes.shape[1])) or not class_names.keys() <= {*columns}:
+            raise SettingsError(f"class names have ids {clipped([*class_names])}; expected some of {columns}")
         check_shares("codes", codes, SettingsError)
         check_evidence(px, SettingsError)
         result = cls.unfiltered(scene, codes, class_names, settings, None if evidence is None else px)
@@ -236,7 +239,8 @@ class Segmentation:
     def with_ids(self, ids: Sequence[int]) -> Segmentation:
         """Give classes that are numbered without gaps, and have no tree, (K,) different ids, 0 first."""
         names, order = list(self.class_names.values()), np.argsort(ids).tolist()
-        if self.tree or not len(names) == self.num_classes == len(ids) == len({*ids}) or order[0] or ids[0]:
+        fits = all(isinstance(k, int | np.integer) and k <= MAX_LABEL for k in ids)
+        if self.tree or not fits or not len(names) == self.num_classes == len(ids) == len({*ids}) or order[0] or ids[0]:
             expected = f"{len(names)} different ones, 0 first, for classes that have neither gaps nor a tree"
             raise SettingsError(f"ids are {clipped(list(ids))}; expected {expected}")
         labels = np.where(self.labels >= 0, np.array(ids, np.int32)[np.maximum(self.labels, 0)], self.labels)
@@ -287,7 +291,6 @@ class Segmentation:
         all masks together, so that errors of single masks carve nothing away. So many of the views have their say,
         spread evenly. Raises `StateMismatchError` for another scene.
         """
-        self.require(scene)
         look = partial(Silhouette.rendered, scene, self.label_map, device)
         return self.carved_by(scene, spread(cameras, num_views), look, device)
 
@@ -298,6 +301,7 @@ class Segmentation:
 
         Of each, `look` tells what it shows.
         """
+        self.require(scene)
         return self._without(carve(scene, self.labels, views, look, device=device))
 
     def label_map(self, operator: ViewOperator) -> np.ndarray:

@@ -90,7 +90,7 @@ def segment_summary(report: Mapping[str, Any], out: str) -> str:
     used = f"{counted(views['used'], 'view')} used" + (f", rejected: {rejected}" if rejected else "")
     checked = [view for view in views.get("reliability", []) if view["reliability"] is not None]
     worst = ", ".join(f"{clipped(view['name'])} ({percent(view['reliability'])})" for view in checked[:LEAST])
-    if worst:
+    if worst and views["used"] > 1:
         used += f"\nmasks that agree least with the other views: {worst}"
     if masks := report.get("masks"):
         used = f"{_masks_line(masks)}\n{used}"

@@ -102,6 +102,14 @@ def test_what_is_predicted_where_the_truth_is_unknown_never_counts() -> None:
         assert evaluation.mean_iou == evaluation.mean_boundary_iou == 1
 
 
+def test_what_is_no_label_is_refused_and_not_counted_as_another_one() -> None:
+    labels = np.ones((6, 8), np.int64)
+    for wrong in (labels + 0.5, labels - 3, labels + 2**32, labels.astype(np.uint64) + 2**63, labels.astype(str)):
+        for pair in ((labels, wrong), (wrong, labels)):
+            with pytest.raises(MaskFormatError, match=r"view: found .*; expected integers -1 to 65534"):
+                evaluate([pair])
+
+
 def test_an_unknown_prediction_is_a_miss_and_no_find() -> None:
     evaluation = evaluate([(np.array([[1, 1, 2, 2]]), np.array([[1, UNKNOWN, 2, 2]]))])
     assert evaluation.iou[1:].tolist() == [0.5, 1]
@@ -164,7 +172,7 @@ def test_folders_that_cannot_be_compared_are_refused_with_one_clear_error(tmp_pa
     with pytest.raises(NoUsableViewsError, match="pred: found no predictions"):
         evaluate_folders(pred, truth)
     write_mask(pred / "a.png", np.zeros((2, 2), int), bits=8)
-    with pytest.raises(MaskFormatError, match=r"truth: found no a\.png"):
+    with pytest.raises(MaskFormatError, match=r"truth: found no a\.png \(1 of 1 are missing\)"):
         evaluate_folders(pred, truth)
     write_mask(truth / "a.png", np.zeros((2, 3), int), bits=8)
     with pytest.raises(MaskSizeError, match=r"a\.png"):

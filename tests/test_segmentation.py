@@ -13,6 +13,7 @@ from small_scenes import NAMES, NUM_CLASSES, OUT_OF_SIGHT, balls_on_a_table, cle
 
 from gsseg_core.errors import SettingsError, StateFileError, StateMismatchError, WriteError
 from gsseg_core.export.class_files import export_classes
+from gsseg_core.learn.temperature import tempered
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.objects.oriented_boxes import object_boxes
 from gsseg_core.objects.removal import left_without, without_objects
@@ -29,6 +30,8 @@ def test_a_temperature_that_is_none_is_refused(temperature: float) -> None:
     codes = np.eye(NUM_CLASSES, dtype=np.float32)[TRUTH]
     with pytest.raises(SettingsError, match=r"temperature is .*; expected a number above 0"):
         Segmentation.from_codes(SCENE, codes, NAMES).calibrated(temperature)
+    with pytest.raises(SettingsError, match=r"temperature is .*; expected a number above 0"):
+        tempered(codes, temperature)
 
 
 def test_labels_are_the_largest_probability_and_minus_one_where_nothing_is_known() -> None:
@@ -137,6 +140,7 @@ def test_a_segmentation_is_neither_made_nor_used_with_another_scene(tmp_path: Pa
         lambda: object_boxes(other, result),
         lambda: without_objects(other, result, [1]),
         lambda: result.carved(other, [view.camera]),
+        lambda: result.carved_by(other, [view], lambda _: None),
         lambda: result.filtered(other, PAPER),
     ):
         with pytest.raises(StateMismatchError, match=r"segmentation: belongs to the scene .* expected"):
@@ -163,6 +167,9 @@ def test_evidence_that_is_no_number_of_pixels_is_refused_and_codes_stay_as_they_
     evidence[7] = value
     with pytest.raises(SettingsError, match=r"array evidence holds .* in row 7 \(1 of .* unusable\); expected"):
         Segmentation.from_codes(SCENE, codes, NAMES, evidence=evidence, copy=False)
+    np.testing.assert_array_equal(codes, CODES)
+    codes.setflags(write=False)
+    Segmentation.from_codes(SCENE, codes, NAMES, copy=False)  # What cannot be written is copied all the same.
     np.testing.assert_array_equal(codes, CODES)
     listed = Segmentation.from_codes(SCENE, CODES, NAMES, evidence=[1.0] * len(SCENE))
     np.testing.assert_array_equal(listed.labels, Segmentation.from_codes(SCENE, CODES, NAMES).labels)
@@ -251,11 +258,31 @@ def test_a_level_is_the_same_before_and_after_calibration_and_its_label_maps_do_
         assert calibrated.temperature == 2.5
 
 
-@pytest.mark.parametrize("ids", [[0, 5, 9], [0, 5, 5, 9], [5, 0, 7, 9], [0, -1, 7, 9], [1, 5, 7, 9]])
+@pytest.mark.parametrize(
+    "ids",
+    [
+        [0, 5, 9],
+        [0, 5, 5, 9],
+        [5, 0, 7, 9],
+        [0, 1, 2, 65535],
+        [0, 1, 2, 2**40],
+        [0, 1, 2, 3.5],
+        [0, -1, 7, 9],
+        [1, 5, 7, 9],
+    ],
+)
 def test_ids_that_are_not_one_for_each_class_with_0_the_background_are_refused(ids: list[int]) -> None:
     result = Segmentation.from_codes(SCENE, CODES, NAMES)
     with pytest.raises(SettingsError, match=r"ids are .*; expected 4 different ones, 0 first"):
         result.with_ids(ids)
+
+
+def test_names_of_classes_that_codes_do_not_have_are_refused() -> None:
+    for names in ({NUM_CLASSES: "chair"}, {-1: "chair"}, {"1": "chair"}):
+        with pytest.raises(
+            SettingsError, match=rf"class names have ids .*; expected some of range\(0, {NUM_CLASSES}\)"
+        ):
+            Segmentation.from_codes(SCENE, CODES, names)
 
 
 def test_classes_with_ids_of_their_own_or_a_tree_get_no_other_ids() -> None:

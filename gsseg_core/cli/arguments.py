@@ -56,7 +56,8 @@ class _Parser(argparse.ArgumentParser):
                 continue
             import difflib
 
-            near = difflib.get_close_matches(name, known, 1)
+            shown = [option for option in known if self._option_string_actions[option].help != argparse.SUPPRESS]
+            near = difflib.get_close_matches(name, shown, 1)
             self.error(f"unknown option {name}" + (f"; did you mean {near[0]}?" if near else ""))
 
 

@@ -70,12 +70,16 @@ def labels_path(options: argparse.Namespace) -> str:
 
 
 def note_frame(options: argparse.Namespace) -> None:
-    """Say so where the run of a segmentation has moved the cameras by `--align`, and this command does not."""
+    """Say so where the run of a segmentation has moved the cameras by a file or `--align`, and this one does not."""
     from gsseg_core.files.json_files import read_object
 
     report = Path(options.segmentation).parent / "report.json"
     with suppress(GssegError, KeyError, TypeError):  # Without a report of a run that moved any, nothing is to be said.
-        found = "; ".join(read_object(report, GssegError, "a report")["frame"]["alignment"]["found"])
+        frame = read_object(report, GssegError, "a report")["frame"]
+        file = frame["dataparser"] and Path(frame["dataparser"])
+        if file and not (options.dataparser or file.parent in (Path(options.scene).parent, Path(options.data))):
+            note(f"{report}: that run moved the cameras by {file}, and here they are not; try --dataparser {file}")
+        found = "; ".join(frame["alignment"]["found"])
         if found and not options.align:
             note(f"{report}: that run moved the cameras by --align ({found}), and here they are not; try --align")
 

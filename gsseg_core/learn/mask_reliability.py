@@ -21,6 +21,7 @@ from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN, PackedLabels
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View, spread
+from gsseg_core.errors import MaskFormatError
 from gsseg_core.kernels.compiler import kernel
 from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.temperature import VIEWS, Sample, grid_of, sample_grid
@@ -234,10 +235,15 @@ def compare_mask(
 ) -> ViewCheck:  # fmt: skip
     """Compare a view's mask with any prediction of its labels, `UNKNOWN` (-1) where there is none.
 
-    The mask is read, unless it is at hand.
+    The mask is read, unless it is at hand. Raises `MaskFormatError` for a prediction of another size or other classes.
     """
     seen = seen or view.read_seen()
     labels, evidence = seen.named(), seen.evidence
+    fits = predicted.shape == labels.shape and predicted.dtype.kind in "iu"
+    if not (fits and predicted.min() >= UNKNOWN and predicted.max() < num_classes):
+        found = f"{predicted.dtype} {predicted.min(initial=0)} to {predicted.max(initial=0)} of shape {predicted.shape}"
+        expected = f"integers {UNKNOWN} to {num_classes - 1} of shape {labels.shape}"
+        raise MaskFormatError(f"view '{view.name}': prediction is {found}; expected {expected}")
     width = int(max(labels.max(initial=-1), -1 if evidence is None else evidence.classes.max(initial=-1))) + 1
     table = np.zeros((num_classes + 1, width + 2), np.int64)
     _count_pixels(predicted, labels, seen.labels, table)

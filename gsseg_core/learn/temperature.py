@@ -26,6 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gsseg_core.errors import SettingsError
 from gsseg_core.raster.view_renderer import PixelGrid
 
 LOWEST, HIGHEST = 0.2, 5.0  # temperatures that are tried
@@ -49,8 +50,10 @@ def tempered(
 
     Below 1 the largest gains, above 1 the others do. The order in a row stays, zeros stay zeros. At 1 the very same
     array is returned; else no entry is above 1. Going to a temperature and then to its reciprocal leads back, up to
-    rounding and to entries that are too small for the type.
+    rounding and to entries that are too small for the type. Raises `SettingsError` for what is no temperature.
     """
+    if not 0 < temperature < np.inf:
+        raise SettingsError(f"temperature is {temperature}; expected a number above 0")
     if temperature == 1:
         return shares
     if shares.ndim != 2 or len(shares) <= _ROWS:

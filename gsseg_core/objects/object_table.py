@@ -192,7 +192,8 @@ class ObjectTable:
         return Repair(changed, successors)
 
     def with_tree(self, segmentation: Segmentation) -> Segmentation:
-        """Add parts and wholes to a segmentation whose classes are these objects, by the views that are kept."""
+        """Add parts and wholes to a segmentation of the scene whose classes are these objects, by the views kept."""
+        segmentation.require(self.scene)
         labels, probabilities = segmentation.labels, segmentation.probabilities
         # What refinement took out covers an object still.
         classes = np.where(labels == REMOVED, probabilities.argmax(axis=1), labels)

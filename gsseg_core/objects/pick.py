@@ -190,11 +190,12 @@ def read_object_mask(
         labels = read_label_image(path, camera)
     else:
         names, labels = masks.class_names, masks.views[camera.image].labels(camera)
-    mask = object_mask(labels, None if label is None else _label_id(str(label), names, path), str(path))
+    named_by = "classes.json" if masks is None and names is not None else path
+    mask = object_mask(labels, None if label is None else _label_id(str(label), names, named_by), str(path))
     return mask if camera.undistortion is None else camera.undistortion.sample(mask, UNKNOWN)
 
 
-def _label_id(label: str, class_names: Mapping[int, str] | None, path: Path) -> int:
+def _label_id(label: str, class_names: Mapping[int, str] | None, path: str | Path) -> int:
     if class_names is not None:
         return class_ids([label], dict(sorted(class_names.items())), path)[0]
     if not re.fullmatch(CLASS_ID, label):

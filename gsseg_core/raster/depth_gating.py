@@ -87,10 +87,12 @@ def gate_view(
     MaskSizeError
         The depth is not of the size of the view.
     GssegError
-        The mask cannot be read.
+        The mask cannot be read, or the scale is not above 0, or infinite.
     """
     camera, tolerance = view.camera, tolerance or DepthTolerance()
     camera.check_image(depth, "depth has")
+    if not 0 < scale < np.inf:
+        raise SettingsError(f"view '{camera.name}': scale of the depth is {scale:g}; expected a number above 0")
     seen, measured = view.read_seen(), np.isfinite(depth) & (depth > 0)
     coverage, rendered = surface(scene, make_operator(scene, camera, device))
     # Rays that meet nothing of the scene have no depth to compare with.

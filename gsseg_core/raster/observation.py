@@ -111,12 +111,14 @@ class Observation(ABC):
         """Add the votes to those of other views, or take them away, in whole units.
 
         They are an (N, K) int64 array, or what `gsseg_core.raster.backends.vote_total` has in place of it. Raises
-        `SceneValueError` where an array has too few rows or classes.
+        `SceneValueError` where an array has too few rows or classes, or another type.
         """
         least = self.ids.max(initial=-1) + 1, self.evidence.votes.indices.max(initial=0) + 1
-        if any(np.less(total.shape, least)):
-            expected = f"({least[0]}, {least[1]}) or more"
-            raise SceneValueError(f"view '{self.name}': votes have shape {total.shape}; expected {expected}")
+        if any(np.less(total.shape, least)) or total.dtype != np.int64:
+            expected = f"({least[0]}, {least[1]}) or more, int64"
+            raise SceneValueError(
+                f"view '{self.name}': votes have shape {total.shape}, {total.dtype}; expected {expected}"
+            )
         add_votes(total, self.ids, self.start, self.labels, self.evidence.votes, self.votes(), units, sign)
 
     def shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares:

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from gsseg_core.data.label_evidence import LabelEvidence
-from gsseg_core.errors import SceneValueError, SettingsError
+from gsseg_core.errors import MaskFormatError, SceneValueError, SettingsError
+from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.raster.objects_alone import ObjectsAlone
 from gsseg_core.raster.observation import Observation
 from gsseg_core.raster.view_renderer import ViewRenderer
@@ -69,10 +70,12 @@ class ViewOperator(ViewRenderer):
 
         Raises
         ------
+        MaskFormatError
+            The labels are not whole numbers, or larger than `MAX_LABEL`, or than there is evidence for.
         MaskSizeError
             The labels are not of the camera's size.
         """
-        self.camera.check_image(labels, "image has")
+        self._check_labels(labels, evidence)
         observation = self._observe(labels, weights)
         if evidence is not None:
             observation.evidence = evidence
@@ -102,13 +105,14 @@ class ViewOperator(ViewRenderer):
         Raises
         ------
         SceneValueError
-            The total has another number of rows, or too few classes.
+            The total has another number of rows, too few classes, or another type.
         """
-        self.camera.check_image(labels, "image has")
+        self._check_labels(labels, evidence)
         most = int((labels if evidence is None else evidence.votes.indices).max(initial=0))
-        if len(total) != self.num_gaussians or most >= total.shape[1]:
-            expected = f"({self.num_gaussians}, K), with K above {most}"
-            raise SceneValueError(f"view '{self.camera.name}': votes have shape {total.shape}; expected {expected}")
+        if len(total) != self.num_gaussians or most >= total.shape[1] or total.dtype != np.int64:
+            found = f"votes have shape {total.shape}, {total.dtype}"
+            expected = f"({self.num_gaussians}, K), with K above {most}, int64"
+            raise SceneValueError(f"view '{self.camera.name}': {found}; expected {expected}")
         return self._vote(labels, evidence, total, units, sign)
 
     def without(self, hidden: np.ndarray) -> ViewOperator:
@@ -117,10 +121,10 @@ class ViewOperator(ViewRenderer):
         Raises
         ------
         SceneValueError
-            There is not one entry per Gaussian.
+            There is not one bool per Gaussian.
         """
-        if hidden.shape != (self.num_gaussians,):
-            raise SceneValueError(f"hidden has shape {hidden.shape}; expected ({self.num_gaussians},)")
+        if hidden.shape != (self.num_gaussians,) or hidden.dtype != bool:
+            raise SceneValueError(f"hidden is {hidden.dtype} {hidden.shape}; expected bool ({self.num_gaussians},)")
         return self._without(hidden[self.ids])
 
     def visibility(self) -> np.ndarray:
@@ -190,3 +194,11 @@ class ViewOperator(ViewRenderer):
         observation = self.observe(labels, evidence)
         observation.vote(total, units, sign)
         return observation.num_pairs > 0
+
+    def _check_labels(self, labels: np.ndarray, evidence: LabelEvidence | None) -> None:
+        """Refuse what a kernel would take for places beyond its tables."""
+        self.camera.check_image(labels, "image has")
+        most = MAX_LABEL if evidence is None else len(evidence.rest) - 1
+        if labels.dtype.kind not in "iu" or labels.max() > most:
+            found = f"view '{self.camera.name}': labels are {labels.dtype} up to {labels.max()}"
+            raise MaskFormatError(f"{found}; expected integers up to {most}")

@@ -112,7 +112,7 @@ class ViewRenderer(ABC):
         If they are those of some Gaussians, (R, K), `of` says of which, (R,) distinct: all of `ids` are among them.
         Raises as `render` does.
         """
-        return self.blend_seen(codes.take(self._rows(codes, of)).dense(num_classes))
+        return self.blend_seen(codes.take(self._rows(codes, num_classes, of)).dense(num_classes))
 
     def blend_probabilities(
         self, codes: CSRRows, num_classes: int, background: bool, of: np.ndarray | None = None
@@ -138,16 +138,23 @@ class ViewRenderer(ABC):
         image = self.blend_probabilities(codes, num_classes, background, of)
         return Strongest.of(image, grid, None if beside is None else self.blend_seen(beside))
 
-    def _rows(self, codes: CSRRows, of: np.ndarray | None) -> np.ndarray:
+    def _rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None) -> np.ndarray:
         """Tell which row of such codes each of `ids` has, (M,) int32."""
         self._check_rows(len(codes.indptr) - 1, of)
+        if codes.indices.size and (most := int(codes.indices.max())) >= num_classes:
+            raise SceneValueError(f"view {self.camera.name!r}: codes are of class {most}; expected below {num_classes}")
         if of is None:
             return self.ids
-        place = np.empty(self.num_gaussians, np.int32)
+        place = np.full(self.num_gaussians, -1, np.int32)
         place[of] = np.arange(len(of), dtype=np.int32)
-        return np.asarray(place[self.ids])
+        rows: np.ndarray = place[self.ids]
+        if rows.min(initial=0) < 0:
+            raise SceneValueError(f"view {self.camera.name!r}: a Gaussian that it shows has no codes; expected all")
+        return rows
 
-    def _check_rows(self, count: int, of: Sized | None) -> None:
+    def _check_rows(self, count: int, of: Sized | None, wanted: np.ndarray | None = None) -> None:
+        if wanted is not None:
+            self.camera.check_image(wanted, "wanted pixels have")
         expected = self.num_gaussians if of is None else len(of)
         if count != expected:
             raise SceneValueError(f"view {self.camera.name!r}: codes are of {count} Gaussians; expected {expected}")

@@ -239,12 +239,16 @@ class GaussianScene:
     ) -> npt.NDArray[np.float32]:  # (3,), (M,)
         """Evaluate the colours (N, 3), RGB float32 in [0, 1], seen from `camera_center`; of degree 0 only if None.
 
-        With `ids`, only those of some Gaussians: (M, 3).
+        With `ids`, only those of some Gaussians: (M, 3). Raises `SceneValueError` where these, or the center, are none.
         """
         from gsseg_core.scene.harmonics_kernel import seen_colors  # It loads numba, which reading scenes does without.
 
-        ids = np.arange(len(self)) if ids is None else ids
+        ids = np.arange(len(self)) if ids is None else np.asarray(ids)
         degree, center = (0, np.zeros(3)) if camera_center is None else (self.sh_degree, np.asarray(camera_center))
+        fits = ids.dtype.kind in "iu" and ids.ndim == 1 and center.shape == (3,)
+        if not (fits and ids.min(initial=0) >= 0 and ids.max(initial=0) < len(self)):
+            found = f"ids are {ids.dtype} of shape {ids.shape} up to {ids.max(initial=0)}, center of {center.shape}"
+            raise SceneValueError(f"{self.path or 'scene'}: {found}; expected integers (M,) below {len(self)}, (3,)")
         return seen_colors(self._coefficients, self.means, ids.astype(np.int32), center.astype(np.float32), degree)
 
 

@@ -141,6 +141,7 @@ def test_impossible_settings_are_one_clear_line_with_exit_code_2(
     ("line", "names"),
     [("segment s.ply --data d --outt o", "unknown option --outt; did you mean --out?"),
      ("segment s.ply --data d -out o", "unknown option -out; did you mean --out?"),
+     ("segment s.ply --data d --no-carve", "unknown option --no-carve; did you mean --no-"),
      ("remove s.ply --klass=chair", "unknown option --klass; did you mean --class?"),
      ("--verison", "unknown option --verison; did you mean --version?"), ("doctor --qq", "unknown option --qq\n")],
 )  # fmt: skip

@@ -56,6 +56,12 @@ def test_segment_says_which_masks_the_other_views_contradict(place: Path, capsys
     assert "pictures/worst_views.png" in report["pictures"]
 
 
+def test_of_one_view_nobody_says_how_far_others_agree_with_it(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(segment(place, "--views", "1", "--learner", "gradient")) == 0
+    told = capsys.readouterr().out
+    assert "1 view used" in told and "other views" not in told
+
+
 def test_render_and_eval_score_the_views_that_were_not_learnt_from(
     place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -72,6 +78,17 @@ def test_render_and_eval_score_the_views_that_were_not_learnt_from(
     assert f"{100 * told['mean_iou']:.1f} %" in capsys.readouterr().out
     assert main([*render, "--split", "all"]) == 0
     assert len(list((place / "maps").glob("*.png"))) == 6
+
+
+def test_a_view_called_like_the_legend_keeps_its_overlay(place: Path) -> None:
+    cameras = place / "data/cameras.json"
+    cameras.write_text(cameras.read_text().replace("view2", "legend"))
+    (place / "data/labels/view2.png").rename(place / "data/labels/legend.png")
+    (place / "data/split.json").unlink()
+    render = ["render", f"{place}/data/scene.ply", "--data", f"{place}/data", "--out", f"{place}/maps", "--quiet"]
+    assert main([*render, "--segmentation", f"{place}/out/segmentation.npz", "--split", "all"]) == 0
+    overlays = sorted(path.name for path in (place / "maps/overlays").iterdir())
+    assert len(overlays) == 6 + 2 and {"contact_sheet.png", "legend.png", "overlay_legend.png"} <= {*overlays}
 
 
 def test_render_needs_no_mask_that_can_be_read(place: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from camera_folders import POINT, entry_3dgs, transforms, write_colmap, write_js
 from scipy.spatial.transform import Rotation
 
 from gsseg_core.align.placing import place
+from gsseg_core.cli.shared import note_frame
 from gsseg_core.data.camera_files import frame_of_training, read_cameras
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.errors import CameraFileError, PoseError
@@ -145,3 +147,14 @@ def test_a_truncated_file_is_refused_wherever_it_ends(tmp_path: Path) -> None:
         (tmp_path / "dp.json").write_bytes(content[:end])
         with pytest.raises(CameraFileError):
             frame_of_training(tmp_path, tmp_path / "dp.json")
+
+
+@pytest.mark.parametrize(("scene", "given", "notes"), [("here", None, 1), ("away", None, 0), ("here", "file", 0)])
+def test_a_command_says_so_where_the_run_was_told_of_a_file_and_it_is_not(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], scene: str, given: str | None, notes: int
+) -> None:
+    file = tmp_path / "away/dataparser_transforms.json"
+    write_json(tmp_path / "report.json", {"frame": {"dataparser": str(file), "alignment": None}})
+    paths = {"scene": tmp_path / scene / "scene.ply", "data": tmp_path, "segmentation": tmp_path / "segmentation.npz"}
+    note_frame(Namespace(**paths, align=False, dataparser=given))
+    assert capsys.readouterr().err.count(f"try --dataparser {file}") == notes

@@ -14,6 +14,7 @@ from wrong_masks import WrongMasks
 
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
+from gsseg_core.errors import MaskFormatError
 from gsseg_core.export.view_pictures import draw_worst_views
 from gsseg_core.learn import mask_reliability
 from gsseg_core.learn.em.em_learner import EMLearner
@@ -92,6 +93,13 @@ def test_a_view_is_held_against_the_others_only() -> None:
     # Nobody else has seen what it shows, so only the empty rays, which belong to the background, say anything.
     assert alone.checked < truth.size and not alone.counts[1:].any()
     assert (alone.prediction()[truth > 0] == UNKNOWN).mean() > 0.9
+
+
+def test_a_prediction_of_another_view_or_of_other_classes_is_refused() -> None:
+    right = CLEAN[0].read_labels()
+    for wrong in (right[:3], right.T, right.astype(float), right - 2, right + NUM_CLASSES):
+        with pytest.raises(MaskFormatError, match=f"view '{CLEAN[0].name}': prediction is .* expected integers -1 to"):
+            compare_mask(CLEAN[0], wrong, NUM_CLASSES)
 
 
 def test_unknown_pixels_do_not_count() -> None:

@@ -133,6 +133,10 @@ def test_drawn_masks_are_read_black_and_white_or_by_label(tmp_path: Path) -> Non
     assert read_object_mask(tmp_path / "labels.png", small, "cup", {3: "box", 5: "cup"}).tolist() == [[0, 1, 0, -1]]
     with pytest.raises(SettingsError, match=r"labels\.png: label is 'cup'; expected a number"):
         read_object_mask(tmp_path / "labels.png", small, "cup")
+    with pytest.raises(
+        SettingsError, match=r"^classes\.json: 2 classes have the name 'cup'; expected one of their ids"
+    ):
+        read_object_mask(tmp_path / "labels.png", small, "cup", {3: "cup", 5: "cup"})
     with pytest.raises(MaskSizeError, match="for an image of 4 x 1 pixels"):
         read_object_mask(tmp_path / "labels.png", CAMERA)
 

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from parts_of_balls import SCENE, TOP, TRUTH, halved, seen_as, views_in_halves
 from per_view_ids import shuffled
-from small_scenes import NAMES, NUM_CLASSES, clean_views, ring, write_dataset
+from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, ring, write_dataset
 
 from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.data.view import View
+from gsseg_core.errors import StateMismatchError
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.objects.association import AssociationSettings
 from gsseg_core.objects.lifted_segments import Lifted
@@ -121,6 +122,13 @@ def test_an_object_table_adds_the_tree_to_a_segmentation() -> None:
     assert fine.class_names[NUM_CLASSES] == f"object_{cut:03d}.1" and cut not in fine.class_names
     np.testing.assert_array_equal(np.isin(fine.labels, [NUM_CLASSES, NUM_CLASSES + 1]), objects.labels == cut)
     np.testing.assert_allclose(fine.probabilities.sum(axis=1), objects.probabilities.sum(axis=1), atol=1e-6)
+
+
+def test_a_tree_is_for_no_segmentation_of_another_scene() -> None:
+    scene = balls_on_a_table(seed=1)[0]
+    other = Segmentation.from_codes(scene, np.ones((len(scene), 1), np.float32), {})
+    with pytest.raises(StateMismatchError, match="belongs to the scene"):
+        ObjectTable(SCENE).with_tree(other)
 
 
 def test_views_that_came_one_by_one_make_the_same_tree() -> None:

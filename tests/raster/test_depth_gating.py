@@ -77,6 +77,9 @@ def test_a_mask_of_probabilities_is_gated_as_one_of_labels() -> None:
 def test_depth_of_another_size_and_an_impossible_tolerance_are_refused() -> None:
     with pytest.raises(MaskSizeError, match=r"depth has shape \(24, 32\); expected \(48, 64\)"):
         gate_view(SCENE, VIEW, DEPTH[::2, ::2])
+    for scale in (0, -1, np.nan, np.inf):
+        with pytest.raises(SettingsError, match=r"scale of the depth is .*; expected a number above 0"):
+            gate_view(SCENE, VIEW, DEPTH, scale=scale)
     for bad in (-0.1, np.nan, np.inf):
         with pytest.raises(SettingsError, match=r"depth_tolerance\.relative is .*; expected 0 or more"):
             DepthTolerance(0.1, bad)

@@ -112,7 +112,7 @@ def test_a_view_without_some_gaussians_is_the_view_of_a_scene_where_they_are_inv
     assert np.abs(other.render(codes) - alone.render(codes)).max() <= 2 * backend.weight
     assert not other.visibility()[hidden].any()
     np.testing.assert_array_equal(operator.transmittance(), before)
-    with pytest.raises(SceneValueError, match=r"hidden has shape \(3,\); expected"):
+    with pytest.raises(SceneValueError, match=r"hidden is bool \(3,\); expected"):
         operator.without(np.zeros(3, bool))
 
 

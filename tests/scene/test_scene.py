@@ -342,6 +342,17 @@ def test_a_scene_can_be_saved_over_itself(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_vertices(path), vertices[:4])
 
 
+def test_colours_of_gaussians_that_are_not_there_are_refused() -> None:
+    scene = GaussianScene.from_arrays(
+        np.zeros((4, 3)), np.ones((4, 4)), np.ones((4, 3)), np.ones(4), np.zeros((4, 4, 3))
+    )
+    for ids in (np.array([4]), np.array([-1]), np.array([1.5]), np.ones(4, bool), np.array([[0]])):
+        with pytest.raises(SceneValueError, match=r"scene: ids are .* expected integers \(M,\) below 4"):
+            scene.colors(ids=ids)
+    with pytest.raises(SceneValueError, match=r"center of \(2,\); expected .* \(3,\)"):
+        scene.colors(np.zeros(2))
+
+
 @pytest.mark.parametrize(("name", "count", "degree"), [("replica_apartment", 126_507, 1), ("fern", 65_311, 3)])
 def test_real_scenes_load_and_save_exactly(real_data: Path, tmp_path: Path, name: str, count: int, degree: int) -> None:
     path = real_data / name / "scene.ply"

@@ -116,6 +116,12 @@ def test_what_is_added_may_not_have_more_colours_than_the_scene_has_room_for() -
     assert after.scene.sh_degree == 1 and not after.scene.sh[-20:, 1:].any()
 
 
+@pytest.mark.parametrize("revision", ["a", 1.5])
+def test_a_revision_is_a_whole_number(revision: object) -> None:
+    with pytest.raises(SceneDeltaError, match=f"revision is '?{revision}'?; expected a whole number"):
+        SceneDelta(revision=revision)  # type: ignore[arg-type]
+
+
 def test_ids_of_a_file_are_checked(tmp_path: Path) -> None:
     grown, _ = LivingScene.of(SCENE).apply(SceneDelta(removed=np.array([0])))
     twice = grown.scene.vertices.copy()

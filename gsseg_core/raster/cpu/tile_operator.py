@@ -66,7 +66,7 @@ class TileOperator(ViewOperator):
 
     def blend_seen(self, codes: np.ndarray, wanted: np.ndarray | None = None) -> Blended:
         """Blend codes (M, K) of what is visible."""
-        self._check_rows(len(codes), self.ids)
+        self._check_rows(len(codes), self.ids, wanted)
         codes = np.ascontiguousarray(codes, np.float32)
         if codes.shape[1] <= products.FEW:
             return Blended(*products.render_few(self._tiles, codes, _ALL_WANTED if wanted is None else wanted))
@@ -76,7 +76,7 @@ class TileOperator(ViewOperator):
 
     def blend_rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None = None) -> Blended:
         """Blend codes without their zeros."""
-        return Blended(*products.render(self._tiles, codes, self._rows(codes, of), num_classes))
+        return Blended(*products.render(self._tiles, codes, self._rows(codes, num_classes, of), num_classes))
 
     def strongest(
         self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid = NO_PIXELS,
@@ -84,9 +84,9 @@ class TileOperator(ViewOperator):
     ) -> Strongest:  # fmt: skip
         """Find the class of each pixel, tile by tile, without an image of all classes."""
         others = np.ascontiguousarray(np.empty((len(self.ids), 0)) if beside is None else beside, np.float32)
-        self._check_rows(len(others), self.ids)
+        self._check_rows(len(others), self.ids, wanted)
         classes, known, on_grid, image, left_over = products.strongest(
-            self._tiles, codes, self._rows(codes, of), num_classes, background, *grid, others,
+            self._tiles, codes, self._rows(codes, num_classes, of), num_classes, background, *grid, others,
             _ALL_WANTED if wanted is None else wanted,
         )  # fmt: skip
         return Strongest(classes, known, on_grid, None if beside is None else Blended(image, left_over))
