@@ -15,6 +15,7 @@ from gsseg_core.cli.shared import add_device, add_frame, add_quiet, load_kernels
 from gsseg_core.cli.terminal import note, tell
 from gsseg_core.errors import SettingsError
 from gsseg_core.progress import progress_bars
+from gsseg_core.text import counted
 
 if TYPE_CHECKING:
     from gsseg_core.viewer.access import Listener
@@ -96,7 +97,7 @@ def _show(options: argparse.Namespace, listener: Listener, viewer_module: Module
         model, views, learnt.reliability, source, listener=listener, draw=options.draw, device=options.device
     )
     with closing(viewer), suppress(KeyboardInterrupt):  # How it is meant to end.
-        tell(f"gsseg: {len(scene):,} Gaussians at {viewer.url} (Ctrl-C ends it)")
+        tell(f"gsseg: {counted(len(scene), 'Gaussian')} at {viewer.url} (Ctrl-C ends it)")
         if listener.everywhere:
             tell("gsseg: from elsewhere, put a name or address of this machine in place of localhost")
         # Without a screen, that would start a browser of text in this very terminal.

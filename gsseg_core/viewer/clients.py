@@ -63,7 +63,7 @@ class ClientRenderers:
     """
 
     def __init__(self, server: viser.ViserServer, scene: GaussianScene, drawn_by: str, device: str) -> None:
-        self._splats, self._drawn_by, self._device = Splats(scene), drawn_by, device
+        self._server, self._splats, self._drawn_by, self._device = server, Splats(scene), drawn_by, device
         self._lock = threading.Lock()
         self._picture: Picture | None = None
         self.by_client: dict[int, ClientRenderer] = {}
@@ -89,7 +89,9 @@ class ClientRenderers:
             self.by_client[client.client_id] = renderer
             if self._picture:
                 renderer.show(self._picture)
-        if self._drawn_by == AUTO:
+        if client.client_id not in self._server.get_clients():
+            self._leave(client)  # Once more: it may have left before it was known here.
+        elif self._drawn_by == AUTO:
             with suppress(RuntimeError, OSError, ValueError):  # It has left.
                 self._decide(client, renderer)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -13,12 +13,11 @@ from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.files.limits import MAX_LABEL
-from gsseg_core.live.session import LiveSession
 from gsseg_core.objects.clicks import click_labels
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.segmentation import REMOVED, UNOBSERVED
+from gsseg_core.segmentation import REMOVED
 from gsseg_core.viewer.model import Labelling
 
 TRUST = 4.0  # a correction that sees a whole Gaussian weighs so many times as much as all that was learnt before
@@ -62,81 +61,74 @@ def looks_alike(
     return _view(camera, click_labels(scene, camera, [(int(row), int(column))], device=device) == 1, label)
 
 
+class Drawn(NamedTuple):
+    """What a correction says of the M Gaussians that it sees, in P pairs of a Gaussian and a label."""
+
+    ids: np.ndarray  # (P,) int32: Gaussian of each pair
+    labels: np.ndarray  # (P,) int32
+    votes: np.ndarray  # (P,) float32, px: sum of the Gaussian's weights over the pixels of the label
+    seen: np.ndarray  # (P,) float32 in [0, 1]: how much the labelled pixels see of the Gaussian, in its first pair
+
+
 class Corrections:
     """Corrections of one scene, in the order in which they came.
 
-    They are views like any other, fused by a `LiveSession` that has no others. How much a correction weighs against
-    what was learnt before goes by how much of a Gaussian it sees: the sum of its weights over what was drawn, divided
-    by that of its opacities over the whole image, which is 1 for one that lies open and inside the drawing, and near 0
-    for what lies behind; 0 without a vote. With e its sum over the corrections, c their class probabilities and q those
-    learnt before,
+    They vote as all masks do. How much a correction weighs against what was learnt before goes by how much of a
+    Gaussian it sees: the sum of its weights over what was drawn, divided by that of its opacities over the whole image,
+    which is 1 for one that lies open and inside the drawing, and near 0 for what lies behind; 0 without a vote. With e
+    its sum over the corrections, c their normalised votes and q the class probabilities learnt before,
 
         q' = normalise( q + TRUST e c )
-
-    Attributes
-    ----------
-    views : list of View
-        The corrections.
     """
 
     def __init__(self, scene: GaussianScene, *, device: str = "cpu") -> None:
         self._scene, self._device = scene, device
-        self.views: list[View] = []
-        self._session = LiveSession(scene, device=device, max_classes=MAX_LABEL + 1)
-        self._seen: list[np.ndarray] = []
+        self._drawn: list[Drawn] = []
 
     def __len__(self) -> int:
         """Count the corrections."""
-        return len(self.views)
+        return len(self._drawn)
 
-    def add(self, view: View) -> None:
-        """Learn a correction. A view of a name that is there already is another correction all the same.
+    def add(self, view: View, shown: np.ndarray | None = None) -> None:
+        """Learn a correction that was drawn on the Gaussians that are shown, (N,) bool; by default, on all.
 
         Raises `NoUsableViewsError` where nothing was drawn on any Gaussian.
         """
-        camera = replace(view.camera, name=f"correction_{len(self.views):04d}")
-        own = View.from_arrays(camera, view.read_labels())
-        rejection = self._session.fuse(own)
-        if rejection is not None:
-            raise NoUsableViewsError(f"correction: {rejection.message}; expected something drawn on the scene")
-        self.views.append(own)
-        self._seen.append(share_seen(self._scene, own, self._device))
+        drawn = drawn_on(self._scene, view, shown, self._device)
+        if not len(drawn.ids):
+            raise NoUsableViewsError(
+                "correction: what was drawn sees no Gaussian; expected something drawn on the scene"
+            )
+        self._drawn.append(drawn)
 
     def undo(self) -> bool:
         """Take the last correction back, exactly; return whether there was one."""
-        if not self.views:
-            return False
-        self.views.pop()
-        self._seen.pop()
-        self._fuse_anew()
-        return True
+        if self._drawn:
+            self._drawn.pop()
+            return True
+        return False
 
     def renumber(self, ids: Mapping[int, int]) -> None:
         """Give some classes other numbers."""
-        table = np.arange(MAX_LABEL + 2)
-        table[-1] = UNKNOWN
+        table = np.arange(MAX_LABEL + 1, dtype=np.int32)
         table[list(ids)] = list(ids.values())
-        self.views = [View.from_arrays(view.camera, table[view.read_labels()]) for view in self.views]
-        self._fuse_anew()
-
-    def _fuse_anew(self) -> None:
-        self._session.reset()
-        for view in self.views:
-            self._session.fuse(view)
+        self._drawn = [drawn._replace(labels=table[drawn.labels]) for drawn in self._drawn]
 
     def apply(self, before: Labelling, names: Mapping[int, str] | None = None) -> Labelling:
         """Combine a labelling of the same scene with the corrections; it stays where none has seen a Gaussian.
 
         `names` are those of classes that only the corrections have.
         """
-        if not self.views:
+        if not self._drawn:
             return before
-        drawn = self._session.codes()
-        num_classes = max(drawn.shape[1], before.probabilities.shape[1])
-        probabilities, drawn = _widened(before.probabilities, num_classes), _widened(drawn, num_classes)
-        weight: np.ndarray = TRUST * np.stack(self._seen).sum(axis=0)
-        touched = np.flatnonzero(weight)
-        mixed = probabilities[touched] + weight[touched, None] * drawn[touched]
+        ids, drawn_labels, votes, seen = map(np.concatenate, zip(*self._drawn, strict=True))
+        num_classes = max(int(drawn_labels.max()) + 1, before.probabilities.shape[1])
+        probabilities = np.pad(before.probabilities, ((0, 0), (0, num_classes - before.probabilities.shape[1])))
+        touched, rows = np.unique(ids, return_inverse=True)
+        drawn = np.zeros((len(touched), num_classes), np.float32)
+        np.add.at(drawn, (rows, drawn_labels), votes)
+        drawn *= TRUST * np.bincount(rows, seen)[:, None] / drawn.sum(axis=1, keepdims=True)
+        mixed = probabilities[touched] + drawn
         mixed /= mixed.sum(axis=1, keepdims=True)
         probabilities[touched] = mixed
         labels = before.labels.copy()
@@ -148,19 +140,21 @@ class Corrections:
         return Labelling(labels, probabilities, {k: class_name(known, k) for k in range(num_classes)})
 
 
-def share_seen(scene: GaussianScene, view: View, device: str = "cpu") -> np.ndarray:
-    """How much of each Gaussian the labelled pixels of a view see, (N,) float32 in [0, 1]; 0 of one without a vote."""
+def drawn_on(scene: GaussianScene, view: View, shown: np.ndarray | None = None, device: str = "cpu") -> Drawn:
+    """Lift the labels of a view onto the Gaussians that are shown, (N,) bool, as if there were no others."""
     operator, labels = make_operator(scene, view.camera, device), view.read_labels()
-    drawn_on = operator.observe(labels).ids  # What lies behind these shines through, but nobody drew on it.
-    full, share = np.zeros(len(scene), np.float32), np.zeros(len(scene), np.float32)
+    if shown is not None:
+        operator = operator.without(~shown)
+    observed = operator.observe(labels)  # What lies behind these shines through, but nobody drew on it.
+    full, seen = np.zeros(len(scene), np.float32), np.zeros(len(observed.labels), np.float32)
     full[operator.ids] = operator.footprints()
-    seen = operator.adjoint((labels != UNKNOWN)[..., None].astype(np.float32))[drawn_on, 0]
-    share[drawn_on] = np.minimum(seen / full[drawn_on], 1)
-    return share
+    weights = operator.adjoint((labels != UNKNOWN)[..., None].astype(np.float32))[observed.ids, 0]
+    seen[observed.start[:-1]] = np.minimum(weights / full[observed.ids], 1)
+    return Drawn(observed.ids[observed.rows], observed.classes[observed.labels], observed.votes(), seen)
 
 
 def _view(camera: Camera, drawn: np.ndarray, label: int) -> View:
-    if label <= UNOBSERVED:
+    if not 0 <= label <= MAX_LABEL:
         raise SettingsError(f"correction: label is {label}; expected a class")
     return View.from_arrays(camera, np.where(drawn, np.int32(label), np.int32(UNKNOWN)))
 
@@ -171,7 +165,3 @@ def _check_inside(camera: Camera, column: float, row: float) -> None:
             f"correction: pixel is (column {column:g}, row {row:g}); expected one of the "
             f"{camera.width} x {camera.height} of the picture"
         )
-
-
-def _widened(probabilities: np.ndarray, num_classes: int) -> np.ndarray:
-    return np.pad(probabilities, ((0, 0), (0, num_classes - probabilities.shape[1])))

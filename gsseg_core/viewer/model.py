@@ -54,9 +54,10 @@ def at_level(objects: Labelling, tree: ObjectTree, granularity: float) -> Labell
 
     Their first classes are those of the tree; others, which were added in the viewer, are on every level.
     """
-    if granularity == tree.level:
-        return objects
     k, added = tree.num_classes, objects.probabilities.shape[1] - tree.num_classes
+    of_added = range(len(tree), len(tree) + added)
+    if granularity == tree.level:
+        return objects._replace(nodes=(*range(k), *of_added)) if added else objects
     shares, nodes = tree.shares_at(granularity, objects.probabilities[:, :k], tree.leaves)
     of_tree, first = objects.labels < k, len(nodes)
     node = tree.labels_at(granularity, np.where(of_tree, objects.labels, 0))
@@ -66,7 +67,7 @@ def at_level(objects: Labelling, tree: ObjectTree, granularity: float) -> Labell
         np.where(of_tree, place, objects.labels - k + first).astype(np.int32),
         np.concatenate([shares, objects.probabilities[:, k:]], axis=1),
         dict(enumerate([*(names[one] for one in nodes), *(objects.class_names[k + i] for i in range(added))])),
-        (*nodes, *range(len(tree), len(tree) + added)),
+        (*nodes, *of_added),
     )
 
 
@@ -141,7 +142,7 @@ class ViewModel:
     def isolate(self, label: int) -> None:
         """Show this class alone; asked for a second time, show all again."""
         others = set(self.labels_in_use) - {self._listed(label)}
-        self.hidden = set() if self.hidden == others else others
+        self.hidden = set() if others <= self.hidden and label not in self.hidden else others
 
     def remove(self, label: int) -> None:
         """Take a class off the list, and its Gaussians out of the picture and of exports."""

@@ -1,18 +1,11 @@
-"""The panel of the viewer: its widgets, and what they call.
-
-viser draws Markdown with whatever HTML stands in it. So text of others, which names and errors hold, gets there only
-through `_paragraph`, and into labels, which are text, only through `_shown`.
-"""
+"""The panel of the viewer: its widgets, and what they call. Text of others gets there as `answer.py` says."""
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
 import viser
 
 from gsseg_core.data.class_names import class_name
@@ -21,21 +14,17 @@ from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.export.collision import KINDS
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.scene_writers import SCENE_WRITERS
-from gsseg_core.text import counted, html_text, printable
+from gsseg_core.text import counted, printable
+from gsseg_core.viewer.answer import LONGEST_NAME, Answer, paragraph, shown_name
 from gsseg_core.viewer.corrections import box, disc, looks_alike, region
 from gsseg_core.viewer.model import MODES, ClassRow, ViewModel
-from gsseg_core.viewer.picking import Picked, ViewVote
 from gsseg_core.viewer.picture import BANDS
 from gsseg_core.viewer.state import ViewerState
 from gsseg_core.viewer.viewpoint import Viewpoint
 
-MOST_CLASSES, MOST_VIEWS = 5, 8  # of the probabilities and votes that the answer to a click names
-LONGEST_NAME = 80  # characters of a name; of a longer one, the first
-NOTICE: float | None = 10.0  # seconds for which a browser is told of an error beside the answer; None: until closed
 SWITCH, ONLY, REMOVE = "switch it on or off", "only this", "remove"
 REGION, DISC, ALIKE = "the whole region", "a disc", "all that looks alike there"
 _OFF = (73, 80, 87)
-_STYLE = "padding: 0 0.75em 0.75em; font-size: 0.875em; overflow-wrap: anywhere"
 _NO_MESH = "none"
 _IN_COLUMNS = """<style>
 div:has(> .gsseg-columns) { display: none }
@@ -45,7 +34,6 @@ div:has(> div > .gsseg-columns) button { height: 20px !important; padding: 0 4px
 div:has(> div > .gsseg-columns) .mantine-Button-inner { justify-content: start }
 </style><i class="gsseg-columns"></i>"""
 """viser knows no columns. Where its page is built otherwise, the rows stand below each other."""
-_ASK = "Click on something in the picture to ask what it is."
 
 Event = viser.GuiEvent[Any]
 
@@ -61,8 +49,7 @@ class Panel:
         self._rows: dict[int, tuple[ClassRow, viser.GuiButtonHandle]] = {}
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="medium")
         gui.set_panel_label("gsseg")
-        self._answer = gui.add_html(_paragraph(_ASK))
-        self._build_offers()
+        self.answer = Answer(gui, state, self._show_level)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Classes"):
             self._build_classes()
@@ -79,43 +66,27 @@ class Panel:
                 lambda: state.selection(str(as_format.value), None if mesh.value == _NO_MESH else str(mesh.value)),
             )
             self._add_download("the segmentation, as npz", state.segmentation_npz)
-            self._live = gui.add_html(_paragraph("live: waiting for the first probabilities")) if live else None
+            self._live = gui.add_html(paragraph("live: waiting for the first probabilities")) if live else None
 
     # Tabs.
-
-    def _build_offers(self) -> None:
-        """Offer the parts and the whole of what was clicked."""
-        self._node: int | None = None
-        self._parts, self._whole = (self._gui.add_button(f"its {what}", visible=False) for what in ("parts", "whole"))
-        for button, show in ((self._parts, self._state.show_parts), (self._whole, self._state.show_whole)):
-            self._on(button.on_click, functools.partial(self._show_offered, show))
-
-    def _show_offered(self, show: Callable[[int], None], _: Event) -> None:
-        if self._node is not None:
-            show(self._node)
-            self._offer(None)
-            _set(self._level, next(name for name, g in self._levels.items() if g == self._state.granularity))
-
-    def _offer(self, node: int | None) -> None:
-        tree, self._node = self._state.model.tree, node
-        of = ([], None) if tree is None or node is None else (tree.parts(node), tree.whole(node))
-        self._parts.visible, self._whole.visible = bool(of[0]), of[1] is not None
 
     def _build_level(self) -> None:
         """Choose a level of the tree of parts and wholes."""
         tree = self._state.model.tree
-        self._levels = {} if tree is None else {tree.level_name(g): g for g in tree.granularities}
-        if tree is None or len(self._levels) < 2:
+        if tree is None or len(tree.granularities) < 2:
             return
-        self._level = self._gui.add_dropdown("show", tuple(self._levels), initial_value=tree.level_name(tree.level))
+        names = _distinct([tree.level_name(g) for g in tree.granularities])
+        self._levels = dict(zip(names, tree.granularities, strict=True))
+        self._level = self._gui.add_dropdown("show", names, initial_value=tree.level_name(tree.level))
 
         def choose(event: Event) -> None:
             if event.client is not None:  # Else it was set from here.
-                names = tuple(self._levels)
                 self._state.set_level(self._levels[names[_chosen(self._level, names)]])
-                self._offer(None)
 
         self._on(self._level.on_update, choose)
+
+    def _show_level(self) -> None:
+        _set(self._level, next(name for name, g in self._levels.items() if g == self._state.granularity))
 
     def _build_classes(self) -> None:
         gui = self._gui
@@ -134,7 +105,7 @@ class Panel:
 
         def choose_mode(_: Event) -> None:
             try:
-                self._state.set_mode(mode.value, self.show_progress)
+                self._state.set_mode(mode.value, self.answer.show_progress)
             except GssegError:
                 _set(mode, self._state.model.mode)
                 raise
@@ -199,7 +170,7 @@ class Panel:
         self._on(self._gui.add_button(text, icon=viser.Icon.DOWNLOAD).on_click, send)
 
     def _add_row(self, row: ClassRow) -> viser.GuiButtonHandle:
-        button = self._gui.add_button(**_look(row), hint=f"{_shown(row.name)}: {counted(row.size, 'Gaussian')}")
+        button = self._gui.add_button(**_look(row), hint=f"{shown_name(row.name)}: {counted(row.size, 'Gaussian')}")
 
         def pressed(_: Event) -> None:
             action = {ONLY: ViewModel.isolate, REMOVE: ViewModel.remove}.get(self._press.value, ViewModel.toggle)
@@ -210,14 +181,15 @@ class Panel:
 
     def _filter(self) -> None:
         """List only the classes whose name has what is searched for."""
-        for row, button in self._rows.values():
-            button.visible = self._search.value.strip().lower() in row.name.lower()
+        with self._state.lock:
+            for row, button in self._rows.values():
+                button.visible = self._search.value.strip().lower() in row.name.lower()
 
     def _on(self, register: Callable[[Callable[[Any], None]], object], action: Callable[[Event], object]) -> None:
         """Have a widget call an action, `register` being its `on_click` or `on_update`; errors are told."""
 
         def called(event: Event) -> None:
-            with self.telling(event.client):
+            with self.answer.telling(event.client):
                 action(event)
 
         register(called)
@@ -227,80 +199,46 @@ class Panel:
     def show_classes(self, rows: Sequence[ClassRow]) -> None:
         """List the classes; widgets that are right already stay."""
         listed = [(row.label, row.name) for row in rows]
-        if listed != [(row.label, row.name) for row, _ in self._rows.values()]:
-            for _, button in self._rows.values():
-                button.remove()
-            with self._list:
-                self._rows = {row.label: (row, self._add_row(row)) for row in rows}
-            self._filter()
-            self._target.options = self._target_names()
-        for row in rows:
-            known, button = self._rows[row.label]
-            if row != known:
-                for key, value in _look(row).items():
-                    setattr(button, key, value)
-                self._rows[row.label] = row, button
-
-    def show_picked(self, picked: Picked | None, votes: Sequence[ViewVote] | None) -> None:
-        """Answer a click: the Gaussian that it hit, and the votes for that, if they are known."""
-        self._offer(None if picked is None else self._state.node_of(picked.gaussian))
-        if picked is None:
-            self._answer.content = _paragraph("Nothing is there.")
-            return
-        model, classes = self._state.model, self._state.objects.class_names
-        i = picked.gaussian
-        label, probabilities = int(model.labelling.labels[i]), model.labelling.probabilities[i]
-        best = [k for k in np.argsort(-probabilities, kind="stable")[:MOST_CLASSES].tolist() if probabilities[k] > 0]
-        lines = [
-            f", class {model.ids()[label]}" if label >= 0 else "",
-            f"Gaussian {i}, {100 * picked.weight:.0f} % of the pixel",
-            "probabilities: " + (", ".join(f"{_shown(model.name(k))} {probabilities[k]:.2f}" for k in best) or "none"),
-        ]
-        if votes is not None:
-            views = counted(len({vote.view for vote in votes}), "view")
-            lines.append(f"{views} voted for it" + (", the largest votes:" if votes else ""))
-            lines += [
-                f"{_shown(v.view)}: {_shown(class_name(classes, v.label))}, {v.weight:.1f} px"
-                for v in votes[:MOST_VIEWS]
-            ]
-        self._answer.content = _paragraph(*lines, title=_shown(model.name(label)))
-
-    def show_progress(self, stage: str, done: int, total: int) -> None:
-        """Say how far a long job is."""
-        self._answer.content = _paragraph(f"{stage}: {done} of {total} views" if done < total else _ASK)
+        with self._state.lock:  # Somebody may search them meanwhile.
+            if listed != [(row.label, row.name) for row, _ in self._rows.values()]:
+                for _, button in self._rows.values():
+                    button.remove()
+                with self._list:
+                    self._rows = {row.label: (row, self._add_row(row)) for row in rows}
+                self._filter()
+            for row in rows:
+                known, button = self._rows[row.label]
+                if row != known:
+                    for key, value in _look(row).items():
+                        setattr(button, key, value)
+                    self._rows[row.label] = row, button
+        self._offer_targets()
+        self.answer.refresh()
 
     def show_live(self, text: str) -> None:
         """Say what the live source has."""
         if self._live is not None:
-            self._live.content = _paragraph(f"live: {text}")
-
-    @contextmanager
-    def telling(self, client: viser.ClientHandle | None) -> Iterator[None]:
-        """Show errors that the user can do something about in the browser."""
-        try:
-            yield
-        except GssegError as error:
-            self._answer.content = _paragraph(f" {error}", title="That did not work.")
-            if client is not None:
-                text = printable(str(error))
-                client.add_notification("That did not work", text, color="red", auto_close_seconds=NOTICE)
+            self._live.content = paragraph(f"live: {text}")
 
     # Corrections, as they are set up in the panel.
 
     def correct_at(self, camera: Camera, column: float, row: float) -> None:
         """Correct what a click hit, in pixels of the camera."""
-        if self._tool.value == REGION:
-            self._correct(region(camera, self._state.label_map(camera), column, row, self._label()))
-        elif self._tool.value == ALIKE:
-            scene, device = self._state.model.scene, self._state.device
-            self._correct(looks_alike(scene, camera, column, row, self._label(), device=device))
-        else:
-            radius = _number(self._radius, 0, 100) / 100 * camera.height
-            self._correct(disc(camera, column, row, radius, self._label()))
+        with self._state.lock:  # Classes may get other numbers meanwhile.
+            label, model = self._label(), self._state.model
+            if self._tool.value == REGION:
+                drawn = region(camera, self._state.label_map(camera), column, row, label)
+            elif self._tool.value == ALIKE:
+                seen = model.scene.subset(model.shown())
+                drawn = looks_alike(seen, camera, column, row, label, device=self._state.device)
+            else:
+                drawn = disc(camera, column, row, _number(self._radius, 0, 100) / 100 * camera.height, label)
+            self._correct(drawn)
 
     def correct_box(self, camera: Camera, corner: Sequence[float], opposite: Sequence[float]) -> None:
         """Correct what is in a box between two corners, column and row in pixels of the camera."""
-        self._correct(box(camera, corner, opposite, self._label()))
+        with self._state.lock:
+            self._correct(box(camera, corner, opposite, self._label()))
 
     def _correct(self, drawn: View) -> None:
         changed = self._state.correct(drawn)
@@ -311,13 +249,24 @@ class Panel:
         return _chosen(self._target, self._target_names())
 
     def _add_class(self) -> None:
-        name, names = printable(self._new.value.strip()), self._target_names()
+        name = printable(self._new.value.strip())
         if not 0 < len(name) <= LONGEST_NAME:
             raise SettingsError(f"new class: name has {len(name)} characters; expected 1 to {LONGEST_NAME}")
-        if name not in names:
-            self._state.added_names[len(names)] = name
-            self._target.options = (*names, name)
+        with self._state.lock:
+            names = self._target_names()
+            if name not in names:
+                self._state.added_names[len(names)] = name
+        self._offer_targets()
         _set(self._target, name)
+
+    def _offer_targets(self) -> None:
+        """Offer the classes of now; the one that is chosen stays, even where it has another name, or is gone."""
+        with self._state.lock:
+            names, before, chosen = self._target_names(), self._target.options, self._target.value
+            if names != before:
+                self._target.options = names
+                place = before.index(chosen) if chosen in before and chosen not in names else len(names)
+                _set(self._target, names[place] if place < len(names) else chosen)
 
     def _undo(self) -> None:
         if self._state.undo():
@@ -327,11 +276,11 @@ class Panel:
     def _target_names(self) -> tuple[str, ...]:
         """Names by class id, as they are shown."""
         known = {**self._state.added_names, **self._state.objects.class_names}
-        return _distinct([_shown(class_name(known, k)) for k in range(max(known) + 1)])
+        return _distinct([shown_name(class_name(known, k)) for k in range(max(known) + 1)])
 
     def _view_text(self, view: View) -> str:
         trust = self._state.reliability.get(view.name, math.nan)
-        return _shown(view.name) + ("" if math.isnan(trust) else f" ({100 * trust:.0f} % reliable)")
+        return shown_name(view.name) + ("" if math.isnan(trust) else f" ({100 * trust:.0f} % reliable)")
 
 
 def _set(widget: Any, value: object) -> None:
@@ -350,7 +299,7 @@ def _number(slider: viser.GuiSliderHandle[float], lowest: float, highest: float)
 def _chosen(dropdown: viser.GuiDropdownHandle[str], options: Sequence[str]) -> int:
     """Which of the options is chosen; a browser may say anything."""
     if dropdown.value not in options:
-        raise SettingsError(f"{dropdown.label} is {_shown(dropdown.value)!r}; expected one of the list")
+        raise SettingsError(f"{dropdown.label} is {shown_name(dropdown.value)!r}; expected one of the list")
     return options.index(dropdown.value)
 
 
@@ -364,20 +313,10 @@ def _distinct(texts: Sequence[str]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _shown(name: str) -> str:
-    return printable(name[:LONGEST_NAME])
-
-
-def _paragraph(*lines: str, title: str = "") -> str:
-    """HTML of lines that hold text of any origin; `title` begins the first one, in bold."""
-    content = "<br>".join(map(html_text, lines))
-    return f'<div style="{_STYLE}"><strong>{html_text(title)}</strong>{content}</div>'
-
-
 def _look(row: ClassRow) -> dict[str, Any]:
     """Label, color and icon of the button that switches a class."""
     return {
-        "label": f"{_shown(row.name)}  {row.size:,}",
+        "label": f"{shown_name(row.name)}  {row.size:,}",
         "color": row.color if row.shown else _OFF,
         "icon": viser.Icon.EYE if row.shown else viser.Icon.EYE_OFF,
     }

@@ -42,18 +42,18 @@ class ViewerState:
         self.granularity = model.tree.level if model.tree else 0.0  # ... of which the model shows this level of a tree
         self._view_votes: ViewVotes | None = None
         self._view_votes_lock = threading.Lock()
-        self._lock = threading.RLock()
+        self.lock = threading.RLock()  # held by whoever needs that nothing of this changes meanwhile
         self._recut()
 
     def seen(self) -> tuple[Picture, list[ClassRow]]:
         """Return the scene as it is to be seen now, and the list of classes."""
-        with self._lock:
+        with self.lock:
             model = self.model
             return Picture(model.scene, self._parts, model.shown(), model.colors()), model.rows()
 
     def change(self, action: Callable[[ViewModel], object]) -> None:
         """Change what is shown, and have the browsers follow; changes that come fast are shown together."""
-        with self._lock:
+        with self.lock:
             action(self.model)
         self.stale.set()
 
@@ -76,7 +76,7 @@ class ViewerState:
     def set_level(self, granularity: float, inside: int | None = None) -> None:
         """Show the level of the tree at a granularity: all of it, or only what lies inside one node."""
         tree = self._tree()
-        with self._lock:
+        with self.lock:
             self.granularity = granularity
             self._relabel()
             model, shown = self.model, None if inside is None else {inside, *tree.inside(inside)}
@@ -86,7 +86,7 @@ class ViewerState:
 
     def node_of(self, gaussian: int) -> int | None:
         """Node of the tree that a Gaussian is in as it is shown; None if none."""
-        with self._lock:
+        with self.lock:
             label, ids, tree = int(self.model.labelling.labels[gaussian]), self.model.ids(), self.model.tree
         return None if tree is None or label < 0 or ids[label] >= len(tree) else ids[label]
 
@@ -114,28 +114,28 @@ class ViewerState:
 
     def label_map(self, camera: Camera) -> np.ndarray:
         """Render labels (H, W) int64 of what is shown, -1 where nothing is."""
-        with self._lock:
+        with self.lock:
             labelling, shown = self.model.labelling, self.model.shown()
-        # The last channel is for what has no class, so that it is a region as well.
-        one_hot = np.eye(labelling.probabilities.shape[1] + 1, dtype=np.float32)[np.maximum(labelling.labels, -1)]
+        # What has no class is a region as well. There may be far more classes than are in use.
+        used, place = np.unique(np.maximum(labelling.labels, -1), return_inverse=True)
+        one_hot = np.eye(len(used), dtype=np.float32)[place]
         image = make_operator(self.model.scene, camera, self.device).without(~shown).render(one_hot)
-        labels = image.argmax(axis=2)
-        return np.where((image.max(axis=2) > 0) & (labels < image.shape[2] - 1), labels, -1)
+        return np.where(image.max(axis=2) > 0, used[image.argmax(axis=2)].astype(np.int64), -1)
 
     def correct(self, view: View) -> int:
-        """Learn what was drawn in a picture; return how many Gaussians that changed.
+        """Learn what was drawn in a picture of what is shown; return how many Gaussians that changed.
 
         Raises `NoUsableViewsError` where nothing was drawn on any Gaussian.
         """
-        with self._lock:
+        with self.lock:
             before = self.model.labelling.labels
-            self.corrections.add(view)
+            self.corrections.add(view, self.model.shown())
             self._relabel()
             return int(np.count_nonzero(before != self.model.labelling.labels))
 
     def undo(self) -> bool:
         """Take the last correction back; return whether there was one."""
-        with self._lock:
+        with self.lock:
             undone = self.corrections.undo()
             self._relabel()
         return undone
@@ -145,10 +145,11 @@ class ViewerState:
 
         Classes that were added here make room for those that turn up there; one of the same name becomes that class.
         """
-        with self._lock:
+        with self.lock:
             taken, added, model = learnt.class_names, self.added_names, self.model
             known, free = {name: k for k, name in taken.items()}, itertools.count(max([*taken, *added]) + 1)
-            ids = {k: known[name] if name in known else next(free) for k, name in added.items() if k in taken}
+            moved = {k: name for k, name in added.items() if k in taken or name in known}
+            ids = {k: known[name] if name in known else next(free) for k, name in moved.items()}
             if ids:
                 self.corrections.renumber(ids)
                 self.added_names = {ids.get(k, k): name for k, name in added.items() if ids.get(k, k) not in taken}
@@ -168,20 +169,23 @@ class ViewerState:
         check_collision(collision)
         if collision and not SCENE_WRITERS[scene_format].together:
             raise SettingsError(f"format {scene_format}: holds no meshes to collide with; expected usd, or none")
-        with self._lock:
+        with self.lock:
             shown, (labels, _, names, _) = self.model.shown(), self.model.labelling
-            scene, ids = self.model.scene, self.model.ids()
+            scene, ids, confidence = self.model.scene, self.model.ids(), self.model.confidence
         name = f"selection{SCENE_WRITERS[scene_format].suffixes[0]}"
         given = np.array([*ids, REMOVED, UNOBSERVED])[labels]  # labels -1 and -2 are its last two
         known = {ids[k]: text for k, text in names.items()}
-        meshes = collision_meshes(scene, np.where(shown, given, REMOVED), self.model.confidence, collision)
+        meshes = collision_meshes(scene, np.where(shown, given, REMOVED), confidence, collision)
         return name, _as_file(
             lambda path: write_selection(scene, shown, given, known, path, scene_format, meshes), name
         )
 
     def segmentation_npz(self) -> tuple[str, bytes]:
         """Write labels and class probabilities, corrections included: the name `segmentation.npz`, and its bytes."""
-        (labels, probabilities, names, _), tree, read = self.objects, self.model.tree, self.model.read
+        with self.lock:
+            objects, tree, read = self.objects, self.model.tree, self.model.read
+            ids = self.model.ids() if tree is None else at_level(objects, tree, tree.level).nodes
+        labels, probabilities, names, _ = objects
         nothing, none = np.zeros(len(labels), bool), np.empty((0, probabilities.shape[1]), np.float32)
         result = Segmentation(labels, completed(probabilities), names, self.model.scene.digest, nothing, none)
         if read is not None:  # What blends into views is what was learnt, but for what was corrected.
@@ -190,10 +194,8 @@ class ViewerState:
             same = (probabilities == before).all(axis=1)
             learnt = learnt[same[read.clustered]]
             result = replace(result, clustered=read.clustered & same, learnt=learnt, temperature=read.temperature)
-        if tree is None:
-            result = result.with_ids(self.model.ids())
-        elif tree.num_classes == len(names):  # Classes that were added are in no tree.
-            result = replace(result, tree=tree)
+        # Classes that were added are in no tree.
+        result = replace(result, tree=tree) if ids is None else result.with_ids(ids)
         return "segmentation.npz", _as_file(result.save, "segmentation.npz")
 
     def _relabel(self) -> None:

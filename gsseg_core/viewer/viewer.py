@@ -77,8 +77,8 @@ class Viewer:
         self._listener.close()
 
     def _on_click(self, event: viser.SceneClickEvent) -> None:
-        state = self.state
-        with self.panel.telling(event.client):
+        state, asked = self.state, self.panel.answer.ask()
+        with self.panel.answer.telling(event.client):
             picked = pick(
                 state.model.scene,
                 np.array(event.ray_origin),
@@ -87,17 +87,20 @@ class Viewer:
                 focal=camera_of(event.client).fy,
                 device=state.device,
             )
-            self.panel.show_picked(picked, None)
+            self.panel.answer.show_picked(asked, picked)
             if picked is not None and state.views:
-                self.panel.show_picked(picked, state.view_votes(self.panel.show_progress).of(picked.gaussian))
+                votes = None
+                with self.panel.answer.telling(event.client, in_place=False):
+                    votes = state.view_votes(self.panel.answer.show_progress).of(picked.gaussian)
+                self.panel.answer.show_picked(asked, picked, votes)
 
     def _on_correction_click(self, event: viser.SceneClickEvent) -> None:
-        with self.panel.telling(event.client):
+        with self.panel.answer.telling(event.client):
             camera = camera_of(event.client, DRAWING_HEIGHT)
             self.panel.correct_at(camera, *_pixel(camera, np.clip(event.screen_pos, 0, 1 - 1e-9)))
 
     def _on_correction_box(self, event: viser.SceneRectSelectEvent) -> None:
-        with self.panel.telling(event.client):
+        with self.panel.answer.telling(event.client):
             camera = camera_of(event.client, DRAWING_HEIGHT)
             self.panel.correct_box(camera, _pixel(camera, event.screen_min), _pixel(camera, event.screen_max))
 

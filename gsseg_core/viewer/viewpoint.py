@@ -23,7 +23,7 @@ class Viewpoint:
     def __init__(self, server: viser.ViserServer, state: ViewerState) -> None:
         self._server, self._state = server, state
         low, high = np.percentile(state.model.scene.means, [5, 95], axis=0)
-        self._reach = float(np.linalg.norm(high - low)) / 2
+        self._reach = float(np.linalg.norm(high - low)) / 2 or 3 * float(state.model.scene.scales.max())
         start = server.initial_camera
         if state.views:
             poses = np.array([np.linalg.inv(view.camera.world_to_camera) for view in state.views])

@@ -13,7 +13,7 @@ from gsseg_core.errors import NoUsableViewsError, SettingsError
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import REMOVED, UNOBSERVED
-from gsseg_core.viewer.corrections import Corrections, box, disc, looks_alike, region, share_seen
+from gsseg_core.viewer.corrections import Corrections, box, disc, drawn_on, looks_alike, region
 from gsseg_core.viewer.model import Labelling
 from gsseg_core.viewer.picking import ViewVotes, pick
 
@@ -101,7 +101,8 @@ def test_what_was_drawn_is_labelled_and_all_else_is_unknown() -> None:
 def test_the_share_seen_is_one_for_what_lies_open_and_nearly_nothing_for_what_lies_behind() -> None:
     """The slow way: alphas of each Gaussian, alone in the scene, summed over the image."""
     drawn = View.from_arrays(CAMERA, np.zeros((CAMERA.height, CAMERA.width), np.int32))
-    share = share_seen(SCENE, drawn)
+    found, share = drawn_on(SCENE, drawn), np.zeros(len(SCENE), np.float32)
+    share[found.ids] = found.seen
     seen = make_operator(SCENE, CAMERA).visibility()
     for i in np.flatnonzero(seen > 0.5)[::25]:
         alone = make_operator(SCENE, CAMERA).without(np.arange(len(SCENE)) != i).visibility()[i]

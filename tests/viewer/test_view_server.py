@@ -29,7 +29,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from gsseg_core.errors import SettingsError
-from gsseg_core.viewer import panel
+from gsseg_core.viewer import answer as view_answer
 from gsseg_core.viewer import server as view_server
 from gsseg_core.viewer.access import listen
 from gsseg_core.viewer.clients import SERVER
@@ -331,7 +331,7 @@ class Asked(ThreadingHTTPServer):
 def test_markup_in_names_and_errors_runs_nothing_and_fetches_nothing(
     chromium: Browser, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(panel, "NOTICE", None)  # Where it closed by itself, a busy machine might look too late.
+    monkeypatch.setattr(view_answer, "NOTICE", None)  # Where it closed by itself, a busy machine might look too late.
     with ExitStack() as stack:
         other = stack.enter_context(closing(Asked()))
         fetched = f"http://127.0.0.1:{other.server_address[1]}/fetched"
@@ -358,7 +358,7 @@ def test_markup_in_names_and_errors_runs_nothing_and_fetches_nothing(
             page.get_by_text(f"{names[3]}: {names[label]}, ").wait_for(timeout=1000 * PATIENCE)
         assert page.get_by_text(rf"<img src={fetched}>\x1b[31m\u202e").count()
         for name in (names[3], script):
-            with viewer.panel.telling(client):
+            with viewer.panel.answer.telling(client):
                 raise SettingsError(f"told of {name}")
             page.get_by_text(f"told of {name}").nth(1).wait_for(timeout=1000 * PATIENCE)
         assert page.title() != "hacked" and not page.locator("iframe").count() and not other.asked

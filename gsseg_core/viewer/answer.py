@@ -1,0 +1,124 @@
+"""What the viewer answers to a click, to errors and while a long job runs, above the tabs of its panel.
+
+viser draws Markdown with whatever HTML stands in it. So text of others, which names and errors hold, gets there only
+through `paragraph`, and into labels, which are text, only through `shown_name`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+import viser
+
+from gsseg_core.data.class_names import class_name
+from gsseg_core.errors import GssegError
+from gsseg_core.text import counted, html_text, printable
+from gsseg_core.viewer.picking import Picked, ViewVote
+from gsseg_core.viewer.state import ViewerState
+
+MOST_CLASSES, MOST_VIEWS = 5, 8  # of the probabilities and votes that the answer to a click names
+LONGEST_NAME = 80  # characters of a name; of a longer one, the first
+NOTICE: float | None = 10.0  # seconds for which a browser is told of an error beside the answer; None: until closed
+_STYLE = "padding: 0 0.75em 0.75em; font-size: 0.875em; overflow-wrap: anywhere"
+_ASK = "Click on something in the picture to ask what it is."
+
+
+class Answer:
+    """Answers the last click for as long as nothing else is asked, as what was hit changes; offers parts and wholes."""
+
+    def __init__(self, gui: viser.GuiApi, state: ViewerState, level_changed: Callable[[], None]) -> None:
+        self._state, self._level_changed = state, level_changed
+        self._asked: object = None  # the last click, ...
+        self._picked: tuple[Picked, Sequence[ViewVote] | None] | None = None  # ... and what it hit, while that is told
+        self._node: int | None = None  # of which parts and whole are offered
+        self._answer = gui.add_html(paragraph(_ASK))
+        self._parts, self._whole = (gui.add_button(f"its {what}", visible=False) for what in ("parts", "whole"))
+        self._parts.on_click(lambda event: self._show_offered(event.client, state.show_parts))
+        self._whole.on_click(lambda event: self._show_offered(event.client, state.show_whole))
+
+    def ask(self) -> object:
+        """Begin to answer a click: what earlier ones would still have to say is said no more."""
+        self._asked = object()
+        return self._asked
+
+    def show_picked(self, asked: object, picked: Picked | None, votes: Sequence[ViewVote] | None = None) -> None:
+        """Answer a click: the Gaussian that it hit, and the votes for that, if they are known."""
+        with self._state.lock:
+            if asked is self._asked:
+                self._picked = None if picked is None else (picked, votes)
+                if picked is None:
+                    self._offer(None)
+                    self._answer.content = paragraph("Nothing is there.")
+                self.refresh()
+
+    def refresh(self) -> None:
+        """Tell what is known by now of the Gaussian that was clicked last."""
+        with self._state.lock:
+            if self._picked is not None:
+                self._offer(self._state.node_of(self._picked[0].gaussian))
+                told = self._told(*self._picked)
+                if told != self._answer.content:
+                    self._answer.content = told
+
+    def show_progress(self, stage: str, done: int, total: int) -> None:
+        """Say how far a long job is."""
+        self._answer.content = paragraph(f"{stage}: {done} of {total} views" if done < total else _ASK)
+
+    @contextmanager
+    def telling(self, client: viser.ClientHandle | None, in_place: bool = True) -> Iterator[None]:
+        """Show errors that the user can do something about in the browser, in place of the last answer or beside it."""
+        try:
+            yield
+        except GssegError as error:
+            if in_place:
+                with self._state.lock:
+                    self._picked = None
+                    self._offer(None)
+                    self._answer.content = paragraph(f" {error}", title="That did not work.")
+            if client is not None:
+                text = printable(str(error))
+                client.add_notification("That did not work", text, color="red", auto_close_seconds=NOTICE)
+
+    def _show_offered(self, client: viser.ClientHandle | None, show: Callable[[int], None]) -> None:
+        with self.telling(client):
+            if self._node is not None:
+                show(self._node)
+                self._level_changed()
+
+    def _offer(self, node: int | None) -> None:
+        tree, self._node = self._state.model.tree, node
+        of = ([], None) if tree is None or node is None else (tree.parts(node), tree.whole(node))
+        self._parts.visible, self._whole.visible = bool(of[0]), of[1] is not None
+
+    def _told(self, picked: Picked, votes: Sequence[ViewVote] | None) -> str:
+        model, classes = self._state.model, self._state.objects.class_names
+        i = picked.gaussian
+        label, probabilities = int(model.labelling.labels[i]), model.labelling.probabilities[i]
+        best = [k for k in np.argsort(-probabilities, kind="stable")[:MOST_CLASSES].tolist() if probabilities[k] > 0]
+        likely = ", ".join(f"{shown_name(model.name(k))} {probabilities[k]:.2f}" for k in best)
+        lines = [
+            f", class {model.ids()[label]}" if label >= 0 else "",
+            f"Gaussian {i}, {100 * picked.weight:.0f} % of the pixel",
+            f"probabilities: {likely or 'none'}",
+        ]
+        if votes is not None:
+            views = counted(len({vote.view for vote in votes}), "view")
+            lines.append(f"{views} voted for it" + (", the largest votes:" if votes else ""))
+            lines += [
+                f"{shown_name(v.view)}: {shown_name(class_name(classes, v.label))}, {v.weight:.1f} px"
+                for v in votes[:MOST_VIEWS]
+            ]
+        return paragraph(*lines, title=shown_name(model.name(label)))
+
+
+def shown_name(name: str) -> str:
+    """Make a name harmless, and short enough to be shown."""
+    return printable(name[:LONGEST_NAME])
+
+
+def paragraph(*lines: str, title: str = "") -> str:
+    """HTML of lines that hold text of any origin; `title` begins the first one, in bold."""
+    content = "<br>".join(map(html_text, lines))
+    return f'<div style="{_STYLE}"><strong>{html_text(title)}</strong>{content}</div>'
