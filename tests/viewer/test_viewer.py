@@ -241,6 +241,8 @@ def test_a_shift_drag_corrects_what_is_in_the_box(shown: Shown) -> None:
     shown.page.keyboard.up("Shift")
     shown.wait(lambda: len(shown.viewer.state.corrections) == 1, "the correction")
     assert (shown.viewer.state.objects.probabilities != LEARNT.probabilities)[TRUTH == 1].any()
+    (drawn,) = shown.viewer.state.corrections._drawn
+    assert drawn.votes.sum() > 100  # px
 
 
 def test_codes_of_a_live_source_refresh_the_picture(chromium: Browser) -> None:
