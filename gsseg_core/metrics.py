@@ -22,16 +22,15 @@ from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.run_folder import settle
 from gsseg_core.scene.camera import Camera
 
-BOUNDARY_SHARE = 0.02
-"""Width of the boundary band as a share of the image diagonal (Cheng et al., Boundary IoU, CVPR 2021)."""
+BOUNDARY_SHARE = 0.02  # of the image diagonal: width of the boundary band (Cheng et al., Boundary IoU, CVPR 2021)
 
 
 class Evaluation:
     """Agreement of predicted label maps with the truth, accumulated view by view.
 
     Labels are integers from 0; K is the largest one seen so far plus one, and grows by itself. Pixels whose truth is
-    `UNKNOWN` are ignored altogether; a prediction that is `UNKNOWN` where the truth is known is a miss of the true
-    class and a find of none.
+    `UNKNOWN` are ignored altogether; a prediction that is `UNKNOWN` where the truth is known is a false negative of
+    the true class, and a false positive of none.
 
     Examples
     --------
@@ -72,9 +71,10 @@ class Evaluation:
         answered = known & (prediction != UNKNOWN)
         size = max(self.num_classes, int(truth.max(initial=-1)) + 1, int(prediction.max(initial=-1)) + 1)
 
-        codes, counts = np.unique(truth[answered] * np.int64(size) + prediction[answered], return_counts=True)
-        for code, count in zip(codes.tolist(), counts.tolist(), strict=True):
-            self._pairs[divmod(code, size)] += count
+        # As int64: of two int32, NumPy 1 makes an int32, and the square of the largest label does not fit.
+        pairs, counts = np.unique(truth[answered].astype(np.int64) * size + prediction[answered], return_counts=True)
+        for pair, count in zip(pairs.tolist(), counts.tolist(), strict=True):
+            self._pairs[divmod(pair, size)] += count
 
         width = max(1, round(BOUNDARY_SHARE * float(math.hypot(*truth.shape))))
         near_truth, near_prediction = known & boundary_band(truth, width), answered & boundary_band(prediction, width)
@@ -179,14 +179,8 @@ def evaluate_folders(pred_dir: str | Path, truth_dir: str | Path, cameras: Itera
     Truth without a prediction is ignored, since a folder of true masks holds the train views too. With `cameras`, truth
     is read as masks to learn from are: undistorted where a lens bent the image, and scaled to its size.
 
-    Raises
-    ------
-    NoUsableViewsError
-        There is no PNG in `pred_dir`.
-    MaskFormatError
-        A prediction has no truth, or a file is no label image.
-    MaskSizeError
-        A prediction and its truth differ in size.
+    Raises `NoUsableViewsError` where there is no PNG in `pred_dir`, `MaskFormatError` where a prediction has no truth
+    or a file is no label image, and `MaskSizeError` where a prediction and its truth differ in size.
     """
     pred_dir, truth_dir, predictions = Path(pred_dir), Path(truth_dir), predicted_maps(pred_dir)
     from gsseg_core.data.mask_files import masks_below  # They load numba, which is of no use to anybody else here.
@@ -212,14 +206,8 @@ def evaluate_folders(pred_dir: str | Path, truth_dir: str | Path, cameras: Itera
 def evaluate_masks(pred_dir: str | Path, masks: MaskSet, cameras: Iterable[Camera] = ()) -> Evaluation:
     """Compare every `<stem>.png` in a folder of label images with the mask of this view that another program wrote.
 
-    A view without a camera among `cameras` has an image of the size of its prediction.
-
-    Raises
-    ------
-    NoUsableViewsError
-        There is no PNG in `pred_dir`.
-    MaskFormatError, MaskSizeError
-        A prediction has no truth, is no label image, or a mask cannot be read or has another shape.
+    A view without a camera among `cameras` has an image of the size of its prediction. Raises as `evaluate_folders`
+    does, and `MaskFormatError` where a mask cannot be read.
     """
     from gsseg_core.data.view import View
 
@@ -235,13 +223,7 @@ def evaluate_masks(pred_dir: str | Path, masks: MaskSet, cameras: Iterable[Camer
 
 
 def predicted_maps(folder: str | Path) -> list[Path]:
-    """List the label maps `<stem>.png` in a folder that `gsseg render` or the like wrote.
-
-    Raises
-    ------
-    NoUsableViewsError
-        There is none.
-    """
+    """List the label maps `<stem>.png` that `gsseg render` or the like wrote, or raise `NoUsableViewsError`."""
     settle(Path(folder))
     predictions = sorted(Path(folder).glob("*.png"))
     if not predictions:

@@ -15,6 +15,12 @@ from gsseg_core.metrics import BOUNDARY_SHARE, Evaluation, evaluate_folders
 from gsseg_core.scene.camera import Camera
 
 
+def test_large_labels_are_paired_as_they_are() -> None:
+    evaluation, labels = Evaluation(), np.full((4, 4), 60000, np.int32)
+    evaluation.add(labels, labels)  # 60000^2 is no int32, which NumPy 1 would make of it.
+    assert evaluation._pairs == {(60000, 60000): 16}
+
+
 def make_views(seed: int, num_views: int = 3, num_classes: int = 7) -> list[tuple[np.ndarray, np.ndarray]]:
     """Patchy label maps of several sizes; the prediction is the truth, moved, with some pixels wrong."""
     rng = np.random.default_rng(seed)
