@@ -4,7 +4,7 @@ Usage: python benchmarks/graph_term.py [--data FOLDER] [--out results_out/graph_
 
 Views are spread evenly over the train views, of which every seventh is held out and scored; test views are not looked
 at. A quarter of the objects of the wrong masks are missed or carry another's id, and edges are off by up to 3 px. The
-share of their labelled pixels that views leave unknown to each other is what the command goes by (`UNKNOWN` in
+share of their labelled pixels that views leave unknown to each other is what the command goes by (`UNKNOWN_SHARE` in
 `gsseg_core.refine.label_propagation`); beside it stands the share of Gaussians seen with less than 1 px.
 """
 
@@ -31,7 +31,7 @@ from gsseg_core.files.atomic import write_atomically
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.metrics import Evaluation
-from gsseg_core.refine.label_propagation import UNKNOWN, GraphSettings, propagate
+from gsseg_core.refine.label_propagation import UNKNOWN_SHARE, GraphSettings, propagate
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.spatial.neighbour_graph import graph_of
@@ -97,7 +97,7 @@ def score(bench: Bench, views: Sequence[View]) -> list[str]:
         iou.append(f"{evaluation.mean_iou:.4f}")
         ece.append(f"{diagram.ece:.4f}")
     share = float((evidence < GraphSettings().strength).mean())
-    used = "yes" if calibration.unknown > UNKNOWN else "no"
+    used = "yes" if calibration.unknown > UNKNOWN_SHARE else "no"
     return [f"{share:.3f}", f"{calibration.unknown:.4f}", used, *iou, *ece]
 
 

@@ -39,7 +39,7 @@ from gsseg_core.learn.prepared_views import default_budget
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.objects.object_table import ObjectTable, find_objects
 from gsseg_core.progress import Progress, Stopwatch, silent, with_progress
-from gsseg_core.refine.label_propagation import UNKNOWN, GraphSettings, propagate
+from gsseg_core.refine.label_propagation import UNKNOWN_SHARE, GraphSettings, propagate
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.report.findings import MaskChecks
 from gsseg_core.report.page import load_templates, write_report_page
@@ -188,7 +188,7 @@ def segment(
             fitted = _learn(inputs, settings, client, watch, progress)
             assessment = _assess(fitted, inputs.class_names, watch, progress)
         codes, evidence = fitted.codes_, fitted.evidence()
-        spreads = settings.graph if assessment.calibration.unknown > UNKNOWN else None
+        spreads = settings.graph if assessment.calibration.unknown > UNKNOWN_SHARE else None
         settings = replace(settings, graph=spreads, learner_settings=getattr(fitted, "settings", None))
         del fitted  # Its votes take as much memory as all that follows.
         with watch.stage("refine"):

@@ -27,9 +27,7 @@ intrinsic: Any = typed_intrinsic
 LANES = 16
 
 AHEAD = 12  # rows between the one that is worked on and the one to `prefetch`
-
-FAST = {"contract", "nnan", "nsz", "reassoc"}
-"""What the compiler may do to sums of weights, none of which is NaN."""
+FAST = {"contract", "nnan", "nsz", "reassoc"}  # what the compiler may do to sums of weights, none of which is NaN
 
 F32, I32, I64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 ROW, BITS = ir.VectorType(F32, LANES), ir.VectorType(I32, LANES)
@@ -87,7 +85,7 @@ class Builder:
         """Write a row."""
         self.llvm.store(value, address, align=4)
 
-    def spread(self, value: Any, kind: Any = ROW) -> Any:
+    def broadcast(self, value: Any, kind: Any = ROW) -> Any:
         """Sixteen times a float32, or an int32 for `BITS`."""
         undefined, first = ir.Constant(kind, ir.Undefined), ir.Constant(I32, 0)
         single = self.llvm.insert_element(undefined, value, first)
@@ -101,11 +99,11 @@ class Builder:
         """Low bits of an int64 as sixteen truth values."""
         return self.llvm.bitcast(self.llvm.trunc(bits, ir.IntType(LANES)), ir.VectorType(ir.IntType(1), LANES))
 
-    def least(self, a: Any, b: Any) -> Any:
+    def minimum(self, a: Any, b: Any) -> Any:
         """Take the smaller one in each lane."""
         return self.llvm.select(self.llvm.fcmp_ordered("<", a, b), a, b)
 
-    def most(self, a: Any, b: Any) -> Any:
+    def maximum(self, a: Any, b: Any) -> Any:
         """Take the larger one in each lane."""
         return self.llvm.select(self.llvm.fcmp_ordered(">", a, b), a, b)
 
@@ -176,140 +174,140 @@ def empty_rows(count: int) -> np.ndarray:
 
 
 @operation(types.int64, types.int64)
-def first_bit(row: Builder, bits: Any) -> Any:
+def first_bit(build: Builder, bits: Any) -> Any:
     """Position of the lowest bit that is set; there must be one."""
-    return row.llvm.cttz(bits, ir.Constant(ir.IntType(1), 1))
+    return build.llvm.cttz(bits, ir.Constant(ir.IntType(1), 1))
 
 
 @operation(types.int64, types.int64)
-def count_bits(row: Builder, bits: Any) -> Any:
+def count_bits(build: Builder, bits: Any) -> Any:
     """How many bits are set."""
-    return row.llvm.ctpop(bits)
+    return build.llvm.ctpop(bits)
 
 
 @operation(types.int64, None, None, types.int32)
-def count_at_most(row: Builder, numbers: Any, i: Any, limit: Any) -> Any:
+def count_at_most(build: Builder, numbers: Any, i: Any, limit: Any) -> Any:
     """Count which of the sixteen int32 in row i are not above a limit."""
-    address = row.llvm.bitcast(row.row(0), ir.PointerType(BITS))
-    found = row.llvm.icmp_signed("<=", row.llvm.load(address, align=4, typ=BITS), row.spread(limit, BITS))
-    return row.llvm.ctpop(row.bits(found))
+    address = build.llvm.bitcast(build.row(0), ir.PointerType(BITS))
+    found = build.llvm.icmp_signed("<=", build.llvm.load(address, align=4, typ=BITS), build.broadcast(limit, BITS))
+    return build.llvm.ctpop(build.bits(found))
 
 
 @operation(row_type)
-def nothing(row: Builder) -> Any:
+def zero_row(build: Builder) -> Any:
     """Sixteen zeros."""
     return constant(0.0)
 
 
 @operation(types.void, None, None, None)
-def store_row(row: Builder, target: Any, i: Any, a: Any) -> None:
+def store_row(build: Builder, target: Any, i: Any, a: Any) -> None:
     """Set target[i] to sixteen numbers."""
-    row.store(a, row.row(0))
+    build.store(a, build.row(0))
 
 
 @operation(row_type, None, None)
-def load_row(row: Builder, source: Any, i: Any) -> Any:
+def load_row(build: Builder, source: Any, i: Any) -> Any:
     """Read source[i]."""
-    return row.load(row.row(0))
+    return build.load(build.row(0))
 
 
 @operation(row_type, None, None, types.float32, types.float32, types.float32)
-def squared_distances(row: Builder, points: Any, i: Any, x: Any, y: Any, z: Any) -> Any:
+def squared_distances(build: Builder, points: Any, i: Any, x: Any, y: Any, z: Any) -> Any:
     """From (x, y, z) to sixteen points, whose coordinates are points[i] to points[i + 2]; unfused, as scalars are."""
     total = None
     for axis, center in enumerate((x, y, z)):
-        number = row.llvm.add(i, ir.Constant(i.type, axis))
-        offset = row.llvm.fsub(row.load(row.address(0, number)), row.spread(center))
-        square = row.llvm.fmul(offset, offset)
-        total = square if total is None else row.llvm.fadd(total, square)
+        number = build.llvm.add(i, ir.Constant(i.type, axis))
+        offset = build.llvm.fsub(build.load(build.address(0, number)), build.broadcast(center))
+        square = build.llvm.fmul(offset, offset)
+        total = square if total is None else build.llvm.fadd(total, square)
     return total
 
 
 @operation(types.int64, None, types.float32)
-def at_most(row: Builder, a: Any, limit: Any) -> Any:
+def at_most(build: Builder, a: Any, limit: Any) -> Any:
     """Bits of the lanes that are not above a limit."""
-    return row.bits(row.llvm.fcmp_ordered("<=", a, row.spread(limit)))
+    return build.bits(build.llvm.fcmp_ordered("<=", a, build.broadcast(limit)))
 
 
 @operation(row_type, None, None, types.int64)
-def add_where(row: Builder, total: Any, a: Any, bits: Any) -> Any:
+def add_where(build: Builder, total: Any, a: Any, bits: Any) -> Any:
     """Add two rows in the lanes of the bits that are set; elsewhere the first stays."""
-    return row.llvm.select(row.lanes(bits), row.llvm.fadd(total, a), total)
+    return build.llvm.select(build.lanes(bits), build.llvm.fadd(total, a), total)
 
 
 @operation(row_type, None, None, None)
-def add_product(row: Builder, total: Any, a: Any, b: Any) -> Any:
+def add_product(build: Builder, total: Any, a: Any, b: Any) -> Any:
     """Add a product of two rows."""
-    return row.fma(a, b, total)
+    return build.fma(a, b, total)
 
 
 @operation(row_type, None, None, types.float32)
-def add_scaled(row: Builder, total: Any, a: Any, factor: Any) -> Any:
+def add_scaled(build: Builder, total: Any, a: Any, factor: Any) -> Any:
     """Add a multiple of a row."""
-    return row.fma(row.spread(factor), a, total)
+    return build.fma(build.broadcast(factor), a, total)
 
 
 @operation(row_type, None, None, None, types.int64)
-def add_product_where(row: Builder, total: Any, a: Any, b: Any, bits: Any) -> Any:
+def add_product_where(build: Builder, total: Any, a: Any, b: Any, bits: Any) -> Any:
     """Add a product of two rows in the lanes of the bits that are set."""
-    return row.llvm.select(row.lanes(bits), row.fma(a, b, total), total)
+    return build.llvm.select(build.lanes(bits), build.fma(a, b, total), total)
 
 
 @operation(row_type, None, None, types.float32, types.int64)
-def add_scaled_where(row: Builder, total: Any, a: Any, factor: Any, bits: Any) -> Any:
+def add_scaled_where(build: Builder, total: Any, a: Any, factor: Any, bits: Any) -> Any:
     """Add a multiple of a row in the lanes of the bits that are set."""
-    return row.llvm.select(row.lanes(bits), row.fma(row.spread(factor), a, total), total)
+    return build.llvm.select(build.lanes(bits), build.fma(build.broadcast(factor), a, total), total)
 
 
 @operation(row_type, None, types.float32)
-def divided(row: Builder, a: Any, number: Any) -> Any:
+def divided(build: Builder, a: Any, number: Any) -> Any:
     """Divide a row by a number."""
-    return row.llvm.fdiv(a, row.spread(number))
+    return build.llvm.fdiv(a, build.broadcast(number))
 
 
 @operation(row_type, None, None)
-def larger(row: Builder, a: Any, b: Any) -> Any:
+def maximum(build: Builder, a: Any, b: Any) -> Any:
     """Take the larger one of two rows in each lane."""
-    return row.most(a, b)
+    return build.maximum(a, b)
 
 
 @operation(row_type, None, None)
-def smaller(row: Builder, a: Any, b: Any) -> Any:
+def minimum(build: Builder, a: Any, b: Any) -> Any:
     """Take the smaller one of two rows in each lane."""
-    return row.least(a, b)
+    return build.minimum(a, b)
 
 
 @operation(types.int64, None, None, types.float32)
-def above(row: Builder, a: Any, b: Any, margin: Any) -> Any:
+def above(build: Builder, a: Any, b: Any, margin: Any) -> Any:
     """Bits of the lanes in which one row exceeds another by more than a margin."""
-    return row.bits(row.llvm.fcmp_ordered(">", row.llvm.fsub(a, b), row.spread(margin)))
+    return build.bits(build.llvm.fcmp_ordered(">", build.llvm.fsub(a, b), build.broadcast(margin)))
 
 
 @operation(types.int64, None, None, types.float32)
-def apart(row: Builder, a: Any, b: Any, limit: Any) -> Any:
+def differ(build: Builder, a: Any, b: Any, limit: Any) -> Any:
     """Bits of the lanes in which two rows differ by more than a limit."""
-    difference = row.llvm.fsub(a, b)
-    size = row.most(difference, row.llvm.fneg(difference))
-    return row.bits(row.llvm.fcmp_ordered(">", size, row.spread(limit)))
+    difference = build.llvm.fsub(a, b)
+    size = build.maximum(difference, build.llvm.fneg(difference))
+    return build.bits(build.llvm.fcmp_ordered(">", size, build.broadcast(limit)))
 
 
 @operation(types.float32, None)
-def sum_row(row: Builder, a: Any) -> Any:
+def sum_row(build: Builder, a: Any) -> Any:
     """Sum of the sixteen."""
-    return row.sum(a)
+    return build.sum(a)
 
 
 @operation(types.float32, None, None, None, None)
-def dot(row: Builder, a: Any, i: Any, b: Any, j: Any) -> Any:
+def dot(build: Builder, a: Any, i: Any, b: Any, j: Any) -> Any:
     """Sum of a[i] * b[j] over the sixteen."""
-    return row.sum(row.llvm.fmul(row.load(row.row(0)), row.load(row.row(2))))
+    return build.sum(build.llvm.fmul(build.load(build.row(0)), build.load(build.row(2))))
 
 
 @operation(types.void, None, types.intp)
-def prefetch(row: Builder, table: Any, i: Any) -> None:
+def prefetch(build: Builder, table: Any, i: Any) -> None:
     """Ask for a row of any array to be in the cache soon."""
-    llvm, bytes_at = row.llvm, ir.PointerType(ir.IntType(8))
-    array = row.context.make_array(row.signature.args[0])(row.context, llvm, table)
+    llvm, bytes_at = build.llvm, ir.PointerType(ir.IntType(8))
+    array = build.context.make_array(build.signature.args[0])(build.context, llvm, table)
     stride = llvm.extract_value(array.strides, 0)
     address = llvm.gep(array.data, [llvm.mul(i, stride)], source_etype=ir.IntType(8))
     insert: Any = cgutils.get_or_insert_function

@@ -22,21 +22,19 @@ import numpy as np
 from gsseg_core.csr_rows import largest
 from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.kernels.compiler import kernel
-from gsseg_core.simd import LANES, add_scaled, apart, divided, empty_rows, load_row, nothing, prefetch, store_row
+from gsseg_core.simd import LANES, add_scaled, differ, divided, empty_rows, load_row, prefetch, store_row, zero_row
 from gsseg_core.spatial.knn import CHUNK
 from gsseg_core.spatial.neighbour_graph import NEIGHBOURS, Graph
 
-SETTLED = np.float32(1e-3)
-"""A Gaussian is left alone while no probability around it changes by more than this in a step."""
+SETTLED = np.float32(1e-3)  # a Gaussian is left alone while no probability around it changes by more in a step
 
-UNKNOWN = 1 / 100
+UNKNOWN_SHARE = 1 / 100
 """Share of each view's labelled pixels that all other views leave unknown, from which on the graph is worth its time.
 
 docs/few_views.md has what it gives on either side of this.
 """
 
-NEVER = 2**31 - 1
-
+NEVER = 2**31 - 1  # steps to a place that no code reaches
 _AHEAD = 8  # places between the one that is worked on and the one that is fetched from memory
 
 
@@ -57,33 +55,15 @@ class GraphSettings:
 
 
 def propagate(
-    graph: Graph, codes: np.ndarray, evidence: np.ndarray, settings: GraphSettings | None = None
+    graph: Graph,  # of N Gaussians
+    codes: np.ndarray,  # (N, K) float32, rows on the simplex, or of zeros where nothing is known
+    evidence: np.ndarray,  # (N,) px of labelled pixels that each code stands on; not read where the code is zeros
+    settings: GraphSettings | None = None,  # all but k, with which the graph was built
 ) -> np.ndarray:
-    """Spread codes along the graph, held by their evidence.
+    """Spread codes along the graph, held by their evidence: (N, K) float32, the same for any number of threads.
 
     A Gaussian with evidence of more than a hundred times the strength keeps its code, bit for bit; one that no code
-    reaches in all the steps stays a row of zeros.
-
-    Parameters
-    ----------
-    graph : Graph
-        Of N Gaussians.
-    codes : (N, K) float32
-        Rows on the simplex, or of zeros where nothing is known.
-    evidence : (N,)
-        Weight of the labelled pixels that each one's code stands on, in px; not read where the code is zeros.
-    settings : GraphSettings, optional
-        All but k, with which the graph was built.
-
-    Returns
-    -------
-    ndarray (N, K) float32
-        Does not depend on the number of threads.
-
-    Raises
-    ------
-    SceneValueError
-        The arrays are not of these shapes.
+    reaches in all the steps stays a row of zeros. Arrays of other shapes raise `SceneValueError`.
 
     Examples
     --------
@@ -104,7 +84,7 @@ def propagate(
     out = codes.copy()
     if settings.strength == 0 or settings.steps == 0:
         return out
-    known: np.ndarray = (largest(codes)[0] > 0)[graph.order]
+    known = (largest(codes)[0] > 0)[graph.order]
     weight = np.where(known, evidence[graph.order] / settings.strength, 0).astype(np.float32)
     moving = weight < 100
     readers = _readers(graph.indptr, graph.indices, moving)
@@ -190,7 +170,7 @@ def _step(
                 prefetch(codes, indices[e])
             i = places[m]
             mass = weight[i]
-            total = add_scaled(nothing(), load_row(learnt, i), weight[i])
+            total = add_scaled(zero_row(), load_row(learnt, i), weight[i])
             for e in range(indptr[i], indptr[i + 1]):
                 # What is not reached yet is zero, and without a branch.
                 mass += weights[e] if reached[indices[e]] <= step else np.float32(0)
@@ -198,7 +178,7 @@ def _step(
             # A code without evidence stays as it is until something is known around it.
             value = divided(total, mass) if mass > 0 else load_row(codes, i)
             store_row(values, m, value)
-            changed[m] = apart(value, load_row(codes, i), SETTLED) != 0 or reached[i] == step + 1
+            changed[m] = differ(value, load_row(codes, i), SETTLED) != 0 or reached[i] == step + 1
 
 
 @kernel(parallel=True)

@@ -17,7 +17,7 @@ from small_scenes import look_at, many_classes, write_dataset
 from gsseg_core.cli.arguments import build_parser
 from gsseg_core.cli.main import main
 from gsseg_core.data.label_images import read_mask, write_mask
-from gsseg_core.refine.label_propagation import UNKNOWN
+from gsseg_core.refine.label_propagation import UNKNOWN_SHARE
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 
@@ -117,7 +117,7 @@ def test_codes_are_spread_where_views_leave_much_of_each_other_unknown(place: Pa
 
     for options, expected in ((["--views", "1"], True), (["--views", "1", "--no-graph"], False), ([], False)):
         unknown, spread = run(*options)
-        assert (unknown > 0.5) if options else (unknown < UNKNOWN)
+        assert (unknown > 0.5) if options else (unknown < UNKNOWN_SHARE)
         assert spread is expected
 
 

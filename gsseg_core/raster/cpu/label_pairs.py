@@ -32,10 +32,11 @@ PARTS = 4  # parts of the image whose sums are added up beside each other
 def keep_entries(
     start: np.ndarray, reached: np.ndarray, kept_start: np.ndarray, shared_start: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Give a number to every entry that reaches a labelled pixel, and another where such a pixel has a weight.
+    """Give numbers to the entries that reach a labelled pixel, and others to those where such a pixel has a weight.
 
-    Those of a tile begin where the two starts say, (T + 1,). Returns both numbers of each entry, -1 for none, and its
-    tile, (E, 3) int32; of those with a weight the first number, int32, and the blocks with a weight, uint16, (E',).
+    The numbers of a tile begin where the two starts say, (T + 1,). Returns for each entry both numbers, -1 for none,
+    and its tile, (E, 3) int32; for those with a weight, (E',), their first number, int32, and the blocks with a weight,
+    uint16.
     """
     kept = np.empty((len(reached), 3), np.int32)
     shared, blocks = np.empty(shared_start[-1], np.int32), np.empty(shared_start[-1], np.uint16)
@@ -114,7 +115,7 @@ def number_pairs(
 
 @kernel(parallel=True)
 def number_on(numbers: np.ndarray, before: np.ndarray) -> None:
-    """Make one count, in place, of numbers of int32 that begin anew in every chunk, `before`, (CHUNKS,); -1 stays."""
+    """Add to numbers, int32, that begin anew in each chunk how many came `before` it, (CHUNKS,), in place; -1 stays."""
     for i in nb.prange(numbers.shape[0]):
         number = (numbers[i] & _NUMBER) + before[max(numbers[i], 0) >> _BITS]
         numbers[i] = number if numbers[i] >= 0 else -1
@@ -233,7 +234,7 @@ def sum_shares(
     n = 0
     for e in range(blocks.shape[0]):
         # Lane by lane, as long as the label stays the same: most blocks have one label, and most entries too.
-        current, lanewise = np.int64(-1), simd.nothing()
+        current, lanewise = np.int64(-1), simd.zero_row()
         todo = np.int64(blocks[e])
         while todo:
             b = simd.first_bit(todo)
@@ -247,7 +248,7 @@ def sum_shares(
                 if labels.slots[span] != current:
                     if current >= 0:
                         sums[e * label_count + current] += simd.sum_row(lanewise)
-                    current, lanewise = np.int64(labels.slots[span]), simd.nothing()
+                    current, lanewise = np.int64(labels.slots[span]), simd.zero_row()
                 here = np.int64(labels.lanes[span])
                 lanewise = simd.add_product_where(lanewise, weight, simd.load_row(inverse, b), here)
         if current >= 0:

@@ -17,7 +17,7 @@ from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.raster.cpu.blending import aim_next, in_tile, open_rays, stride_of, tile_of_turn
 from gsseg_core.raster.cpu.splat import OPEN, SIDE, WIDTH, lift_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
-from gsseg_core.simd import FAST, LANES, add_where, count_bits, first_bit, nothing, sum_row
+from gsseg_core.simd import FAST, LANES, add_where, count_bits, first_bit, sum_row, zero_row
 
 
 class Labels(NamedTuple):
@@ -181,7 +181,7 @@ def _lift_tile(
         ahead = aim_next(tiles, e, last, left, top, lines)
         hit = np.int64(0)
         # Lane by lane, as long as the label stays the same: most blocks have one label, and most entries too.
-        current, lanewise = np.int64(-1), nothing()
+        current, lanewise = np.int64(-1), zero_row()
         while blocks:
             b = first_bit(blocks)
             blocks &= blocks - 1
@@ -196,7 +196,7 @@ def _lift_tile(
                 if labels.slots[span] != current:
                     if current >= 0:
                         sums[(e - first) * label_count + current] += sum_row(lanewise)
-                    current, lanewise = np.int64(labels.slots[span]), nothing()
+                    current, lanewise = np.int64(labels.slots[span]), zero_row()
                 lanewise = add_where(lanewise, weight, np.int64(labels.lanes[span]))
         if current >= 0:
             sums[(e - first) * label_count + current] += sum_row(lanewise)

@@ -30,12 +30,12 @@ from gsseg_core.simd import (
     add_scaled,
     dot,
     first_bit,
-    larger,
     load_row,
-    nothing,
+    maximum,
+    minimum,
     prefetch,
-    smaller,
     store_row,
+    zero_row,
 )
 
 _ROUNDING = np.float32(1e-5)  # of blended codes, and more
@@ -61,7 +61,7 @@ def _put(
 def render(tiles: Tiles, codes: CSRRows, rows: np.ndarray, channels: int) -> tuple[np.ndarray, np.ndarray]:
     """Blend codes of the M projected Gaussians, float32: W q, (H, W, K) float32, and final transmittance, (H, W).
 
-    Which row of the codes each of them has say `rows`, (M,) int32.
+    Row `rows[m]` of the codes, (M,) int32, is that of Gaussian m.
     """
     (out, left_over), nothing_else = _blank(tiles, channels), np.empty((len(rows), 0), np.float32)
     stride = stride_of(tiles.rows)
@@ -79,12 +79,12 @@ def strongest(
     tiles: Tiles, codes: CSRRows, rows: np.ndarray, channels: int, background: bool, first: int, step: int,
     beside: np.ndarray, wanted: np.ndarray,  # (M, C) float32; (H, W) bool, or (0, 0) for all pixels
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    """Find the column of the largest blended code in each pixel, (H, W) int32, the first of equal ones.
+    """Find the column of the largest blended code in each pixel, without an image of all columns.
 
-    Second is told whether the sum of all is more than a half, (H, W) bool. What a ray has left over is added to column
-    0, if that is the background. No image of all columns is written, but for each step-th pixel of rows and columns,
-    from the first on: (R, C, K). Then comes what `render_few` makes of the codes `beside` these, if there are any.
-    Blocks of 4 x 4 pixels none of which is `wanted` are not looked at: what is told of them has no meaning.
+    Returns that column, (H, W) int32, the first of equal ones; whether the sum of all columns is more than a half,
+    (H, W) bool; all columns of the pixels of a `PixelGrid`, (R, C, K); and what `render_few` makes of the codes
+    `beside` these. What a ray has left over is added to column 0, if that is the background. Blocks of 4 x 4 pixels
+    none of which is `wanted` are left out: what is returned for them has no meaning.
 
     Codes are at most 1. So once one column leads by more than a ray has left, nothing farther changes that, and a block
     in which all rays are so far takes no more codes.
@@ -140,13 +140,13 @@ def _is_decided(values: np.ndarray, b: int, rays: np.ndarray, live: int) -> bool
     Rays that are not `live`, by the bits of their lanes, meet nothing.
     """
     channels = values.shape[1]
-    most, second, known = load_row(values, b * channels), nothing(), load_row(values, b * channels)
+    most, second, known = load_row(values, b * channels), zero_row(), load_row(values, b * channels)
     for k in range(b * channels + 1, (b + 1) * channels):
         value = load_row(values, k)
-        second, most = larger(second, smaller(most, value)), larger(most, value)
+        second, most = maximum(second, minimum(most, value)), maximum(most, value)
         known = add_scaled(known, value, np.float32(1))
     ahead = above(add_scaled(most, second, np.float32(-1)), load_row(rays, b), _ROUNDING)
-    return (ahead & above(known, nothing(), np.float32(0.5) + _ROUNDING) | ~live) & OPEN == OPEN
+    return (ahead & above(known, zero_row(), np.float32(0.5) + _ROUNDING) | ~live) & OPEN == OPEN
 
 
 @called_by_kernels

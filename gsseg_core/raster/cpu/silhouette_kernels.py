@@ -17,10 +17,10 @@ from gsseg_core.simd import (
     add_scaled,
     first_bit,
     load_row,
-    nothing,
     prefetch,
     store_row,
     sum_row,
+    zero_row,
 )
 
 ROUNDING = np.float32(1e-3)  # of 1 - T, below which a pixel is as good as empty
@@ -134,7 +134,7 @@ def reasons_to_stay(
                 b = first_bit(reached)
                 reached &= reached - 1
                 before = load_row(through, slot * TILE + b)
-                share = add_scaled(nothing(), alpha_of(b, lines, table[g, WIDTH]), -kept[g])
+                share = add_scaled(zero_row(), alpha_of(b, lines, table[g, WIDTH]), -kept[g])
                 after = add_product(before, before, share)
                 store_row(through, slot * TILE + b, after)
                 if sum_row(after) < T_MIN:
@@ -144,7 +144,7 @@ def reasons_to_stay(
         for e in range(start[tile], start[tile + 1]):
             g = entries[e]
             if asked[g] and live[slots[labels[g]]]:
-                slot, total = slots[labels[g]], nothing()
+                slot, total = slots[labels[g]], zero_row()
                 reached = aim(table, g, left, top, lines) & live[slot]
                 while reached:
                     b = first_bit(reached)
