@@ -46,15 +46,11 @@ class CSRRows(NamedTuple):
     def dense(self, num_classes: int) -> np.ndarray:
         """Return the array with its zeros, (N, K)."""
         out = np.zeros((len(self.indptr) - 1, num_classes), self.data.dtype)
-        self.write(out)
+        _write(self, out)
         return out
 
-    def write(self, out: np.ndarray) -> None:  # (N, K)
-        """Write the entries into an array, and leave the rest of it as it is."""
-        _write(self, out)
-
     def united(self, other: CSRRows) -> tuple[CSRRows, CSRRows]:
-        """Give both arrays the pattern of either, filled up with explicit zeros."""
+        """Give two arrays the union of their patterns, filled up with explicit zeros."""
         indptr = np.zeros_like(self.indptr)
         _count_united(self, other, indptr[1:])
         np.cumsum(indptr, out=indptr)
@@ -62,18 +58,6 @@ class CSRRows(NamedTuple):
         united_other = united.with_data(np.empty(indptr[-1], other.data.dtype))
         _unite(self, other, united, united_other.data)
         return united, united_other
-
-    def scattered(self, ids: np.ndarray, count: int) -> CSRRows:  # (N,) distinct
-        """Scatter row i to row ids[i] of `count` rows; the others are empty. Ascending rows keep their entries."""
-        indptr = np.zeros(count + 1, np.int64)
-        indptr[1:][ids] = np.diff(self.indptr)
-        np.cumsum(indptr, out=indptr)
-        if (ids[1:] > ids[:-1]).all():
-            return self._replace(indptr=indptr)
-        source = np.full(count, -1, np.int64)
-        source[ids] = np.arange(len(ids))
-        _, indices, data = self.take(source[source >= 0])
-        return CSRRows(indptr, indices, data)
 
     def normalised(self) -> CSRRows:
         """Scale each row of float32 to sum 1, in place; rows of zeros stay zero."""
@@ -97,8 +81,8 @@ class CSRRows(NamedTuple):
         _take(self, ids, rows)
         return rows
 
-    def with_rows(self, ids: np.ndarray, rows: CSRRows) -> CSRRows:  # (M,) distinct; M rows of the same patterns
-        """Replace the entries of some rows."""
+    def with_rows(self, ids: np.ndarray, rows: CSRRows) -> CSRRows:  # (M,) distinct; M rows of the same pattern
+        """Copy the array with other entries in some of its rows."""
         replaced = self.with_data(self.data.copy())
         _put(replaced, ids, rows)
         return replaced

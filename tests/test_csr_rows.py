@@ -29,14 +29,3 @@ def test_rows_are_replaced_as_in_an_array(array: np.ndarray, data: st.DataObject
     replaced = rows.with_rows(ids, chosen.with_data(3 * chosen.data))
     np.testing.assert_array_equal(replaced.dense(array.shape[1]), expected)
     np.testing.assert_array_equal(rows.dense(array.shape[1]), array)
-
-
-@given(codes, st.data())
-def test_rows_are_scattered_as_in_an_array(array: np.ndarray, data: st.DataObject) -> None:
-    count = len(array) + data.draw(st.integers(0, 5))
-    ids = np.array(data.draw(st.permutations(range(count))), np.int32)[: len(array)]
-    rows = CSRRows.from_dense(array)
-    for places in (ids, np.sort(ids)):
-        expected = np.zeros((count, array.shape[1]), np.float32)
-        expected[places] = array
-        np.testing.assert_array_equal(rows.scattered(places, count).dense(array.shape[1]), expected)

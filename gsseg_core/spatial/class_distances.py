@@ -63,7 +63,7 @@ def members_of_classes(labels: np.ndarray, num_classes: int) -> Iterator[np.ndar
 def _to_be_found(tree: Tree, labels: np.ndarray, before: Found, k: int) -> np.ndarray:
     """Mark the distances that may have changed, (n,) bool."""
     moved = labels != before.labels
-    wanted: np.ndarray = moved & (labels > 0)
+    wanted = moved & (labels > 0)
     if not moved.any():
         return wanted
     count = int(max(labels.max(), before.labels.max())) + 1

@@ -30,40 +30,36 @@ class Lists(NamedTuple):
     """The nearest others of M points, one point after the other."""
 
     counts: np.ndarray  # (M,) int64: how many of each point are listed
-    room: np.ndarray  # (M most,) int32: their places, those of each chunk of points from CHUNK * most on
-
-    @property
-    def most(self) -> int:
-        """How many of one point there is room for."""
-        return len(self.room) // len(self.counts)
+    places: np.ndarray  # (M capacity,) int32: those of each chunk of points from CHUNK * capacity on
 
     def joined(self) -> np.ndarray:
         """Put the places of all points together."""
-        lengths, first = np.add.reduceat(self.counts, np.arange(0, len(self.counts), CHUNK)), CHUNK * self.most
-        return np.concatenate([self.room[first * chunk :][:length] for chunk, length in enumerate(lengths.tolist())])
+        lengths = np.add.reduceat(self.counts, np.arange(0, len(self.counts), CHUNK)).tolist()
+        first = CHUNK * (len(self.places) // len(self.counts))
+        return np.concatenate([self.places[first * chunk :][:length] for chunk, length in enumerate(lengths)])
 
 
 @kernel(parallel=True)
 def nearest(tree: Tree, places: np.ndarray, k: int, listed: bool) -> tuple[np.ndarray, np.ndarray, Lists]:
     """Find the squared distance to the k-th nearest other point, (M,) float32, and the mean of the k, (M,) float64.
 
-    They are looked for from the points at ascending places, (M,) int32. By the triangle inequality the radius of one
-    point bounds those of all others in its leaf.
+    They are those of the points at ascending places, (M,) int32. By the triangle inequality the radius of one point
+    bounds those of all others in its leaf.
 
-    If they are to be `listed`, these are told in place of the means, with those tied for the last place up to twice as
-    many.
+    With `listed`, the neighbours themselves are returned in place of the mean distances: k of each point, or up to 2 k
+    where several are tied for the last place.
     """
     points, boxes = tree.points, tree.boxes
-    m, n, leaves, most = places.shape[0], points.shape[1], boxes.shape[0] // 2, 2 * k if listed else 0
+    m, n, leaves, capacity = places.shape[0], points.shape[1], boxes.shape[0] // 2, 2 * k if listed else 0
     radii, distances = np.empty(m, np.float32), np.empty(0 if listed else m, np.float64)
     bits, skip = radii.view(np.int32), np.empty(0, np.int32)
     counts = np.zeros(m if listed else 0, np.int64)
-    room = np.empty(m * most, np.int32)  # of which what no list fills is not touched
+    others = np.empty(m * capacity, np.int32)  # of which what no list fills is not touched
     for chunk in nb.prange((m + CHUNK - 1) // CHUNK):
         gaps, close, candidates = np.empty(DEPTH, np.float32), np.empty(3 * k + 2 * LEAF, np.float32), scratch_for(128)
         box, bounds = np.empty(6, np.float32), np.empty((2, LEAF), np.float32)
         bound_bits = bounds.view(np.int32)
-        before, first, end = -1, chunk * CHUNK, chunk * CHUNK * most
+        before, first, end = -1, chunk * CHUNK, chunk * CHUNK * capacity
         while first < min((chunk + 1) * CHUNK, m):
             last = end_of_group(tree, places, first)
             middle = middle_of(points, places, first, last, box)
@@ -82,12 +78,12 @@ def nearest(tree: Tree, places: np.ndarray, k: int, listed: bool) -> tuple[np.nd
                 _leave_out(own, leaf_of(own, leaves, n), leaves, n, rows, candidates)
                 bits[q] = _smallest(near_bits, rows, k, bound_bits[0, q - first], bound_bits[1, q - first])
                 if listed:
-                    counts[q] = _list(candidates, rows, radii[q], leaves, n, room[end : end + most])
+                    counts[q] = _list(candidates, rows, radii[q], leaves, n, others[end : end + capacity])
                     end += counts[q]
                 else:
                     distances[q] = _mean_root(near, LEAF * rows, k, radii[q])
             before, first = middle, last
-    return radii, distances, Lists(counts, room)
+    return radii, distances, Lists(counts, others)
 
 
 @called_by_kernels
@@ -208,7 +204,7 @@ def _search(
 
 @called_by_kernels
 def _shorten(near: np.ndarray, found: int, k: int) -> np.float32:
-    """Keep the k smallest, of equal ones any; returns the largest of them."""
+    """Keep the k smallest, whichever of equal ones; returns the largest of them."""
     bits, limit, kept = near.view(np.int32), _smallest_of(near, found, k), 0
     for i in range(found):
         if bits[i] < limit:

@@ -36,9 +36,7 @@ class Graph:
     weights: np.ndarray  # (E,) float32: p_ij, which sum to 1 over the neighbours of a Gaussian
 
     @classmethod
-    def build(
-        cls, means: np.ndarray, colors: np.ndarray, k: int = NEIGHBOURS, tree: Tree | None = None
-    ) -> Graph:  # fmt: skip
+    def build(cls, means: np.ndarray, colors: np.ndarray, k: int = NEIGHBOURS, tree: Tree | None = None) -> Graph:
         """Link points, (N, 3) float32 as their colours are, with their k nearest others, or with all there are.
 
         The tree, if one is at hand, is that of the scaled points.

@@ -26,12 +26,13 @@ from gsseg_core.scene.scene_cache import PerScene
 from gsseg_core.simd import at_most, first_bit, load_row
 from gsseg_core.spatial import knn
 from gsseg_core.spatial.kd_tree import LEAF, Tree, leaf_range, scaled, tree_of
+from gsseg_core.spatial.row_order import inverse
 
 CODE_UNIT = 2.0**-24  # codes are summed in steps of this, which is the precision of a float32 near 1
 ROWS_AT_ONCE = 1 << 16  # points whose mean codes are written out at once
 
 HALF = 3.0
-"""Evidence in px by which a Gaussian weighs half as much for its neighbours as by any amount of it."""
+"""Evidence in px with which a Gaussian has half of the weight in its neighbours' means that it could have at most."""
 
 _LEAST_WEIGHT = np.float32(2.0**-10)  # of one with a code: where all have next to no evidence, something still counts
 
@@ -93,7 +94,7 @@ class Neighbours:
             out, rows = np.zeros((len(places), num_classes), np.float32), np.arange(len(places), dtype=np.int32)
             means_of(places, rows, out, np.zeros(len(places), bool))
             parts.append(CSRRows.from_dense(out))
-        return CSRRows.vstack(parts).scattered(self.tree.order, len(asked))
+        return CSRRows.vstack(parts).take(inverse(self.tree.order))
 
     def average_into(
         self,
@@ -111,7 +112,7 @@ class Neighbours:
     def _asked(
         self, codes: CSRRows, weights: np.ndarray, wanted: np.ndarray
     ) -> tuple[np.ndarray, Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], None]]:
-        """Find the places in the tree that are wanted, and prepare `average` for all but its last four arguments."""
+        """Find the places in the tree that are wanted; returns them, and `average` but for its last four arguments."""
         order = self.tree.order
         selected = wanted[order]
         # In the order of the tree, neighbours lie beside each other.
