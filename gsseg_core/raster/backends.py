@@ -1,4 +1,4 @@
-"""The rasterisers by device: who adds one, adds its file and a line to the table here."""
+"""The table of rasterisers by device; a new one needs its file and a line here."""
 
 from __future__ import annotations
 
@@ -42,13 +42,7 @@ def devices() -> str:
 
 
 def rasteriser_of(device: str) -> Rasteriser:
-    """Find the rasteriser of a device by its name; whether there is such a device shows when it is used.
-
-    Raises
-    ------
-    SettingsError
-        None takes this name.
-    """
+    """Find the rasteriser of a device by its name, or raise `SettingsError`; whether the device exists shows in use."""
     for rasteriser in RASTERISERS:
         if re.fullmatch(rasteriser.devices, device):
             return rasteriser
@@ -72,23 +66,20 @@ def make_operator(scene: GaussianScene, camera: Camera, device: str = "cpu") -> 
     SettingsError
         There is no such device, or what it needs is not installed.
     """
-    operator: ViewOperator = _module_of(device).view_operator(scene, camera, device)
-    return operator
+    return _module_of(device).view_operator(scene, camera, device)
 
 
 def free_memory_on(device: str) -> int | None:
-    """Tell how many bytes for views are free on a device, None where the system does not say; raises the same."""
-    free: int | None = _module_of(device).free_memory_on(device)
-    return free
+    """Tell how many bytes are free on a device for views, None where unknown; raises as `make_operator` does."""
+    return _module_of(device).free_memory_on(device)
 
 
 def vote_total(votes: np.ndarray, device: str) -> AbstractContextManager[Any]:
-    """Give what the observations of many views on a device can `vote` for, in place of votes, (N, K) int64.
+    """Give a total on a device, to which `Observation.vote` adds views one after the other.
 
-    These have their votes once the context is left.
+    When the context is left, it has been added to `votes`, (N, K) int64.
     """
-    total: AbstractContextManager[Any] = _module_of(device).vote_total(votes, device)
-    return total
+    return _module_of(device).vote_total(votes, device)
 
 
 def _module_of(device: str) -> ModuleType:

@@ -15,10 +15,6 @@ soft edges would be learnt to be the table.
 """
 TINY = 1e-30  # floor of a pixel's likelihood
 
-CHANNELS = 32
-"""Channels that one pass of an adjoint sums at once: bounds its memory, and fits the shared memory of every GPU."""
-
+CHANNELS = 32  # that one pass of an adjoint sums at once, which bounds its memory
 BLOCK = 4  # px, side of the square blocks into which tiles are cut: sixteen pixels are one vector
-
-CHUNKS = 16
-"""Parts into which Gaussians are cut, to be worked on beside each other; fixed, so that threads change nothing."""
+CHUNKS = 16  # parts of the Gaussians that are worked on beside each other; fixed, so that threads change nothing

@@ -26,13 +26,13 @@ class Surface(NamedTuple):
 
 
 def surface(scene: GaussianScene, operator: ViewOperator) -> Surface:
-    """Render coverage and depth of a scene, or of an object alone, from the view of its operator."""
+    """Render coverage and depth of a scene, or of an object alone, by the operator of a view."""
     image, left_over = operator.blend_seen(depths(scene, operator.camera, operator.ids)[:, None])
     return surface_of(image[..., 0], left_over)
 
 
 def surface_of(depth: np.ndarray, left_over: np.ndarray) -> Surface:  # (H, W), (H, W)
-    """Tell what rays meet by their blended depth and what is left of them."""
+    """Divide blended depths by how much of each ray was blended."""
     coverage = 1 - left_over
     mean = np.divide(depth, coverage, out=np.full_like(coverage, np.inf), where=coverage > _EMPTY)
     return Surface(coverage, mean)
@@ -44,15 +44,14 @@ def colours_and_depth(scene: GaussianScene, operator: ViewOperator) -> Blended:
 
 
 def with_depths(scene: GaussianScene, operator: ViewOperator, others: np.ndarray) -> np.ndarray:
-    """Put the depth of each Gaussian of an operator behind what else it is to blend, (M, C): (M, C + 1) float32."""
+    """Append the depths of an operator's Gaussians, as one more channel, to others, (M, C): (M, C + 1) float32."""
     return np.concatenate([others, depths(scene, operator.camera, operator.ids)[:, None]], axis=1)
 
 
 def depths(scene: GaussianScene, camera: Camera, ids: np.ndarray | None = None) -> np.ndarray:
     """Depth of each centre, or of some of them, (M,) float32 in scene units, from a camera; 0 for those behind it."""
     ids = np.arange(len(scene), dtype=np.int32) if ids is None else ids
-    depth: np.ndarray = _depths(scene.means, ids, camera.world_to_camera[2].astype(np.float64))
-    return depth
+    return _depths(scene.means, ids, camera.world_to_camera[2].astype(np.float64))
 
 
 @kernel(parallel=True)

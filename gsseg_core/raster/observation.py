@@ -27,18 +27,11 @@ class VoteShares(NamedTuple):
 
 
 class ViewPairs(NamedTuple):
-    """The (Gaussian, label) pairs of a view as kernels take them; `Observation` says what the arrays are.
+    """The (Gaussian, label) pairs of a view as kernels take them; `Observation` says what the arrays are."""
 
-    Attributes
-    ----------
-    ids : (M,) int32
-    start : (M + 1,) int64
-    labels : (P,) int32
-    """
-
-    ids: np.ndarray
-    start: np.ndarray
-    labels: np.ndarray
+    ids: np.ndarray  # (M,) int32
+    start: np.ndarray  # (M + 1,) int64
+    labels: np.ndarray  # (P,) int32
 
 
 class Observation(ABC):
@@ -57,7 +50,7 @@ class Observation(ABC):
     classes: np.ndarray  # (L,) int32: labels that occur in the mask, ascending
     areas: np.ndarray  # (L,) int64: pixels of each label
     weighted_areas: np.ndarray  # (L,) float64: the same, each pixel by its weight in `shares`
-    # What `shares` was asked last, and what it answered; it is not asked twice.
+    # The arguments of `shares` when it was last called, and what it returned: nothing is computed twice in succession.
     answered: tuple[np.ndarray, np.ndarray, VoteShares] | None = None
 
     @property
@@ -108,36 +101,23 @@ class Observation(ABC):
         """Sum of weights of each pair, the entries of W^T onehot(y) that are not zero: (P,) float32, in px."""
 
     def vote(self, total: Any, units: float, sign: int = 1) -> None:
-        """Add the votes to those of other views, or take them away, in whole units.
+        """Add the votes to a total of all views, or take them away (sign -1), exactly: in whole units.
 
-        They are an (N, K) int64 array, or what `gsseg_core.raster.backends.vote_total` has in place of it. Raises
+        The total is an (N, K) int64 array, or what `gsseg_core.raster.backends.vote_total` has in place of it. Raises
         `SceneValueError` where an array has too few rows or classes, or another type.
         """
-        least = self.ids.max(initial=-1) + 1, self.evidence.votes.indices.max(initial=0) + 1
-        if any(np.less(total.shape, least)) or total.dtype != np.int64:
-            expected = f"({least[0]}, {least[1]}) or more, int64"
-            raise SceneValueError(
-                f"view '{self.name}': votes have shape {total.shape}, {total.dtype}; expected {expected}"
-            )
+        rows, classes = self.ids.max(initial=-1) + 1, self.evidence.votes.indices.max(initial=0) + 1
+        check_total(self.name, total, rows, classes)
         add_votes(total, self.ids, self.start, self.labels, self.evidence.votes, self.votes(), units, sign)
 
     def shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares:
         """Share one vote per labelled pixel, times its weight, among the Gaussians that made it.
 
+        Given are the likelihood of the label of each pair by its Gaussian, (P,) float32 of at least 0, and that of each
+        label by the background, `rest`, (L,) float32; other shapes raise `SceneValueError`.
+
         With p(y_p) = (W likelihood)[p, y_p] + T_end[p] rest[y_p], the share of a pair is the sum over the pixels of its
         label of w[p, i] / p(y_p). It is the gradient of the log likelihood with respect to that of the pairs.
-
-        Parameters
-        ----------
-        likelihood : (P,) float32
-            Of the label of each pair, given its Gaussian; at least 0.
-        rest : (L,) float32
-            Of each label, given the background.
-
-        Raises
-        ------
-        SceneValueError
-            They are not of these shapes.
         """
         likelihood, rest = np.ascontiguousarray(likelihood, np.float32), np.ascontiguousarray(rest, np.float32)
         if likelihood.shape != self.labels.shape or rest.shape != self.classes.shape:
@@ -153,6 +133,13 @@ class Observation(ABC):
     def _shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares: ...
 
 
+def check_total(view: str, total: np.ndarray, rows: int, classes: int) -> None:
+    """Refuse a total to which a view cannot add its votes: kernels would write beyond it."""
+    if total.ndim != 2 or len(total) < rows or total.shape[1] < classes or total.dtype != np.int64:
+        found = f"votes have shape {total.shape}, {total.dtype}"
+        raise SceneValueError(f"view '{view}': {found}; expected ({rows}, {classes}) or more, int64")
+
+
 @kernel(parallel=True)
 def add_votes(
     total: np.ndarray, ids: np.ndarray,  # (N, K) int64, added to; (M,) int32, ascending
@@ -160,7 +147,7 @@ def add_votes(
     label_votes: CSRRows, votes: np.ndarray,  # L rows, float64: what a pixel of each label votes; (P,) float32
     units: float, sign: int,  # per vote; a power of 2
 ) -> None:  # fmt: skip
-    """Add a view's votes to those of other views, or take them away, exactly: in whole units."""
+    """Add a view's votes to those of other views, or take them away."""
     cells = total.reshape(-1)
     for m in nb.prange(ids.shape[0]):
         # A row may be several cache lines: what is asked for is the one with the first label's class.

@@ -11,7 +11,7 @@ from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.errors import MaskFormatError, SceneValueError, SettingsError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.raster.objects_alone import ObjectsAlone
-from gsseg_core.raster.observation import Observation
+from gsseg_core.raster.observation import Observation, check_total
 from gsseg_core.raster.view_renderer import ViewRenderer
 
 
@@ -84,7 +84,7 @@ class ViewOperator(ViewRenderer):
     def vote(
         self, labels: np.ndarray, evidence: LabelEvidence | None, total: np.ndarray, units: float, sign: int = 1
     ) -> bool:
-        """Add the view's votes to those of others: those of `observe`, with nothing kept of it.
+        """Add the votes of a mask to those of other views, as `Observation.vote` does, and keep nothing of the view.
 
         Parameters
         ----------
@@ -108,11 +108,9 @@ class ViewOperator(ViewRenderer):
             The total has another number of rows, too few classes, or another type.
         """
         self._check_labels(labels, evidence)
+        self._check_rows(len(total), None, what="votes")
         most = int((labels if evidence is None else evidence.votes.indices).max(initial=0))
-        if len(total) != self.num_gaussians or most >= total.shape[1] or total.dtype != np.int64:
-            found = f"votes have shape {total.shape}, {total.dtype}"
-            expected = f"({self.num_gaussians}, K), with K above {most}, int64"
-            raise SceneValueError(f"view '{self.camera.name}': {found}; expected {expected}")
+        check_total(self.camera.name, total, self.num_gaussians, most + 1)
         return self._vote(labels, evidence, total, units, sign)
 
     def without(self, hidden: np.ndarray) -> ViewOperator:

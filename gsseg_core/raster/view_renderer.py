@@ -1,4 +1,4 @@
-"""A posed view that blends what Gaussians carry, be it by the whole operator or by what an observation kept of it."""
+"""Render a posed view: blend what its Gaussians carry, such as class probabilities or colours."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Blended(NamedTuple):
 
 
 class PixelGrid(NamedTuple):
-    """Some pixels of a view: each `step`-th one of each row and column, from the `first`, below the step, on."""
+    """A regular grid of the pixels of a view: every `step`-th row and column, from the `first` on."""
 
     first: int
     step: int
@@ -34,8 +34,7 @@ class PixelGrid(NamedTuple):
         return image[self.first :: self.step, self.first :: self.step]
 
 
-NO_PIXELS = PixelGrid(1 << 30, 1 << 30)
-"""A grid of which no image has a pixel."""
+NO_PIXELS = PixelGrid(1 << 30, 1 << 30)  # of which no image has one
 
 
 class Strongest(NamedTuple):
@@ -48,7 +47,7 @@ class Strongest(NamedTuple):
 
     @classmethod
     def of(cls, image: np.ndarray, grid: PixelGrid = NO_PIXELS, beside: Blended | None = None) -> Strongest:
-        """Find it in an image of probabilities, (H, W, K)."""
+        """Find the strongest class of each pixel of an image of probabilities, (H, W, K)."""
         return cls(image.argmax(axis=2).astype(np.int32), image.sum(axis=2) > 0.5, grid.of(image), beside)
 
     def labels(self) -> np.ndarray:
@@ -74,7 +73,7 @@ class ViewRenderer(ABC):
     ids: np.ndarray
 
     def render(self, codes: np.ndarray) -> np.ndarray:
-        """Blend into the view anything that a Gaussian carries, as class probabilities, colours or depths: W q.
+        """Blend anything that Gaussians carry, such as class probabilities, colours or depths, into the view: W q.
 
         Parameters
         ----------
@@ -93,7 +92,7 @@ class ViewRenderer(ABC):
         return self.blend(codes).image
 
     def blend(self, codes: np.ndarray) -> Blended:
-        """Render codes (N, K), and return what is left of each ray, in one pass; raises as `render` does."""
+        """Render codes (N, K) as `render` does, and tell what is left of each ray."""
         codes = np.asarray(codes)
         if codes.ndim != 2 or len(codes) != self.num_gaussians:
             raise SceneValueError(f"codes have shape {codes.shape}; expected ({self.num_gaussians}, K)")
@@ -101,16 +100,15 @@ class ViewRenderer(ABC):
 
     @abstractmethod
     def blend_seen(self, codes: np.ndarray, wanted: np.ndarray | None = None) -> Blended:
-        """Do the same for codes (M, K) of `ids` alone.
+        """Blend codes (M, K) of `ids` alone; raises as `render` does.
 
-        If only some pixels are `wanted`, (H, W) bool, others may have any value. Raises as `render` does.
+        If only some pixels are `wanted`, (H, W) bool, others may have any value.
         """
 
     def blend_rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None = None) -> Blended:
-        """Do the same for codes (N, K) of which only the entries that are not zero are at hand.
+        """Blend sparse codes, (N, K); raises as `render` does.
 
-        If they are those of some Gaussians, (R, K), `of` says of which, (R,) distinct: all of `ids` are among them.
-        Raises as `render` does.
+        Where they are of some Gaussians alone, (R, K), `of` says of which, (R,) distinct: all of `ids` are among them.
         """
         return self.blend_seen(codes.take(self._rows(codes, num_classes, of)).dense(num_classes))
 
@@ -139,7 +137,7 @@ class ViewRenderer(ABC):
         return Strongest.of(image, grid, None if beside is None else self.blend_seen(beside))
 
     def _rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None) -> np.ndarray:
-        """Tell which row of such codes each of `ids` has, (M,) int32."""
+        """Check sparse codes, and tell which of their rows each of `ids` has, (M,) int32."""
         self._check_rows(len(codes.indptr) - 1, of)
         if codes.indices.size and (most := int(codes.indices.max())) >= num_classes:
             raise SceneValueError(f"view {self.camera.name!r}: codes are of class {most}; expected below {num_classes}")
@@ -147,14 +145,17 @@ class ViewRenderer(ABC):
             return self.ids
         place = np.full(self.num_gaussians, -1, np.int32)
         place[of] = np.arange(len(of), dtype=np.int32)
-        rows: np.ndarray = place[self.ids]
+        rows = place[self.ids]
         if rows.min(initial=0) < 0:
             raise SceneValueError(f"view {self.camera.name!r}: a Gaussian that it shows has no codes; expected all")
         return rows
 
-    def _check_rows(self, count: int, of: Sized | None, wanted: np.ndarray | None = None) -> None:
+    def _check_rows(
+        self, count: int, of: Sized | None, wanted: np.ndarray | None = None, what: str = "codes"
+    ) -> None:  # fmt: skip
+        """Refuse codes, or votes, that are not of all Gaussians, or those of some; and `wanted` of another size."""
         if wanted is not None:
             self.camera.check_image(wanted, "wanted pixels have")
         expected = self.num_gaussians if of is None else len(of)
         if count != expected:
-            raise SceneValueError(f"view {self.camera.name!r}: codes are of {count} Gaussians; expected {expected}")
+            raise SceneValueError(f"view {self.camera.name!r}: {what} are of {count} Gaussians; expected {expected}")

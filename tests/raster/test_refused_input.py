@@ -47,11 +47,14 @@ def test_codes_of_another_scene_are_refused(backend):
         with pytest.raises(SceneValueError, match=r"codes have shape .* expected \(120, K\)"):
             operator.render(np.zeros(shape))
     labels = np.full(operator.camera.image_size[::-1], 2, np.int32)
-    for shape in [(119, 3), (120, 2)]:
-        with pytest.raises(SceneValueError, match=r"votes have shape .* expected \(120, K\), with K above 2"):
-            operator.vote(labels, None, np.zeros(shape, np.int64), 1.0)
+    for count in (119, 121):
+        with pytest.raises(SceneValueError, match=f"view 'view': votes are of {count} Gaussians; expected 120"):
+            operator.vote(labels, None, np.zeros((count, 3), np.int64), 1.0)
+    for wrong in (np.zeros((120, 2), np.int64), np.zeros(120, np.int64), np.zeros((120, 3), np.int32)):
+        with pytest.raises(SceneValueError, match=r"votes have shape .* expected \(120, 3\) or more, int64"):
+            operator.vote(labels, None, wrong, 1.0)
     seen = operator.observe(labels)
-    for shape in [(seen.ids[-1], 3), (120, 2)]:
+    for shape in [(seen.ids[-1], 3), (120, 2), (120,)]:
         with pytest.raises(SceneValueError, match=rf"votes have shape .* expected \({seen.ids[-1] + 1}, 3\) or more"):
             seen.vote(np.zeros(shape, np.int64), 1.0)
     some = np.zeros((len(operator.ids) - 1, 3), np.float32)

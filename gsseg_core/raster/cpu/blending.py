@@ -41,7 +41,7 @@ def in_block(r: int, c: int) -> tuple[int, int]:
 
 @nb.njit(inline="always")
 def in_tile(b: int, lane: int) -> tuple[int, int]:
-    """Row and column in the tile of a pixel of block b: the same sum, which is its own inverse."""
+    """Row and column in the tile of pixel `lane` of block b: the same formula, which is its own inverse."""
     return in_block(b, lane)
 
 

@@ -1,4 +1,4 @@
-"""Votes of a view straight from the sums of its entries, where nothing else is asked of it."""
+"""Votes of a view straight from the sums of its entries, where no observation of it is needed."""
 
 from __future__ import annotations
 
@@ -26,16 +26,17 @@ def add_entry_votes(
     labels = lifted.labels
     count = np.diff(labels.start)
     facts = np.stack([count, lifted.slot_start[:-1] - tiles.start[:-1] * count, labels.start[:-1]], axis=1)
-    votes = _put_beside(tiles.start, facts, lifted.sums, labels.present)
+    votes = _pack(tiles.start, facts, lifted.sums, labels.present)
     _vote(total, ids, tiles, facts, votes, lifted.sums, labels.present, evidence.votes, units, sign)
 
 
 @kernel(parallel=True)
-def _put_beside(start: np.ndarray, facts: np.ndarray, sums: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """Put beside each other what an entry votes, (E, 2) float32, in one place of memory: its label and the weight.
+def _pack(start: np.ndarray, facts: np.ndarray, sums: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Pack the vote of each entry, (E, 2) float32: its label and the weight, so that one look in memory finds both.
 
-    Where it votes for several labels, there is -1 less the tile instead of one, in whose sums they are found. The facts
-    of each tile, (T, 3) int64: how many labels; sums of entry e begin at e times these plus this; first label.
+    An entry with several labels has -1 - tile in place of one: its votes are looked up in the sums of that tile. Facts
+    of each tile, (T, 3) int64: the number of its labels, L; what to add to e * L for the first sum of entry e; and the
+    place of its first label in `present`.
     """
     votes = np.empty((start[-1], 2), np.float32)
     for tile in nb.prange(start.shape[0] - 1):
@@ -58,7 +59,7 @@ def _put_beside(start: np.ndarray, facts: np.ndarray, sums: np.ndarray, present:
 @kernel(parallel=True)
 def _vote(
     total: np.ndarray, ids: np.ndarray, tiles: Tiles,  # (N, K) int64, added to; (M,) int32
-    facts: np.ndarray, entry_votes: np.ndarray, sums: np.ndarray, present: np.ndarray,  # as in `_put_beside`
+    facts: np.ndarray, entry_votes: np.ndarray, sums: np.ndarray, present: np.ndarray,  # as in `_pack`
     label_votes: CSRRows, units: float, sign: int,  # L rows, float64: what a pixel of each label votes
 ) -> None:  # fmt: skip
     count, last, num_labels = ids.shape[0], tiles.gaussian_entries.shape[0] - 1, label_votes.indptr.shape[0] - 1

@@ -25,15 +25,10 @@ from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEA
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
-FRUSTUM_MARGIN = 0.3
-"""The linearisation point is kept within the image widened by this fraction of half its width, as trainers do."""
-
+FRUSTUM_MARGIN = 0.3  # of half the image's size, within which around the image the camera is linearised, as in trainers
 REACH_MAX = 1e6  # a reach is cut off here, in px: far beyond any image, and safely an integer
-
-HALF_LOG2E = 0.5 / np.log(2.0)
-
 LARGEST_REACH = np.sqrt(2.0 * np.log(255.0))  # standard deviations at which a Gaussian of opacity 1 falls to 1/255
-
+HALF_LOG2E = 0.5 / np.log(2.0)
 ROOT = np.sqrt(DILATION)
 
 BATCH = 128  # Gaussians that are looked at together before those among them that may be visible are projected

@@ -40,19 +40,12 @@ class TileOperator(ViewOperator):
     def __init__(self, camera: Camera, num_gaussians: int, ids: np.ndarray, tiles: Tiles) -> None:  # ids (M,)
         self.camera, self.num_gaussians, self.ids, self._tiles = camera, num_gaussians, ids, tiles
 
-    @classmethod
-    def of(cls, scene: GaussianScene, camera: Camera) -> TileOperator:
-        """Project a scene, and sort what can be seen into tiles."""
-        projected = project(scene, camera)
-        return cls(camera, len(scene), projected.ids, assign(projected, camera.width, camera.height))
-
     def footprints(self) -> np.ndarray:
         """Sum of the alphas of each of `ids` over an endless image, (M,)."""
         # |S| = var(x|y) S_yy, and the table has log2(e) / 2 over each of them.
         table = self._tiles.table
         area = np.pi / np.log(2.0) / np.sqrt(table[:, WIDTH] * table[:, HEIGHT])
-        areas: np.ndarray = np.exp2(table[:, LOG_OPACITY]) * area
-        return areas
+        return np.exp2(table[:, LOG_OPACITY]) * area
 
     def objects_alone(self, labels: np.ndarray) -> ObjectsAlone:
         """Choose the Gaussians that belong to an object."""
@@ -124,13 +117,14 @@ class TileOperator(ViewOperator):
 
 
 def view_operator(scene: GaussianScene, camera: Camera, device: str) -> TileOperator:
-    """Make the operator of a view on the CPU, the only device of this name."""
+    """Project a scene, and sort what can be seen into tiles; the CPU is the only device of its name."""
     del device
-    return TileOperator.of(scene, camera)
+    projected = project(scene, camera)
+    return TileOperator(camera, len(scene), projected.ids, assign(projected, camera.width, camera.height))
 
 
 def vote_total(votes: np.ndarray, device: str) -> AbstractContextManager[np.ndarray]:
-    """Have observations vote for these at once."""
+    """Give the votes themselves: observations add to them at once."""
     del device
     return nullcontext(votes)
 
@@ -150,7 +144,8 @@ class TileObservation(Observation):
         kept, shared, self._blocks = label_pairs.keep_entries(
             tiles.start, lifted.reached, start, shared_start, self._mask.weights
         )
-        # A Gaussian has at most as many labels as sums, and each entry one sum, but for so many in all:
+        # A chunk has at most one pair for each sum above zero: one for each of its entries, and `extra` more if all
+        # entries that have several are in this chunk.
         extra = counts[:, 3].sum() - counts[:, 0].sum()
         chunks = np.arange(CHUNKS + 1) * len(ids) // CHUNKS
         capacity = tiles.gaussian_start[chunks] + extra * np.arange(len(chunks))
@@ -173,7 +168,7 @@ class TileObservation(Observation):
         self._shared = self._tiles._replace(start=shared_start, entries=entries[shared])
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what `shares` was asked last."""
+        """Leave out what `shares` was called with last."""
         return {**self.__dict__, "answered": None}
 
     @property
@@ -182,7 +177,7 @@ class TileObservation(Observation):
         held = (self.ids, self.start, self.labels, self._votes, *self._tiles[4:],
                 self._shared.start, self._shared.entries, self._blocks, self._records, self._slot_start, self._pair,
                 *self._mask)  # fmt: skip
-        # And what `shares` was asked last, and answered.
+        # And what `shares` was called with last, and returned.
         return sum(array.nbytes for array in held) + 2 * self._votes.nbytes
 
     def operator(self, camera: Camera, num_gaussians: int) -> TileOperator:

@@ -15,16 +15,12 @@ from gsseg_core.raster.cpu.projection import Projected, joined
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
 from gsseg_core.simd import AHEAD, LANES, prefetch
 
-TILE = LANES
-"""Side of a tile in px. One row of a tile is one vector register of sixteen float32."""
-
+TILE = LANES  # side of a tile in px: one row of a tile is one vector register of sixteen float32
 TYPICAL = 8  # tiles that a Gaussian touches, at first; where they touch more on average, they are listed once more
-
 MOST_ENTRIES = 2**31 - 1  # their numbers are int32
+BATCH = 256  # Gaussians that are looked at together
 
 _LEAST = np.float32(LOG_ALPHA_MIN)
-
-BATCH = 256  # Gaussians that are looked at together
 
 
 class Tiles(NamedTuple):

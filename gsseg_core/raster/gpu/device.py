@@ -48,10 +48,7 @@ def _try(number: np.ndarray) -> None:
 def find_gpu(device: str) -> torch.device:
     """Find the GPU that is called 'cuda', the first one, or 'cuda:1' and so on.
 
-    Raises
-    ------
-    SettingsError
-        There is no such GPU, or something that it needs is missing.
+    Raises `SettingsError` where there is none of this name, or something that it needs is missing.
     """
     if SIMULATED:
         return torch.device("cpu")

@@ -154,7 +154,7 @@ class GPUObservation(Observation):
         return VoteShares(to_cpu(shares.pairs), shares.rest, shares.log_likelihood)
 
     def shared(self, likelihood: torch.Tensor, rest: np.ndarray) -> ShareTensors:
-        """Do what `shares` does with a tensor, and answer with one; it is not asked twice either."""
+        """Do what `shares` does with a tensor, and return one; nothing is computed twice in succession either."""
         known = self._shared
         if known is None or not (torch.equal(known[0], likelihood) and np.array_equal(known[1], rest)):
             self._shared = known = likelihood, rest.copy(), self._share(likelihood, rest)
@@ -179,14 +179,8 @@ class GPUObservation(Observation):
 def _cut(mask: torch.Tensor, tiles: TileTensors) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Give numbers to the labels of each tile of a mask, (H, W) int32.
 
-    Returns
-    -------
-    slots : (T, THREADS) int16
-        Number of the label of each pixel, by threads; -1 where unknown.
-    label_start : (T + 1,) int64
-        Labels of tile t are present[label_start[t]:label_start[t + 1]].
-    present : (label_start[-1],) int32
-        Positions of labels.
+    Returns the number of each pixel's label, (T, THREADS) int16 by threads, -1 where unknown; where the labels of each
+    tile begin, (T + 1,) int64; and which these are, (label_start[-1],) int32.
     """
     count, device = tiles.columns * tiles.rows, mask.device
     slots = torch.empty((count, THREADS), dtype=torch.int16, device=device)

@@ -187,7 +187,7 @@ def view_operator(scene: GaussianScene, camera: Camera, device: str) -> GPUOpera
 
 @contextmanager
 def vote_total(votes: np.ndarray, device: str) -> Iterator[Any]:
-    """Give votes on the GPU that are added to these at last; where they are too many for it, these."""
+    """Give a total on the GPU that is added to the votes at the end, or the votes themselves if that has no room."""
     free = free_memory_on(device)
     if free is not None and 4 * votes.nbytes > free:
         yield votes

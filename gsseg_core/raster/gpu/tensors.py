@@ -27,9 +27,9 @@ class RowTensors(NamedTuple):
 
     @classmethod
     def kept(cls, rows: CSRRows, device: torch.device) -> RowTensors:
-        """Do the same, and keep the copy of what was asked for last, as long as it is there: views are blended in turn.
+        """Copy rows, or return the copy of them if they were the last: all views blend the same codes, one by one.
 
-        Rows that are kept must not change.
+        Rows that are kept must not change; the copy lives as long as they do.
         """
         with _COPYING:
             if device not in _LAST or _LAST[device][0]() is not rows.data:
