@@ -15,43 +15,23 @@ from gsseg_core.spatial.neighbourhood import Neighbours, neighbour_weights
 
 
 def cluster_in_place(
-    means: np.ndarray,
-    codes: np.ndarray,
-    observed: np.ndarray,
-    k: int = RefineSettings.k,
+    means: np.ndarray,  # (N, 3) float32, finite, scene units
+    codes: np.ndarray,  # (N, K) float32, contiguous, rows on the simplex, written to; not read where unobserved
+    observed: np.ndarray,  # (N,) bool: whether any view saw the Gaussian
+    k: int = RefineSettings.k,  # at least 1
     beta: float = RefineSettings.beta,
-    neighbours: Neighbours | None = None,
-    evidence: np.ndarray | None = None,
+    neighbours: Neighbours | None = None,  # of `means` for this k, if they are known already
+    evidence: np.ndarray | None = None,  # (N,) px that each code stands on, for `neighbour_weights`
 ) -> tuple[np.ndarray, np.ndarray]:
     """Give every unsure and every unobserved Gaussian the mean code of the observed ones among its k nearest.
+
+    Returns which rows changed, (N,) bool, and what these were before, (M, K) float32.
 
     Unsure are those whose largest probability is below `beta`. All neighbours' codes are those from before the step.
     Where the paper is silent: codes are averaged as probabilities, not as logits; a Gaussian is not its own neighbour;
     neighbours may be unsure themselves; Gaussians tied for the last place share its weight equally. One with no
-    observed neighbour keeps its code: a part of the scene that no view has come near stays unobserved.
-
-    Parameters
-    ----------
-    means : array (N, 3) of float32
-        Finite positions, scene units.
-    codes : array (N, K) of float32
-        Rows on the simplex, contiguous; written to. Those of unobserved Gaussians are not read.
-    observed : array (N,) of bool
-        Whether any view saw the Gaussian.
-    k : int
-        Number of neighbours, at least 1.
-    beta : float
-        Threshold of the largest probability.
-    neighbours : Neighbours, optional
-        Those of `means` for this k, if they are known already.
-    evidence : array (N,) of float, optional
-        Px that each code stands on, for `gsseg_core.spatial.neighbourhood.neighbour_weights`. Without, as in the paper,
-        all observed ones weigh the same.
-
-    Returns
-    -------
-    (N,) bool, (M, K) float32
-        Which rows changed, and what these were before.
+    observed neighbour keeps its code: a part of the scene that no view has come near stays unobserved. Without
+    evidence, all observed ones weigh the same, as in the paper.
 
     Examples
     --------
@@ -72,39 +52,19 @@ def cluster_in_place(
 
 
 def statistical_filter(
-    means: np.ndarray,
-    labels: np.ndarray,
-    k: int = RefineSettings.k,
+    means: np.ndarray,  # (N, 3) float32, finite, scene units
+    labels: np.ndarray,  # (N,) class of each; the background, 0, is no object and not filtered, nor are negative ones
+    k: int = RefineSettings.k,  # at least 1
     sigmas: float = RefineSettings.filter_sigmas,
-    num_classes: int | None = None,
-    neighbours: Neighbours | None = None,
+    num_classes: int | None = None,  # K; labels from there on are ignored: by default there are none
+    neighbours: Neighbours | None = None,  # of `means` for this k, if they are known already
 ) -> np.ndarray:
-    """Find the Gaussians that lie too far from the rest of their own object.
+    """Find the Gaussians that lie too far from the rest of their own object, and are to be removed: (N,) bool.
 
     D is the mean distance from a Gaussian to its k nearest others of its class, and one is removed where
     D > mu + sigmas * sigma over the class. What the paper calls the variance sigma is taken as the standard deviation,
     since it is added to a distance. A class of k members or fewer uses all others; one of fewer than three is left
     alone. The limit has a slack of one millionth, the precision of D, so that objects of equal spacing stay whole.
-
-    Parameters
-    ----------
-    means : array (N, 3) of float32
-        Finite positions, scene units.
-    labels : array (N,) of int
-        Class of each Gaussian. The background, 0, is no object and is not filtered, nor are negative labels.
-    k : int
-        Number of neighbours, at least 1.
-    sigmas : float
-        Standard deviations above the mean at which to cut.
-    num_classes : int, optional
-        K; labels from there on are ignored. By default there are none.
-    neighbours : Neighbours, optional
-        Those of `means` for this k, if they are known already.
-
-    Returns
-    -------
-    ndarray (N,) bool
-        Which Gaussians to remove.
 
     Examples
     --------

@@ -61,8 +61,5 @@ class RefineSettings:
             raise SettingsError("refinement: found both carve and filter; expected one of them")
 
 
-PAPER = RefineSettings(weigh=False, filter=True, carve=False)
-"""KNN clustering and the statistical filter."""
-
-UNREFINED = RefineSettings(cluster=False, carve=False)
-"""Codes as they were learnt."""
+PAPER = RefineSettings(weigh=False, filter=True, carve=False)  # KNN clustering and the statistical filter
+UNREFINED = RefineSettings(cluster=False, carve=False)  # codes as they were learnt

@@ -38,15 +38,15 @@ from gsseg_core.several_at_once import several_at_once
 STEPS = 2  # of the shares: all move at once and so overshoot; on held-out views five were no better
 KEPT = 0.4  # least share with which a Gaussian stays with its object, of the largest share in that object
 _LEAST = np.float32(0.01)  # of a share, so that a Gaussian may come back
-_MEMORY = 2 << 30  # bytes of projected views that are kept between the steps; others are projected anew
+_MEMORY = 2 << 30  # bytes of projected objects that are kept between the steps; others are projected anew
 
-ENOUGH = 1 << 17  # px that a view tells as much by, about, as by more: see `looked_from`
+ENOUGH = 1 << 17  # px of a view with which it tells about as much as with more: see `looked_from`
 
 T = TypeVar("T")
 
 
 def looked_from(camera: Camera) -> Camera:
-    """Make the camera that a view is looked at from: the same, or one of `ENOUGH` px, about, if that has more.
+    """Make the camera that carving looks at a view from: the same, or one of about `ENOUGH` px if the view has more.
 
     docs/clean_objects.md has what more and fewer pixels are worth.
     """
@@ -62,7 +62,7 @@ class Silhouette(NamedTuple):
     operator: ViewOperator  # of the scene from there
     labels: np.ndarray  # (H, W) int32: class of each pixel, negative where unknown
     depth: np.ndarray  # (H, W) float32: of the scene's surface, scene units; infinite where there is none
-    stands_for: float = 1.0  # px of the view, each of these
+    stands_for: float = 1.0  # px of the view that each of these pixels stands for
 
     @classmethod
     def of(
@@ -71,12 +71,8 @@ class Silhouette(NamedTuple):
     ) -> Silhouette:  # fmt: skip
         """Put a label map (H, W) int32 and the depth of the scene together, which is rendered unless it is at hand.
 
-        If the operator is `looked_from` a view, its pixels count as much as those of the view.
-
-        Raises
-        ------
-        MaskSizeError
-            The labels are not of the camera's size.
+        If the operator is `looked_from` a view, its pixels count as much as those of the view. Labels that are not of
+        the camera's size raise `MaskSizeError`.
         """
         operator.camera.check_image(labels, "labels have")
         depth = surface(scene, operator).depth if depth is None else depth
@@ -93,47 +89,32 @@ class Silhouette(NamedTuple):
 
 
 def kept_shares(
-    scene: GaussianScene,
-    labels: np.ndarray,
-    views: Iterable[T],
-    look: Callable[[T], Silhouette],
+    scene: GaussianScene,  # of N Gaussians
+    labels: np.ndarray,  # (N,) int32; those of class 0 and below belong to no object and are not looked at
+    views: Iterable[T],  # of any kind that `look` takes
+    look: Callable[[T], Silhouette],  # tells what a view shows; may be called in several threads at once
     *,
-    device: str = "cpu",
-    steps: int = STEPS,
+    device: str = "cpu",  # where `look` renders, and where what is beyond the memory for views is projected again
+    steps: int = STEPS,  # at least 1
 ) -> np.ndarray:
-    """Find how much of each Gaussian its object should keep.
+    """Find how much of each Gaussian its object should keep: (N,) float64, 0.01 to 1.
 
-    Parameters
-    ----------
-    scene : GaussianScene
-        N Gaussians.
-    labels : (N,) int32
-        Class of each; those of class 0 and below belong to no object and are not looked at.
-    views : iterable
-        Views, of any kind that `look` takes.
-    look : function of a view
-        Tells what it shows. It may be called in several threads at once.
-    device : str
-        Where `look` renders, and where what is beyond the memory for views is projected again.
-    steps : int
-        How often to go through them, at least 1.
-
-    Returns
-    -------
-    (N,) float64
-        0.01 to 1; 1 where it has no object or no view says anything.
+    It is 1 where there is no object or no view says anything.
     """
     labels = np.ascontiguousarray(labels, np.int32)
     go, kept, stay = np.zeros(len(scene)), np.ones(len(scene)), np.zeros(len(scene))
-    known = _ObjectViews(scene, labels, device)
+    known: list[tuple[_Shown, ObjectsAlone | None]] = []  # views, and the objects in them as far as memory allows
+    taken = 0
     for shown, alone, reasons in several_at_once(partial(_look, scene, labels, look), views, device):
-        known.add(shown, alone)
+        fits = taken + alone.nbytes <= _MEMORY
+        known.append((shown, alone if fits else None))
+        taken += alone.nbytes if fits else 0
         go[alone.ids] += reasons
     asked = go > 0
     for step in range(steps):
         stay[asked] = 0
-        speak = partial(_reasons_to_stay, known, kept.astype(np.float32), asked)
-        for ids, reasons in several_at_once(speak, range(len(known)), device):
+        speak = partial(_reasons_to_stay, scene, labels, device, kept.astype(np.float32), asked)
+        for ids, reasons in several_at_once(speak, known, device):
             stay[ids] += reasons
         kept[asked] = np.clip(kept[asked] * stay[asked] / go[asked], _LEAST, 1.0)
         if step == 0:
@@ -153,10 +134,12 @@ def _look(
 
 
 def _reasons_to_stay(
-    views: _ObjectViews, shares: np.ndarray, asked: np.ndarray, number: int
-) -> tuple[np.ndarray, np.ndarray]:
+    scene: GaussianScene, labels: np.ndarray, device: str, shares: np.ndarray, asked: np.ndarray,
+    view: tuple[_Shown, ObjectsAlone | None],
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Weigh what speaks in one view for those that are asked for, (N,) bool: which they are, and how much."""
-    shown, alone = views[number]
+    shown, alone = view
+    alone = alone or make_operator(scene, shown.camera, device).objects_alone(labels)
     wanted = asked[alone.ids]
     reasons = alone.reasons_to_stay(shares[alone.ids], wanted, shown.labels)
     return alone.ids[wanted], shown.stands_for * reasons[wanted]
@@ -168,28 +151,6 @@ class _Shown(NamedTuple):
     camera: Camera
     labels: np.ndarray  # (H, W) int32
     stands_for: float
-
-
-class _ObjectViews:
-    """Views with the objects in them, of which those that do not fit into memory are projected again each time."""
-
-    def __init__(self, scene: GaussianScene, labels: np.ndarray, device: str) -> None:  # (N,) int32
-        self._scene, self._labels, self._device = scene, labels, device
-        self._shown: list[_Shown] = []
-        self._kept: dict[int, ObjectsAlone] = {}
-
-    def add(self, shown: _Shown, alone: ObjectsAlone) -> None:
-        """Keep a view, and its objects if there is room."""
-        if alone.nbytes + sum(kept.nbytes for kept in self._kept.values()) <= _MEMORY:
-            self._kept[len(self._shown)] = alone
-        self._shown.append(shown)
-
-    def __len__(self) -> int:
-        return len(self._shown)
-
-    def __getitem__(self, number: int) -> tuple[_Shown, ObjectsAlone]:
-        shown, alone = self._shown[number], self._kept.get(number)
-        return shown, alone or make_operator(self._scene, shown.camera, self._device).objects_alone(self._labels)
 
 
 def carve(
