@@ -1,8 +1,7 @@
-"""Work on several views at once: what one thread alone can do of a view leaves no core idle.
+"""Work on several views at once, so that no core is idle while one thread alone decodes a mask or reads a file.
 
-A mask is decoded, cut into regions and counted by one thread, and a view of another step comes out of a file, while the
-other cores would wait. On the CPU two views at once have half of the threads each: more would gain little, and each
-takes the memory of a view. On a GPU the rest of the work is such work, so there are as many views as threads.
+On the CPU two views are worked on, with half of the threads each: more would gain little, and each takes the memory of
+a view. Where a GPU renders, the CPU has nothing but such work of one thread, and there are as many views as threads.
 """
 
 from __future__ import annotations
@@ -31,17 +30,17 @@ def several_at_once(work: Callable[[T], R], items: Iterable[T], device: str = "c
     if threads == 1 or not kernels_run_beside_each_other():
         yield from map(work, items)
         return
-    many = 2 if device == "cpu" else threads
-    each, begun = threads // many, deque[Future[R]]()
-    beside = max(each, threads // 4)
-    with ThreadPoolExecutor(many, "gsseg-view", numba.set_num_threads, (each,)) as pool:
+    workers = 2 if device == "cpu" else threads
+    each, begun = threads // workers, deque[Future[R]]()
+    callers = max(each, threads // 4)
+    with ThreadPoolExecutor(workers, "gsseg-view", numba.set_num_threads, (each,)) as pool:
         try:
             for item in items:
                 begun.append(pool.submit(work, item))
-                if len(begun) > many:
-                    yield from _with_threads(beside, begun.popleft().result(), threads)
+                if len(begun) > workers:
+                    yield from _with_threads(callers, begun.popleft().result(), threads)
             while begun:
-                yield from _with_threads(beside, begun.popleft().result(), threads)
+                yield from _with_threads(callers, begun.popleft().result(), threads)
         finally:
             for future in begun:
                 future.cancel()
@@ -57,7 +56,7 @@ def each_with_made(
 
 @contextmanager
 def meanwhile(work: Callable[[], object], device: str) -> Iterator[None]:
-    """Do something beside what the body has a GPU do, and be done with it at its end; with none, it is left undone."""
+    """Do some work on the CPU while the body has a GPU at work, and end with it; without a GPU, leave it undone."""
     if device == "cpu" or not kernels_run_beside_each_other():
         yield
         return
@@ -68,7 +67,7 @@ def meanwhile(work: Callable[[], object], device: str) -> Iterator[None]:
 
 
 def _with_threads(few: int, made: R, usual: int) -> Generator[R, None, None]:
-    """Give something to the caller, whose kernels take few threads until he wants the next: the others have them."""
+    """Give the caller a result, and his kernels only few threads until he asks for the next one."""
     numba.set_num_threads(few)
     try:
         yield made

@@ -1,4 +1,4 @@
-"""Text for people: that of others, made harmless where it is shown, and tables for the terminal."""
+"""Text shown to people: foreign names and messages made harmless to print, and tables for the terminal."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
-LEAST = 3  # views that are named as those that agree least with the others
+_WORST = 3  # views that `segment` names as those that agree least with the others
 _JOINERS = "\u200c\u200d"  # change how their neighbours are written, as in Persian and in emoji, and nothing else
 _LONGEST = 1000  # characters of a message, at most
 
@@ -89,7 +89,7 @@ def segment_summary(report: Mapping[str, Any], out: str) -> str:
     rejected = ", ".join(f"{count} {why}" for why, count in views["rejected"].items())
     used = f"{counted(views['used'], 'view')} used" + (f", rejected: {rejected}" if rejected else "")
     checked = [view for view in views.get("reliability", []) if view["reliability"] is not None]
-    worst = ", ".join(f"{clipped(view['name'])} ({percent(view['reliability'])})" for view in checked[:LEAST])
+    worst = ", ".join(f"{clipped(view['name'])} ({percent(view['reliability'])})" for view in checked[:_WORST])
     if worst and views["used"] > 1:
         used += f"\nmasks that agree least with the other views: {worst}"
     if masks := report.get("masks"):

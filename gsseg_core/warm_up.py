@@ -43,8 +43,7 @@ EVERY_RUN = (
     "compiling kernels, about a minute on two cores, as in every run: they cannot be kept; " + kernel_cache.REMEDY
 )
 
-SIDE = 72
-"""Gaussians on a side of the square that is segmented; trees of fewer than 4,096 in all are built by other kernels."""
+SIDE = 72  # Gaussians on a side of the square; trees of fewer than 4,096 in all are built by other kernels
 
 _warm: set[str] = set()  # the devices for which all kernels are there
 
@@ -91,9 +90,8 @@ def warm_up(device: str = "cpu", say: Callable[[str], object] = lambda text: Non
 
 
 def telling(say: Callable[[str], object]) -> AbstractContextManager[object]:
-    """Tell, within the context, when the first kernel is compiled that was not in the cache."""
-    context: AbstractContextManager[object] = event.install_listener("numba:compile", _FirstCompilation(say))
-    return context
+    """Within the context, `say` once that kernels are being compiled: at the first that is not in the cache."""
+    return event.install_listener("numba:compile", _FirstCompilation(say))
 
 
 def _start_beside() -> Iterator[subprocess.Popen[bytes]]:
@@ -126,11 +124,8 @@ def _square() -> tuple[GaussianScene, Camera, np.ndarray]:
     scene = GaussianScene.from_arrays(means, quats, np.full((len(x), 3), 0.05), 0.9 * ones, sh)
     # The square is larger than the image: edges are only where the classes meet, and so the outline is moved there.
     K = np.array([[48.0, 0, 16], [0, 48, 16], [0, 0, 1]])
-    return (
-        scene,
-        Camera("warm_up", 32, 32, K, np.eye(4)),
-        np.repeat(np.arange(2, dtype=np.int32), 16)[None].repeat(32, 0),
-    )
+    labels = np.repeat(np.arange(2, dtype=np.int32), 16)[None].repeat(32, 0)
+    return scene, Camera("warm_up", 32, 32, K, np.eye(4)), labels
 
 
 def _learn_something(device: str) -> None:

@@ -1,4 +1,4 @@
-"""What numba does less of when it compiles kernels: changes to its inside, for versions that they were tried with.
+"""What numba is spared when it compiles kernels: changes to its internals, for the versions that they were tried with.
 
 For numba each function is one that Python, C or other functions may call at any time. So it optimises the body of a
 parallel loop as a function, as a ufunc of that, as a parallel kernel of that and once more within the function that has
@@ -48,8 +48,7 @@ class _Part(JITCodeLibrary):
         if not self._has_code and any(function.name == name for function in self.get_defined_functions()):
             self._has_code = True
             super()._finalize_final_module()
-        address: int = super().get_pointer_to_function(name)
-        return address
+        return super().get_pointer_to_function(name)
 
 
 class _PartsCodegen(JITCPUCodegen):
@@ -63,8 +62,7 @@ class _PartsCodegen(JITCPUCodegen):
 
     def unserialize_library(self, state: object) -> JITCodeLibrary:
         with _taken_for(JITCPUCodegen, self):  # Machine code of a kernel that calls this one or is called by it.
-            library: JITCodeLibrary = JITCPUCodegen.unserialize_library(self, state)
-            return library
+            return JITCPUCodegen.unserialize_library(self, state)
 
 
 @contextmanager
