@@ -18,26 +18,15 @@ _TEMPORARY = re.compile(r"\.gsseg-[0-9a-f]{12}(\..*)?", re.DOTALL)
 
 @contextlib.contextmanager
 def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a temporary path beside `path`, and move what was written there to `path` at the end.
+    """Yield the path of an empty file beside `path`, which the body writes; at the end it takes the name `path`.
 
-    An earlier file at `path` stays whole until the new one is complete and on the disk. If the body raises, whatever
-    it raises, the temporary file is removed and the earlier file remains; after a kill the next write into the same
-    folder, or run of it, removes it. A link to a file stays, and what it points to is replaced.
+    An earlier file at `path` stays whole until the new one is complete and on the disk. If the body raises anything,
+    the temporary file is removed and the earlier one remains; after a kill, the next write or run in the same folder
+    removes it. A link to a file stays, and the file that it leads to is replaced. Parent folders are created. The
+    temporary file has the suffix of `path`, for writers that go by it.
 
-    Parent folders are created. What is yielded is the name of an empty file, which the body must write; it has the
-    suffix of `path`, for writers that go by it.
-
-    Raises
-    ------
-    PathTakenError
-        `path` is a folder, a device, a FIFO or a socket.
-    WriteError
-        In place of any `OSError`: disk full, folder not writable.
-
-    Examples
-    --------
-    >>> with write_atomically("out/report.json") as temporary:  # doctest: +SKIP
-    ...     temporary.write_text("{}")
+    Raises `PathTakenError` where `path` is a folder, a device, a FIFO or a socket, and `WriteError` in place of any
+    `OSError`: disk full, folder not writable.
     """
     path = Path(path)
     temporary, lock = None, -1
@@ -63,13 +52,7 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Raise at once most of what `write_atomically` would raise after the work; writes nothing.
-
-    Raises
-    ------
-    PathTakenError, WriteError
-        As `write_atomically` does, but for a disk that is full.
-    """
+    """Raise at once what `write_atomically` would raise after the work, but for a full disk; writes nothing."""
     path = Path(path)
     try:
         folder = _replaceable(path).parent
@@ -104,7 +87,7 @@ def try_lock(file: int) -> bool | None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Have the names in a folder on the disk, where its file system can do that."""
+    """Flush the entries of a folder to the disk, where its file system can do that."""
     with contextlib.suppress(OSError):
         file = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
         try:
@@ -124,7 +107,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def _replaceable(path: Path) -> Path:
-    """Follow a link, and refuse what is neither a file nor missing; raises `OSError`, too."""
+    """Follow a link to the file that is to be replaced; `PathTakenError` if it is none, or `OSError`."""
     target = Path(os.path.realpath(path)) if path.is_symlink() else path
     try:
         mode = os.stat(target).st_mode
@@ -137,7 +120,7 @@ def _replaceable(path: Path) -> Path:
 
 
 def _locked_file(folder: Path, suffix: str) -> tuple[Path, int]:
-    """Make an empty file that `remove_leftovers` leaves alone while this process lives; its name and descriptor."""
+    """Make an empty file that `remove_leftovers` leaves alone while this process lives; returns path and descriptor."""
     while True:
         path = folder / f".gsseg-{secrets.token_hex(6)}{suffix}"
         file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)

@@ -23,7 +23,8 @@ from gsseg_core.files.limits import LIMITS
 from gsseg_core.text import clipped
 
 OPENED = "/proc/self/fd"
-"""Where Linux names what a descriptor stands for: to open it there opens that, and not what a path has become since."""
+"""Folder in which Linux has a link to each open file, by its descriptor: it leads to the file that was opened, even if
+another one has taken its path since."""
 
 READABLE_IMAGES = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 """Suffixes of images that `open_image` reads."""
@@ -45,13 +46,8 @@ DAMAGED = (
 def open_input(path: str | os.PathLike[str], within: Path | None = None) -> BufferedReader:
     """Open a file for reading; links are followed, and with `within` must lead to a file below that folder.
 
-    Raises
-    ------
-    PathNotAllowedError
-        It lies elsewhere; it has not been opened.
-    OSError
-        There is none, it cannot be read, or it is no regular file: a named pipe might never have anything to read, and
-        a device never an end. `strerror` says which.
+    Raises `PathNotAllowedError` where it lies elsewhere, before it is opened, and `OSError`, whose `strerror` says why,
+    where it cannot be read or is no regular file: a named pipe might never have anything to read, a device never end.
     """
     try:
         # Without O_NONBLOCK, a named pipe would keep us waiting for a writer right here.
@@ -90,7 +86,7 @@ def read_input(
 
 
 def _open_below(path: str | os.PathLike[str], within: Path, flags: int) -> int:
-    """Open the file that a path leads to now, and nothing that takes its place meanwhile."""
+    """Open the file that a path leads to, once it is known to lie below `within`: never one that replaces it then."""
     found = os.open(path, os.O_PATH | os.O_CLOEXEC)  # opens nothing yet
     try:
         require_below(os.readlink(f"{OPENED}/{found}"), path, within)
@@ -99,15 +95,15 @@ def _open_below(path: str | os.PathLike[str], within: Path, flags: int) -> int:
         os.close(found)
 
 
-def require_below(place: str, path: str | os.PathLike[str], within: Path) -> None:
-    """Raise `PathNotAllowedError`, on `path`, unless the place that it leads to is below a folder."""
+def require_below(target: str, path: str | os.PathLike[str], within: Path) -> None:
+    """Raise `PathNotAllowedError`, naming `path`, unless `target`, to which its links lead, is below a folder."""
     root = os.path.realpath(within)
-    if place != root and not place.startswith(root.rstrip("/") + "/"):
+    if target != root and not target.startswith(root.rstrip("/") + "/"):
         raise PathNotAllowedError(f"{path}: leads out of {within}; expected what lies below it, links followed")
 
 
 def list_folder(folder: Path, within: Path | None) -> list[Path]:
-    """List, sorted, what is in a folder that `require_below` allows, none if there is no folder; for `open_input`."""
+    """List what is in a folder, sorted; nothing if there is no folder. With `within`, it must lie below that."""
     if not folder.is_dir():
         return []
     if within is not None:
@@ -116,7 +112,7 @@ def list_folder(folder: Path, within: Path | None) -> list[Path]:
 
 
 def list_below(folder: Path, within: Path | None, depth: int = 4) -> list[Path]:
-    """List the files in a folder and, so deep, in those in it that are not hidden; as `list_folder` does."""
+    """List the files of a folder and, `depth` levels down, of its folders that are not hidden, by `list_folder`."""
     files: list[Path] = []
     for path in list_folder(folder, within):
         if not path.is_dir():
@@ -127,12 +123,9 @@ def list_below(folder: Path, within: Path | None, depth: int = 4) -> list[Path]:
 
 
 def is_there(path: Path, error: type[GssegError]) -> bool:
-    """Tell whether an optional file is there; whatever else has its name is refused.
+    """Tell whether an optional file is there; raise `error` if something else has its name.
 
-    Raises
-    ------
-    GssegError
-        Of the given class: a link that leads nowhere, which was meant to be there; a folder; a named pipe.
+    That is a folder, a named pipe, or a link that leads nowhere: its file was meant to be there.
     """
     try:
         mode = path.stat().st_mode
@@ -141,7 +134,7 @@ def is_there(path: Path, error: type[GssegError]) -> bool:
             raise error(f"{path}: is a link to {os.readlink(path)}, which does not exist; expected a file") from cause
         return False
     except OSError as cause:
-        raise error(f"{path}: cannot be read ({cause.strerror or cause})") from cause
+        raise error(f"{path}: cannot be read ({reason(cause)})") from cause
     if not stat.S_ISREG(mode):
         raise error(f"{path}: is {_KINDS.get(stat.S_IFMT(mode), 'no file')}; expected a regular file, or nothing")
     return True
@@ -173,9 +166,9 @@ def open_image(
 ) -> Iterator[Image.Image]:
     """Open an image whose header claims no more pixels than any camera takes; its pixels are not read yet.
 
-    `error` is raised, also for pixels that the body finds to be damaged; messages call the image a `kind`, and say what
-    was `expected`. `formats` are those of Pillow, all by default. With `within`, it must lie below that folder, links
-    followed.
+    Raises `error`, also for pixels that turn out to be damaged in the body; messages call the image a `kind`, and say
+    what was `expected`. `formats` are names of Pillow's, all by default. With `within`, the image must lie below that
+    folder, links followed.
     """
     try:
         file = open_input(path, within)

@@ -1,4 +1,4 @@
-"""Arrays out of an npz that anybody may have written: each is checked by its header before it is inflated."""
+"""Arrays of an npz that anybody may have written: each is checked by its header before it is inflated."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gsseg_core.files.limits import LIMITS, MAX_LABEL
 from gsseg_core.text import clipped, quoted
 
 SHARES_TOLERANCE = 0.01
-"""Probabilities of a row may sum to so much more or less than 1."""
+"""By how much probabilities of a row may sum to more or less than 1."""
 
 _COLDEST = 1e-3  # lowest temperature of probabilities; the highest is one over it
 _SUFFIX = ".npy"
@@ -51,9 +51,9 @@ class Header(NamedTuple):
 
 
 class NpzArrays:
-    """The arrays of an open npz, and their `names`; what is wrong with one takes no more memory than was asked for.
+    """The arrays of an open npz, and their `names`, read one by one.
 
-    Arrays that claim more than `Limits.max_npz_bytes` are an `UnfitError`.
+    Raises `UnfitError` where they claim more than `Limits.max_npz_bytes` together.
     """
 
     def __init__(self, archive: zipfile.ZipFile) -> None:
@@ -212,18 +212,11 @@ def read_json_header(arrays: NpzArrays) -> dict[str, Any]:
 def open_npz(
     path: Path, what: str, formats: Sequence[str], digest: str | None, within: Path | None = None
 ) -> Iterator[tuple[NpzArrays, Any]]:
-    """Open an npz whose JSON header must say one of `formats`, the newest first, and `digest`, if given, as "scene".
+    """Open an npz whose JSON header must name one of `formats`, the newest first, and `digest`, if given, as "scene".
 
-    What is yielded, the arrays and the header, is as safe as that of `open_arrays`.
-
-    Raises
-    ------
-    StateFileError
-        The file is missing, damaged, or of another format.
-    StateMismatchError
-        It belongs to another scene.
-    PathNotAllowedError
-        The file lies outside `within`.
+    Yields the arrays and the header. Raises `StateFileError` where the file is missing, damaged, also as the body finds
+    out, or of another format, `StateMismatchError` where it belongs to another scene, and `PathNotAllowedError` where
+    it lies outside `within`.
     """
     with open_arrays(path, what, StateFileError, within) as arrays:
         header = read_json_header(arrays)
@@ -244,7 +237,7 @@ def check_scene(path: Path, header: dict[str, Any], digest: str) -> None:
 
 
 def npz_format(path: Path) -> str:
-    """Read from the header of an npz what it says that it is; empty if it is missing, damaged or says nothing."""
+    """Read the format that the header of an npz names; "" if the file is missing, damaged or names none."""
     with suppress(GssegError), open_arrays(path, "an npz with a header", GssegError) as arrays:
         return str(read_json_header(arrays)["format"])
     return ""

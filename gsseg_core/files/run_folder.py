@@ -47,17 +47,13 @@ _PROBE = 1 << 16  # bytes that must fit on the disk before work begins
 
 @contextlib.contextmanager
 def staged_run(out: str | os.PathLike[str], kind: str, *, places: Iterable[str] = ()) -> Iterator[StagedRun]:
-    """Give a run whose files, at the end of the body, become the result of their kind in `out`: all or none.
+    """Yield a run whose files, at the end of the body, become the result of their kind in `out`: all or none.
 
-    The folder is made if it is not there; results of other kinds in it stay. `places`, files that the run will write as
-    far as they are known, are claimed at once.
+    The folder is made if it is not there; results of other kinds in it stay. `places`, the files that the run will
+    write, as far as they are known, are checked by `StagedRun.claim` at once.
 
-    Raises
-    ------
-    PathTakenError
-        `out`, or a place in it, is taken by what is not gsseg's.
-    WriteError
-        Something cannot be written. What was there before is whole and unchanged, unless the message says otherwise.
+    Raises `PathTakenError` where `out`, or a place in it, is taken by what is not gsseg's, and `WriteError` where
+    something cannot be written; what was there before is then unchanged, unless the message says otherwise.
     """
     run = StagedRun(Path(out), kind)
     try:
@@ -73,13 +69,7 @@ def staged_run(out: str | os.PathLike[str], kind: str, *, places: Iterable[str] 
 
 
 def settle(folder: str | os.PathLike[str]) -> None:
-    """Finish the move of a run that was cut short, before something is read from a folder.
-
-    Raises
-    ------
-    WriteError
-        There is one, and it cannot be finished.
-    """
+    """Finish the move of a run that was cut short, before something is read from a folder; `WriteError` if it fails."""
     folder = Path(folder)
     if os.path.lexists(folder / COMMIT_FILE):
         with _locked(folder):
@@ -89,7 +79,7 @@ def settle(folder: str | os.PathLike[str]) -> None:
 class StagedRun:
     """A run that is being written into `folder`, under the relative paths that its files will have in `out`.
 
-    Every file of the run carries its `id`, time (UTC) and eight random hex digits, for whoever finds it elsewhere.
+    Its files carry its `id`, time (UTC) and eight random hex digits, so that they can be traced back to it.
     """
 
     def __init__(self, out: Path, kind: str) -> None:
@@ -122,16 +112,10 @@ class StagedRun:
             raise _unwritable(self.out, error) from error
 
     def claim(self, places: Iterable[str]) -> None:
-        """Refuse, by name, a place that the run will write and that is taken by what is not of an earlier one.
-
-        Raises
-        ------
-        PathTakenError
-            There is one.
-        """
+        """Raise `PathTakenError` if a place that the run will write is taken by what no run of its kind wrote."""
         manifest = Manifest.read(self.out / RUN_FILE)
         for place in places:
-            _refuse_stranger(self.out, place, manifest, self._kind)
+            _check_free(self.out, place, manifest, self._kind)
 
     def commit(self) -> None:
         """Make what was written the result."""
@@ -175,7 +159,7 @@ class StagedRun:
 
 
 def _finish(out: Path) -> None:
-    """Move the files of the run that is the result into their places, if that is not done yet; `out` is locked."""
+    """Move the files of the run that `.gsseg-commit.json` names, if it is there, to their places; `out` is locked."""
     if not os.path.lexists(out / COMMIT_FILE):
         return
     manifest = Manifest.read(out / COMMIT_FILE)
@@ -235,7 +219,8 @@ def _move_aside(path: Path, run_id: str) -> None:
     os.rename(path, aside)
 
 
-def _refuse_stranger(out: Path, place: str, manifest: Manifest, kind: str) -> None:
+def _check_free(out: Path, place: str, manifest: Manifest, kind: str) -> None:
+    """Raise `PathTakenError` unless nothing is at a place, or a file of the last run of this kind."""
     for folder in reversed(Path(place).parents[:-1]):
         if os.path.lexists(out / folder) and not _is_folder(out / folder):
             raise PathTakenError(f"{out / folder}: is a link or a file; expected a folder, or nothing")
@@ -260,12 +245,12 @@ def _is_folder(path: Path) -> bool:
 
 
 def _lies_in(out: Path, place: str) -> bool:
-    """Whether something is there, in the folder itself, not behind a link."""
+    """Whether something is at a place, and no folder above it in `out` is a link."""
     return os.path.lexists(out / place) and all(_is_folder(out / folder) for folder in Path(place).parents[:-1])
 
 
 def _is_unchanged(out: Path, place: str, record: FileRecord | None) -> bool:
-    """Whether a file is there as a manifest says; None says nothing of it."""
+    """Whether a file is as its record says; not where there is no record."""
     is_file = _lies_in(out, place) and stat.S_ISREG((out / place).lstat().st_mode)
     return is_file and record is not None and record.fits(out / place)
 
@@ -293,7 +278,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _remove_dead(out: Path) -> None:
-    """Remove what was staged by runs whose processes have ended, and files they were writing; `out` is locked."""
+    """Remove what was staged, or half written, by processes that have ended; `out` is locked."""
     remove_leftovers(out)
     for path in [path for path in out.iterdir() if STAGING.fullmatch(path.name) and _is_folder(path)]:
         with contextlib.suppress(OSError):

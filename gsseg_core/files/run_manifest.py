@@ -28,7 +28,7 @@ class FileRecord:
         return cls(status.st_size, status.st_mtime_ns, _sha256(path))
 
     def fits(self, path: Path) -> bool:
-        """Whether a file is still the same. A copy has another time, and the same content; raises `OSError`."""
+        """Whether a file still has the recorded content, whatever its time; raises `OSError`."""
         status = path.lstat()
         if status.st_size != self.size:
             return False
@@ -45,13 +45,11 @@ class RunRecord:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Runs of a folder of results, and what it takes to finish the newest; empty where there is no manifest.
-
-    The newest takes the place of a run whose files are `before`: those that are still the same are replaced or removed.
-    """
+    """Runs of a folder of results, and what it takes to finish the newest; empty where there is no manifest."""
 
     runs: dict[str, RunRecord] = field(default_factory=dict)  # the last of each kind
     staging: str = ""  # the folder in which the newest of them was written
+    # Files of the run that the newest one replaces: those that are still the same are replaced or removed.
     before: dict[str, FileRecord] = field(default_factory=dict)
 
     @classmethod

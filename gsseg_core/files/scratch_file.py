@@ -1,4 +1,4 @@
-"""What does not fit into memory, in a temporary file without a name: it is gone with the process, however that ends."""
+"""A temporary file without a name, for what does not fit into memory; it is gone when the process ends, however."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _ALIGNED = 64  # bytes, as arrays in memory begin
 
 
 class _Place(NamedTuple):
-    """Where an object is: its arrays one after the other in the file, and all else here."""
+    """Where an object is: its arrays one after the other in the file, the rest of its pickle here."""
 
     offset: int
     sizes: list[int]  # of the arrays, in bytes
@@ -30,7 +30,7 @@ class ScratchFile:
     """Objects made of large arrays, by name; each is read as it was written, into memory of its own.
 
     The file is made when it is first needed, in the folder that the environment variable TMPDIR names, or else in
-    /var/tmp, which no memory stands behind, or else where Python puts temporary files.
+    /var/tmp, which is never kept in memory, or else where Python puts temporary files.
     """
 
     def __init__(self) -> None:
@@ -56,7 +56,7 @@ class ScratchFile:
         return name in self._places
 
     def put(self, name: str, value: Any) -> bool:
-        """Write an object; whether that was possible: there may be no space, and what was there of the name is gone."""
+        """Write an object in place of an earlier one of that name; False, with neither kept, if space is lacking."""
         self.drop(name)
         buffers: list[pickle.PickleBuffer] = []
         rest = pickle.dumps(value, protocol=5, buffer_callback=buffers.append)
@@ -65,7 +65,7 @@ class ScratchFile:
         try:
             if self._file is None:
                 self._file = tempfile.TemporaryFile(dir=_folder())  # noqa: SIM115 - it lives as long as this object
-            place = place._replace(offset=self._room_for(place.size))
+            place = place._replace(offset=self._find_space(place.size))
             offset = place.offset
             for array in arrays:
                 _write(self._file.fileno(), array, offset)
@@ -106,11 +106,11 @@ class ScratchFile:
             self._file.close()
             self._file = None
 
-    def _room_for(self, size: int) -> int:
-        """Find where so many bytes go: into a hole that is large enough, or to the end, if the disk has room there."""
-        for number, (offset, room) in enumerate(self._holes):
-            if room >= size:
-                self._holes[number : number + 1] = [(offset + size, room - size)] * (room > size)
+    def _find_space(self, size: int) -> int:
+        """Find the offset at which so many bytes fit: in a hole, or at the end; `OSError` if the disk has no space."""
+        for number, (offset, capacity) in enumerate(self._holes):
+            if capacity >= size:
+                self._holes[number : number + 1] = [(offset + size, capacity - size)] * (capacity > size)
                 return offset
         assert self._file is not None
         descriptor = self._file.fileno()

@@ -12,17 +12,17 @@ from gsseg_core.several_at_once import kernels_run_beside_each_other
 Arguments = ParamSpec("Arguments")
 
 WriteBehind = Callable[Concatenate[Callable[Arguments, object], Arguments], None]
-"""Called with what writes a file, and the arguments of that."""
+"""Has a function that writes a file called with these arguments, now or later."""
 
 
 @contextmanager
 def writing_behind() -> Iterator[WriteBehind[...]]:
-    """Give a function that has files written by two other threads; all are when the body has ended.
+    """Yield a function that has files written by two other threads; all are written when the body has ended.
 
-    To compress and to wait for the disk takes little of the cores that the body works on. Only what writes, or gets
-    something ready for that, belongs there: nothing else may change what it is given. The first error of a writer is
-    raised with the next call, or at the end. Where kernels of two threads cannot run beside each other, who calls it
-    writes: what is got ready may take a kernel, and numba would end the process.
+    To compress and to wait for the disk takes little of the cores that the body works on. Nobody may change what a
+    writer was given. The first error of a writer is raised with the next call, or at the end. Where kernels of two
+    threads cannot run beside each other, the caller's own thread writes: a writer may use a kernel, and numba would end
+    the process.
     """
     with ThreadPoolExecutor(2, "gsseg-write") as threads:
         waiting: list[Future[object]] = []

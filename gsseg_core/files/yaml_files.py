@@ -15,12 +15,8 @@ _MOST_BYTES = 2**20
 def read_yaml(path: Path, error: type[GssegError], within: Path | None = None) -> Any:
     """Read a YAML file, below `within` if given; raise `error` if it is missing, broken, or larger than any is.
 
-    Anchors are refused, since a few lines with them stand for more than any memory holds.
-
-    Raises
-    ------
-    SettingsError
-        PyYAML is not installed.
+    Anchors are refused: a few lines with them can stand for more than memory holds. Raises `SettingsError` where PyYAML
+    is not installed.
     """
     try:
         import yaml
